@@ -1,8 +1,8 @@
 """The far end of the serial wire in a benchmark: a process that simulates the board on a pty.
 
-The process has real-time priority if that is permitted. At its start it writes the path of the pty
-to standard output. When its standard input ends, the process writes all recorded data to standard
-output and ends.
+The process has real-time priority if it has permission. At its start, it writes the path of the pty
+to standard output. When its standard input ends, it writes all recorded data to standard output and
+ends.
 """
 
 from __future__ import annotations
@@ -26,11 +26,12 @@ from acsard.host.timerfd import TimerFd
 
 
 class Part(msgspec.Struct, frozen=True):
-    """The parameters that the simulated board's process reads from a file when it starts."""
+    """The parameters of the process that simulates the board, as it reads them from a file."""
 
     config: dict[str, object]
     free_running: float = 0.0
-    """Period at which the simulated board reports unasked, s; 0 if it only replies to lines."""
+    """Period at which the simulated board reports by its own clock, s; 0 for a board that answers
+    lines."""
     baud_rate: int = 0
     """Baud rate of the simulated board; 0 means the configured rate.
 
@@ -56,7 +57,7 @@ class NumberedMcu(FakeMcu):
 
 
 class FarEnd:
-    """Runs the simulated board at one end of a pty. The daemon opens the other end, `path`."""
+    """A simulated board at one end of a pty. The daemon opens the other end, at `path`."""
 
     def __init__(self, mcu: FakeMcu) -> None:
         self.seen = Seen()
@@ -102,7 +103,7 @@ class FarEnd:
 def main(part: Part) -> None:
     """Simulate the board until standard input ends.
 
-    Then write a `Seen` with all data that the board received and sent to standard output.
+    Then write a `Seen` to standard output, with all data that the board received and sent.
     """
     try:
         # Other processes must not delay the simulated board: a real one has its own processor.

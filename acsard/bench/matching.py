@@ -1,7 +1,7 @@
 """The record of a benchmark, and the figures that are computed from the record.
 
 Successive commands have different speeds, and so have successive feedback lines. Each output of the
-measured daemon is therefore matched with its input by the speed, not by the time. Times are
+measured daemon is therefore matched with its input by the speed, not by the time. All times are
 monotonic, in ns.
 """
 
@@ -30,14 +30,14 @@ The step is so small that the limits on acceleration do not change the speeds.
 """
 
 PATIENCE_NS = 1_000_000_000
-"""Time after which a command that has not reached the wire counts as lost, ns."""
+"""Time after which a command without a line on the wire counts as lost, ns."""
 
 Chunk = tuple[int, bytes]
-"""Pair: a monotonic time, ns, and the bytes that were sent or received at that time."""
+"""A pair: a monotonic time, ns, and the bytes that were sent or received at that time."""
 
 
 class Summary(Struct, frozen=True):
-    """Median, 99th percentile and maximum of `count` durations, us."""
+    """Median, 99th percentile and maximum of `count` durations, in us."""
 
     count: int
     p50: float
@@ -46,19 +46,20 @@ class Summary(Struct, frozen=True):
 
 
 class Fed(Struct, frozen=True):
-    """A feedback line from which the measured daemon published an odometry sample."""
+    """A feedback line for which the measured daemon published an odometry sample."""
 
     delay_ns: int
-    """Time from the moment at which the board wrote the line to the arrival of the sample, ns."""
+    """Time from the board's write of the line to the arrival of the sample at the benchmark, ns."""
     waiting: int
-    """Number of newer lines that the simulated board had written before the sample arrived."""
+    """Number of newer lines that the simulated board had already written when the sample
+    arrived."""
 
 
 def staircase(number: int) -> float:
-    """Return the speed of all wheels, rad/s, in the command or feedback line with this number.
+    """Return the speed of all wheels in the command or feedback line with this number, rad/s.
 
-    The speeds rise and fall with a period of `STEPS` lines. The falling speeds lie between the
-    rising speeds, so that all speeds of a period differ.
+    The speeds rise and then fall, and repeat after `STEPS` lines. The falling speeds lie between
+    the rising speeds, so all speeds of a period differ.
     """
     half = STEPS // 2
     place = number % STEPS
@@ -67,7 +68,7 @@ def staircase(number: int) -> float:
 
 
 def lines_of(chunks: Iterable[Chunk]) -> list[Chunk]:
-    """Return the non-empty lines, each with the time of its first byte, ns.
+    """Return the non-empty lines in `chunks`, each with the time of its first byte, ns.
 
     Line ends and trailing commas are removed.
     """
@@ -84,14 +85,14 @@ def lines_of(chunks: Iterable[Chunk]) -> list[Chunk]:
 
 
 def commands_to_lines(sent: Sequence[Chunk], lines: Sequence[Chunk]) -> list[int]:
-    """Return the time, ns, from each command to the line that carries it to the board.
+    """Return the time from each command to the line that carries it to the board, ns.
 
     If no such line follows within `PATIENCE_NS`, the command is lost and has no entry in the
     result.
 
     Args:
-        sent: for each command, its time, ns, and the line that the daemon must make of it.
-        lines: the time, ns, and the text of each line on the wire.
+        sent: for each command, its time, ns, and the line that the daemon must make of the command.
+        lines: for each line on the wire, its time, ns, and its text.
     """
     times: dict[bytes, list[int]] = {}
     for at_ns, line in lines:
@@ -114,8 +115,8 @@ def lines_to_samples(
     ignored.
 
     Args:
-        said: the time, ns, and the linear speed, m/s, of each feedback line.
-        samples: the time, ns, and the linear speed, m/s, of each odometry sample.
+        said: for each feedback line, its time, ns, and its linear speed, m/s.
+        samples: for each odometry sample, its time of arrival, ns, and its linear speed, m/s.
     """
     all_ns = [at_ns for at_ns, _ in said]
     places: dict[int, list[int]] = {}
@@ -137,7 +138,7 @@ def _key(speed: float) -> int:
 
 
 def summary(durations_ns: Sequence[int]) -> Summary | None:
-    """Return the count, percentiles and maximum of the durations, or None if the list is empty.
+    """Return the summary of the durations, or None if there are none.
 
     Each percentile is one of the durations, not an interpolation between two of them.
     """
@@ -154,9 +155,9 @@ class Seen(Struct, frozen=True):
     """All data that the simulated board received and sent, with monotonic times in ns."""
 
     heard: list[Chunk] = []
-    """Bytes from the daemon, each chunk with the time at which the board could read it."""
+    """Bytes from the daemon. Each chunk has the time at which the board could read it."""
     said: list[Chunk] = []
-    """Bytes to the daemon, each chunk with the time just before the board wrote it."""
+    """Bytes to the daemon. Each chunk has the time just before the board wrote it."""
 
 
 class Sent(Struct, frozen=True):
@@ -180,7 +181,7 @@ class Record(Struct, frozen=True):
     began_ns: int
     """Monotonic time just before the daemon was started, ns."""
     window_ns: tuple[int, int]
-    """Pair: begin and end, ns, of the time that is evaluated. It excludes start-up and shutdown."""
+    """Start and end of the evaluated time, ns. Start-up and shutdown of the daemon are excluded."""
     seen: Seen | None
     """Data on the wire; None on a real port, whose wire cannot be observed."""
     sent: list[Sent]
@@ -195,7 +196,10 @@ class Record(Struct, frozen=True):
 
 
 def command_waits(record: Record) -> list[int]:
-    """Return the time from each command to its line on the wire, ns, without lost commands."""
+    """Return the time from each command to its line on the wire, ns.
+
+    Lost commands have no entry. On a real port, the list is empty.
+    """
     if record.seen is None:
         return []
     sent = [(sent.at_ns, sent.line) for sent in record.sent]

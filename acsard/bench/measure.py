@@ -40,13 +40,15 @@ from acsard.host.errors import MendableError
 
 
 def bench_config(config: Config, *, simulated: bool) -> Config:
-    """Return `config` with a separate robot id, bus and command source for the measured daemon.
+    """Return `config` for the measured daemon, with its own robot id, bus and command source.
 
-    If the board is `simulated`, three more settings change:
+    The rates, the log and the state directory have their default values. If `simulated` is true,
+    further settings change:
 
     - The limits are so high that the next line to the board has the speeds of a command unchanged.
     - Feedback that contradicts the commands does not count as a fault.
     - Lines have no sequence number, because the benchmark recognizes a line by its text.
+    - The robot becomes active by itself, and drive, simulator and encoders have default values.
     """
     own = replace(
         config,
@@ -78,7 +80,7 @@ def bench_config(config: Config, *, simulated: bool) -> Config:
 
 
 def free_endpoint() -> str:
-    """Return an endpoint on the loopback interface at which no process listens."""
+    """Return an endpoint on the loopback interface on which no process listens."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
@@ -93,8 +95,8 @@ def write(config: Config, where: Path) -> Path:
 def measure(config: Config, port: str, seconds: float) -> Result:
     """Run a daemon, measure it for `seconds` s, and return the figures.
 
-    In the first quarter of this time the benchmark sends no commands. `port` is the serial port; ""
-    means the simulated board.
+    In the first quarter of this time, the benchmark sends no commands. `port` is the serial port;
+    "" means the simulated board. On a real port, all commands are zero.
     """
     with TemporaryDirectory(prefix="acsard-bench-") as where:
         file = write(config, Path(where))

@@ -20,7 +20,7 @@ POINTS = {
     "feedback_to_odometry": "microcontroller sends a line's last byte -> benchmark gets odometry",
     "read_to_odometry": "microcontroller samples the wheels (stamp) -> benchmark gets odometry",
 }
-"""Maps each duration that the benchmark measures to the events that begin and end it."""
+"""Maps each duration that the benchmark measures to the events at its start and at its end."""
 
 OWN = {
     "period_lateness": "control step due (the first missed step, if any) -> step begins",
@@ -30,7 +30,7 @@ OWN = {
     "feedback_to_bus": "daemon has read a feedback line -> its messages are on the bus queue",
     "mcu_round_trip": "daemon writes a line -> end of the reply (only on a checked link)",
 }
-"""Maps each duration that the daemon measures to the events that begin and end it."""
+"""Maps each duration that the daemon measures to the events at its start and at its end."""
 
 
 class Machine(Struct, frozen=True):
@@ -43,7 +43,7 @@ class Machine(Struct, frozen=True):
 
 
 class Result(Struct, frozen=True, omit_defaults=False):
-    """All figures of one run; durations are in us unless the name says otherwise."""
+    """All figures of one run. The durations are in us unless the name states another unit."""
 
     machine: Machine
     port: str
@@ -52,9 +52,10 @@ class Result(Struct, frozen=True, omit_defaults=False):
     baud_rate: int
     seconds: float
     realtime: bool
-    """True if the daemon's control task had real-time scheduling."""
+    """Whether the daemon's control loop had real-time scheduling."""
     outside: dict[str, Summary | None]
-    """Summaries of the durations in `POINTS`, by name. An unmeasured duration is null or absent."""
+    """Summaries of the durations in `POINTS`, by name. A duration that was not measured is null or
+    absent."""
     own: dict[str, Summary]
     """Summaries of the durations in `OWN`, by name. The percentiles are accurate to 12 %."""
     commands_sent: int
@@ -65,15 +66,16 @@ class Result(Struct, frozen=True, omit_defaults=False):
     lines_told: int
     """Number of feedback lines whose odometry the benchmark received."""
     lines_waiting_max: int | None
-    """Largest number of newer lines that the simulated board had written before the odometry of a
-    line arrived at the benchmark; null on a real port."""
+    """Largest number of newer lines that the simulated board had already written when the odometry
+    of a line arrived at the benchmark; null on a real port."""
     lines_sent: int
-    """Number of lines that the daemon had written to the port when `missed_periods` was read."""
+    """Number of lines that the daemon had written to the port when the benchmark read
+    `missed_periods`."""
     missed_periods: int
     cpu_percent_following: float
-    """Processor use with one subscriber to the odometry and without commands, % of one core."""
+    """Processor use with a subscriber to the odometry and without commands, % of one core."""
     cpu_percent_commanded: float
-    """Processor use with one subscriber to the odometry and 25 commands a second, % of one core."""
+    """Processor use with a subscriber to the odometry and 25 commands a second, % of one core."""
     resident_mb: float
     start_up_ms: float | None
     """Time from the start of the daemon to its first line on the port, ms; null on a real port."""

@@ -45,14 +45,14 @@ from acsard.host.errors import Exit, ExitError, MendableError, NoAnswerError, Un
 from acsard.host.own_identity import sender_id
 
 END_S = 5.0
-"""Time limit, s, for the end of a process after the request to end. It usually takes 0.2 s."""
+"""Time limit for a process to end after the request to end, s. It usually takes 0.2 s."""
 
 
 def ended(who: str, code: int, said: str = "") -> MendableError:
     """Return an error which says that the process named `who` ended, and how.
 
-    `code` is its exit code. If `code` is negative, the signal with the number -`code` ended the
-    process. `said` is the last message of the process.
+    `code` is its exit code, or the negative number of the signal that ended the process. `said` is
+    the last message of the process; "" if it left none.
     """
     return MendableError(f"{who} {how_it_ended(code)}" + (f": {said}" if said else ""))
 
@@ -60,8 +60,9 @@ def ended(who: str, code: int, said: str = "") -> MendableError:
 def daemon_ended(code: int, log: Path) -> MendableError:
     """Return an error that says why the daemon ended by itself.
 
-    The error quotes the daemon's last message in the file `log`. If there is such a message and the
-    exit code `code` is one of `Exit`, the benchmark exits with the same code.
+    `code` is its exit code. The error quotes the daemon's last message in the file `log`. If there
+    is such a message and the code is one of `Exit` except 0, the benchmark ends with the same exit
+    code.
     """
     lines = log.read_text(errors="replace").splitlines()
     # The daemon's log lines are JSON; its reason for ending is plain text.
@@ -103,8 +104,8 @@ LOOK_S = 0.5
 FAR_END = "the simulated microcontroller's process"
 
 SPACING_S = (0.02, 0.06)
-"""Shortest and longest random time between two commands, s. If the time were constant, all commands
-could arrive at the same phase of the daemon's control period."""
+"""Shortest and longest random time between two commands, s. If this time were constant, all
+commands could arrive at the same phase of the daemon's control period."""
 
 
 class Rig:
@@ -117,8 +118,8 @@ class Rig:
         file: the configuration file of the measured program.
         words: the command line that starts the measured program.
         port: the serial port; "" starts a process that simulates the board on a pty.
-        free_running: period at which the simulated board reports without being asked, s; 0
-            simulates a board that answers each line.
+        free_running: period at which the simulated board reports by its own clock, s; 0 simulates a
+            board that answers each line.
         wire_baud_rate: baud rate of the simulated board; 0 means the configured baud rate.
     """
 
@@ -249,7 +250,10 @@ class Rig:
         self._arrived.append((clock.now(), sample.payload.to_bytes()))
 
     def follow(self, seconds: float) -> float:
-        """Receive odometry for `seconds`. Return the daemon's CPU use as a fraction of one core."""
+        """Receive odometry for `seconds` s, and return the daemon's processor use.
+
+        The result is a share of one core, such as 0.1.
+        """
         began_ns, used_ns = clock.mono_ns(), processor_ns(self.process.pid)
         end_ns = began_ns + int(seconds * NS_PER_S)
         while (left_ns := end_ns - clock.mono_ns()) > 0:
@@ -258,11 +262,10 @@ class Rig:
         return self._share(began_ns, used_ns)
 
     def command(self, seconds: float, wheel_speed: Callable[[int], float], seed: int = 1) -> float:
-        """Send commands at random intervals for `seconds`.
+        """Send commands at random intervals for `seconds` s, and return the daemon's processor use.
 
-        Returns the daemon's CPU use as a fraction of one core. `wheel_speed` takes the number of a
-        command (0, 1, ...) and returns the speed of all wheels, rad/s. `seed` determines the random
-        intervals.
+        The result is a share of one core. `wheel_speed` takes the number of a command (0, 1, ...)
+        and returns the speed of all wheels, rad/s. `seed` determines the random intervals.
         """
         phases, number = random.Random(seed), 0
         self._neutral(phases)
@@ -278,9 +281,10 @@ class Rig:
         return self._share(began_ns, used_ns)
 
     def _neutral(self, phases: random.Random) -> None:
-        """Send zero speeds until the daemon counts a command. It first ignores a new sender.
+        """Send zero speeds until the daemon accepts a command.
 
-        `phases` generates the random times between the commands.
+        The daemon first ignores the commands of a new sender. `phases` generates the random times
+        between the commands.
         """
         before = self._counted()
 
@@ -313,7 +317,7 @@ class Rig:
         return Sent(at_ns, line)
 
     def deaf(self) -> None:
-        """Unsubscribe from the odometry."""
+        """Unsubscribe from the odometry, so that no more samples are recorded."""
         self._kept.undeclare()
 
     def state(self) -> RobotState:
@@ -327,7 +331,7 @@ class Rig:
         end(self.process, END_S)
 
     def end(self) -> Record:
-        """End the measured program and return the record. The rig cannot be used again."""
+        """End the measured program and return the record. Do not use the rig after this."""
         window_ns = (self._settled_ns, clock.mono_ns())
         # Wait for messages that have not arrived yet.
         time.sleep(0.1)

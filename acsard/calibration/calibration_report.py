@@ -21,10 +21,11 @@ from acsard.terminal.output import table
 NAMES = (
     "wheel_separation_multiplier", "left_wheel_radius_multiplier", "right_wheel_radius_multiplier",
 )  # fmt: skip
-"""Names of the multipliers in `[drive]`, in the order of `Multipliers.values`."""
+"""Names of the settings of `[drive]` that contain the multipliers, in the order of
+`Multipliers.values`."""
 
 DIGITS = 5
-"""Precision of the settings that are written into `acsard.toml`.
+"""Number of digits of the settings that are written into `acsard.toml`.
 
 A multiplier has this number of decimals. A setting of `[odometry]` has this number of significant
 digits.
@@ -36,16 +37,17 @@ class Refusal(Struct, frozen=True):
 
     log: str
     refused: str
-    """The reason why there is no calibration, and what to do."""
+    """Text that says why the log gives no calibration, and what the user must do."""
     notes: Sequence[str] = ()
 
 
 class Report(Struct, frozen=True):
     """The object that `--json` prints for a calibration.
 
-    A field `..._error_before` is an error with the configured multipliers, and `..._error_after` is
-    the same error with the new multipliers. Both are measured on drives that the fit did not use.
-    Both are None if the log does not show this error.
+    A field `..._error_before` is an error of the odometry with the configured multipliers. The
+    field `..._error_after` is the same error with the new multipliers. The two errors are measured
+    on drives that the fit did not use. The two fields are None if the log does not show this
+    error.
     """
 
     log: str
@@ -55,31 +57,46 @@ class Report(Struct, frozen=True):
     Examples are "yaw_rate and positions" and "a tape".
     """
     scale: str
-    """Measurements that show the size of the wheels: "positions", "distance" (by tape), or both.
+    """Kind of the measurements that show the size of the wheels.
 
-    If it is "", no measurement shows the size, and the mean radius stays as configured.
+    The value is "positions" (from a sensor), "distance" (by tape), "positions and distance", or
+    "". If it is "", no measurement shows the size, and the mean of the two wheel radii stays as
+    configured.
     """
     wheel_separation_multiplier: float
     left_wheel_radius_multiplier: float
     right_wheel_radius_multiplier: float
     wheel_separation_multiplier_std: float | None
-    """Standard deviation of the multiplier; None if the track stays as configured."""
-    left_wheel_radius_multiplier_std: float | None
-    """Standard deviation of the multiplier; None if the ratio of the radii stays as configured."""
-    right_wheel_radius_multiplier_std: float | None
-    """Standard deviation of the multiplier; None if the ratio of the radii stays as configured."""
-    covariance: Sequence[Sequence[float]]
-    """Covariance matrix (3 x 3) of the multipliers: wheel separation, left radius, right radius."""
-    odometry: dict[str, float]
-    """New settings of `[odometry]`, by name: the uncertainty of the wheel radii and of the track.
+    """Standard deviation of `wheel_separation_multiplier`.
 
-    They include the noise settings if the new noise settings are better by more than chance
-    explains.
+    It is None if the track stays as configured.
+    """
+    left_wheel_radius_multiplier_std: float | None
+    """Standard deviation of `left_wheel_radius_multiplier`.
+
+    It is None if the ratio of the wheel radii stays as configured.
+    """
+    right_wheel_radius_multiplier_std: float | None
+    """Standard deviation of `right_wheel_radius_multiplier`.
+
+    It is None if the ratio of the wheel radii stays as configured.
+    """
+    covariance: Sequence[Sequence[float]]
+    """Covariance matrix of the multipliers, shape (3, 3).
+
+    The order is wheel separation, left radius, right radius.
+    """
+    odometry: dict[str, float]
+    """New values for settings of `[odometry]`, by the name of the setting.
+
+    These settings state the uncertainty of the wheel radii and of the track. The noise settings
+    are included only if their new values describe the log clearly better than the configured ones.
     """
     feedback: dict[str, float]
-    """New settings of `[feedback]`, by name.
+    """New values for settings of `[feedback]`, by the name of the setting.
 
-    It is empty unless the configured settings would cause false wheel faults and better ones exist.
+    The dictionary is empty if the configured settings cause no false wheel fault in this log, or
+    if no better settings were found.
     """
     effective_track: float
     """Effective track, m."""
@@ -104,25 +121,33 @@ class Report(Struct, frozen=True):
     """RMS position error over whole drives with the configured multipliers, m."""
     position_error_after: float | None
     heading_noise_before: float | None
-    """Standard deviation of the heading after 10 m that the configured noise settings give, deg.
+    """Standard deviation of the heading error after 10 m of driving, deg.
 
-    The calculation assumes that the robot turns as much per metre as in the log. The value is None
-    if the noise settings stay as configured.
+    It is computed from the configured noise settings, for a robot that turns as much per metre as
+    in the log. It is None if the noise settings stay as configured.
     """
     heading_noise_after: float | None
-    """The same standard deviation as `heading_noise_before`, but with the new noise settings."""
-    distance_noise_before: float | None
-    """Standard deviation of the distance after 10 m that the configured noise settings give, m.
+    """Standard deviation of the heading error after 10 m of driving, deg.
 
-    It is None if the noise settings stay as configured, or if the log has no positions.
+    It is computed from the new noise settings, for a robot that turns as much per metre as in the
+    log. It is None if the noise settings stay as configured.
+    """
+    distance_noise_before: float | None
+    """Standard deviation of the error of the distance after 10 m of driving, m.
+
+    It is computed from the configured noise settings. It is None if the noise settings stay as
+    configured, or if the log has no positions.
     """
     distance_noise_after: float | None
-    """The same standard deviation as `distance_noise_before`, but with the new noise settings."""
-    time_offsets: dict[str, float]
-    """Maps the name of each sensor to its delay, s.
+    """Standard deviation of the error of the distance after 10 m of driving, m.
 
-    The delay is the time by which the sensor's recorded times are later than those of the wheels
-    for the same event.
+    It is computed from the new noise settings. It is None if the noise settings stay as
+    configured, or if the log has no positions.
+    """
+    time_offsets: dict[str, float]
+    """Delay of each sensor's recorded times relative to those of the wheels, s, by sensor name.
+
+    A delay is positive if the sensor records the same event with a later time than the wheels.
     """
     gyro_bias: float
     """Gyro bias, rad/s."""
@@ -180,10 +205,11 @@ def report(log: str, calibration: Calibration, drive: DriveConfig, written: str)
 
 
 def _noise(calibration: Calibration) -> tuple[BeforeAfter, BeforeAfter]:
-    """Return the standard deviations of heading, deg, and distance, m, after `METRES` m of driving.
+    """Return a pair: the uncertainty after `METRES` m of the heading, deg, and of the distance, m.
 
-    Each has two values: with the configured noise settings, and with the new noise settings. Both
-    values are None if the noise settings stay as configured.
+    Each item contains two standard deviations: with the configured and with the new noise
+    settings. They are None if the noise settings stay as configured. Those of the distance are
+    also None if the log has no positions.
     """
     noise = calibration.noise
     if noise is None or not noise.better:
@@ -199,7 +225,10 @@ def _deviations(calibration: Calibration) -> list[float | None]:
 
 
 def keys(calibration: Calibration) -> dict[str, object]:
-    """Return the settings that `--write` sets, by name, such as "odometry.wheel_slip_std"."""
+    """Return the new value of each setting that `--write` writes.
+
+    The names include the table of the configuration, such as "odometry.wheel_slip_std".
+    """
     wanted: dict[str, object] = {
         f"drive.{name}": round(float(value), DIGITS)
         for name, value in zip(NAMES, calibration.multipliers.values, strict=True)
@@ -209,7 +238,10 @@ def keys(calibration: Calibration) -> dict[str, object]:
 
 
 def odometry(calibration: Calibration) -> dict[str, float]:
-    """Return the new settings of `[odometry]` by name, rounded to `DIGITS` significant digits."""
+    """Return the new values for settings of `[odometry]`, by the name of the setting.
+
+    The values are rounded to `DIGITS` significant digits.
+    """
     return {name: float(f"{value:.{DIGITS - 1}g}") for name, value in calibration.odometry.items()}
 
 

@@ -1,10 +1,12 @@
-"""Fits the parameters of the calibration to the evidence of all sensors.
+"""Fits the parameters of the calibration to the measurements of all sensors.
 
-The fit is a Gauss-Newton fit. The evidence of a sensor is its contribution to the normal equations,
-summed over each block (a few seconds of driving). The standard deviations come from a jackknife
-over the blocks (Quenouille and Tukey): each block is left out in turn, and the parameters are
-computed from the other blocks. This takes only one linear step from the parameters that fit all
-blocks. These deviations are right even if the errors within a block are correlated.
+The fit is a Gauss-Newton fit. Each sensor contributes to the normal equations of the fit. This
+contribution is called the evidence of the sensor. It is kept separately for each block (a few
+seconds of driving).
+
+The standard deviations come from a jackknife over the blocks (Quenouille and Tukey). The jackknife
+leaves out each block in turn, and computes the parameters from the other blocks with a single
+linear step. These standard deviations are right even if the errors within a block are correlated.
 """
 
 from __future__ import annotations
@@ -36,7 +38,10 @@ class P(IntEnum):
     TRACK_GROWTH = 3
     """Fraction by which the effective track grows for each rad/s of turn rate."""
     DELAY = 4
-    """Delay of the positions' recorded times behind those of the wheels for the same event, s."""
+    """Delay of the positions' recorded times relative to those of the wheels, s.
+
+    It is positive if a position has a later time than a wheel sample of the same moment.
+    """
     SENSOR_X = 5
     """Distance by which the position sensor is ahead of the robot's middle, m."""
     SENSOR_Y = 6
@@ -50,7 +55,7 @@ class P(IntEnum):
 COUNT = len(P)
 
 HUBER = 2.0
-"""Size of a residual, in standard deviations, above which the residual weighs less (Huber)."""
+"""Size of a residual, in standard deviations, above which its weight is less than 1 (Huber)."""
 
 
 class Base(Struct, frozen=True):
@@ -73,21 +78,26 @@ class Base(Struct, frozen=True):
         )  # fmt: skip
 
     def start(self) -> Floats:
-        """Return the parameters for the configured multipliers. All other parameters are 0."""
+        """Return the parameters that describe the configured robot, shape (COUNT,).
+
+        The track growth and all parameters of sensors are 0.
+        """
         return np.array([self.left, self.right, 1 / self.track, *[0.0] * (COUNT - P.TRACK_GROWTH)])
 
     @property
     def gain(self) -> float:
-        """Wheel radius / wheel separation. This is the robot's turn, rad, if the right wheels roll
-        1 rad further than the left wheels."""
+        """Wheel radius / wheel separation, without multipliers.
+
+        This is the robot's turn, rad, if the right wheels roll 1 rad further than the left wheels.
+        """
         return self.radius / self.separation
 
 
 class Evidence(Struct, frozen=True):
-    """The weighted normal equations of one sensor, block by block.
+    """The contribution of one sensor to the normal equations of the fit, block by block.
 
-    J is the Jacobian of the predictions with respect to the parameters, r the residuals and W their
-    weights. `fit()` divides J^T W J and J^T W r by the noise variance of the sensor.
+    J is the Jacobian of the predictions with respect to the parameters, r the residuals and W
+    their weights. `fit()` divides J^T W J and J^T W r by the noise variance of the sensor.
     """
 
     normal: Floats
@@ -106,8 +116,9 @@ def of_rows(
     """Return the evidence of one sensor from its measurements, summed by block.
 
     Args:
-        jacobian: derivatives of each prediction by the parameters, shape (measurements, COUNT).
-        residual: measured minus predicted values.
+        jacobian: derivatives of each prediction with respect to the parameters, shape
+            (measurements, COUNT).
+        residual: measured minus predicted value of each measurement.
         weight: weight of each measurement.
         block: index of the block of each measurement.
         blocks: number of blocks.
@@ -150,30 +161,39 @@ Source = Callable[[Floats], Evidence]
 
 MOST_STEPS = 30
 SMALL, SETTLED = 1e-5, 0.02
-"""Limits for one step of the fit: the largest change of the radii, the track or the track growth.
+"""Step sizes at which the fit ends (`SMALL`), and at which it has converged (`SETTLED`).
 
-A change is measured in the units of `P`, so that 0.01 is 1 % of a radius. The fit ends after a step
-below `SMALL`. It has converged if its last step is below `SETTLED`.
+The fit ends after a step below `SMALL`, or after `MOST_STEPS` steps. It has converged if its last
+step is below `SETTLED`. The size of a step is the largest change of the two radii, the inverse
+track and the track growth, in the units of `P`. A size of 0.01 is a change by 1 % of a radius.
 """
 
 USUAL = {P.TRACK_GROWTH: 0.06, P.DELAY: 1.0, P.SENSOR_X: 0.5, P.SENSOR_Y: 0.5}
 """Prior standard deviations of parameters that some logs do not determine, in the units of `P`."""
 
 GYRO_SCALE = 0.005
-"""Prior relative standard deviation of a MEMS gyro's scale. Only positions show a wrong scale."""
+"""Prior relative standard deviation of the scale of a MEMS gyro.
+
+Only positions can show that the scale is wrong.
+"""
 
 HELD = 1e9
 """Weight of a constraint (`Held`) in the normal equations, large enough to enforce it."""
 
 Held = tuple[Floats, float]
-"""Constraint on a weighted sum of the parameters: a pair of the weights, shape (COUNT,), and the
-value that the sum must have."""
+"""Constraint on the parameters: a pair of weights, shape (COUNT,), and a value.
+
+The weighted sum of the parameters must be equal to the value.
+"""
 
 MANY = 16
 """Minimum number of blocks at which the jackknife also leaves out pairs of neighboring blocks."""
 
 LEAST_BLOCKS = 5
-"""Minimum number of blocks, or of runs, at which the jackknife leaves out each of them in turn."""
+"""Minimum number of blocks that a log must have.
+
+It is also the minimum number of runs at which the jackknife also leaves out whole runs.
+"""
 
 
 def student_factor(free: Floats | float) -> Floats:
@@ -200,9 +220,9 @@ class Fit(Struct, frozen=True):
     """Prior standard deviation of each parameter that has one."""
 
     def without(self, blocks: Mask) -> Floats:
-        """Return the parameters that fit all blocks outside the mask `blocks`, approximately.
+        """Return the parameters that fit the log without the blocks in the mask `blocks`.
 
-        They are computed by one linear step from `parameters`, without another fit.
+        The result is an approximation: one linear step from `parameters`, without another fit.
         """
         rest = self.normal[~blocks].sum(axis=0) + self.known
         found = self.parameters.copy()
@@ -252,13 +272,14 @@ class Fit(Struct, frozen=True):
         return np.asarray(chance + pull @ np.diag(1 / np.where(usual, usual, np.inf)) @ pull.T)
 
     def _changes(self, group: npt.NDArray[np.int64]) -> tuple[Floats, Floats]:
-        """Return a pair: changes of the parameters if a group of blocks is left out, and variances.
+        """Return the changes of the parameters if a group of blocks is left out, and variances.
 
-        `group` contains, for each block, the number of its group. The changes have a row for each
-        group: the parameters without this group minus `parameters`. The variances come from a
-        jackknife over the groups, and have one number for each parameter. They are widened to those
-        of Student's t, with the degrees of freedom of Satterthwaite (An approximate distribution of
-        estimates of variance components, 1946).
+        The changes have a row for each group: the parameters without this group minus
+        `parameters`. The variances are those of the parameters, from a jackknife over the groups.
+        They are widened to those of Student's t, with the degrees of freedom of Satterthwaite (An
+        approximate distribution of estimates of variance components, 1946).
+
+        `group` contains the number of the group of each block.
         """
         change = np.array(
             [self.without(group == number) - self.parameters for number in np.unique(group)]
@@ -273,14 +294,17 @@ def fit(
     sources: Sequence[Source], start: Floats, *, places: bool, gyro: bool = False,
     bias_std: float = 0.0, held: Sequence[Held] = (),
 ) -> Fit:  # fmt: skip
-    """Return the fit of the parameters to the evidence of all sensors.
+    """Fit the parameters to the evidence of all sensors, and return the result.
+
+    Without positions, the mean of the two wheel radii stays as in `start`.
 
     Args:
         sources: one function for each sensor, which returns its evidence for given parameters.
         start: the parameters to start from, which must be nearly right.
         places: whether positions are among the sources.
         gyro: whether a gyro is among the sources.
-        bias_std: standard deviation of the gyro bias, rad/s; 0 if the fit must not change the bias.
+        bias_std: standard deviation of the gyro bias, rad/s; 0 if the fit must not change the
+            bias.
         held: constraints on the parameters.
     """
     active: tuple[P, ...] = tuple(P)[: P.BIAS_ERROR if places else P.DELAY]
@@ -317,9 +341,7 @@ def _sum(evidence: Sequence[Evidence]) -> tuple[Floats, Floats]:
 
     The first array has the left-hand side for each block, shape (blocks, COUNT, COUNT). The second
     array has the right-hand side for each block, shape (blocks, COUNT). Both arrays are weighted
-    sums over the sensors. The weight of a sensor follows from the differences between the
-    right-hand sides of its blocks. Unlike the residuals, these differences become larger if the
-    residuals are correlated.
+    sums over the sensors.
     """
     normal, score = np.zeros_like(evidence[0].normal), np.zeros_like(evidence[0].score)
     for part in evidence:
@@ -329,6 +351,8 @@ def _sum(evidence: Sequence[Evidence]) -> tuple[Floats, Floats]:
 
 
 def _weight(part: Evidence) -> float:
+    # The noise comes from the differences between the right-hand sides of the blocks. Unlike the
+    # residuals, these differences become larger if the residuals are correlated.
     total = part.normal.sum(axis=0)
     used = np.flatnonzero(np.diag(total) > 0.0)
     if not len(used):

@@ -22,39 +22,48 @@ from acsard.calibration.log_table import Floats, LogError
 from acsard.calibration.runs import Block, Run, cumulative, gaps, inside, rests
 
 REST_S, EDGE_S = 0.6, 0.3
-"""Shortest rest of the robot that shows the gyro's bias, and the margin at both ends of a rest, s.
+"""Limits for a standstill of the robot from which the gyro's bias is measured, s.
 
-Samples in the margins are not used, because the robot may shake there.
+The time `EDGE_S` is cut off at both ends of the standstill, because the robot may shake there. The
+remaining time must be at least `REST_S`.
 """
 
 TURNED_BY_HAND = 0.05
-"""Limit for the difference between the gyro's mean rate in one rest and its usual rate, rad/s.
+"""Largest accepted deviation of the gyro's mean rate in a standstill from its usual rate, rad/s.
 
-The usual rate is the median over all rests. If the difference is larger, a person turned the robot
-during this rest, so the rest is not used.
+The usual rate is the median over all standstills. If the deviation is larger, a person turned the
+robot during this standstill, so the standstill is not used.
 """
 
 LEAST_SAMPLES = 5
-"""Minimum number of gyro samples in a rest of the robot."""
+"""Minimum number of gyro samples in a standstill from which the bias is measured."""
 
 OUTLIER = 6.0
-"""A gyro sample at rest is left out if its deviation from the median exceeds `OUTLIER` times the
-median deviation."""
+"""Limit above which a gyro sample in a standstill is left out as an outlier.
+
+The limit applies to the sample's deviation from the median, divided by the median deviation.
+"""
 
 WALK = 5e-5
 """Smallest random walk assumed for the gyro bias, rad/s per square root of a second."""
 
 UNSEEN_WALK = 2e-4
-"""Random walk of the gyro bias if no run has two rests, rad/s per square root of a second."""
+"""Random walk assumed for the gyro bias if the robot does not stand still twice in any run.
+
+The unit is rad/s per square root of a second.
+"""
 
 ROW_S = 1.0
 """Approximate length of the intervals in which turns of wheels and sensor are compared, s."""
 
 GRID_S, FURTHEST_S = 0.02, 2.0
-"""Step of the search for the heading sensor's delay, and the largest delay that it tries, s."""
+"""Step of the search for the heading sensor's delay, and the largest delay that is tried, s."""
 
 DEGREES = 10.0
-"""Ratio of the yaw's turns to the wheels' turns above which the yaw must be in degrees."""
+"""Limit for the turns in the column yaw, divided by the turns of the wheels.
+
+Above this limit, the yaw must be in degrees.
+"""
 
 
 class Heading(Struct, frozen=True):
@@ -63,9 +72,12 @@ class Heading(Struct, frozen=True):
     t: Floats
     """Times of the sensor's samples, s."""
     angle: Floats
-    """Heading at the times `t`, rad."""
+    """Heading at the times `t`, rad, without jumps by 2 pi."""
     gaps: Floats
-    """Long intervals without a sample, one row (begin, end) for each, s. See `runs.gaps`."""
+    """Long intervals without a sample of the sensor, s: one row (begin, end) for each.
+
+    `runs.gaps` defines which intervals are long.
+    """
 
 
 class Headings(Struct, frozen=True):
@@ -75,16 +87,25 @@ class Headings(Struct, frozen=True):
     """Column of the log from which the headings come: "yaw_rate" or "yaw"."""
     of: tuple[Heading, ...]
     delay: float
-    """Delay of the sensor's times behind those of the wheels for the same event, s."""
+    """Delay of the sensor's recorded times relative to those of the wheels, s.
+
+    It is positive if the sensor records the same event with a later time than the wheels.
+    """
     bias: float
-    """Median of the gyro's bias in all rests, rad/s; 0 without a gyro or without a rest."""
+    """Median of the gyro biases that were measured in standstills of the robot, rad/s.
+
+    It is 0 if there is no gyro or no standstill.
+    """
     bias_unknown: bool
-    """True if no rest of the robot shows the gyro's bias.
+    """True if the sensor is a gyro whose bias no standstill of the robot shows.
 
     The bias must then be found by a comparison with the wheels.
     """
     bias_std: float = 0.0
-    """Standard deviation of the bias while the robot moves, rad/s; 0 if no bias is known."""
+    """Standard deviation of the error of the measured gyro bias, rad/s.
+
+    The error is averaged over all runs. The deviation is 0 if no bias was measured.
+    """
 
 
 TURNING = 0.05
@@ -95,7 +116,10 @@ FASTEST = 0.95
 
 
 class Rows(Struct, frozen=True):
-    """The motion of the robot in intervals of about a second."""
+    """The motion of the robot in intervals of about a second.
+
+    Each array has one value for each interval.
+    """
 
     block: npt.NDArray[np.int64]
     """Index of the block (a few seconds of driving) to which each interval belongs."""
@@ -105,13 +129,16 @@ class Rows(Struct, frozen=True):
     """Angle by which the left wheels rolled in each interval, rad."""
     right: Floats
     fast: Floats
-    """Integral of |w| w over each interval, rad2/s. w is the right minus the left wheels' speed."""
+    """Integral of |w| w over each interval, rad2/s.
+
+    w is the speed of the right wheels minus the speed of the left wheels, rad/s.
+    """
     seconds: Floats
     """Length of each interval, s."""
 
 
 class Rates(Struct, frozen=True):
-    """The turn rates of a log, rad/s."""
+    """Statistics of the turn rates in a log."""
 
     mean: float
     """Mean turn rate, rad/s, weighted by the turned angle."""
@@ -181,7 +208,8 @@ def _in_degrees(run: Run, gain: float) -> bool:
 
 
 Rests = tuple[Floats, Floats, Floats]
-"""Times (s), gyro biases (rad/s) and variances of the biases (rad2/s2) in the rests of a run."""
+"""The standstills of a run: their times (s), gyro biases (rad/s) and variances of these biases
+(rad2/s2)."""
 
 
 def _biases(run: Run) -> Rests:
@@ -195,27 +223,28 @@ def _biases(run: Run) -> Rests:
 
 
 def _mean(samples: Floats) -> tuple[float, float]:
-    """Return a pair: the mean of a rest's gyro samples without outliers, and its variance.
+    """Return a pair: the mean of the gyro samples of a standstill, and the variance of this mean.
 
-    The variance comes from the means of five parts, so it is right for correlated noise as well.
-    The median is not used instead of the mean, because for a coarse gyro it would always be one of
-    the few reported values.
+    Outliers are left out.
     """
     off = np.abs(samples - np.median(samples))
     steps = np.diff(np.unique(samples))
     step = float(steps.min()) if len(steps) else 0.0
     kept = samples[off <= max(OUTLIER * float(np.median(off)), 1.01 * step)]
     kept = kept if len(kept) >= LEAST_SAMPLES else samples
+    # The variance comes from the means of five parts, so it is right for correlated noise as well.
+    # The result is not the median, because the median of a coarse gyro is always one of its few
+    # reported values.
     parts = [float(part.mean()) for part in np.array_split(kept, LEAST_SAMPLES)]
     few = step**2 / 12 if len(np.unique(kept)) <= 2 else 0.0
     return float(kept.mean()), float(np.var(parts, ddof=1)) / len(parts) + few
 
 
 def _bias_std(rested: Sequence[Rests], seconds: Sequence[float]) -> float:
-    """Return the standard deviation of the mean bias over all runs, rad/s.
+    """Return the standard deviation of the mean error of the measured bias over all runs, rad/s.
 
-    The deviation has two causes: the noise in the rests, and the random walk of the bias outside
-    of the rests.
+    The error has two causes: the gyro's noise in the standstills, and the random walk of the bias
+    between and outside of them.
     """
     count = sum(len(t) for t, _, _ in rested)
     noise = sum(float(variance.sum()) for _, _, variance in rested) / max(1, count) ** 2
@@ -224,8 +253,8 @@ def _bias_std(rested: Sequence[Rests], seconds: Sequence[float]) -> float:
     # An estimate from few differences is uncertain, so increase it.
     few = 1 + 2 / max(1, count - len(rested))
     walk = max(WALK**2, few * changed / lasted) if lasted else UNSEEN_WALK**2
-    # Between two rests the bias error is a Brownian bridge; outside of them it is a free random
-    # walk.
+    # Between two standstills, the bias error is a Brownian bridge. Before the first and after the
+    # last standstill, the bias error is a free random walk.
     whole = sum(seconds)
     between = sum(float(np.sum(np.diff(t) ** 3)) for t, _, _ in rested) / 12
     outside = sum(
@@ -240,11 +269,11 @@ def _sums(rate: Floats, steps: Floats) -> Floats:
 
 
 def offset(found: Sequence[Heading], driven: Sequence[Run]) -> float:
-    """Return the delay of the sensor, s, for which its turns correlate best with the wheels'.
+    """Return the delay of a heading sensor's recorded times relative to those of the wheels, s.
 
-    `found` contains the sensor's headings in the runs `driven`. The turn according to the wheels is
-    the right minus the left angle. The sum of both angles is tried as well, because the speeds of
-    one side may have the wrong sign.
+    The result is the delay, from -`FURTHEST_S` to `FURTHEST_S`, for which the turns of the sensor
+    correlate best with the turns of the wheels. It is 0 if the sensor or the wheels show no turns.
+    `found` contains the sensor's headings in each of the runs `driven`.
     """
     reach = round(FURTHEST_S / GRID_S)
     scores, sizes = np.zeros((2, 2 * reach + 1)), np.zeros(2)
@@ -256,6 +285,8 @@ def offset(found: Sequence[Heading], driven: Sequence[Run]) -> float:
         sensor = np.diff(np.interp(grid, heading.t, heading.angle))
         sensor[~inside(grid[:-1], grid[1:], heading.gaps)] = 0.0
         sensor -= sensor.mean()
+        # Try the sum of the angles as well as the difference, because the speeds of one side may
+        # have the wrong sign.
         for at, series in enumerate((np.diff(right - left), np.diff(right + left))):
             centred = series - series.mean()
             scores[at] += _correlation(sensor, centred, reach)
@@ -282,10 +313,10 @@ def _correlation(later: Floats, earlier: Floats, reach: int) -> Floats:
 
 
 def rows(headings: Headings | None, driven: Sequence[Run], parts: Sequence[Block]) -> Rows:
-    """Divide the blocks `parts` into intervals of about `ROW_S` s. Return the motion in each.
+    """Return the motion of the robot in intervals of about `ROW_S` s.
 
-    Intervals without samples of the heading sensor are left out. If `headings` is None, no interval
-    is left out.
+    The intervals are parts of the blocks `parts`. An interval without samples of the heading
+    sensor is left out. If `headings` is None, no interval is left out.
     """
     fast = [_fast(run) for run in driven]
     found: list[tuple[Floats, ...]] = []
@@ -311,7 +342,7 @@ def rows(headings: Headings | None, driven: Sequence[Run], parts: Sequence[Block
 
 
 def rates(rows: Rows, by_wheels: Floats) -> Rates:
-    """Return the turn rates of a log.
+    """Return statistics of the turn rates in a log. They are 0 if the robot hardly turns.
 
     `by_wheels` contains the turn of the robot in each interval of `rows` according to the wheels,
     rad.
@@ -331,7 +362,8 @@ def rates(rows: Rows, by_wheels: Floats) -> Rates:
 def level(rows: Rows) -> Rows:
     """Return `rows` without the part of each column that is proportional to the intervals' length.
 
-    An unknown constant gyro bias then has no effect on a comparison with the wheels.
+    An unknown constant gyro bias then has no effect on a comparison with the wheels. The column
+    `seconds` does not change.
     """
     share = rows.seconds / float(rows.seconds @ rows.seconds)
     turned, left, right, fast = (
@@ -356,7 +388,7 @@ fraction `SHARE` of the wheels' turn.
 
 
 def turned(rows: Rows, base: Base, parameters: Floats) -> Floats:
-    """Return the turn in each interval, rad, that the wheels and these parameters give."""
+    """Return the robot's turn in each interval, rad, computed from the wheels with `parameters`."""
     left, right, inverse, growth = parameters[[P.LEFT, P.RIGHT, P.INVERSE_TRACK, P.TRACK_GROWTH]]
     constant = base.gain * inverse * (right * rows.right - left * rows.left)
     return np.asarray(constant + growth * _by_growth(rows, base, parameters))
@@ -370,9 +402,9 @@ def _by_growth(rows: Rows, base: Base, parameters: Floats) -> Floats:
 
 
 def evidence(rows: Rows, base: Base, parameters: Floats, blocks: int) -> Evidence:
-    """Return the evidence of a heading sensor in `rows`, linearized at `parameters`.
+    """Return the evidence of a heading sensor for the fit, linearized at `parameters`.
 
-    `blocks` is the number of blocks.
+    `rows` contains the turns of the sensor and of the wheels. `blocks` is the number of blocks.
     """
     turn = parameters[P.INVERSE_TRACK]
     by_wheels = turned(rows, base, parameters)
@@ -395,7 +427,11 @@ def _weight(rows: Rows, residual: Floats, by_wheels: Floats) -> Floats:
 
 
 def bias(rows: Rows, by_wheels: Floats) -> float:
-    """Return the gyro's bias, rad/s: its mean turn rate minus that according to the wheels."""
+    """Return the gyro's bias, rad/s, from a comparison with the wheels.
+
+    The bias is the mean of the turn rate of the gyro minus the turn rate of the wheels.
+    `by_wheels` contains the turn in each interval of `rows` according to the wheels, rad.
+    """
     seconds, found = rows.seconds, 0.0
     off = rows.turned - by_wheels
     for _ in range(10):
@@ -405,11 +441,12 @@ def bias(rows: Rows, by_wheels: Floats) -> float:
 
 
 def first(rows: Rows, base: Base) -> Floats:
-    """Return two factors, of the left and the right wheels, that fit the sensor's turns best.
+    """Return the two factors with which the turns of the wheels fit the heading sensor best.
 
-    A factor is wheel radius / effective track, divided by the configured wheel radius / wheel
-    separation (`base.gain`). It is negative if the sign of this side's wheel speeds, or the sign of
-    the sensor, is wrong.
+    The first factor is that of the left wheels, the second that of the right wheels. A factor is
+    wheel radius / effective track, divided by the configured wheel radius / wheel separation
+    (`base.gain`). It is negative if the sign of this side's wheel speeds, or the sign of the
+    sensor, is wrong.
     """
     columns = base.gain * np.column_stack((-rows.left, rows.right))
     weight = np.ones(len(rows.turned))
@@ -425,6 +462,6 @@ def first(rows: Rows, base: Base) -> Floats:
 def by_sides(rows: Rows, base: Base, sides: Floats) -> Floats:
     """Return the robot's turn in each interval of `rows`, rad, computed from the wheels.
 
-    `sides` contains the two factors that `first` returns.
+    `sides` contains the factors of the left and the right wheels, as `first()` returns them.
     """
     return np.asarray(base.gain * (sides[1] * rows.right - sides[0] * rows.left))

@@ -23,22 +23,25 @@ from acsard.calibration.runs import Block, Mask, Run, cumulative
 
 FOLDS = 5
 LEAST_RUNS = 3
-"""Minimum number of runs for leaving out whole runs. With fewer, fifths of the log are left out."""
+"""Minimum number of runs at which the cross-validation leaves out whole runs.
+
+If a log has fewer runs, the cross-validation leaves out a fifth of the log at a time (`FOLDS`).
+"""
 
 STRAIGHT = 0.1
-"""Largest curvature of the path that the wheels show, rad/m, that counts as straight."""
+"""Curvature of the path according to the wheels, rad/m, below which the path counts as straight."""
 
 STRAIGHT_M = 1.0
 """Minimum total distance of straight driving in a log, m.
 
-With less, the heading error per 10 m would be only noise, so it is not computed.
+If a log has less, the heading error per 10 m is not computed, because it would be only noise.
 """
 
 
 class BeforeAfter(Struct, frozen=True):
     """An odometry error with the configured multipliers, and with the new multipliers.
 
-    Both are None if the log does not show this error.
+    The two numbers are None if the log does not show this error.
     """
 
     before: float | None
@@ -48,10 +51,10 @@ class BeforeAfter(Struct, frozen=True):
 NOTHING = BeforeAfter(None, None)
 
 SURE = 2.0
-"""A gain counts as sure (95 %) if it is above `SURE` times its standard deviation."""
+"""Smallest ratio of a gain to its standard deviation at which the gain counts as sure (95 %)."""
 
 HALVED = float(np.log(2.0))
-"""The value of `Improvement.gain` if the calibration halves one error.
+"""Value of `Improvement.gain` if the calibration halves one error.
 
 A larger gain always counts as sure. In a guided drive, one leg may show nearly all of the error.
 The standard deviation of the gain is then large although the gain is real.
@@ -95,11 +98,11 @@ class Improvement(Struct, frozen=True):
     chance: float = 0.0
     """Standard deviation of `gain`, from the differences between drives; inf for a single drive."""
     apart: float = FAR
-    """Distance of the new multipliers from the configured ones, in standard deviations."""
+    """Distance of the new multipliers from the configured multipliers, in standard deviations."""
 
     @property
     def sure(self) -> bool:
-        """Whether the new multipliers are better by more than chance can explain."""
+        """Whether the new multipliers are better by more than chance explains."""
         least = SURE * self.chance * min(1.0, FAR / max(NEAR, self.apart))
         return self.apart > NEAR and self.gain > min(least, HALVED)
 
@@ -117,9 +120,9 @@ class Fold(Struct, frozen=True):
 
 
 def drives(driven: Sequence[Run]) -> list[Block]:
-    """Return the drives that the cross-validation leaves out, one at a time.
+    """Return the parts of the log that the cross-validation leaves out, one at a time.
 
-    A drive is a whole run, or a fifth of the log if the log has fewer than `LEAST_RUNS` runs.
+    A part is a whole run, or a fifth of the log if the log has fewer than `LEAST_RUNS` runs.
     """
     longest = np.inf
     if len(driven) < LEAST_RUNS:
@@ -132,7 +135,10 @@ def drives(driven: Sequence[Run]) -> list[Block]:
 
 
 def positions_of(drive: Block, driven: Sequence[Run]) -> list[Segment]:
-    """Return the positions of a drive, split at jumps and at gaps between the wheel samples."""
+    """Return the measured positions in a drive, split into segments.
+
+    A new segment begins at each jump of the positions, and at each gap in the wheel samples.
+    """
     gaps = driven[drive.run].gaps
     edges = np.concatenate(([drive.begin], gaps.ravel(), [drive.end])).clip(drive.begin, drive.end)
     pieces = [Block(drive.run, float(a), float(b)) for a, b in edges.reshape(-1, 2)]
@@ -172,7 +178,9 @@ def improvement(
     held: Sequence[Fold], configured: Floats, base: Base, rows: Rows,
     places: Sequence[Sequence[Segment]], steps: Sequence[WheelSteps],
 ) -> Improvement:  # fmt: skip
-    """Return the odometry errors before and after the calibration, on drives that were left out.
+    """Return the errors of the odometry before and after the calibration.
+
+    The errors after the calibration are measured on drives that the fit did not use.
 
     Args:
         held: the folds. Each contains a drive, and parameters that were fitted without this drive.
@@ -215,7 +223,7 @@ def rms(sums: Floats) -> BeforeAfter:
     """Return the RMS errors before and after the calibration.
 
     `sums` contains three numbers: the sum of the squared errors before the calibration, the sum
-    after it, and the number of samples.
+    after it, and the number of samples. Without samples, the errors are None.
     """
     before, after, count = sums.tolist()
     if not count:
@@ -226,9 +234,10 @@ def rms(sums: Floats) -> BeforeAfter:
 def per_amount(sums: Floats, unit: float) -> BeforeAfter:
     """Return the errors before and after the calibration, per driven angle or distance.
 
-    `sums` contains three numbers: the sum of the errors before, the sum after, and the driven angle
-    or distance. The quotients are multiplied by `unit`. For example, if errors and angle are in
-    rad, a `unit` of 360 gives the error for a full turn in deg.
+    `sums` contains three numbers: the sum of the errors before the calibration, the sum after it,
+    and the driven angle or distance. The quotients are multiplied by `unit`. For example, if
+    errors and angle are in rad, a `unit` of 360 gives the error for a full turn in deg. If the
+    driven angle or distance is 0, the errors are None.
     """
     before, after, amount = sums.tolist()
     if not amount:
@@ -254,10 +263,11 @@ def _gain(kinds: Sequence[Floats]) -> tuple[float, float]:
 
 
 def with_chance(gain: Callable[[Mask], float], drives: Mask) -> tuple[float, float]:
-    """Return a pair: `gain(drives)`, and the standard deviation of this gain.
+    """Return a pair: the gain from all drives, and the standard deviation of this gain.
 
-    `gain` computes a gain from the drives in a mask. The deviation comes from a jackknife over the
-    drives, and is widened to that of Student's t. It is infinite for a single drive.
+    `gain` computes a gain from the drives in a mask, and `drives` is the mask of all drives. The
+    deviation comes from a jackknife over the drives, and is widened to that of Student's t. It is
+    infinite for a single drive.
     """
     count = int(drives.sum())
     if count == 1:
@@ -322,7 +332,10 @@ def _of_positions(
 
 
 def no_better(found: Improvement) -> str:
-    """Return the message that the new multipliers are not surely better than the old ones."""
+    """Return the text of the error that the new multipliers are not clearly better.
+
+    `found` contains the errors of the odometry before and after the calibration.
+    """
     errors = ", ".join(
         f"{name} {error.before * factor:.2g} {unit} now and {error.after * factor:.2g} {unit} "
         "with the new values"

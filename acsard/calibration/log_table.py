@@ -35,9 +35,10 @@ APPLIED = "applied_linear", "applied_angular"
 """Columns with the twist that the daemon commands to the wheels, in m/s and rad/s."""
 
 UNITS = {"t": TIME, "x": LENGTH, "y": LENGTH, "yaw": ANGLE, APPLIED[0]: SPEED}
-"""Maps a column to its known units, and each unit to its factor to SI.
+"""Units that each column can have.
 
-All other columns have the units of `RATE`.
+Each column is mapped to a table that maps the name of a unit to the factor that converts it to SI.
+The columns that are not listed here have the units of `RATE`.
 """
 
 SI = {"t": "s", "x": "m", "y": "m", "yaw": "rad", APPLIED[0]: "m/s"}
@@ -58,7 +59,10 @@ def parted(cell: str) -> tuple[str, str]:
 
 
 def factor(name: str, unit: str) -> float | None:
-    """Return the factor from `unit` to SI, or None for an unknown unit. An empty unit means SI."""
+    """Return the factor that converts `unit` to SI, or None if the unit is unknown.
+
+    `name` is the name of the column. An empty unit means SI.
+    """
     known = UNITS.get(name, RATE)
     return known.get(unit.replace("degrees", "deg").replace("/sec", "/s"), None if unit else 1.0)
 
@@ -88,7 +92,10 @@ rates above `SLOW` rad/s.
 
 
 def bounded(columns: dict[str, Floats]) -> Iterator[str]:
-    """Replace impossible values by NaN in place, and yield a sentence for each changed column."""
+    """Replace impossible values in `columns` by NaN, and yield a sentence for each changed column.
+
+    The arrays are changed in place.
+    """
     order = np.argsort(columns["t"], kind="stable")
     for name, values in columns.items():
         with np.errstate(invalid="ignore"):
@@ -121,9 +128,10 @@ def spikes(values: Floats, order: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_
 
 
 def _alone(sizes: Floats, usual: float) -> npt.NDArray[np.bool_]:
-    """Return a mask of the values that are more than `SPIKE` times as large as their surroundings.
+    """Return a mask of the values that are more than `SPIKE` times as large as their neighbors.
 
-    These are `usual`, and the nearest values on both sides that are not NaN.
+    The neighbors of a value are the nearest values before and after it that are not NaN. A value
+    in the mask is also more than `SPIKE` times as large as `usual`.
     """
     held = np.flatnonzero(np.isfinite(sizes))
     seen = np.concatenate([[0.0], sizes[held], [0.0]])
@@ -134,11 +142,14 @@ def _alone(sizes: Floats, usual: float) -> npt.NDArray[np.bool_]:
 
 
 FOUR, TWO = ("fr", "fl", "rl", "rr"), ("left", "right")
-"""Columns of wheel speeds, rad/s: `FOUR` has one for each wheel, `TWO` one for each side's mean."""
+"""Columns of wheel speeds, rad/s.
+
+`FOUR` has a column for each wheel. `TWO` has a column for the mean speed of each side.
+"""
 
 NUMBERS = ("t", *FOUR, *TWO, "yaw_rate", "x", "y", "yaw", *APPLIED)
 COLUMNS = (*NUMBERS, "run")
-"""Columns that a log can have: the columns of numbers, and the column with the name of the run."""
+"""Columns that a log can have: `NUMBERS`, and the column with the name of the run."""
 
 MISSING = frozenset(("", "nan", "-nan(ind)", "null", "none", "na", "n/a", "#n/a", "-", "--"))
 """Contents of a cell without a value, in lower case."""
@@ -147,7 +158,7 @@ COUNTS = re.compile(r"tick|count|(?:^|_)enc")
 """Pattern for names of columns with encoder counts, which the user must convert to speeds."""
 
 COMMENTS = ("#", "%")
-"""First characters of the comment lines above the table."""
+"""Characters with which a comment line above the table begins."""
 
 BEHIND = re.compile(r"(?:^|\s)#")
 """Pattern for the start of a comment after a number.
@@ -156,9 +167,9 @@ It does not match the "#" in "1.#QNAN", which means NaN.
 """
 
 FEW, SHARE = 3, 0.01
-"""Largest accepted number of unreadable rows, and the same as a fraction of the readable rows.
+"""Limits for the number of unreadable rows in a log.
 
-The larger of the two limits applies.
+At most `FEW` rows may be unreadable, or the fraction `SHARE` of the readable rows if that is more.
 """
 
 EXAMPLE = '"t,left,right,yaw_rate" or "t,fr,fl,rl,rr,x,y"'
@@ -181,20 +192,23 @@ def noted(error: Exception, notes: Iterable[str]) -> None:
 
 
 class Table(Struct, frozen=True):
+    """The content of a log: columns of numbers, and the run of each row."""
+
     columns: dict[str, Floats]
     """Columns by name, in SI units, with NaN for an empty cell."""
     runs: npt.NDArray[np.int64]
-    """For each row, the index of its run in `names`."""
+    """Index in `names` of the run of each row."""
     names: tuple[str, ...]
     notes: tuple[str, ...]
     """Sentences about data that was left out."""
 
     @classmethod
     def joined(cls, sensors: Sequence[Mapping[str, Floats]]) -> Table:
-        """Return the table of one run: a row for each sample of each sensor, sorted by time.
+        """Return a table of one run with all samples of several sensors, sorted by time.
 
         Each element of `sensors` maps the column names of one sensor to values. Every sensor has
-        the column "t". Any other column belongs to only one sensor.
+        the column "t". Any other column belongs to only one sensor. Each sample has its own row,
+        in which the columns of the other sensors are NaN.
         """
         ends = np.cumsum([0, *(len(sensor["t"]) for sensor in sensors)])
         columns = {name: np.full(ends[-1], math.nan) for sensor in sensors for name in sensor}
@@ -231,7 +245,7 @@ def _text(data: bytes) -> str:
 def _header(lines: Sequence[str]) -> tuple[int, list[tuple[str, str]], str]:
     """Return three values: the number of lines above the data, the columns, and the separator.
 
-    A column is a pair of its name and its unit. The header may be the last comment above a table of
+    A column is a pair of its name and its unit. The header may also be the last comment above the
     numbers, as numpy writes it.
     """
     comment = ""
@@ -342,12 +356,15 @@ def _unknown_units(header: list[tuple[str, str]], names: list[str]) -> list[str]
 
 
 class _Reader:
-    """Parses the lines below the header. It is fast, because a log may have a million lines."""
+    """Parser of the lines below the header.
+
+    The parser must be fast, because a log may have a million lines.
+    """
 
     def __init__(self, names: list[str], separator: str, factors: list[float]) -> None:
         self._names, self._separator, self._factors = names, separator, factors
         self._run = names.index("run") if "run" in names else -1
-        # Columns that are neither a known number nor the run are not parsed.
+        # Parse as numbers only the columns that the calibration uses, without the name of the run.
         self._picks = [i for i, name in enumerate(names) if name and name != "run"]
         self._last = max(*self._picks, self._run)
         self._values = array("d")  # a list of lists would take ten times the memory
@@ -448,14 +465,14 @@ class _Reader:
 HEADER = f"t,{','.join(FOUR)},yaw_rate,x,y,yaw"
 
 KEYS = ("wheel_states", "imu", "sim/pose")
-"""Zenoh keys whose messages a log can contain."""
+"""Zenoh keys whose messages `row()` converts to rows of a log."""
 
 
 def row(message: Message, arrived_ns: int) -> str:
-    """Return the CSV row for a message from one of `KEYS`. Raises `ValueError` for other messages.
+    """Return the CSV row of a message on one of `KEYS`. Raises `ValueError` for other messages.
 
-    `arrived_ns` is the wall-clock time of arrival, ns since 1970. It is used if the message has no
-    stamp.
+    The time of the row is the stamp of the message. If the message has no stamp, the time is
+    `arrived_ns`, the wall-clock time of its arrival, ns since 1970.
     """
     if isinstance(message, JointState) and len(message.velocity) == len(FOUR):
         cells = [*(f"{speed:.6g}" for speed in message.velocity), "", "", "", ""]

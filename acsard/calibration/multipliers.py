@@ -37,7 +37,10 @@ class Deviations(Struct, frozen=True):
 
     @classmethod
     def of(cls, odometry: OdometryConfig, base: Base) -> Deviations:
-        """Return the standard deviations that `[odometry]` declares for the geometry `base`."""
+        """Return the standard deviations that the settings of `[odometry]` state.
+
+        `base` is the configured geometry, to which the settings belong.
+        """
         sides = (
             odometry.left_wheel_radius_multiplier_std / base.left,
             odometry.right_wheel_radius_multiplier_std / base.right,
@@ -66,18 +69,19 @@ class Multipliers(Struct, frozen=True):
         return self.own().ratio
 
     def apart(self, base: Base) -> float:
-        """Return how far these multipliers are from those of `base`, in standard deviations.
+        """Return the distance of these multipliers from those of `base`, in standard deviations.
 
-        Combinations of multipliers that no sensor measures stay as configured, so they add nothing.
+        Combinations of multipliers that no sensor measures stay as configured, so they add
+        nothing.
         """
         off = self.values - (base.track, base.left, base.right)
         return math.sqrt(off @ np.linalg.solve(self.covariance + SAME**2 * np.eye(3), off))
 
     def own(self) -> Deviations:
-        """Return the standard deviations of track, ratio of the radii and mean radius.
+        """Return the relative standard deviations of track, ratio of the radii and mean radius.
 
-        `[odometry]` describes the uncertainty in this form, because the odometry treats the errors
-        of these three quantities as independent.
+        The settings of `[odometry]` have the same form, because the odometry treats the errors of
+        these three quantities as independent.
         """
         shares = self.covariance / np.outer(self.values, self.values)
         rows = np.array([[1.0, -0.5, -0.5], [0.0, -1.0, 1.0], [0.0, 0.5, 0.5]])
@@ -85,16 +89,16 @@ class Multipliers(Struct, frozen=True):
 
 
 def configured(base: Base) -> Multipliers:
-    """Return the configured multipliers. Their covariance is unknown and set to zero."""
+    """Return the configured multipliers, with a covariance of zeros because it is unknown."""
     return Multipliers(np.array([base.track, base.left, base.right]), np.zeros((3, 3)))
 
 
 def multipliers(parameters: Floats, covariance: Floats, rate: Rates) -> Multipliers:
     """Return the multipliers that fit best at the turn rates of the log.
 
-    The daemon uses one track for all turn rates, so the multiplier of the separation describes the
-    track at the mean of `rate`. Its variance does not cover skidding that differs from turn to
-    turn, because that is noise of the odometry.
+    The multiplier of the wheel separation describes the track at the mean turn rate of the log,
+    because the daemon uses one track for all turn rates. The variance of this multiplier does not
+    cover skidding that differs from turn to turn, because that is noise of the odometry.
 
     Args:
         parameters: the fitted parameters, shape (COUNT,).
@@ -112,7 +116,10 @@ def multipliers(parameters: Floats, covariance: Floats, rate: Rates) -> Multipli
 
 
 TAPE_M = 0.01
-"""Standard deviation of a distance by tape, m, including the choice of the point on the robot."""
+"""Standard deviation of a distance that a person measures by tape, m.
+
+It includes the error of choosing the point on the robot to measure.
+"""
 
 CONTRADICTS, CONTRADICTS_STD = 0.02, 5.0
 """Limits for the difference between a distance by tape and the same distance by positions.
@@ -122,13 +129,13 @@ If the difference exceeds the fraction `CONTRADICTS` of the distance and also ex
 """
 
 UNKNOWN = 1.0
-"""Standard deviation of the logarithm of the wheels' size if no sensor has measured the size."""
+"""Standard deviation of the logarithm of the wheels' size if no measurement has shown the size."""
 
 LEAST_M = 0.5
-"""Shortest distance between start and end of a run, m, that a tape may measure."""
+"""Shortest distance between start and end of a run, m, that a person may measure by tape."""
 
 STRAIGHT = 0.8
-"""Smallest `Extent.straight` (distance / path length) of a run that may be measured by tape."""
+"""Smallest `Extent.straight` of a run whose distance a person may measure by tape."""
 
 
 class Tape(Struct, frozen=True):
@@ -175,7 +182,7 @@ def scaled(
         known: whether positions have already shown the size of the wheels.
 
     Returns:
-        A pair: the corrected multipliers, and the name of the run that the distance belongs to.
+        A pair: the corrected multipliers, and the name of the run whose distance was measured.
 
     Raises:
         RefusedError: the log has no such run, the run is too short or not straight enough, or the

@@ -1,22 +1,12 @@
 """Fits the noise settings of `[odometry]` to drives that the fit of the geometry did not use.
 
-A window is about half a minute of a drive. A residual is the difference between a measured heading
-or position and the heading or position that the wheels give for the same time. Some errors last for
-a whole turn, for example if the track changes with the turn rate. The residuals of a window are
-therefore seconds apart, so that each contains the whole of such an error.
+Each drive is divided into windows of about half a minute. A residual is the difference between a
+measured heading or position and the heading or position that the wheels give for the same time.
+`Windows.search` finds the noise for which the residuals of all windows have the greatest
+likelihood. The comment above `Windows` has the equations.
 
-The residuals are modelled as normal with mean 0. Their covariance V is linear in the noise x, which
-contains one number x_i for each `Source`. C_i is the covariance that noise of x_i = 1 causes. K is
-the covariance that the known uncertainty of the geometry causes:
-
-    V = K + sum over i of x_i C_i
-
-The pose at the start of the window is unknown and is projected out (restricted maximum likelihood:
-Patterson & Thompson, Biometrika 58, 1971). The iteration of Zhou, Hu, Qiao, Cho & Zhou (MM
-Algorithms for Variance Components Models, 2019) finds x. Its sums run over the windows, and no x_i
-becomes negative:
-
-    x_i <- x_i sqrt(sum of r' V^-1 C_i V^-1 r / sum of tr(V^-1 C_i))
+The residuals of a window are seconds apart. Some errors last for a whole turn, for example if the
+track changes with the turn rate. Each residual then contains the whole of such an error.
 """
 
 from __future__ import annotations
@@ -41,31 +31,40 @@ from acsard.core.config.settings import OdometryConfig
 
 
 class Source(IntEnum):
-    """Sources of noise, as indices of arrays.
+    """Sources of random errors, as indices of an array with one number for each source.
 
-    The sources 0 to 5 are those of the robot, and the others those of sensors.
+    The sources 0 to 5 belong to the robot, and the sources 6 to 8 belong to its sensors.
     """
 
     DISTANCE = 0
-    """Variance of the distance per metre driven, m2/m."""
+    """Variance of the error of the distance, per metre driven, m2/m."""
     YAW = 1
-    """Variance of the heading per metre that the wheels roll (mean of both sides), rad2/m."""
+    """Variance of the error of the heading, per metre that the wheels roll (mean of both sides),
+    rad2/m."""
     SKID = 2
-    """Variance of the heading per radian turned, rad2/rad."""
+    """Variance of the error of the heading, per radian that the robot turns, rad2/rad."""
     SLIP = 3
     """Variance of the fraction of the distance that is lost because wheels slip.
 
-    The fraction is constant in a window (half a minute) and differs from window to window.
+    The fraction is assumed to be constant in a window (half a minute) and to differ from window to
+    window.
     """
     RATIO = 4
-    """Relative variance of the ratio of the right to the left wheel radius, from window to window
-    (half a minute)."""
+    """Relative variance of the ratio of the right to the left wheel radius.
+
+    The ratio is assumed to be constant in a window (half a minute) and to differ from window to
+    window.
+    """
     TRACK = 5
-    """Relative variance of the effective track from window to window (half a minute)."""
+    """Relative variance of the effective track.
+
+    The track is assumed to be constant in a window (half a minute) and to differ from window to
+    window.
+    """
     HEADING = 6
     """Variance of a measured heading, rad2."""
     DRIFT = 7
-    """Variance of the gyro's heading per second, rad2/s."""
+    """Growth of the variance of the gyro's heading per second, rad2/s."""
     PLACE = 8
     """Variance of a measured coordinate, m2."""
 
@@ -77,13 +76,22 @@ START = np.array([1e-4, 1e-4, 1e-3, 1e-4, 1e-6, 1e-4, 1e-5, 1e-6, 1e-4])
 """Noise of each `Source` from which the search starts. The numbers only have to be positive."""
 
 WINDOW_S, APART_S = 32.0, 4.0
-"""Length of a window, and time between its residuals, s. A shorter drive has one window."""
+"""Length of a window, and time between the residuals in a window, s.
+
+A drive that is shorter than a window has one window of its own length.
+"""
 
 LEAST = 4
-"""Minimum number of intervals between the residuals of a window."""
+"""Minimum number of intervals between the residuals of a window.
+
+If the window is short, these intervals are shorter than `APART_S`.
+"""
 
 MOST_WINDOWS = 80
-"""Maximum number of windows that are used. A longer log is thinned to every n-th window."""
+"""Maximum number of windows that are used.
+
+If a log has more windows, only every n-th window is used.
+"""
 
 FINE_S = 0.5
 """Duration of the steps into which a window is divided, s.
@@ -105,7 +113,7 @@ STEPS, FEWER_STEPS = 150, 60
 """
 
 OUTLIER = 9.0
-"""A window weighs less if the mean square of its normalized residuals exceeds this limit."""
+"""Mean square of a window's normalized residuals, above which the window weighs less."""
 
 ROUNDING = 1e-12
 """Variance added to each residual, so that even a perfect sensor's covariance can be inverted."""
@@ -117,30 +125,46 @@ In a short log, the fit often finds a noise of 0. Without the minimum, the odome
 that the pose is exact.
 """
 
+# A window does not show whether an error lasts longer than the window. Without this minimum, the
+# pose covariance of one robot in eight was singular.
 CHANGES = 0.1
 """Minimum for the noise of `DISTANCE`, as a fraction of the noise of `SLIP`.
 
 In the same way, `RATIO` gives the minimum for `YAW`, and `TRACK` gives the minimum for `SKID`.
 `Windows.lasting` first converts the noise of one source to the unit of the other.
-
-The reason is that a window does not show whether an error lasts longer than the window. Without
-this minimum, the pose covariance of one robot in eight was singular.
 """
 
 TWICE = math.log(2.0) - 3 / 8
-"""Limit for `Noise.gain` above which the new noise always counts as better.
+"""Value of `Noise.gain` above which the new noise always counts as better.
 
-The limit is the mean loss of log likelihood per residual if each standard deviation is stated at
-twice its true value. Above it, a large `Noise.chance` does not matter.
+The value is the mean loss of log likelihood per residual if each standard deviation is stated at
+twice its true value. Above this value, a large `Noise.chance` does not matter.
 """
 
 MOST = 1.0
-"""Limit to which each proposed setting is reduced. The configuration accepts this value."""
+"""Largest value of a proposed setting. Larger values are reduced to this one.
+
+The configuration accepts this value.
+"""
 
 METRES = 10.0
-"""Distance after which the report states the uncertainty that noise causes, m."""
+"""Distance, m, after which the report states how uncertain heading and distance are due to noise.
+"""
 
 
+# The residuals of a window are modelled as normal with mean 0. Their covariance V is linear in the
+# noise x, which contains one number x_i for each `Source`. C_i is the covariance that noise of
+# x_i = 1 causes (`effects`). K is the covariance that the known uncertainty of the geometry causes
+# (`known`):
+#
+#     V = K + sum over i of x_i C_i
+#
+# The pose at the start of the window is unknown and is projected out (restricted maximum
+# likelihood: Patterson & Thompson, Biometrika 58, 1971). The iteration of Zhou, Hu, Qiao, Cho &
+# Zhou (MM Algorithms for Variance Components Models, 2019) finds x. Its sums run over the windows,
+# and no x_i becomes negative:
+#
+#     x_i <- x_i sqrt(sum of r' V^-1 C_i V^-1 r / sum of tr(V^-1 C_i))
 class Windows(Struct, frozen=True):
     """The windows of a log (half a minute each), padded to the same number n of residuals."""
 
@@ -156,15 +180,15 @@ class Windows(Struct, frozen=True):
     The shape is (windows, COUNT, n, n).
     """
     known: Floats
-    """Covariance of the residuals due to the uncertain geometry and gyro bias.
+    """Covariance of the residuals due to the uncertain geometry and the uncertain gyro bias.
 
     The shape is (windows, n, n).
     """
     lasting: Floats
     """Factors that convert the noise of one source to an equivalent noise of another source.
 
-    They convert `SLIP` to `DISTANCE` (m), `RATIO` to `YAW` (1/m) and `TRACK` to `SKID` (rad).
-    Equivalent means that the effect in a window of average motion is the same.
+    The three factors convert `SLIP` to `DISTANCE` (m), `RATIO` to `YAW` (1/m) and `TRACK` to
+    `SKID` (rad). Noises are equivalent if they have the same effect in a window of average motion.
     """
 
     def of(self, chosen: Mask | npt.NDArray[np.int64]) -> Windows:
@@ -174,13 +198,17 @@ class Windows(Struct, frozen=True):
         )  # fmt: skip
 
     def covariance(self, noise: Floats) -> Floats:
-        """Return the covariance of the residuals for this noise, shape (windows, n, n)."""
+        """Return the covariance of the residuals, shape (windows, n, n).
+
+        `noise` contains a number for each `Source`.
+        """
         return np.asarray(np.tensordot(self.effects, noise, (1, 0)) + self.known)
 
     def search(self, start: Floats, free: Mask, steps: int = STEPS) -> Floats:
-        """Return the noise with the greatest likelihood, found in `steps` steps from `start`.
+        """Return the noise for which the residuals have the greatest likelihood.
 
-        Sources outside the mask `free` keep the noise that they have in `start`.
+        The search starts from the noise `start` and takes `steps` steps. Sources outside the mask
+        `free` keep the noise that they have in `start`.
         """
         noise, flat = start.copy(), np.moveaxis(self.effects, 1, 0).reshape(COUNT, -1)
         for _ in range(steps):
@@ -198,9 +226,9 @@ class Windows(Struct, frozen=True):
         """Return `noise`, increased so that it is not too small for other drives.
 
         `FLOOR` and `CHANGES` give minima. If few residuals show the noise of `DISTANCE`, `YAW` or
-        `SKID`, this noise is also increased like the variance of Student's t. Windows overlap by
-        half, so each residual counts as half a degree of freedom.
+        `SKID`, this noise is also increased like the variance of Student's t.
         """
+        # Windows overlap by half, so each residual counts as half a degree of freedom.
         shares = np.linalg.inv(self.covariance(noise))[:, None] @ self.effects
         free = noise * np.einsum("wkii->k", shares) / 2
         noise = np.where(RATES, noise * student_factor(free), noise)
@@ -212,7 +240,10 @@ class Windows(Struct, frozen=True):
         return np.asarray(np.maximum(noise, least))
 
     def likelihood(self, noise: Floats) -> Floats:
-        """Return the log likelihood of each window for this noise, up to a constant."""
+        """Return the log likelihood of the residuals of each window, up to a constant.
+
+        `noise` contains a number for each `Source`.
+        """
         covariance = self.covariance(noise)
         solved = np.linalg.solve(covariance, self.residual[:, :, None])[:, :, 0]
         squares = np.einsum("wi,wi->w", solved, self.residual)
@@ -221,7 +252,7 @@ class Windows(Struct, frozen=True):
 
 
 class Noise(Struct, frozen=True):
-    """The noise of the odometry that a log shows, compared with the configured noise."""
+    """The noise of the odometry in a log, compared with the configured noise."""
 
     found: Floats
     """The noise that the log shows, a number for each `Source`."""
@@ -230,7 +261,7 @@ class Noise(Struct, frozen=True):
     gain: float
     """Log likelihood per residual with the found noise, minus that with the configured noise.
 
-    Both are computed on drives that the fit did not use.
+    The two likelihoods are computed on drives that the fit did not use.
     """
     chance: float
     """Standard deviation of `gain`, from the differences between drives."""
@@ -243,20 +274,20 @@ class Noise(Struct, frozen=True):
 
     @property
     def better(self) -> bool:
-        """Whether the found noise describes other drives better by more than chance can explain."""
+        """Whether the found noise describes other drives clearly better than the configured one."""
         return self.gain > min(SURE * self.chance, TWICE)
 
     def heading(self) -> tuple[float, float]:
-        """Return a pair of standard deviations of the heading after `METRES` m, rad.
+        """Return the standard deviations of the heading after `METRES` m of driving, rad.
 
-        The first is due to the configured noise, the second to the found noise.
+        The first number is due to the configured noise, the second number to the found noise.
         """
         return self._after(Source.YAW, Source.RATIO, Source.SKID)
 
     def distance(self) -> tuple[float, float]:
-        """Return a pair of standard deviations of the distance after `METRES` m, m.
+        """Return the standard deviations of the distance after `METRES` m of driving, m.
 
-        The first is due to the configured noise, the second to the found noise.
+        The first number is due to the configured noise, the second number to the found noise.
         """
         return self._after(Source.DISTANCE, Source.SLIP, None)
 
@@ -275,14 +306,15 @@ def settings(
     known: Deviations, track: float, kept: Collection[str], odometry: OdometryConfig,
     shown: Noise | None = None, *, scaled: bool,
 ) -> dict[str, float]:  # fmt: skip
-    """Return the new settings of `[odometry]` by name.
+    """Return the new values for settings of `[odometry]`, by the name of the setting.
 
     Args:
         known: the standard deviations of the new geometry.
         track: the new multiplier of the wheel separation.
-        kept: the quantities that stay as configured: `TRACK` or `RATIO` of `plausibility`, or both.
+        kept: the quantities that stay as configured: `TRACK` or `RATIO` of `plausibility`, or
+            both.
         odometry: the configured settings.
-        shown: the noise that the log shows, or None if the noise stays as configured.
+        shown: the noise that the log shows, or None if the noise settings stay as configured.
         scaled: whether the size of the wheels was measured.
     """
     found, x = {}, np.zeros(COUNT) if shown is None else shown.found
@@ -323,10 +355,15 @@ class Reference(Struct, frozen=True):
 def noise(
     held: Sequence[Fold], seen: Reference, known: Deviations, odometry: OdometryConfig
 ) -> Noise | None:
-    """Return the noise that a log shows, or None if fewer than two drives have residuals.
+    """Return the noise that a log shows, compared with the configured noise.
 
-    `held` contains the drives, each with parameters that were fitted without this drive. `known`
-    contains the standard deviations of track and wheel radii in these parameters.
+    Return None if fewer than two drives have residuals.
+
+    Args:
+        held: the drives, each with parameters that were fitted without this drive.
+        seen: the sensors of the log.
+        known: the standard deviations of track and wheel radii in these parameters.
+        odometry: the configured settings.
     """
     motions: list[_Motion] = []
     windows = _windows(held, seen, known, motions)
@@ -389,7 +426,7 @@ class _Motion(Struct, frozen=True):
 
 
 class _Window(Struct, frozen=True):
-    """The residuals of half a minute of a drive, and the effects of errors on these residuals."""
+    """The residuals of a window (half a minute of a drive), and the effects of errors on them."""
 
     residual: Floats
     start: Floats
@@ -414,7 +451,7 @@ class _Window(Struct, frozen=True):
     """Covariance of the residuals due to the uncertain bias of the gyro; 0 without a gyro."""
 
     def projected(self, known: Deviations) -> tuple[Floats, Floats, Floats]:
-        """Return three arrays without the effect of the unknown start pose, which is projected out.
+        """Return three arrays, from which the unknown start pose is projected out.
 
         - The residuals.
         - For each `Source`, the covariance of the residuals if its noise is 1.
@@ -445,9 +482,9 @@ class _Window(Struct, frozen=True):
 def _windows(
     held: Sequence[Fold], seen: Reference, known: Deviations, motions: list[_Motion]
 ) -> Windows | None:
-    """Return the windows of all drives, or None if there are none.
+    """Return the windows of all drives, or None if no drive has a window.
 
-    `held` contains the drives. The motions in the windows are appended to `motions`.
+    `held` contains the drives. The motion in each window is appended to `motions`.
     """
     rows = []
     for number, fold in enumerate(held):
@@ -509,11 +546,12 @@ def _by_headings(
     t: Floats, at: Floats, heading: Heading, way: Path, track: float, headings: Headings,
     parameters: Floats,
 ) -> _Window:  # fmt: skip
-    """Return the window whose residuals are those of the heading at the times `t`, s.
+    """Return a window whose residuals are differences of headings at the times `t`, s.
 
-    `t` are times on the wheels' clock, and `at` the same moments on the sensor's clock. `heading`
-    is the heading that the sensor measured, and `way` the path according to the wheels. `track` is
-    the effective track, m.
+    A residual is the heading of the sensor minus the heading of the wheels. `t` are times on the
+    wheels' clock, and `at` the same moments on the sensor's clock. `heading` is the heading that
+    the sensor measured, and `way` the path according to the wheels. `track` is the effective
+    track, m.
     """
     motion, since = _Motion.of(t, way, track), t - t[0]
     turned = np.interp(at, heading.t, heading.angle) - parameters[P.BIAS_ERROR] * since
@@ -531,11 +569,12 @@ def _by_headings(
 def _by_places(
     t: Floats, at: Floats, place: Complexes, way: Path, track: float, parameters: Floats
 ) -> Iterator[_Window]:
-    """Yield the window of the positions `place` (x + iy, m), measured at the times `at`, s.
+    """Yield a window whose residuals are differences of positions at the times `t`, s.
 
-    There is a residual for each of the times `t`. It is the median over the positions that are
-    nearer to this time than to the other times. If one of the times has no position, no window is
-    yielded. `way` is the path according to the wheels, and `track` the effective track, m.
+    `place` contains the measured positions (x + iy, m), and `at` their times, s. `way` is the path
+    according to the wheels. A residual is the median over the positions that are nearer to one of
+    the times `t` than to the others. If one of these times has no position, no window is yielded.
+    `track` is the effective track, m.
     """
     group = np.searchsorted((t[1:] + t[:-1]) / 2, at)
     numbers = range(len(t))
@@ -562,5 +601,5 @@ def _by_places(
 
 
 def _both(places: Complexes) -> Floats:
-    """Return the x coordinates of all places, and then their y coordinates."""
+    """Return the x coordinates of all places x + iy, and then their y coordinates."""
     return np.concatenate((places.real, places.imag))

@@ -25,7 +25,8 @@ LEAST_ANGLE = 2 * np.pi
 LEAST_ROLL = 3.0
 """Minimum angle that the wheels must roll in a log, rad.
 
-It applies to the mean of the left and the right angle, and also to half of their difference.
+The limit applies to the mean of the left and the right angle, and also to half of their
+difference. The absolute values of all intervals are added.
 """
 
 ALIKE = 0.98
@@ -46,10 +47,10 @@ DRIVE = (
 )
 
 UNLIKE = 0.5
-"""Largest fraction of a sensor's motion (sum of squares) that may contradict the wheels."""
+"""Largest fraction of a sensor's motion (sum of squares) that the wheels may leave unexplained."""
 
 UNITS = 8.0
-"""Largest credible ratio of a measured to a configured value. If it is larger, a unit is wrong."""
+"""Largest credible ratio of a measured value to a configured one. Above it, a unit is wrong."""
 
 LEAST_TURN = 0.2
 """Smallest credible ratio of the measured turn to the turn that the configured wheels predict.
@@ -58,13 +59,17 @@ Skidding does not explain a smaller ratio. The wheel speeds are then probably in
 """
 
 FAR_SIZE = 2e-3
-"""Ratio of the measured radius to the configured one below which the positions have a wrong unit.
+"""Limit for the ratio of the measured wheel radius to the configured wheel radius.
 
-If the ratio is between `FAR_SIZE` and 1 / `UNITS`, the wheel speeds have a wrong unit.
+Below `FAR_SIZE`, the positions have a wrong unit. From `FAR_SIZE` to 1 / `UNITS`, the wheel speeds
+have a wrong unit.
 """
 
 FASTEST_TURN = 12.0
-"""Largest credible turn rate, rad/s (two turns in a second). A larger one is probably in deg/s."""
+"""Largest credible turn rate of a heading sensor, rad/s (two turns in a second).
+
+A larger value is probably in deg/s.
+"""
 
 LEAST_CHI = 0.4
 """Smallest credible ratio of effective track to wheel separation. Skidding only makes it larger."""
@@ -89,13 +94,16 @@ If the ratio is smaller, a remark says that nearly all turns are to one side.
 """
 
 ODD_SIZE = 1.25
-"""Factor between the measured and the configured wheel radius from which it is reported."""
+"""Factor between measured and configured wheel radius above which a remark states this factor."""
 
 ODD_RATIO = 1.1
-"""Ratio of the larger to the smaller wheel radius from which it is reported as unusual."""
+"""Ratio of the larger to the smaller wheel radius above which a remark calls it unusual."""
 
 LEAST_TRACK, MOST_TRACK = 0.85, 3.0
-"""Usual range of the ratio of effective track to wheel separation. Other ratios are reported."""
+"""Usual range of the ratio of effective track to wheel separation.
+
+A remark states any other ratio.
+"""
 
 
 def drives_enough(parts: Sequence[Block]) -> None:
@@ -108,10 +116,10 @@ def drives_enough(parts: Sequence[Block]) -> None:
 def rolls_enough(rows: Rows, *, spins: bool = False) -> None:
     """Raise `RefusedError` if the log lacks a movement of the wheels that the fit needs.
 
-    Two angles are checked in each interval: the mean of the left and the right angle, and half
-    their difference. Each must add up to `LEAST_ROLL`, and the two must not be proportional to each
-    other (`ALIKE`). If `spins` is true, a log with only turns in place, in which the mean is nearly
-    0, is accepted too.
+    Two angles are computed in each interval of `rows`: the mean of the left and the right angle,
+    and half of their difference. Each angle must add up to `LEAST_ROLL`. The two angles must not
+    be proportional to each other (`ALIKE`). If `spins` is true, a log with only turns in place, in
+    which the mean is nearly 0, is accepted too.
     """
     together, against = (rows.right + rows.left) / 2, (rows.right - rows.left) / 2
     for rolled, what in ((together, "ahead or back"), (against, "in opposite directions")):
@@ -134,7 +142,7 @@ def rolls_enough(rows: Rows, *, spins: bool = False) -> None:
 def turns_enough(turned: Floats) -> None:
     """Raise `RefusedError` if the robot hardly turns.
 
-    `turned` contains its turn in each interval of the log, rad.
+    `turned` contains the robot's turn in each interval of the log, rad.
     """
     if (angle := float(np.abs(turned).sum())) < LEAST_ANGLE:
         raise RefusedError(
@@ -150,10 +158,16 @@ TRACK, RATIO = "the effective track", "the ratio of the left to the right wheel 
 def unsure(
     found: Multipliers, track_std: float, worst: tuple[float, float] = WORST
 ) -> dict[str, float]:
-    """Map the name of each quantity that is too uncertain to its relative standard deviation.
+    """Return the quantities that a log determines too inaccurately.
 
-    `worst` contains the limits for `TRACK` and `RATIO`. `track_std` is the relative standard
-    deviation of the mean track. The track of a single turn varies more.
+    The result maps the name of each such quantity, `TRACK` or `RATIO`, to its relative standard
+    deviation.
+
+    Args:
+        found: the multipliers that were computed from the log.
+        track_std: relative standard deviation of the mean track. The track of a single turn varies
+            more.
+        worst: largest accepted relative standard deviations of `TRACK` and of `RATIO`.
     """
     deviations = {TRACK: track_std, RATIO: found.ratio_std}
     return {
@@ -164,15 +178,15 @@ def unsure(
 
 
 def separates_track(fitted: Fit) -> bool:
-    """Return whether the log shows if an error comes from the wheel radii or from the track."""
+    """Return whether the log distinguishes errors of the wheel radii from errors of the track."""
     return condition(fitted.marginal()) <= WORST_CONDITION
 
 
 def heading_follows(source: str, rows: Rows, base: Base, sides: Floats) -> None:
     """Raise `RefusedError` if the heading sensor's turns differ much from those of the wheels.
 
-    `source` is the name of the sensor. `sides` is the result of `heading.first`, the two factors
-    with which the wheels fit the sensor best.
+    `source` is the name of the sensor. `sides` contains the two factors with which the wheels fit
+    the sensor best, as `heading.first()` returns them.
     """
     spread = float(rows.turned @ rows.turned)
     off = rows.turned - heading.by_sides(rows, base, sides)
@@ -196,14 +210,14 @@ def positions_follow(begun: StartingPoint) -> None:
 
 
 def turns_the_right_way(source: str, sides: Floats | None, begun: StartingPoint | None) -> None:
-    """Raise `RefusedError` if wheels and sensors show turns in different directions.
+    """Raise `RefusedError` if wheels and sensors show turns in opposite directions.
 
     The text of the error names the sign that is wrong.
 
     Args:
-        source: the name of the heading sensor.
-        sides: the result of `heading.first`, or None without a heading sensor.
-        begun: the result of `positions.search`, or None without positions.
+        source: the name of the heading sensor; "" without a heading sensor.
+        sides: the result of `heading.first()`, or None without a heading sensor.
+        begun: the result of `positions.search()`, or None without positions.
     """
     by_places = by_heading = ""
     if begun is not None:
@@ -243,10 +257,10 @@ def turns_the_right_way(source: str, sides: Floats | None, begun: StartingPoint 
 
 
 def _wrong_sign(sides: Floats) -> str:
-    """Return the side whose wheel speeds have the wrong sign: "left", "right", or "" for none.
+    """Return the side whose wheel speeds have the wrong sign: "left", "right", or "" for neither.
 
-    Return "turn" if both sides have the wrong sign. `sides` contains the factors of the left and of
-    the right side. A negative factor means a wrong sign.
+    Return "turn" if the speeds of both sides have the wrong sign. `sides` contains the factors of
+    the left and of the right side. A negative factor means a wrong sign.
     """
     left, right = (sides > 0.0).tolist()
     if left:
@@ -255,7 +269,10 @@ def _wrong_sign(sides: Floats) -> str:
 
 
 def turns_like_the_wheels(source: str, rows: Rows, base: Base) -> None:
-    """Raise `RefusedError` if the sensor shows nearly no turns while the wheels turn the robot."""
+    """Raise `RefusedError` if the heading sensor shows far smaller turns than the wheels.
+
+    `source` is the name of the sensor. `LEAST_TURN` is the limit for the ratio of the turns.
+    """
     shown = float(np.abs(rows.turned).sum())
     by_wheels = float(np.abs(heading.by_sides(rows, base, np.ones(2))).sum())
     if shown < LEAST_TURN * by_wheels:
@@ -269,9 +286,10 @@ def turns_like_the_wheels(source: str, rows: Rows, base: Base) -> None:
 
 
 def turn_rates(source: str, rows: Rows) -> None:
-    """Raise `RefusedError` if the sensor shows turns so fast that its unit must be degrees.
+    """Raise `RefusedError` if the heading sensor seems to report its turns in degrees.
 
-    The sensor is not compared with the wheels, because the wheel speeds may be in degrees as well.
+    The turns are then too fast for a robot. The sensor is not compared with the wheels, because
+    the wheel speeds may be in degrees as well.
     """
     rate = float(np.percentile(np.abs(rows.turned) / rows.seconds, 90))
     if rate > FASTEST_TURN:
@@ -283,12 +301,13 @@ def turn_rates(source: str, rows: Rows) -> None:
 
 
 def turn_units(source: str, turn: float, bare: float, base: Base) -> None:
-    """Raise `RefusedError` if sensor and wheels differ so much in a turn that a unit must be wrong.
+    """Raise `RefusedError` if sensor and wheels show so different turns that a unit must be wrong.
 
     Args:
         source: the name of the heading sensor, or "" if positions show the turns.
         turn: the ratio of the measured turn to the turn that the configured multipliers predict.
         bare: the ratio of the measured turn to the turn that multipliers of 1 predict.
+        base: the configured geometry.
     """
     if LEAST_TURN < turn < UNITS and bare < 1 / LEAST_CHI:
         return
@@ -357,6 +376,7 @@ def remarks(
         bias: the gyro bias, rad/s.
         turned: the turn in each interval of the log, rad, positive to the left.
         values: the multipliers, as in `Multipliers.values`.
+        base: the configured geometry.
         sized: whether the size of the wheels was measured.
     """
     for source, seconds in delays.items():

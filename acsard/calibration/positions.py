@@ -4,14 +4,7 @@ The path of each block (a few seconds) is first shifted and rotated so that it f
 best. The remaining differences are the evidence for the fit. The start pose, the frame and the yaw
 are therefore not needed. Places are complex numbers x + iy in m.
 
-`search` finds parameters from which the fit to positions can start, because the fit needs a track
-that is nearly right. The search tries tracks from a tenth to thirty times the configured one. It
-also tries reversed turns, and wheels of one side that roll backwards. For each of these trials, the
-size of the path gives the wheel radius.
-
-Positions often determine a turn in place only up to whole turns: the robot faces the same way
-after 90 deg to the left as after 270 deg to the right. If several starting points explain the
-positions about equally well, the search chooses the one that describes the more usual robot.
+The fit needs a track that is nearly right. `search` finds parameters from which it can start.
 """
 
 from __future__ import annotations
@@ -34,23 +27,23 @@ FINE_S = 0.02
 """Time step for integrating the path, s. Finer steps cost time and add no accuracy."""
 
 JUMP, JUMP_M = 6.0, 0.05
-"""Limits for the distance between two successive positions.
+"""Limits above which the distance between two successive positions is a jump.
 
-This distance may exceed the rolled distance by `JUMP` standard deviations plus `JUMP_M` m. A larger
-distance is a jump: the source of the positions was wrong, or it corrected itself.
+The distance may exceed the distance that the wheels rolled by `JUMP` standard deviations plus
+`JUMP_M` m. At a jump, the source of the positions was wrong, or it corrected itself.
 """
 
 SPEED_S = 0.05
-"""Half of the interval from which the speed along the path is computed, s."""
+"""Half of the interval from which the speed of the position sensor is computed, s."""
 
 
 def extent(places: Complexes) -> float:
-    """Return the extent of these places: width plus height of the box around them, m."""
+    """Return the width plus the height of the box around these places (x + iy), m."""
     return float(np.ptp(places.real) + np.ptp(places.imag))
 
 
 class Segment(Struct, frozen=True):
-    """The positions of a block between two jumps of their source."""
+    """Measured positions in one block of a run, without a jump between them."""
 
     block: int
     run: int
@@ -61,7 +54,7 @@ class Segment(Struct, frozen=True):
 
 
 class WheelSteps(Struct, frozen=True):
-    """The motion of the wheels of a run, divided into the steps from which its path is computed."""
+    """The rolling of a run's wheels, divided into the steps from which the path is computed."""
 
     t: Floats
     """Times at which the steps begin and end, s. There is one more time than there are steps."""
@@ -70,11 +63,17 @@ class WheelSteps(Struct, frozen=True):
     right: Floats
     """Angle that the right wheels roll in each step, rad."""
     fast: Floats
-    """Integral of |w| w over each step, rad2/s. w is the right minus the left wheels' speed."""
+    """Integral of |w| w over each step, rad2/s.
+
+    w is the speed of the right wheels minus the speed of the left wheels, rad/s.
+    """
 
 
 class Path(Struct, frozen=True):
-    """The path of a run according to the wheels, interpolated linearly between the times `t`."""
+    """The path of the robot in a run, computed from the wheels.
+
+    It is interpolated linearly between the times `t`.
+    """
 
     t: Floats
     """Times of the points of the path, s."""
@@ -83,15 +82,16 @@ class Path(Struct, frozen=True):
     heading: Floats
     """Heading of the robot at the times `t`, rad."""
     derivatives: dict[P, Complexes]
-    """Derivatives of `place` by the radii, the inverse track and the track growth."""
+    """Derivatives of `place` with respect to the radii, the inverse track and the track growth."""
     heading_derivatives: dict[P, Floats]
-    """Derivatives of `heading` by the radii, the inverse track and the track growth."""
+    """Derivatives of `heading` with respect to the radii, the inverse track and the track growth.
+    """
 
     def at(self, t: Floats, parameters: Floats) -> tuple[Complexes, Complexes]:
         """Return the places of the position sensor at the times `t`, m, and their derivatives.
 
-        `t` contains recorded times, s, which are late by the parameter `P.DELAY`. The derivatives
-        are with respect to the parameters, and have the shape (times, COUNT).
+        `t` contains recorded times of positions, s. The delay `P.DELAY` is subtracted from them.
+        The derivatives are with respect to the parameters, and have the shape (times, COUNT).
         """
         t = t - parameters[P.DELAY]
         derivatives = np.zeros((len(t), COUNT), dtype=np.complex128)
@@ -106,9 +106,10 @@ class Path(Struct, frozen=True):
         return here, derivatives
 
     def _sensor(self, t: Floats, parameters: Floats) -> tuple[Complexes, Complexes]:
-        """Return a pair for each time: the sensor's place, and the robot's heading.
+        """Return two arrays: the places of the position sensor, and the headings of the robot.
 
-        The place is x + iy in m. The heading is a complex number of length 1.
+        Each array has a value for each of the times `t`, s. A place is x + iy in m. A heading is a
+        complex number of length 1.
         """
         ahead = np.exp(1j * np.interp(t, self.t, self.heading))
         lever = complex(parameters[P.SENSOR_X], parameters[P.SENSOR_Y])
@@ -116,7 +117,7 @@ class Path(Struct, frozen=True):
 
 
 def segments(driven: Sequence[Run], parts: Sequence[Block]) -> list[Segment]:
-    """Return the positions of the blocks `parts`, split at jumps of the positions.
+    """Return the measured positions in the blocks `parts`, split at jumps of the positions.
 
     Segments with fewer than `LEAST_POINTS` positions are left out.
     """
@@ -133,7 +134,10 @@ def segments(driven: Sequence[Run], parts: Sequence[Block]) -> list[Segment]:
 
 
 def jumps(run: Run) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
-    """Return the index of the first position after each jump (`JUMP`) of the positions."""
+    """Return the index of the first position after each jump of the positions.
+
+    `JUMP` and `JUMP_M` define a jump.
+    """
     steps = np.abs(np.diff(run.place))
     if len(steps) < LEAST_POINTS:
         return np.zeros(0, dtype=np.int64)
@@ -147,7 +151,10 @@ def jumps(run: Run) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
 
 
 def wheel_steps(run: Run, fine_s: float = FINE_S) -> WheelSteps:
-    """Return the wheels' motion in steps of about `fine_s` s. A step has at least one sample."""
+    """Return the rolling of the wheels in steps of about `fine_s` s.
+
+    If the samples of the wheels are further apart, a step is the interval between two samples.
+    """
     usual = float(np.median(np.diff(run.t)))
     every = max(1, int(fine_s / usual))
     kept = np.unique(np.append(np.arange(0, len(run.t), every), len(run.t) - 1))
@@ -157,7 +164,10 @@ def wheel_steps(run: Run, fine_s: float = FINE_S) -> WheelSteps:
 
 
 def path(steps: WheelSteps, base: Base, parameters: Floats) -> Path:
-    """Return the path of the robot from the origin with heading 0. Each step is an exact arc."""
+    """Return the path of the robot from the origin with heading 0, computed from the wheels.
+
+    Each step is an exact arc.
+    """
     left, right, turn, rate = parameters[[P.LEFT, P.RIGHT, P.INVERSE_TRACK, P.TRACK_GROWTH]]
     gain = base.gain * turn
     mean = gain * (left + right) / 2
@@ -180,19 +190,17 @@ def path(steps: WheelSteps, base: Base, parameters: Floats) -> Path:
 
 
 def place(steps: WheelSteps, base: Base, parameters: Floats) -> Complexes:
-    """Return the places of `path()` without its other results, which takes less time.
-
-    The parameter TRACK_GROWTH must be 0.
-    """
+    """Return only the places of `path()`, which takes less time. TRACK_GROWTH must be 0."""
     left, right = parameters[P.LEFT] * steps.left, parameters[P.RIGHT] * steps.right
     _, ahead = _directions(base.gain * parameters[P.INVERSE_TRACK] * (right - left))
     return _sums(ahead * base.radius * (left + right) / 2)
 
 
 def _directions(turns: Floats) -> tuple[Floats, Complexes]:
-    """Return a pair: the heading before the first and after each step, rad, and each step's chord.
+    """Return a pair: headings, rad, and the chord of each step.
 
-    A chord is a complex number, computed for an arc of length 1.
+    The headings are those before the first step and after each step. A chord is a complex number,
+    computed for an arc of length 1.
     """
     heading = cumulative(turns)
     return heading, np.exp(1j * (heading[:-1] + turns / 2)) * np.sinc(turns / (2 * np.pi))
@@ -203,24 +211,31 @@ def _sums(steps: Complexes) -> Complexes:
 
 
 Paths = Sequence[Path] | Mapping[int, Path]
-"""Path of the wheels in each run, by the index of the run."""
+"""Path of the robot according to the wheels in each run, by the index of the run."""
 
 
 class Aligned(Struct, frozen=True):
-    """The positions of a segment, compared with the path that was aligned with them."""
+    """The positions of a segment, compared with the path of the wheels.
+
+    The path was shifted and rotated so that it fits the positions best.
+    """
 
     block: int
     residual: Complexes
-    """Position minus aligned path, m, times the root of the position's weight."""
+    """Position minus aligned path, m, times the square root of the position's weight."""
     derivatives: Complexes
-    """Derivatives of the aligned path by the parameters, times the root of the position's weight.
+    """Derivatives of the aligned path with respect to the parameters, shape (positions, COUNT).
 
-    Their shape is (positions, COUNT). They include the change of the aligning shift and rotation.
+    They are multiplied by the square root of the position's weight. They include the change of the
+    aligning shift and rotation.
     """
 
 
 def aligned(segments: Sequence[Segment], paths: Paths, parameters: Floats) -> Iterator[Aligned]:
-    """Shift and rotate each path so that it fits its positions best. Outliers weigh less."""
+    """Yield the positions of each segment, compared with the path of the wheels.
+
+    The path is first shifted and rotated so that it fits the positions best. Outliers weigh less.
+    """
     for segment in segments:
         place, derivatives = paths[segment.run].at(segment.t, parameters)
         weight = np.ones(len(place))
@@ -244,7 +259,7 @@ def aligned(segments: Sequence[Segment], paths: Paths, parameters: Floats) -> It
 def evidence(
     segments: Sequence[Segment], paths: Paths, parameters: Floats, blocks: int
 ) -> Evidence:
-    """Return the evidence of the positions, linearized at `parameters`.
+    """Return the evidence of the positions for the fit, linearized at `parameters`.
 
     `paths` must be computed with the same parameters. `blocks` is the number of blocks.
     """
@@ -261,7 +276,7 @@ def evidence(
 
 
 def spread(segments: Sequence[Segment], paths: Paths, parameters: Floats) -> float:
-    """Return the RMS distance of the positions from the aligned paths, m."""
+    """Return the RMS distance of the positions from the aligned paths, m. Outliers weigh less."""
     squares, count = 0.0, 0
     for part in aligned(segments, paths, parameters):
         squares += float(np.sum(np.abs(part.residual) ** 2))
@@ -272,26 +287,27 @@ def spread(segments: Sequence[Segment], paths: Paths, parameters: Floats) -> flo
 TURNS = np.unique(np.concatenate((np.geomspace(0.03, 10.0, 60), np.geomspace(0.28, 1.4, 40))))
 """Ratios of configured to true track that the search tries.
 
-They are closer together in the usual range.
+The ratios in the usual range are closer together than the others.
 """
 
 DELAYS = np.arange(-1.5, 1.55, 0.1)
 """Delays of the positions that the search tries, s."""
 
 MOST_SEGMENTS, REFINED_SEGMENTS = 60, 20
-"""Maximum number of segments for trying starting points, and maximum number for refining them.
+"""Maximum numbers of segments that the search uses.
 
-If there are more segments, those with the largest extent are used.
+`MOST_SEGMENTS` applies while starting points are tried, and `REFINED_SEGMENTS` while they are
+refined. If there are more segments, those with the largest extent are used.
 """
 
 MOST_POINTS = 80
-"""Approximate number of positions of a segment that the search uses, evenly spaced."""
+"""Approximate largest number of positions of a segment that the search uses, evenly spaced."""
 
 MOST_REFINED, FAR_WORSE = 4, 20.0
-"""Limits for the starting points that are refined: their number, and their badness.
+"""Limits for the starting points that the search refines.
 
-A point is not refined if its badness (see `search`) is more than `FAR_WORSE` times that of the best
-point.
+At most `MOST_REFINED` points are refined. A point is not refined if its badness (see `search`) is
+more than `FAR_WORSE` times that of the best point.
 """
 
 USUAL_TURN = 0.31, 1.25
@@ -305,12 +321,16 @@ NEAR_HEADING = 0.8, 1.25
 """Usual range of the turn that positions show, divided by the turn that a heading sensor shows."""
 
 WRONG_WAY = 4.0
-"""Penalty factor if the wheels of one side seem to roll backwards, or all turns seem reversed."""
+"""Penalty factor for a starting point with reversed wheels or turns.
+
+The factor applies if the wheels of one side seem to roll backwards, or if all turns seem reversed.
+"""
 
 NOTHING = 1e-3
-"""Number that is added to each `StartingPoint.unexplained` before these values are compared.
+"""Number that is added to each `StartingPoint.unexplained` before two points are compared.
 
-Differences below this number, which are only noise of the positions, then hardly matter.
+Smaller differences between points are only noise of the positions. With this number added, they
+hardly matter.
 """
 
 STRAYED = 1.3
@@ -331,12 +351,23 @@ class StartingPoint(Struct, frozen=True):
     """Fraction of the variance of the positions that the path of the wheels does not explain."""
 
 
+# The search tries tracks from a tenth to thirty times the configured one. It also tries reversed
+# turns, and wheels of one side that roll backwards. For each of these trials, the size of the path
+# gives the wheel radius.
+#
+# Positions often determine a turn in place only up to whole turns: the robot faces the same way
+# after 90 deg to the left as after 270 deg to the right. If several starting points explain the
+# positions about equally well, the search chooses the one that describes the more usual robot.
 def search(
     segments: Sequence[Segment], driven: Sequence[Run], base: Base, sides: Floats | None = None
 ) -> StartingPoint:
-    """Return the best starting point for the fit.
+    """Return the best parameters from which a fit to the positions can start.
 
-    `sides` is the result of `heading.first()`, or None without a heading sensor.
+    Args:
+        segments: the measured positions.
+        driven: the runs of the log.
+        base: the configured geometry.
+        sides: the result of `heading.first()`, or None without a heading sensor.
     """
     kept = _furthest(segments, MOST_SEGMENTS)
     needed = sorted({segment.run for segment in kept})
@@ -395,7 +426,7 @@ def _penalty(point: StartingPoint, sides: Floats | None) -> float:
 
 
 def _turn(parameters: Floats) -> float:
-    """Return the robot's turn, in `Base.gain` rad, if only the right wheels roll, by 1 rad."""
+    """Return the robot's turn if only the right wheels roll, by 1 rad, divided by `Base.gain`."""
     return float(parameters[P.INVERSE_TRACK] * parameters[P.RIGHT])
 
 
@@ -404,8 +435,8 @@ def _timed(
 ) -> StartingPoint:
     """Return `point` with the delay of the positions that fits best among `DELAYS`.
 
-    `kept` contains the segments that are compared, and `steps` the motion of the wheels in each
-    run.
+    `kept` contains the segments that are compared with the path, and `steps` the rolling of the
+    wheels in each run.
     """
     parameters = point.parameters
     shape = float(np.sign(parameters[P.LEFT])), _turn(parameters)
@@ -421,9 +452,13 @@ def _tried(
 ) -> StartingPoint:
     """Return the starting point for a shape of the path, with the wheel size that fits best.
 
-    `kept` contains the segments that are compared, and `steps` the motion of the wheels in each
-    run. `shape` contains three numbers: the sign of the left side, the ratio of configured to true
-    track (negative if the robot turns opposite to its wheels), and the delay of the positions, s.
+    Args:
+        kept: the segments that are compared with the path.
+        steps: the rolling of the wheels in each run.
+        base: the configured geometry.
+        shape: three numbers: the sign of the left wheels' rolling, the ratio of configured to true
+            track (negative if the robot turns opposite to its wheels), and the delay of the
+            positions, s.
     """
     parameters = base.start()
     parameters[[P.LEFT, P.RIGHT, P.INVERSE_TRACK, P.DELAY]] = shape[0], 1.0, shape[1], shape[2]
@@ -449,8 +484,8 @@ def _refined(
 ) -> StartingPoint:
     """Return a starting point that is refined by a fit to the segments `few`.
 
-    Return the parameters of `point` if the refined ones fit worse, or if the turn changed too much
-    (`STRAYED`).
+    The parameters of `point` are kept if the refined ones fit worse, or if the refinement changes
+    the robot's turn too much (`STRAYED`).
     """
     segments = [replace(segment, block=number) for number, segment in enumerate(few)]
 

@@ -1,4 +1,4 @@
-"""Calibrates from the recorded drive that `acsard calibrate --log` names.
+"""Computes the calibration from the recorded drive that `acsard calibrate --log` names.
 
 The drive is a CSV file, a black-box recording of acsard, or a ROS 2 bag in MCAP.
 """
@@ -30,10 +30,13 @@ MOST_BYTES = 1 << 30
 """Maximum size of a CSV file or a black-box recording, bytes. The file is read into memory."""
 
 MOST_RECORD_BYTES = 1 << 28
-"""Maximum size of a record in a bag, bytes. This is ample: a chunk of rosbag2 is below 1 MiB."""
+"""Maximum size of a record in a bag, bytes. It is ample: a chunk of rosbag2 is below 1 MiB."""
 
 BAG_DAMAGE = (*DAMAGE, RuntimeError, KeyError)
-"""Exceptions of the MCAP reader and of LZ4 for a damaged bag. `KeyError` means a missing schema."""
+"""Exceptions that the MCAP reader and LZ4 raise for a damaged bag.
+
+A `KeyError` means that a schema is missing.
+"""
 
 OTHER_BAGS = {
     ".db3": (b"SQLite format 3\0", "in SQLite: convert it to MCAP with `ros2 bag convert`"),
@@ -155,7 +158,7 @@ def _messages(file: Path, notes: list[str]) -> Iterator[RosMessage]:
 
 
 def _measured(log: Path) -> bytes:
-    """Return the CSV table of a black-box recording.
+    """Return the CSV table of a black-box recording, up to its first gap.
 
     Raises `LogError` if the recording is unreadable or contains no gyro samples.
     """

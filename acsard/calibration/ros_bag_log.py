@@ -1,13 +1,12 @@
 """Builds the table of a log from the messages of a ROS 2 bag.
 
 The wheel speeds come from a `JointState`, the turn rates from an `Imu`, and the positions from a
-`PoseStamped` or an `Odometry`. This module chooses the topics by their types. If several topics
-fit, or if one of them should not be used, the user names the topics to use with `--topic`.
+`PoseStamped` or an `Odometry`. This module chooses the topics by their types. With `--topic`, the
+user can name the topics to use instead.
 
-An `Odometry` is usually computed from the wheels, and such a pose cannot calibrate them. An
-`Odometry` is therefore used only if the user names its topic, or if the bag has neither turn rates
-nor other positions. An `Odometry` that the user did not name is refused if its turns are exactly
-the turns that the wheels show.
+An `Odometry` is usually computed from the wheels, so it cannot calibrate them. It is used only if
+the user names its topic, or if the bag has neither turn rates nor other positions. If the user did
+not name its topic, an `Odometry` whose turns are exactly those of the wheels is refused.
 """
 
 from __future__ import annotations
@@ -45,12 +44,12 @@ AXES = ("z", "-z", "x", "-x", "y", "-y")
 """Axes of an IMU that may point up. `-x` means that x points down."""
 
 LEAST_MESSAGES = 20
-"""A topic is used only if at least this many of its messages have a value."""
+"""Minimum number of messages with a value in a topic that is used."""
 
 CLOCKS_APART_S = 1.0
-"""Largest difference between the delays of two topics with stamps from the same clock, s.
+"""Largest difference between the delays of two topics whose stamps come from the same clock, s.
 
-A topic's delay is the median time from the stamp of a message to its recording.
+The delay of a topic is the median time from the stamp of a message to its recording.
 """
 
 STEP_S = 1.0
@@ -59,15 +58,15 @@ STEP_S = 1.0
 UPRIGHT, LYING = 0.5, 0.8
 """Limits for the absolute correlation between turns about an IMU axis and turns of the wheels.
 
-The log is refused if the correlation is below `UPRIGHT` for the chosen axis and above `LYING` for
-another axis, because the IMU then lies on its side.
+If the correlation is below `UPRIGHT` for the chosen axis and above `LYING` for another axis, the
+IMU lies on its side. The log is then refused.
 """
 
 OWN = 3e-3
 """Limit for the RMS difference between the turns of an `Odometry` and those of the wheels.
 
-The difference is divided by the RMS turn. Up to this limit, the `Odometry` counts as computed from
-the wheels.
+The limit is relative to the RMS turn. Up to this limit, the `Odometry` counts as computed from the
+wheels.
 """
 
 DELAYS_S = np.arange(-0.1, 0.101, 0.01)
@@ -77,16 +76,16 @@ DELAYS_S = np.arange(-0.1, 0.101, 0.01)
 class RosMessage(NamedTuple):
     topic: str
     type: str
-    """ROS name, such as `nav_msgs/msg/Odometry`."""
+    """Type of the message by its name in ROS, such as `nav_msgs/msg/Odometry`."""
     encoding: str
     """Encoding of `data`; ROS 2 uses `cdr`."""
     wall_ns: int
-    """Time of the recording, ns since 1970."""
+    """Time at which the message was recorded, ns since 1970."""
     data: bytes
 
 
 class Choice(Struct, frozen=True):
-    """The topics and the axis that the user chose."""
+    """The topics and the IMU axis that the user chose for a ROS 2 bag."""
 
     topics: tuple[str, ...] = ()
     """Names of the topics to use; () means that the tool chooses them by their message types."""
@@ -211,10 +210,14 @@ def wheel_of(joint: str) -> str:
 
 @cache
 def wheel_joints(names: tuple[str, ...], joints: tuple[str, ...]) -> dict[str, list[int]]:
-    """Map each log column to the indices in `names` of the wheel joints that fill the column.
+    """Return the wheel joints that fill each column of the log, as indices in `names`.
 
     The columns are "fr", "fl", "rl" and "rr", or "left" and "right". The result is empty unless
-    both sides have a wheel joint. `joints` contains the configured names, in the order of `FOUR`.
+    both sides have a wheel joint.
+
+    Args:
+        names: the names of the joints in a message.
+        joints: the configured names of the wheel joints, in the order of `FOUR`.
     """
     if set(joints) <= set(names):
         return {column: [names.index(joint)] for column, joint in zip(FOUR, joints, strict=True)}
@@ -235,7 +238,7 @@ def table(messages: Iterable[RosMessage], joints: Sequence[str], choice: Choice)
     """Build the table of a log from the messages of a bag.
 
     `joints` contains the configured names of the wheel joints, in the order of `FOUR`. Raises
-    `LogError` if the bag lacks usable data or its topics are ambiguous.
+    `LogError` if the bag lacks usable data, or if it is unclear which topics to use.
     """
     topics: dict[str, _Topic] = {}
     others: dict[str, str] = {}
@@ -329,11 +332,11 @@ class _Log:
         return wheels, gyro, places
 
     def _one(self, what: str, fit: Sequence[_Topic], *, free: bool = True) -> _Topic | None:
-        """Return the topic to use among `fit`, or None. Topics that the user named take precedence.
+        """Return the topic to use among `fit`, or None if no topic can be used.
 
-        `what` names the data in error messages, such as "the wheels". If `free` is false, only a
-        topic that the user named is used. Raises `LogError` if several topics remain, or if the
-        topic has too few messages.
+        Topics that the user named take precedence. If `free` is false, only a topic that the user
+        named is used. `what` names the data in error messages, such as "the wheels". Raises
+        `LogError` if several topics remain, or if the topic has too few messages.
         """
         named = [topic for topic in fit if topic.name in self._choice.topics]
         for topic in named:
@@ -469,12 +472,16 @@ def _too_few(topic: _Topic) -> str:
 
 
 def speeds_of(t: Floats, angles: Floats) -> tuple[Floats, Floats]:
-    """Return wheel speeds, rad/s, from recorded angles: a pair of their times, s, and the speeds.
+    """Return wheel speeds that are computed from recorded angles.
 
-    `angles`, rad, has a column for each wheel, and a row for each of the times `t`, s. A speed is
-    the mean over one sample period, so the integral of the speeds is exactly the angle that the
-    wheel rolled, even if the sample times are uneven. No speed is computed across a gap in the
-    samples, or across a jump of an angle, for example to 0 after a restart of the motor driver.
+    The result is a pair: the times of the speeds, s, and the speeds, rad/s. A speed is the mean
+    over one sample period, so the integral of the speeds is exactly the angle that the wheel
+    rolled, even if the sample times are uneven. No speed is computed across a gap in the samples,
+    or across a jump of an angle, for example to 0 after a restart of the motor driver.
+
+    Args:
+        t: the times of the samples, s.
+        angles: the angles, rad, with a row for each time and a column for each wheel.
     """
     whole = np.isfinite(angles).all(axis=1)
     times, first = np.unique(t[whole], return_index=True)
@@ -509,9 +516,9 @@ def _unwrapped(angles: Floats) -> Floats:
 
 
 def _sides(wheels: dict[str, Floats]) -> tuple[Floats, Floats, Floats]:
-    """Return three arrays: sample times, s, and the mean rolled angle of each side's wheels, rad.
+    """Return the times of the wheel samples, s, and the rolled angles of the two sides, rad.
 
-    The left side comes before the right side.
+    The result is the triple (times, left, right). The angle of a side is the mean over its wheels.
     """
     t = wheels["t"]
     left, right = (
@@ -535,7 +542,8 @@ def _edges(t: Floats, sides: tuple[Floats, Floats, Floats]) -> Floats:
 def _follows(t: Floats, rates: Floats, sides: tuple[Floats, Floats, Floats]) -> float:
     """Return the correlation between a sensor's turns and those of the wheels; NaN if unknown.
 
-    `rates` contains the sensor's turn rates at the times `t`, s. `sides` is the result of `_sides`.
+    `rates` contains the sensor's turn rates at the times `t`, s. `sides` contains the times and
+    the rolled angles of the two sides, as `_sides` returns them.
     """
     order = np.argsort(t, kind="stable")
     edges = _edges(t, sides)
@@ -552,7 +560,8 @@ def _follows(t: Floats, rates: Floats, sides: tuple[Floats, Floats, Floats]) -> 
 def _computed_from(t: Floats, yaw: Floats, sides: tuple[Floats, Floats, Floats]) -> bool:
     """Return whether the yaw follows the wheels so exactly that it was computed from them.
 
-    `yaw`, rad, was measured at the times `t`, s. `sides` is the result of `_sides`.
+    `yaw`, rad, was measured at the times `t`, s. `sides` contains the times and the rolled angles
+    of the two sides, as `_sides` returns them.
     """
     held = np.isfinite(yaw)
     order = np.argsort(t[held], kind="stable")

@@ -27,7 +27,7 @@ Mask = npt.NDArray[np.bool_]
 Rows = npt.NDArray[np.int64]
 
 RESTART_S = 1.0
-"""Smallest backward step of the times in a log, s, that may be a restart of the recording."""
+"""Smallest backward step of the times in a log that may be a restart of the recording, s."""
 
 FEW_RESTARTS = 100
 """Maximum number of restarts in a log.
@@ -37,19 +37,22 @@ time.
 """
 
 SLOWEST_S = 0.7
-"""Longest period of wheel samples, s. If it is longer, the times are probably not in seconds."""
+"""Longest accepted median period of wheel samples, s.
+
+If the period is longer, the times are probably not in seconds.
+"""
 
 LEAST_ROWS = 20
 """Minimum number of wheel samples in a run."""
 
 PAUSE_S = 60.0
-"""Time without a wheel sample after which a new run begins, s."""
+"""Time without a wheel sample, s, after which a new run begins."""
 
 ROUNDED_S, REPEATED = 0.2, 4.0
 """Limits that show that the times in the column `t` were rounded.
 
-They were rounded if the median interval between different times exceeds `ROUNDED_S`, s, and if on
-average more than `REPEATED` rows have the same time.
+The times were rounded if the median interval between different times exceeds `ROUNDED_S` s, and if
+on average more than `REPEATED` rows have the same time.
 """
 
 ROLLING, AGAIN = 0.2, 0.4
@@ -63,22 +66,25 @@ rows have the same value as the row before.
 WHEELS = "left right"
 COMMANDS = " ".join(APPLIED)
 STREAMS = (WHEELS, "yaw_rate", "yaw", "x y", COMMANDS)
-"""Names of the sensors. A name lists the sensor's columns. The commands count as a sensor."""
+"""Names of the sensors of a log. The commands count as a sensor.
+
+A name consists of the columns of the sensor, separated by spaces.
+"""
 
 Streams = dict[str, tuple[Floats, ...]]
-"""The times and the values of each sensor, by the sensor's name in `STREAMS`."""
+"""The times and the values of each sensor, by the name of the sensor in `STREAMS`."""
 
 MOST_RUNS = 1000
 """Maximum number of different values in the column `run`. A log with more values is refused."""
 
 TOGETHER = 50
-"""Number of rows whose speeds are summed before the two wheels of a side are compared."""
+"""Number of rows over which wheel speeds are summed before two wheels are compared."""
 
 NOTED, APART = 0.15, 0.8
 """Limits for the difference between the front and the rear wheel of a side.
 
-They are fractions of the distance rolled. The report mentions a difference above `NOTED`. A log
-with a difference above `APART` is refused.
+The limits are fractions of the distance rolled. The report mentions a difference above `NOTED`. A
+log with a difference above `APART` is refused.
 """
 
 GAP_S, GAP_PERIODS = 0.3, 5.0
@@ -92,29 +98,37 @@ STILL = 0.02
 """Largest speed at which a wheel is considered to stand still, rad/s."""
 
 BLOCKS = 16
-"""Number of blocks into which a log is divided, unless the blocks would be too short or too
-long."""
+"""Number of blocks into which a log is divided, unless the blocks would be too short or too long.
+"""
 
 LONGEST_S = 12.0
 """Maximum length of a block, s, unless the caller of `blocks()` asks for longer blocks."""
 
 SMOOTH_S = 0.3
-"""Time over which a wheel speed is averaged before it is squared, s.
+"""Time over which the difference of the wheel speeds is averaged before it is squared, s.
 
-Without this average, the speeds of a coarse encoder would be 0 in some samples and far too large in
-others.
+Without this average, the speeds of a coarse encoder would be 0 in some samples and far too large
+in others.
 """
 
 LEAST_TURN = 0.2
-"""A block is left out if the wheels of each side roll by less than this angle in it, rad."""
+"""Minimum angle that the wheels of one side must roll in a block, rad.
+
+A block in which neither side rolls this far is left out.
+"""
 
 MOST_JITTER_S = 5.0
-"""Largest variation of the delay from stamp to arrival, s. If the delay varies by more, the stamps
-are not used."""
+"""Largest accepted variation of the delay from stamp to arrival, s.
+
+If the delay varies by more, the stamps are not used.
+"""
 
 
 class Run(Struct, frozen=True, dict=True):
-    """The samples of one drive. Times are in s since `start`, and strictly increase."""
+    """The samples of one drive.
+
+    Times are in s since `start`. The times of each sensor strictly increase.
+    """
 
     name: str
     start: float
@@ -141,15 +155,15 @@ class Run(Struct, frozen=True, dict=True):
 
     @cached_property
     def gaps(self) -> Floats:
-        """Long intervals without a wheel sample, one row (begin, end) for each, s. See `gaps()`."""
+        """Long intervals without a wheel sample, s: one row (begin, end) for each. See `gaps()`."""
         return gaps(self.t)
 
     @cached_property
     def rolled(self) -> tuple[Floats, Floats]:
-        """A pair: the angles that the left and the right wheels have rolled since the start, rad.
+        """Angles that the left and the right wheels have rolled since the start of the run, rad.
 
-        Both arrays have a value for each of the times `t`. They stay constant during a gap in the
-        samples.
+        The value is a pair of arrays with a number for each of the times `t`. The angles stay
+        constant during a gap in the samples.
         """
         steps = np.diff(self.t)
         steps[np.isin(self.t[:-1], self.gaps[:, 0])] = 0.0
@@ -158,7 +172,7 @@ class Run(Struct, frozen=True, dict=True):
 
     @cached_property
     def moving(self) -> Mask:
-        """Mask of the wheel samples at which the wheels of at least one side turn."""
+        """Mask of the wheel samples in which the wheels of at least one side turn."""
         return np.asarray((np.abs(self.left) > STILL) | (np.abs(self.right) > STILL))
 
     def angles(self, t: Floats) -> tuple[Floats, Floats]:
@@ -172,7 +186,7 @@ class Run(Struct, frozen=True, dict=True):
     def speed_difference(self, t: Floats) -> Floats:
         """Return the speed of the right minus that of the left wheels at the times `t`, rad/s.
 
-        It is averaged over `SMOOTH_S`.
+        The speed is averaged over `SMOOTH_S`.
         """
         begin, end = (np.clip(t + s / 2, self.t[0], self.t[-1]) for s in (-SMOOTH_S, SMOOTH_S))
         (left, right), (far_left, far_right) = self.angles(begin), self.angles(end)
@@ -199,7 +213,7 @@ class Notes:
             sums[0], sums[1] = sums[0] + count, sums[1] + 1
 
     def sentences(self) -> tuple[str, ...]:
-        """Return each sentence once, with its count, in the order in which they were added."""
+        """Return each sentence once, with its count, in the order in which it was added."""
         return tuple(
             sentence.replace("{}", str(count)) + (f" (in {runs} runs)" if 1 < runs < count else "")
             for sentence, (count, runs) in self._sentences.items()
@@ -279,9 +293,9 @@ def _sides(columns: dict[str, Floats], notes: Notes) -> tuple[Floats, Floats]:
 
 
 def _apart(columns: dict[str, Floats], front: str, rear: str) -> float:
-    """Return the difference between two wheels of a side, as a fraction of the rolled distance.
+    """Return the difference between the front and the rear wheel of a side.
 
-    Both wheels roll over the same floor. Raises `LogError` if the difference is above `APART`.
+    The difference is a fraction of the rolled distance. Raises `LogError` if it is above `APART`.
     """
     seen = np.isfinite(columns[front]) & np.isfinite(columns[rear])
     starts = np.arange(0, int(seen.sum()), TOGETHER)
@@ -305,11 +319,12 @@ def _apart(columns: dict[str, Floats], front: str, rear: str) -> float:
 def _restarts(t: Floats, rows: Rows, columns: dict[str, Floats]) -> list[Rows]:
     """Split `rows` where the times `t` jump back. Return the rows of each drive.
 
-    Only the times of rows with wheel speeds are checked. The times of other rows may jump back
-    within a drive, because a file may list all rows of one sensor after all rows of another. The
-    rows stay together if there are more than `FEW_RESTARTS` jumps, or if the parts do not overlap
-    in time, because they are then unsorted rows of one drive.
+    Only the times of rows with wheel speeds are checked. The rows stay together if there are more
+    than `FEW_RESTARTS` jumps. The rows also stay together if the parts do not overlap in time,
+    because they are then unsorted rows of one drive.
     """
+    # The times of rows without wheel speeds may jump back within a drive, because a file may list
+    # all rows of one sensor after all rows of another.
     wheels = rows[np.isfinite(columns["left"][rows]) & np.isfinite(columns["right"][rows])]
     back = np.flatnonzero(np.diff(t[wheels]) < -RESTART_S) + 1
     if not 0 < len(back) <= FEW_RESTARTS:
@@ -317,7 +332,7 @@ def _restarts(t: Floats, rows: Rows, columns: dict[str, Floats]) -> list[Rows]:
     blocks = [part for part in np.split(wheels, back) if len(part) >= LEAST_ROWS]
     spans = sorted((float(np.min(t[part])), float(np.max(t[part]))) for part in blocks)
     if not any(a[1] > b[0] for a, b in pairwise(spans)):
-        return [rows]  # the blocks do not overlap in time: they are unsorted parts of one drive
+        return [rows]
     return list(np.split(rows, np.searchsorted(rows, wheels[back])))
 
 
@@ -348,10 +363,8 @@ def _in_seconds(name: str, t: Floats, parts: list[Rows], columns: dict[str, Floa
 
 
 def _pauses(t: Floats, rows: Rows, columns: dict[str, Floats]) -> list[Rows]:
-    """Split `rows` where the wheels have no sample for `PAUSE_S`. Return the rows of each drive.
-
-    Without this split, one row with a time of another day would make the drive many hours long.
-    """
+    """Split `rows` where the wheels have no sample for `PAUSE_S`. Return the rows of each drive."""
+    # Without this split, one row with a time of another day would make the drive many hours long.
     times = _wheel_times(t, rows, columns)
     ends = np.flatnonzero(np.diff(times) > PAUSE_S)
     if not len(ends):
@@ -385,10 +398,8 @@ def _run(name: str, streams: Streams) -> Run:
 
 
 def _remove_repeats(drives: Iterable[tuple[str, Streams]], notes: Notes) -> None:
-    """Remove from `drives`, in place, the yaws and positions that the logger repeated.
-
-    A short drive may not show the repetition, so all drives are evaluated together.
-    """
+    """Remove, in place, the yaws and positions in `drives` that the logger repeated."""
+    # A short drive may not show the repetition, so all drives are evaluated together.
     for what in ("yaw", "x y"):
         found = [(streams, *_repeats(streams, what)) for _, streams in drives]
         rolling = sum(int((again & rolls).sum()) for _, again, rolls in found)
@@ -408,8 +419,8 @@ def _remove_repeats(drives: Iterable[tuple[str, Streams]], notes: Notes) -> None
 def _repeats(streams: Streams, what: str) -> tuple[Mask, Mask]:
     """Return two masks of the samples of the sensor `what`, in the order of time.
 
-    The first is true if a sample has the same values as the sample before it. The second is true if
-    the wheels roll at the time of the sample.
+    The first mask is true for a sample with the same values as the sample before it. The second
+    mask is true for a sample during which the wheels roll.
     """
     t, *values = streams[what]
     if not len(t):
@@ -453,7 +464,10 @@ def _ordered(stream: list[Floats], what: str, notes: Notes) -> Iterator[Floats]:
 
 
 class Block(Struct, frozen=True):
-    """A few seconds of a run. To find uncertainties, the fit leaves out one block at a time."""
+    """A few seconds of a run.
+
+    To compute uncertainties, the fit leaves out one block at a time.
+    """
 
     run: int
     begin: float
@@ -463,10 +477,10 @@ class Block(Struct, frozen=True):
 
 
 def gaps(t: Floats) -> Floats:
-    """Return the gaps in the samples with the times `t`, s, one row (begin, end) for each gap.
+    """Return the gaps in the samples of a sensor, s: one row (begin, end) for each gap.
 
-    A gap is an interval between two samples that is much longer than usual (`GAP_S`,
-    `GAP_PERIODS`).
+    `t` contains the times of the samples, s. A gap is an interval between two samples that is much
+    longer than usual (`GAP_S`, `GAP_PERIODS`).
     """
     steps = np.diff(t)
     if not len(steps):
@@ -478,8 +492,8 @@ def gaps(t: Floats) -> Floats:
 def inside(begin: Floats, end: Floats, holes: Floats) -> Mask:
     """Return a mask of the intervals that do not overlap a gap.
 
-    `begin` and `end` contain the limits of the intervals. `holes` has a row (begin, end) for each
-    gap, as `gaps()` returns them.
+    `begin` and `end` contain the limits of the intervals. `holes` contains the gaps, as `gaps()`
+    returns them.
     """
     after = np.searchsorted(holes[:, 1], begin, side="right")
     before = np.searchsorted(holes[:, 0], end, side="left")
@@ -492,7 +506,7 @@ def cumulative(steps: Floats) -> Floats:
 
 
 def rests(run: Run, least_s: float, edge_s: float) -> Floats:
-    """Return the intervals in which all wheels stand still, one row (begin, end) for each, s.
+    """Return the intervals in which all wheels stand still, s: one row (begin, end) for each.
 
     Each interval is shortened by `edge_s` s at each end. It is left out if it is then shorter than
     `least_s` s.
@@ -507,8 +521,8 @@ def rests(run: Run, least_s: float, edge_s: float) -> Floats:
 def blocks(driven: Sequence[Run], shortest_s: float) -> list[Block]:
     """Return the blocks of all runs, without the blocks in which the robot hardly moved.
 
-    A block is about `shortest_s` long. If the log would then have more than `BLOCKS` blocks, the
-    blocks are longer, up to `LONGEST_S`.
+    The blocks are about `shortest_s` s long. If the log would then have more than `BLOCKS` blocks,
+    the blocks are longer, up to `LONGEST_S`.
     """
     moved = sum(float(np.minimum(np.diff(r.t), GAP_S) @ r.moving[1:]) for r in driven)
     length = float(np.clip(moved / BLOCKS, shortest_s, max(LONGEST_S, shortest_s)))
@@ -528,10 +542,10 @@ def blocks(driven: Sequence[Run], shortest_s: float) -> list[Block]:
 
 
 def _turned(run: Run, begin: float, end: float, left: Floats, right: Floats) -> bool:
-    """Return whether the wheels of a side rolled by at least `LEAST_TURN` from `begin` to `end`, s.
+    """Return whether the wheels of a side rolled by at least `LEAST_TURN` in a time interval.
 
-    `left` and `right` contain the rolled angles at both times, rad. Rolling back and rolling ahead
-    are added.
+    The interval is from `begin` to `end`, s. `left` and `right` contain the rolled angles at the
+    two times, rad. Angles that the wheels roll back and ahead are added.
     """
     if max(abs(left[1] - left[0]), abs(right[1] - right[0])) >= LEAST_TURN:
         return True
@@ -543,9 +557,12 @@ def _turned(run: Run, begin: float, end: float, left: Floats, right: Floats) -> 
 def on_arrival_clock(came: Floats, made: Floats) -> Floats:
     """Return the times at which a sender made its samples, s, on the receiver's clock.
 
-    `came` contains the times of arrival, and `made` the stamps of the sender's clock, both in s. If
-    the delay from stamp to arrival varies by at most `MOST_JITTER_S`, the result is the stamps plus
-    the smallest delay. Otherwise it is the times of arrival.
+    The times are the stamps plus the smallest delay from stamp to arrival. If this delay varies by
+    more than `MOST_JITTER_S`, the times are the times of arrival.
+
+    Args:
+        came: the times of arrival on the receiver's clock, s.
+        made: the stamps of the sender's clock, s.
     """
     delay = came - made
     if float(np.ptp(delay)) > MOST_JITTER_S:

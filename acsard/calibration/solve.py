@@ -1,4 +1,7 @@
-"""Computes the calibration from a log. If that is impossible, an error says why and what to do."""
+"""Computes the calibration from a log.
+
+If the log gives no calibration, an error says why, and what the user must do.
+"""
 
 from __future__ import annotations
 
@@ -50,29 +53,31 @@ hide small turns. Without positions, the tool tries only the shortest length. Wi
 heading sensor, it does not try the shortest length.
 """
 
+# With six blocks, the standard deviation of the ratio of the radii was up to three times too small.
 ENOUGH_BLOCKS = 8
-"""Minimum number of blocks.
+"""Number of blocks that a log should have.
 
 A block length that gives fewer blocks is not tried if a shorter length has already given a fit.
-With six blocks, the standard deviation of the ratio of the radii was up to three times too small.
 """
 
 # For comparison: on a good floor, motion capture differs from the wheels by less than 1e-3.
 PERFECT = 1e-4
 """Smallest credible difference between a sensor and the wheels, as a fraction of the motion.
 
-A sensor with a smaller difference was probably computed from the wheels.
+If the difference is smaller, the sensor's data were probably computed from the wheels.
 """
 
 
 class Drives(Struct, frozen=True):
+    """Totals of the drives in a log."""
+
     runs: int
     seconds: float
     metres: float
     turns: float
-    """Sum of all left and right turns of the robot, as a number of turns of 360 deg.
+    """Total turning of the robot to the left and to the right, as a number of turns of 360 deg.
 
-    The turns are those of the calibrated wheels.
+    The turns are computed from the calibrated wheels.
     """
     fastest: float
     """Turn rate below which the robot turned 95 % of its total turned angle, rad/s."""
@@ -82,10 +87,16 @@ class Drives(Struct, frozen=True):
         cls, runs: Sequence[Run], rows: Rows, by_wheels: Floats, base: Base, found: Multipliers,
         rate: Rates,
     ) -> Drives:  # fmt: skip
-        """Return the totals of these runs.
+        """Return the totals of the runs.
 
-        `by_wheels` contains the robot's turn in each interval of `rows` according to the calibrated
-        wheels, rad.
+        Args:
+            runs: the runs of the log.
+            rows: the motion in intervals of about a second.
+            by_wheels: the robot's turn in each interval of `rows`, rad, computed from the
+                calibrated wheels.
+            base: the configured geometry.
+            found: the new multipliers.
+            rate: the turn rates of the log.
         """
         size = base.radius * float(found.values[[LEFT_RADIUS, RIGHT_RADIUS]].mean())
         return cls(
@@ -96,7 +107,10 @@ class Drives(Struct, frozen=True):
 
 
 class Calibration(Struct, frozen=True):
-    """The result of a calibration. Each standard deviation has the unit of its quantity."""
+    """The result of a calibration.
+
+    Each standard deviation has the unit of its quantity.
+    """
 
     reference: str
     """Names of the sensors, or of the measuring tool, with which the wheels were compared.
@@ -108,34 +122,39 @@ class Calibration(Struct, frozen=True):
     multipliers: Multipliers
     """New multipliers of the wheel separation and of the two wheel radii."""
     scale: str
-    """Measurements that show the size of the wheels: "positions", "distance" (by tape), or both.
+    """Kind of the measurements that show the size of the wheels.
 
-    "positions and distance" means both, and "" means that nothing shows the size.
+    The value is "positions" (from a sensor), "distance" (by tape), "positions and distance", or
+    "". If it is "", no measurement shows the size of the wheels.
     """
     growth: float
     """Fraction by which the effective track grows with each rad/s of turn rate."""
     growth_std: float
     improvement: Improvement
     delays: dict[str, float]
-    """Maps the name of each sensor to its delay, s.
+    """Delay of each sensor's recorded times relative to those of the wheels, s, by sensor name.
 
-    The delay is the time by which the sensor's recorded times are later than those of the wheels
-    for the same event.
+    A delay is positive if the sensor records the same event with a later time than the wheels.
     """
     gyro_bias: float
     """Gyro bias, rad/s; 0 without a gyro."""
     notes: tuple[str, ...]
     odometry: dict[str, float]
-    """New settings of `[odometry]`, by name: the uncertainty of the wheel radii and of the track.
+    """New values for settings of `[odometry]`, by the name of the setting.
 
-    They include the noise settings if `Noise.better` is true.
+    These settings state the uncertainty of the wheel radii and of the track. The noise settings
+    are included only if `Noise.better` is true.
     """
     kept: tuple[str, ...] = ()
-    """Names of the quantities that stay as configured: `plausibility.TRACK`, `RATIO` or both."""
-    feedback: dict[str, float] = {}
-    """New settings of `[feedback]`, by name.
+    """Names of the quantities that stay as configured.
 
-    It is empty unless the configured settings would cause false wheel faults and better ones exist.
+    The possible names are `plausibility.TRACK` and `plausibility.RATIO`.
+    """
+    feedback: dict[str, float] = {}
+    """New values for settings of `[feedback]`, by the name of the setting.
+
+    The dictionary is empty if the configured settings cause no false wheel fault in this log, or
+    if no better settings were found.
     """
     noise: Noise | None = None
     """Noise of the odometry that this log shows; None if the log does not show it."""
@@ -148,10 +167,11 @@ def calibrate(
     """Return the calibration of the robot that recorded this log.
 
     Args:
+        log: the runs of the log.
         drive: the configured geometry, and the configured multipliers that scale it.
-        tape: a distance that was measured by tape.
-        odometry: the configured noise. None means the default settings.
-        feedback: the configured response time. None means the default settings.
+        tape: a distance that a person measured by tape, or None.
+        odometry: the settings of `[odometry]`. None means the default settings.
+        feedback: the settings of `[feedback]`. None means the default settings.
 
     Raises:
         LogError: a sensor of the log cannot be used. The error includes the notes of the log.
@@ -169,23 +189,23 @@ def calibrate(
 
 
 class Prepared(Struct, frozen=True):
-    """A log that was cut into blocks of one length, and all other inputs of the fit."""
+    """A log that was divided into blocks of one length, and all other inputs of the fit."""
 
     runs: Sequence[Run]
     headings: Headings | None
-    """None if the log has no heading sensor."""
+    """Headings that a sensor measured, or None if the log has no heading sensor."""
     base: Base
     parts: list[Block]
     rows: Rows
     """Motion in intervals of about 1 s.
 
-    The gyro's bias has been subtracted from the turns, unless the bias is unknown
+    The turns of a gyro are corrected for its bias, unless the bias is unknown
     (`Headings.bias_unknown`).
     """
     segments: list[Segment]
-    """The measured positions; empty if the log has none."""
+    """Measured positions; empty if the log has no positions."""
     steps: list[WheelSteps]
-    """The motion of the wheels in each run; empty if the log has no positions."""
+    """Rolling of the wheels in each run; empty if the log has no positions."""
     sources: list[Source]
     """One function for each sensor, which returns the sensor's evidence for given parameters."""
     start: Floats
@@ -194,9 +214,9 @@ class Prepared(Struct, frozen=True):
 def prepared(
     driven: Sequence[Run], headings: Headings | None, base: Base, length: float
 ) -> Prepared:
-    """Cut the runs into blocks of about `length` s, check the log, and find starting parameters.
+    """Divide the runs into blocks, check the log, and return the inputs of the fit.
 
-    Raises `RefusedError` if a check fails.
+    The blocks are about `length` s long. Raises `RefusedError` if a check fails.
     """
     parts = blocks(driven, length)
     plausibility.drives_enough(parts)
@@ -255,7 +275,7 @@ def _check_units(headings: Headings | None, start: Floats, base: Base, sized: bo
 
 
 class Candidate(Struct, frozen=True):
-    """A fit to blocks of one length, and the improvement that it brings, by cross-validation."""
+    """A fit to blocks of one length, and the improvement of the odometry that it brings."""
 
     made: Prepared
     fitted: Fit
@@ -269,10 +289,11 @@ class Candidate(Struct, frozen=True):
     result: Multipliers
     improvement: Improvement
     kept: dict[str, float]
-    """Maps the name of each quantity that stays as configured to a relative standard deviation.
+    """Quantities that stay as configured, with the uncertainty that they have in this log.
 
-    The names are `plausibility.TRACK` and `RATIO`. The deviation is the one with which the log
-    determines the quantity; inf if this is unknown.
+    The names of the quantities, `plausibility.TRACK` and `RATIO`, are mapped to the relative
+    standard deviation with which the log determines the quantity. The deviation is inf if it is
+    unknown.
     """
 
 
@@ -324,8 +345,8 @@ def _noise(
 ) -> Noise | None:
     """Return the noise of the odometry that this log shows, or None if the log does not show it.
 
-    If `present` is true, the path of the wheels is computed with the configured geometry instead of
-    the fitted one.
+    If `present` is true, the path of the wheels is computed with the configured geometry.
+    Otherwise it is computed with the fitted geometry.
     """
     made, fitted = best.made, best.fitted
     held = folds(fitted, made.parts, drives(made.runs), best.rate)
@@ -342,10 +363,12 @@ def _noise(
 
 
 def _candidates(made: Prepared) -> list[Candidate]:
-    """Return the fit of all parameters if it determines both the track and the ratio of the radii.
+    """Return one or two fits to the log.
 
-    Otherwise return up to two fits: the first keeps the ratio as configured, the second keeps the
-    track. Raises `RefusedError` if these fits are too inaccurate as well, or if no fit converges.
+    If the log determines both the track and the ratio of the radii, the only fit is that of all
+    parameters. Otherwise the first fit keeps the ratio as configured, and the second fit keeps the
+    track. A fit that is too inaccurate or does not converge is left out. Raises `RefusedError` if
+    no fit remains.
     """
     found: list[Candidate] = []
     deviations: dict[str, float] = {}
@@ -382,7 +405,7 @@ def _candidates(made: Prepared) -> list[Candidate]:
 
 
 def _held(base: Base) -> dict[str, list[Held]]:
-    """Map each quantity that a fit can keep as configured to the constraints that keep it.
+    """Return the constraints that keep a quantity as configured, by the name of the quantity.
 
     The name "" stands for a fit without constraints.
     """
@@ -393,7 +416,10 @@ def _held(base: Base) -> dict[str, list[Held]]:
 
 
 def _candidate(made: Prepared, fitted: Fit) -> Candidate:
-    """Return a fit with its improvement. Raises `RefusedError` if the robot hardly turned."""
+    """Return a fit with the improvement that it brings.
+
+    Raises `RefusedError` if the robot hardly turned.
+    """
     headings, base = made.headings, made.base
     rows, by_wheels = made.rows, heading.turned(made.rows, base, fitted.parameters)
     gyro_scale = 1 + float(fitted.parameters[P.SCALE_ERROR])
@@ -512,8 +538,6 @@ def _own(what: str) -> str:
 
 
 def _follow(made: Prepared, fitted: Fit, rate: Rates) -> Follow:
-    """Return a function that computes the extent of a run's path for given multipliers."""
-
     def follow(values: Floats, number: int) -> Extent:
         parameters = fitted.parameters.copy()
         parameters[[P.LEFT, P.RIGHT]] = values[[LEFT_RADIUS, RIGHT_RADIUS]]

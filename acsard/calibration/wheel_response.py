@@ -1,16 +1,10 @@
 """Estimates from a log how soon the wheels follow their commands, and how fast they can turn.
 
-The daemon expects the speed y of a healthy wheel to follow the command u with the time constant
-`feedback.response_time` (T below):
-
-    T dy/dt = u - y
-
-If a wheel contradicts this for `feedback.fault_time`, the daemon reports a fault.
-
-This module tries several response times, and takes the one that fits best. It assumes that the
-wheels of the log are healthy. With the configured response time, it runs the daemon's own fault
-detection (`core/motion/wheel_witness.py`) on the log. It measures the longest time for which this
-detection considers a wheel faulty.
+The daemon reports a fault if a wheel contradicts the model of a healthy wheel for
+`feedback.fault_time`. The model depends on `feedback.response_time`. This module finds the
+response time that fits the wheels of the log best, and assumes that these wheels are healthy. It
+also runs the daemon's own fault detection (`core/motion/wheel_witness.py`) on the log, with the
+configured response time. The result shows whether the daemon would report a false fault.
 """
 
 from __future__ import annotations
@@ -34,41 +28,43 @@ TRIED = np.geomspace(0.01, 5.0, 60)
 """Response times that are tried, s. They cover the range of `feedback.response_time`."""
 
 LEAST_ROWS, MOST_ROWS = 200, 30_000
-"""Minimum number of wheel samples in a log, and maximum number that is used.
+"""Minimum and maximum number of wheel samples.
 
-The maximum is 5 minutes at 100 Hz.
+A log with fewer samples than `LEAST_ROWS` gives no response time. At most `MOST_ROWS` samples are
+used, which is 5 minutes at 100 Hz.
 """
 
 FOLLOWS = 0.5
 """Largest fraction of the sum of squared wheel speeds that the model may leave unexplained."""
 
 SPARE = 0.5
-"""Limit for the time in which a wheel looks faulty, as a fraction of `feedback.fault_time`.
+"""Longest time for which a healthy wheel may look faulty with the proposed response time.
 
-The proposed response time keeps within this limit.
+The time is a fraction of `feedback.fault_time`.
 """
 
 STEADY_S, REACHED, CONSTANT = 1.0, 0.9, 0.03
 """Limits that show that a wheel turns as fast as it can.
 
-Its speed stays below `REACHED` times its command for at least 2 * `STEADY_S` s, and changes by less
-than the fraction `CONSTANT` in the last `STEADY_S` s.
+The speed of such a wheel stays below `REACHED` times its command for at least 2 * `STEADY_S` s. In
+the last `STEADY_S` s, the speed changes by less than the fraction `CONSTANT`.
 """
 
 SAME = 1.5
-"""Largest factor between the fitted and the configured response time.
-
-Up to this factor, the report says that they agree.
-"""
+"""Largest factor between the fitted and the configured response time at which they agree."""
 
 
 class WheelResponse(Struct, frozen=True):
-    seconds: float
-    """Response time that fits best, s."""
-    proposed: float | None
-    """Response time to configure, s; None if the configured one must not change or none is good.
+    """The response of the wheels to their commands in a log."""
 
-    It is the smallest time in `TRIED` that is at least `seconds` and keeps within `SPARE`.
+    seconds: float
+    """Response time that fits the log best, s."""
+    proposed: float | None
+    """Response time to configure, s; None if the tool proposes no change.
+
+    There is a proposal only if `false_fault` is true. The proposal is the smallest time in
+    `TRIED`, not below `seconds`, with which no wheel looks faulty for longer than `SPARE` permits.
+    If no time fulfils this, the value is None.
     """
     present: float
     """Configured response time, s."""
@@ -78,18 +74,21 @@ class WheelResponse(Struct, frozen=True):
     Such a fault would be false, because the wheels are assumed to be healthy.
     """
     fastest: float
-    """Highest speed that the wheels reach, rad/s, or infinity if the log shows no such limit."""
+    """Highest speed that the wheels reach, rad/s; infinity if the log shows no such limit."""
 
     def settings(self) -> dict[str, float]:
-        """Return the settings of `[feedback]` that must change, by name; empty if none must."""
+        """Return the new values for settings of `[feedback]`, by the name of the setting.
+
+        The dictionary is empty if no setting must change.
+        """
         if not self.false_fault or self.proposed is None:
             return {}
         return {"response_time": self.proposed}
 
     def sentences(self) -> list[str]:
-        """Return a sentence about the response time.
+        """Return a sentence about the response time, for the report.
 
-        If `fastest` is finite, return a second sentence about `limits.wheel_speed`.
+        If `fastest` is finite, the list also contains a sentence about `limits.wheel_speed`.
         """
         follow = f"the wheels follow their commands with a response time of {self.seconds:.2g} s"
         if self.false_fault:
@@ -156,7 +155,7 @@ def response(
 
 
 def _commanded(run: Run, drive: DriveConfig) -> tuple[Floats, Floats, Floats]:
-    """Return three arrays: the time steps, s, the commanded speeds and the measured speeds, rad/s.
+    """Return three arrays: time steps, s, commanded wheel speeds and measured wheel speeds, rad/s.
 
     The speeds have the shape (samples, 2), with the left side first. The time step of a sample is
     NaN if no command applies to the sample, or if a gap in the samples precedes it.
@@ -177,8 +176,12 @@ def _commanded(run: Run, drive: DriveConfig) -> tuple[Floats, Floats, Floats]:
 def _expected(steps: Floats, wanted: Floats, seen: Floats) -> Floats:
     """Return the speeds of the wheels that each response time in `TRIED` predicts, rad/s.
 
-    The arguments are results of `_commanded`. The shape of the result is (samples, 2, times).
+    The arguments are the arrays that `_commanded` returns. The shape of the result is (samples, 2,
+    times).
     """
+    # The speed y of a healthy wheel follows the command u with the response time T:
+    #
+    #     T dy/dt = u - y
     expected = np.empty((*wanted.shape, len(TRIED)))
     last = np.zeros((2, len(TRIED)))
     for number, step in enumerate(steps):
@@ -193,9 +196,9 @@ def _expected(steps: Floats, wanted: Floats, seen: Floats) -> Floats:
 def _evidence(
     parts: Sequence[tuple[Floats, Floats, Floats]], response_time: float, fault_time: float
 ) -> float:
-    """Return the longest time, s, for which the daemon's fault detection considers a wheel faulty.
+    """Return the longest time for which the daemon's fault detection considers a wheel faulty, s.
 
-    `parts` contains the results of `_commanded`.
+    `parts` contains the triples that `_commanded` returns.
     """
     longest, most = 0.0, fault_time / LINES_OF_EVIDENCE
     for steps, wanted, seen in parts:
@@ -216,7 +219,8 @@ def _evidence(
 def _fastest(parts: Sequence[tuple[Floats, Floats, Floats]]) -> float:
     """Return the highest steady speed of a wheel that stays below its command, rad/s.
 
-    Return infinity if there is none. `parts` contains the results of `_commanded`.
+    Return infinity if no wheel has such a speed. `parts` contains the triples that `_commanded`
+    returns.
     """
     found: list[float] = []
     for steps, wanted, seen in parts:

@@ -1,1 +1,1 @@
-"""`acsard mcu check`: tests the microcontroller step by step. The package itself does no I/O."""
+"""Tests the microcontroller step by step, for `acsard mcu check`. This package does no I/O."""

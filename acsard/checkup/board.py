@@ -1,10 +1,11 @@
-"""Drives the board that is checked: sends speeds for its motors a to d, and stores its replies.
+"""Sends speeds to the board that is checked, and stores its replies.
 
 A step of the check sends lines through a `Board` for some time, and then evaluates the stored
-`replies`. Speeds are given for motors and not for wheels, because the check has to find out which
-wheel a motor turns. Three events interrupt a step immediately: a motor runs away, the board falls
-silent while motors turn, or the board restarts. After the first two, the check ends. The caller
-implements the interfaces `Wire` (the serial line) and `Operator` (the person at the robot).
+`replies`. Speeds are given for the motors a to d and not for wheels, because the check must find
+out which wheel a motor turns. A step ends immediately if a motor runs away, if the board falls
+silent, or if the board restarts. After a restart the step can be repeated; otherwise the check
+ends. The caller implements the interfaces `Wire` (the serial line) and `Operator` (the person at
+the robot).
 """
 
 from __future__ import annotations
@@ -33,71 +34,78 @@ class Wire(Protocol):
     """Interface of the serial connection between this computer and the board."""
 
     def open(self, baud_rate: int) -> None:
-        """Open the connection, or set the baud rate if the connection is open already.
+        """Open the connection at this baud rate. If it is open already, change its baud rate.
 
-        Raises `MendableError` or `WireLostError`.
+        Raises `MendableError` if the port cannot be opened, and `WireLostError` if it is lost.
         """
 
     def close(self) -> None:
-        """Send the bytes that are still waiting, and close the connection."""
+        """Send the bytes that are still in the driver's buffer, then close the connection."""
 
     def now_ns(self) -> int:
-        """Return the monotonic time, ns."""
+        """Return the present monotonic time, ns."""
 
     def send(self, data: bytes) -> None:
         """Send bytes now. Raises `WireLostError` if the connection is lost."""
 
     def late_ns(self) -> int:
-        """Return how long the board has waited for a processor since the last call, ns.
+        """Return for how long a simulated board waited for a processor since the last call, ns.
 
-        Only a simulated board, which is a program on this computer, can wait for a processor. For a
-        real board the result is 0.
+        Such a board is a program on this computer, so a busy processor delays its replies. Return 0
+        for a real board.
         """
 
     def listen(self, until_ns: int) -> Sequence[tuple[int, bytes]]:
-        """Receive until the monotonic time `until_ns`, and return the received pieces of data.
+        """Receive data until the monotonic time `until_ns`, ns, and return it in pieces.
 
-        Each piece is a pair: the monotonic time of its arrival, ns, and the bytes. Raises
+        Each piece is a pair: the monotonic time of its arrival, ns, and its bytes. Raises
         `WireLostError` if the connection is lost.
         """
 
 
 class Operator(Protocol):
-    """Interface through which the check asks and informs the operator, a person at the robot."""
+    """Interface through which the check informs and asks the operator, a person near the robot."""
 
     def doing(self, text: str) -> None:
-        """Show `text`, which says what the check does now, until the next call of this method."""
+        """Show what the check does now. `text` stays until the next call of this method."""
 
     def ask(self, question: str, answers: Sequence[str]) -> str | None:
-        """Ask a question. Return one of `answers`, or None if no person watches the robot."""
+        """Ask a question. Return one of `answers`, or None if there is no operator to answer."""
 
     def keys(self, wait_s: float) -> str:
-        """Return the keys that the operator has typed. Wait up to `wait_s` s for the first key."""
+        """Return the keys that the operator has typed, or "" if no key was typed.
+
+        If no key has been typed yet, wait up to `wait_s` s for the first one.
+        """
 
 
 def _nothing() -> None:
-    """Do nothing, as the default of `Board.between`."""
+    """Do nothing. This is the default of `Board.between`."""
 
 
 LEAST_S = 0.001
-"""`Board.drive` sends no further line if less than this part of its duration is left, s."""
+"""Shortest remaining time in which `Board.drive` sends one more line, s."""
 
 BEAT_NS = int(motion.PERIOD_S * NS_PER_S)
-"""Interval at which `Board.listen` measures how late this computer runs the check, ns."""
+"""Longest uninterrupted wait of `Board.listen`, ns. After each such wait, `listen` measures by how
+much this computer runs the check too late."""
 
 FAREWELL = 5
-"""Number of times that zeros are sent at the end of the check."""
+"""Number of times that the check sends zeros at its end."""
 
 
 KNOWN = ("comma", "latched", "sealed", "sampled", "own_clock", "gap_s", "paced", "lost")
-"""Names of the attributes of `Board` that hold the results of steps, which later steps use."""
+"""Names of the attributes of `Board` that are set back before a step is repeated.
+
+They contain results of earlier steps, which later steps use.
+"""
 
 
 class Board:
     """The board that is checked, with its replies and the results of the steps.
 
-    As a context manager, it opens the wire at the beginning. At the end it sends zeros, unless a
-    motor runs away (`fled`), and closes the wire.
+    It is a context manager, which opens the wire at the beginning and closes it at the end. Before
+    it closes the wire, it sends zeros, unless a motor runs away (`fled`).
     """
 
     def __init__(
@@ -105,54 +113,57 @@ class Board:
     ) -> None:
         self.wire, self.mcu, self.rate_hz = wire, mcu, rate_hz
         self.longest_reply_s = longest_reply
-        """Largest permitted value of mcu.reply_period, s."""
+        """Largest permitted value of the setting `mcu.reply_period`, s."""
         self.armed = False
-        """Whether the check has seen all motors stand still. Once this is true, a motor that runs
-        away ends the check."""
+        """Whether the check has seen all motors stand still. From then on, the check ends if a
+        motor runs away or if the board falls silent."""
         self.between: Callable[[], object] = _nothing
-        """Callback that may raise an exception to end the check. `send` calls it before each line
-        that turns a motor. `listen` calls it at its beginning, and then after each wait of up to
-        `BEAT_NS`. It is not called while the last zeros are sent."""
+        """Callback that can end the check by an exception. `send` calls it before each line that
+        turns a motor. `listen` calls it at its beginning and after each wait, which lasts `BEAT_NS`
+        at most. It is not called while the check sends its last zeros."""
         # Results of the steps
         self.baud_rate: int = mcu.baud_rate
         self.comma = mcu.trailing_comma
         """Whether the lines to the board end with a comma."""
         self.latched = False
-        """Whether motor d stops only at lines of zeros with the ending that `comma` selects."""
+        """Whether motor d stops only if a line of zeros has the ending that `comma` selects."""
         self.sealed = self.sampled = False
-        """`sealed` says whether each line has a checksum. `sampled` says whether each line to the
-        board also requests the board's clock and encoder counts."""
+        """`sealed`: whether each line has a checksum. `sampled`: whether each line to the board
+        requests a sample, that is the board's clock and encoder counts."""
         self.identity: dict[str, str] = {}
         self.own_clock = False
-        """Whether the board sends reports by its own clock, instead of replies to lines."""
+        """Whether the board sends its replies by its own clock, and not as answers to lines."""
         self.gap_s = mcu.reply_period
         """Mean time between two replies while lines are sent, s."""
         self.paced = False
         """Whether the reply rate has been measured, so that `own_clock` and `gap_s` are known."""
         self.lost = 0.0
-        """Fraction of the lines, in both directions together, that are lost or damaged."""
+        """Fraction of lines that are lost or damaged, to the board and from the board together."""
         # Received lines
         self.replies: list[Reply] = []
         self.others: list[bytes] = []
-        """Received lines that are not valid replies."""
+        """Received lines that are neither valid replies nor status lines."""
         self.inputs: dict[int, bool] = {}
-        """Maps the number of each reported input to whether it was pressed in the last status line
-        that reported it. Input 0 is the emergency stop, and inputs 1, 2, ... are the bumpers."""
+        """Maps the number of each input to whether the board last reported it as pressed.
+
+        Input 0 is the emergency stop, and inputs 1, 2, ... are the bumpers. An input that the board
+        has never reported is missing.
+        """
         self.heard = Heard()
-        """Statistics of all bytes and lines received since the port was opened."""
+        """Statistics of all bytes and lines received since the last call of `open`."""
         self.sent_lines = 0
         self.sent_s = 0.0
         self.lateness = Lateness()
-        """The times by which this computer ran the check too late. If the board is simulated on
-        this computer, the delays of the simulation are included."""
+        """The delays by which this computer ran the check too late. If the board is simulated on
+        this computer, the delays of the simulator are included."""
         self.fled = False
-        """Whether a motor runs away, or keeps turning although zeros are sent. Then the check sends
-        nothing more, so that the board's watchdog can stop the motor."""
+        """Whether a motor runs away, or keeps turning although zeros are sent. The check sends
+        nothing more in this case, so that the board's watchdog can stop the motor."""
 
         self._commanded = ZERO
         self._unanswered_s = 0.0
-        """Time for which `drive` has sent lines since the last reply, s. Times during which this
-        computer paused do not count."""
+        """Time for which `drive` has sent lines since the last reply, s. A delay of this computer
+        counts for the time between two lines at most."""
         self._listened_s = 0.0
         self._sequence = 0
         self._lines = LineReader()
@@ -160,13 +171,13 @@ class Board:
         self._codecs = {comma: Codec(WheelMap(), comma) for comma in (False, True)}
 
     def open(self, baud_rate: int) -> None:
-        """Open the port at this baud rate, and discard all lines that were received before."""
+        """Open the port at this baud rate, or change its rate. Discard all received lines."""
         self.wire.open(baud_rate)
         self.baud_rate, self.heard = baud_rate, Heard()
         self.forget()
 
     def forget(self) -> None:
-        """Discard all received lines, but keep the results of the steps."""
+        """Discard all received lines and the signs of a restart. Keep the results of the steps."""
         self.restarts, self._unanswered_s = Restarts(), 0.0
         for heard in (self._lines, self.replies, self.others):
             heard.clear()
@@ -179,17 +190,16 @@ class Board:
         try:
             self._farewell()
         except BaseException:
-            self._farewell()  # a signal interrupted the first call, but zeros must still be sent
+            # A signal interrupted the first call, but zeros must still be sent.
+            self._farewell()
             raise
         finally:
             self.wire.close()
 
     def _farewell(self) -> None:
-        """Send zeros several times, but stop sending once a motor runs away.
-
-        If an encoder is reversed, the firmware's speed control may make the motor run away even
-        when zeros are sent. Each further line would keep the watchdog from stopping the motor.
-        """
+        """Send zeros several times, but send nothing more once a motor runs away."""
+        # If an encoder is reversed, the firmware's speed control may make the motor run away even
+        # when zeros are sent. Each further line would keep the watchdog from stopping the motor.
         self.armed, self.restarts.watched, self.between = False, False, _nothing
         try:
             for _ in range(FAREWELL):
@@ -199,16 +209,20 @@ class Board:
                 self.listen(2 * self.period_s)
                 self.fled = motion.fastest(self.replies, motion.RUNAWAY) is not None
         except WireLostError:
-            pass  # nothing reaches the motors any more, so the MCU's own watchdog has to stop them
+            # No line reaches the board any more, so its own watchdog must stop the motors.
+            pass
 
     @property
     def now_s(self) -> float:
-        """Monotonic time, s."""
+        """Present monotonic time, s."""
         return self.wire.now_ns() / NS_PER_S
 
     @property
     def known(self) -> dict[str, object]:
-        """Values of the attributes in `KNOWN`, which are restored before a step is repeated."""
+        """Mapping from each name in `KNOWN` to the value of that attribute.
+
+        Assign an earlier mapping to set the attributes back, before a step is repeated.
+        """
         return {name: getattr(self, name) for name in KNOWN}
 
     @known.setter
@@ -218,13 +232,13 @@ class Board:
 
     @property
     def line_s(self) -> float:
-        """Time that the wire needs for the longest line, with a margin of 25 %, s."""
+        """Time for the transmission of the longest line, with a margin of 25 %, s."""
         longest = line_bytes(True, self.sealed, self.sampled)
         return 1.25 * wire_ns(longest, self.baud_rate) / NS_PER_S
 
     @property
     def period_s(self) -> float:
-        """Time between two lines, s."""
+        """Time from one sent line to the next, s. It is longer than usual on a slow wire."""
         return max(motion.PERIOD_S, self.line_s)
 
     # Sending
@@ -232,7 +246,8 @@ class Board:
     def line(self, motors: Motors, comma: bool | None = None) -> bytes:
         """Return the line that commands these speeds, rad/s.
 
-        `comma` says whether the line ends with a comma; None means `self.comma`.
+        The line ends with a comma if `comma` is true. None means the value of `self.comma`. The
+        line has a sequence number and a checksum if `self.sealed` is true.
         """
         line = self._codecs[self.comma if comma is None else comma].encode(WheelSpeeds(*motors))
         if not self.sealed:
@@ -241,7 +256,10 @@ class Board:
         return seal(line, self._sequence, ASK_SAMPLE if self.sampled else b"")
 
     def send(self, motors: Motors, comma: bool | None = None) -> None:
-        """Send one line that commands these speeds, rad/s. See `line()` for the parameters."""
+        """Send one line that commands the speeds `motors`, rad/s.
+
+        The line ends with a comma if `comma` is true. None means the value of `self.comma`.
+        """
         if any(motors):
             self.between()
         turned, self._commanded = any(self._commanded), motors
@@ -253,9 +271,9 @@ class Board:
         self.restarts.sent(motors, self.sent_s)
 
     def zeros(self) -> None:
-        """Send zeros in all forms: lines with and without a final comma, and one with a checksum.
+        """Send zeros as a line with a final comma, and again as a line without a final comma.
 
-        The line with a checksum is sent only if `sealed` is true.
+        If `sealed` is true, also send them as a line with a checksum.
         """
         self._commanded = ZERO
         plain = self._codecs[True].stop + self._codecs[False].stop
@@ -263,7 +281,7 @@ class Board:
         self.restarts.sent(ZERO, self.now_s)
 
     def wakes(self, seconds: float) -> bool:
-        """Send zeros until the board answers. Return False if no reply arrives within `seconds`."""
+        """Send zeros until the board answers. Return whether a reply arrives within `seconds` s."""
         before, end_s = len(self.replies), self.now_s + seconds
         while len(self.replies) == before:
             if self.now_s >= end_s:
@@ -275,7 +293,7 @@ class Board:
     def ask(self, wait_s: float = 0.0, comma: bool | None = None) -> None:
         """Send one line of zeros, then listen for `wait_s` s, but at least for `period_s`.
 
-        See `line()` for `comma`.
+        The line ends with a comma if `comma` is true. None means the value of `self.comma`.
         """
         self.send(ZERO, comma)
         self.listen(max(wait_s, self.period_s))
@@ -283,12 +301,17 @@ class Board:
     def answers(
         self, lines: int, wait_s: float, comma: bool | None = None
     ) -> list[tuple[float, Reply]]:
-        """Send `lines` lines of zeros, and return the first reply to each line with its delay, s.
+        """Send lines of zeros, and return the first reply to each line together with its delay.
 
-        After each line the method waits for `wait_s` s, but at least for 1.5 times `period_s`. A
-        line without a reply has no entry in the result. See `line()` for `comma`.
+        Each entry of the result is a pair: the time from the line to its reply, s, and the reply. A
+        line without a reply has no entry.
+
+        Args:
+            lines: the number of lines to send.
+            wait_s: how long to listen after each line, s; at least 1.5 times `period_s`.
+            comma: whether the lines end with a comma. None means the value of `self.comma`.
         """
-        # Replies to earlier lines must not be taken for replies to these lines.
+        # Receive the replies to earlier lines now, so that they are not taken for replies to these.
         self.listen(max(motion.GLANCE_S / 4, wait_s))
         got: list[tuple[float, Reply]] = []
         for _ in range(lines):
@@ -298,10 +321,11 @@ class Board:
         return got
 
     def drive(self, motors: Motors, seconds: float, period_s: float = 0.0) -> list[Reply]:
-        """Send these speeds, rad/s, repeatedly for `seconds`, and return the replies received then.
+        """Send lines with the speeds `motors`, rad/s, for `seconds` s, and return the replies.
 
-        `period_s` is the time between two lines; 0 means `self.period_s`. Raises `StoppedError` if
-        the board falls silent while `armed` is true, because a motor could then run away unnoticed.
+        `period_s` is the time from one line to the next, s; 0 means `self.period_s`. Raises
+        `StoppedError` if the board falls silent while `armed` is true, because a motor could then
+        run away unnoticed. Also raises the errors of `listen`.
         """
         period_s = period_s or self.period_s
         end_s = self.now_s + seconds
@@ -320,21 +344,23 @@ class Board:
         return got
 
     def let_go(self, silent_s: float) -> None:
-        """Send zeros once, then nothing for `silent_s` s, so that the watchdog stops the motors."""
+        """Send zeros once, then send nothing for `silent_s` s, so that the watchdog can act."""
         self.zeros()
         self.listen(silent_s)
 
     # Receiving
 
     def listen(self, seconds: float) -> list[Reply]:
-        """Receive data for `seconds`, and return the replies that arrived in this time.
+        """Receive data for `seconds` s, and return the replies that arrived in this time.
 
-        Raises `StoppedError` if a motor runs away while `armed` is true, and `RestartedError` if
-        the board restarts.
+        Raises `RestartedError` if the board restarts, and `StoppedError` if a motor runs away while
+        `armed` is true.
         """
         end_ns = self.wire.now_ns() + ceil(seconds * NS_PER_S)
         if self.now_s - self._listened_s > BEAT_NS / NS_PER_S:
-            self.wire.late_ns()  # nothing was measured during that lateness, so discard it
+            # Discard the delay of a simulated board before this call, because nothing was measured
+            # then.
+            self.wire.late_ns()
         got: list[Reply] = []
         self.between()
         while True:
@@ -395,7 +421,7 @@ class Board:
 
     @property
     def silent_s(self) -> float:
-        """Time since the last reply, s; 0 before the first reply, and 0 while `fled` is true."""
+        """Time since the last reply, s. It is 0 before the first reply, and if `fled` is true."""
         return self.now_s - self.replies[-1].at_s if self.replies and not self.fled else 0.0
 
     def _guard(self) -> None:
@@ -423,9 +449,9 @@ class Board:
     def rest(self) -> None:
         """Send zeros until all motors stand still. Raises `StoppedError` if a motor keeps turning.
 
-        Some firmware stops motor d only at lines with a final comma, or only at lines without one.
-        If motor d stops only at lines with the other ending than `comma` says, `comma` is changed,
-        so that all later lines have the right ending.
+        If motor d does not stop, try lines with the other ending: a comma or none. Some firmware
+        stops motor d only at lines with one of the two endings. If motor d stops now, change
+        `comma`, so that all later lines have this ending.
         """
         began_s = self.now_s
         if self.settles(self.comma):
@@ -442,16 +468,13 @@ class Board:
         raise StoppedError(outcomes.find("stop: turns", motors=motors, seconds=seconds))
 
     def settles(self, comma: bool) -> bool:
-        """Send zeros until every motor stands still, and return whether all of them came to rest.
+        """Send zeros until all motors stand still, and return whether this happens in time.
 
-        The motors count as standing still if the last two replies since the call report no motion,
-        and if no earlier reply suggests that a motor with a coarse encoder still turns
-        (`motion.turning`). The method returns False if the motors do not stand still after
-        `MOTOR_S` s. While a motor slows down, this time limit is `PATIENCE_S` s instead.
-
-        Args:
-            comma: whether the lines of zeros end with a comma.
+        The time limit is `motion.MOTOR_S`, or `motion.PATIENCE_S` while a motor slows down. `comma`
+        says whether the lines of zeros end with a comma.
         """
+        # The motors stand still if the last two replies since the call report no motion, and if no
+        # earlier reply shows that a motor with a coarse encoder may still turn (`motion.turning`).
         began_s = self.now_s
         while True:
             last = motion.since(self.replies[-2:], began_s)

@@ -1,4 +1,4 @@
-"""Makes the report of the check, as text and as an object, and advises changes to `acsard.toml`."""
+"""Makes the report of the check, as an object and as text, and suggests configuration values."""
 
 from __future__ import annotations
 
@@ -17,23 +17,28 @@ from acsard.core.config.settings import Config
 from acsard.core.config.toml_text import excerpt
 
 Changes = dict[str, object]
-"""Maps dotted keys, such as `mcu.port`, to new configuration values."""
+"""Maps dotted keys of the configuration, such as "mcu.port", to new values."""
 
 OPTIONAL = ("mcu.encoder_counts", "mcu.link_check")
-"""Keys that improve the link but make its lines longer. If the wire is too slow, the advice leaves
-out the first key. If that is not enough, it leaves out the second key too."""
+"""Keys of settings that improve the link but make its lines longer.
+
+If the wire is too slow for the longer lines, `changes` leaves out the first key. If that is not
+enough, it leaves out the second key too.
+"""
 
 
 def answered(findings: Iterable[Finding]) -> bool:
-    """Return whether a board answered at the port, so that the check found its baud rate."""
+    """Return whether a board answered the check, so that its baud rate is known."""
     return any(finding.name == "baud rate" and finding.keys for finding in findings)
 
 
 def changes(findings: Sequence[Finding], config: Config, port: str = "") -> Changes:
-    """Return the suggested changes of the configuration.
+    """Return the suggested values that differ from the configuration `config`.
 
-    The changes include `mcu.port` with the value `port`, unless `port` is "" or no board answered
-    at the port.
+    They come from the findings. If a board answered, `mcu.port` gets the value `port`, unless
+    `port` is "". If the suggested values contradict each other, for example because the lines
+    would be too long for the control rate, suggestions for `OPTIONAL` keys are left out. If that is
+    not enough, `control.rate` gets the value "auto", provided that this helps.
     """
     wanted: Changes = {"mcu.port": port} if port and answered(findings) else {}
     for finding in findings:
@@ -44,8 +49,8 @@ def changes(findings: Sequence[Finding], config: Config, port: str = "") -> Chan
         changed = applied(given, config)
         return changed is not None and not contradictions(changed)
 
-    # Longer or slower lines may take too long for the control rate. Then leave out the optional
-    # keys, the least important one first.
+    # Longer or slower lines may take too long for the control rate. Then leave out one optional key
+    # after the other, the least important one first.
     for optional in ("", *OPTIONAL):
         if optional and attrgetter(optional)(config) in (0, "off"):
             differing.pop(optional, None)
@@ -56,9 +61,9 @@ def changes(findings: Sequence[Finding], config: Config, port: str = "") -> Chan
 
 
 def withheld(simulated: bool, config: Config) -> str:
-    """Return why the findings do not apply to the robot of this configuration, or "" if they do.
+    """Return the reason why the findings do not apply to the configured robot, or "".
 
-    `simulated` is true if the check tested the simulator.
+    They do not apply if the check tested the simulator (`simulated`), but `config` has a real port.
     """
     if not simulated or config.mcu.simulated:
         return ""
@@ -69,7 +74,7 @@ def withheld(simulated: bool, config: Config) -> str:
 
 
 def applied(given: Changes, config: Config) -> Config | None:
-    """Return `config` with the new values `given`, or None if a value is not permitted."""
+    """Return a copy of `config` with the values `given`, or None if a value is not permitted."""
     plain: Any = effective(config)
     for key, value in given.items():
         where, _, name = key.rpartition(".")
@@ -83,10 +88,10 @@ def applied(given: Changes, config: Config) -> Config | None:
 class Report(Struct, frozen=True):
     """The result of a check.
 
-    `changes` are the suggested configuration values, and `toml` contains them as lines of TOML.
-    `written` is the path of the file that now contains the changes, or None. `error` describes a
-    failure outside the board, such as a port that cannot be opened or a file that cannot be
-    written.
+    `passed` says whether the check has passed. `changes` are the suggested configuration values,
+    and `toml` contains them as lines of TOML. `written` is the path of the configuration file if
+    the changes were written into it, else None. `error` describes a failure outside the board, such
+    as a port that cannot be opened or a file that cannot be written. It is None without a failure.
     """
 
     port: str
@@ -97,8 +102,7 @@ class Report(Struct, frozen=True):
     written: str | None = None
     error: str | None = None
     withheld: str | None = None
-    """Reason why the findings do not apply to the robot of the configuration file; None if they
-    do."""
+    """Reason why the findings do not apply to the robot of the configuration file, else None."""
 
 
 def report(
@@ -111,8 +115,8 @@ def report(
 ) -> Report:
     """Return the report of a check.
 
-    A check has passed if the board answered, every step was run and judged, and no step failed. The
-    report contains None instead of an empty `written`, `error` or `withheld`.
+    The check has passed if the board answered, if every step was run and judged, and if no step
+    failed. In the report, None takes the place of an empty `written`, `error` or `withheld`.
     """
     judged = answered(findings) and not lateness.unjudged(findings)
     passed = judged and not any(one.verdict == "FAIL" or one.name == REST for one in findings)
@@ -123,7 +127,10 @@ def report(
 
 
 def summary(found: Report, where: str) -> str:
-    """Return the last lines that the check prints. `where` names the configuration file."""
+    """Return the text that the check prints last: the number of each verdict, and the changes.
+
+    `where` is the path of the configuration file.
+    """
     verdicts = [finding.verdict for finding in found.findings]
     counts = ", ".join(f"{verdicts.count(v)} {v}" for v in get_args(Verdict) if v in verdicts)
     if late := lateness.unjudged(found.findings):

@@ -1,4 +1,4 @@
-"""Sends damaged speed commands while the motors stand. No such line may move a motor."""
+"""Sends damaged lines with speeds while the motors stand still. No such line may move a motor."""
 
 from __future__ import annotations
 
@@ -12,14 +12,18 @@ from acsard.core.link.checked_line import seal
 from acsard.core.link.codec import LETTERS
 
 WHOLE = {"over-long", "garbage before it"}
-"""Kinds of damage that leave the speeds intact. A board that obeys such lines is not dangerous."""
+"""Kinds of damage that do not change the speeds in a line.
+
+It is not dangerous if the board obeys lines with these kinds of damage.
+"""
 
 
 def broken_lines(comma: bool, sealed: bool, motors: Sequence[int]) -> list[tuple[str, bytes]]:
-    """Return a pair for each damaged line: the name of the kind of damage, and the line.
+    """Return damaged lines, each as a pair: the name of the kind of damage, and the line.
 
-    The lines command `SPEED` for `motors` and zero for the other motors. If `comma` is true, the
-    lines end with a comma. If `sealed` is true, the result includes lines with a damaged checksum.
+    The lines command `SPEED` for `motors` (numbers 0 to 3) and zero for the other motors. If
+    `comma` is true, the lines end with a comma. If `sealed` is true, the result also contains lines
+    with a damaged checksum.
     """
     a, b, c, d = (
         f"{letter}p{SPEED if motor in motors else 0.0:05.2f}"
@@ -50,11 +54,16 @@ def broken_lines(comma: bool, sealed: bool, motors: Sequence[int]) -> list[tuple
 
 
 def finding(board: Board, motors: Sequence[int]) -> Finding:
-    """Send damaged lines while `motors` stand, and return which kinds of damage moved a motor."""
+    """Send damaged lines, and return the finding that names the kinds that moved a motor.
+
+    `motors` are the numbers of the motors that are known to follow commands. The damaged lines
+    command speeds for these motors, which must stand still. If `motors` is empty, nothing is sent.
+    """
     if not motors:
         return outcomes.find("damaged lines: untested")
     lines = broken_lines(board.comma, board.sealed, motors)
-    board.drive(ZERO, GLANCE_S)  # a coarse encoder may report an earlier movement only now
+    # A coarse encoder may report an earlier movement only now.
+    board.drive(ZERO, GLANCE_S)
     took = dict.fromkeys(what for what, line in lines if _moves(board, line))
     if not took:
         return outcomes.find("damaged lines: right", lines=len(lines))
@@ -64,7 +73,8 @@ def finding(board: Board, motors: Sequence[int]) -> Finding:
 
 
 def _moves(board: Board, line: bytes) -> bool:
-    for _ in range(3):  # a motor needs a moment to show that it obeyed
+    # Send the line three times, because a motor needs some time until its encoder shows a movement.
+    for _ in range(3):
         board.wire.send(line)
         board.listen(max(GLANCE_S / 6, len(line) * 12 / board.baud_rate))
     shown = board.drive(ZERO, GLANCE_S + 2 * board.gap_s)

@@ -1,6 +1,8 @@
 """Steps of the check that find out how the board communicates.
 
-These steps send only zeros and questions. Later steps use their results.
+The steps measure the baud rate, the form of the lines, the checked link, the rate of the replies
+and their delay. They send only zeros and questions, so no motor turns. They store their results in
+the `Board`, for the later steps.
 """
 
 from __future__ import annotations
@@ -21,11 +23,16 @@ from acsard.core.link.session import IDENTITY
 
 
 def baud(board: Board) -> Finding:
-    """Find the baud rate at which the board answers. Raises `StoppedError` if it never answers."""
+    """Find the baud rate at which the board answers, and leave the port at this rate.
+
+    The configured rate is tried first. Raises `StoppedError` if the board answers at no rate.
+    """
     configured = board.mcu.baud_rate
     if board.baud_rate != configured:
-        board.open(configured)  # a restart of the board interrupted a trial of another rate
-    if _knock(board, BOOT_S):  # the wait is long because opening the port resets many boards
+        # The board restarted while another baud rate was tried.
+        board.open(configured)
+    # The wait is long, because opening the port resets many boards.
+    if _knock(board, BOOT_S):
         return outcomes.find("baud rate: right", {"mcu.baud_rate": configured}, rate=configured)
     heard = board.heard
     for rate in (rate for rate in reversed(get_args(Baud)) if rate != configured):
@@ -39,9 +46,9 @@ def baud(board: Board) -> Finding:
 
 
 def _knock(board: Board, seconds: float) -> bool:
-    """Send zeros until three valid replies have arrived, and set `board.sealed`.
+    """Send zeros, and return whether three valid replies arrive within `seconds` s.
 
-    Returns False if fewer than three valid replies arrive within `seconds`.
+    If they arrive, set `board.sealed` to whether all replies have a checksum.
     """
     end_s = board.now_s + seconds
     while board.now_s < end_s:
@@ -56,12 +63,14 @@ def _knock(board: Board, seconds: float) -> bool:
 
 
 def identity(board: Board) -> Finding:
-    """Ask for the board's identification.
+    """Ask the board for its identification, and store its `NAME=VALUE` fields in the `Board`.
 
-    Raises `StoppedError` if the question comes back as an echo, without an identification.
+    The identification is optional for the board. Raises `StoppedError` if only the question itself
+    comes back, because then no board answers.
     """
     board.others.clear()
-    for _ in range(3):  # the question or its answer may be lost
+    # Ask up to three times, because the question or its answer may be lost.
+    for _ in range(3):
         board.restarts.asked(board.now_s)
         board.wire.send(b"\r\n?\r\n")
         board.listen(1.5 * GLANCE_S)
@@ -79,15 +88,16 @@ def identity(board: Board) -> Finding:
 
 
 def form(board: Board) -> Finding | None:
-    """Find out whether the configured `mcu.trailing_comma` keeps the board from answering.
+    """Find out whether a wrong value of `mcu.trailing_comma` keeps the board from answering.
 
-    If the board answers only lines with the other ending, use this ending for later lines and
-    return a finding. Otherwise return None.
+    If the board answers only lines with the other ending (a comma or none), use this ending from
+    now on, and return a finding with the verdict FAIL. Otherwise return None.
     """
     if board.own_clock or _answers(board, board.comma) or not _answers(board, not board.comma):
         return None
     if _answers(board, board.comma):
-        return None  # the board was only late
+        # The board answers both endings: its replies to the first lines were only late.
+        return None
     board.comma = not board.comma
     return _comma_wrong(board, "refused")
 
@@ -97,10 +107,10 @@ def _answers(board: Board, comma: bool) -> list[Reply]:
 
 
 def comma(board: Board, dead: bool) -> Finding:
-    """Return the finding about `mcu.trailing_comma`, according to how motor d behaved.
+    """Return the finding about `mcu.trailing_comma`, after the test of motor d.
 
-    Some firmware turns or stops motor d only at lines with a final comma. `dead` is True if motor d
-    was not seen to move, or if its movement could not be measured.
+    Some firmware turns or stops motor d only if the line ends with a comma. `dead` is true if motor
+    d showed no movement, or if this computer was too late to measure its movement.
     """
     if board.comma != board.mcu.trailing_comma:
         return _comma_wrong(board, "latched" if board.latched and board.comma else "disobeyed")
@@ -126,9 +136,9 @@ def _comma_wrong(board: Board, how: str) -> Finding:
 
 
 def replies(board: Board) -> Finding:
-    """Compare the form of the replies with the documented form.
+    """Compare the replies with the documented form, and return a finding with the differences.
 
-    The finding names the differences. The daemon can also read replies with these differences.
+    Each difference is a warning only, because the daemon can read such replies too.
     """
     lines = [reply.line.partition(b"#")[0] for reply in board.replies]
     forms = {"spaces": rb", ", "unpadded": rb"[pn]\d\.", "trailing comma": rb", *\Z"}
@@ -141,10 +151,11 @@ def replies(board: Board) -> Finding:
 
 
 def check(board: Board) -> Finding:
-    """Find out whether the board supports the checked link, and samples in its replies.
+    """Find out whether the board supports the checked link, and whether it can send samples.
 
-    The checked link adds a sequence number and a checksum to each line. A sample is a reading of
-    the board's clock and of its encoder counts.
+    The checked link adds a sequence number and a checksum to each line. A sample in a reply
+    contains the board's clock and encoder counts. The results are stored in `board.sealed` and
+    `board.sampled`.
     """
     wanted = board.mcu.link_check
     board.sealed = board.sampled = True
@@ -161,7 +172,10 @@ def check(board: Board) -> Finding:
 
 
 def rate(board: Board) -> Finding:
-    """Measure how often the board replies, and whether it reports by its own clock."""
+    """Measure how often the board replies, and whether it reports by its own clock.
+
+    The results are stored in `board.gap_s` and `board.own_clock`.
+    """
     board.paced = True
     board.listen(GLANCE_S / 4)
     unasked = board.listen(CUT_S)
@@ -199,7 +213,10 @@ def rate(board: Board) -> Finding:
 
 
 def trip(board: Board) -> Finding:
-    """Measure the time from the sending of a line to the arrival of the board's reply."""
+    """Measure the time from the sending of a line to the arrival of the board's reply.
+
+    Boards that report by their own clock do not reply to single lines, so the step is skipped.
+    """
     if not board.paced:
         return lateness.finding("round trip", board.lateness.since(0.0))
     if board.own_clock:

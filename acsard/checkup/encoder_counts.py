@@ -13,33 +13,41 @@ from acsard.checkup.motion import GLANCE_S, Reply, steps
 from acsard.core.link.codec import LETTERS
 
 AGREES = 0.02
-"""Largest tolerated relative difference between measured counts per turn and the stated number."""
+"""Largest tolerated difference between the measured counts per turn and the expected number.
+
+It is relative to the expected number, which the configuration or the firmware states.
+"""
 
 ALIKE = 0.75
-"""The measured counts per turn of each motor must be at least this fraction of the largest measured
-value. The fraction is low, because a coarse encoder allows only a rough measurement."""
+"""Smallest tolerated ratio of the smallest to the largest counts per turn of the motors.
+
+The limit is low, because a coarse encoder allows only a rough measurement.
+"""
 
 COARSE = 0.015
-"""An encoder is coarse if the angle by which it turns from one reply to the next varies by at least
-this much on average, rad. The daemon must know the counts per turn of a coarse encoder."""
+"""Smallest mean variation of the angles between replies that shows a coarse encoder, rad.
+
+The daemon must know the counts per turn of a coarse encoder.
+"""
 
 LONGEST_S = 0.05
-"""Longest time between replies, s, at which jumps of the speed reveal a coarse encoder. At longer
-times, the accelerations of the motors look like jumps too."""
+"""Longest time between two replies at which jumps of the speed reveal a coarse encoder, s.
+
+With a longer time, an accelerating motor causes similar jumps.
+"""
 
 LEAST_ANGLES = 20
-"""Smallest number of nonzero speed readings that can show a coarse encoder."""
+"""Smallest number of reported speeds other than 0 from which a coarse encoder is recognized."""
 
 MOST_COUNTS = 100_000
 """Largest value that `mcu.encoder_counts` accepts."""
 
 
 def per_turn(replies: Sequence[Reply], motors: Sequence[int]) -> float | None:
-    """Return the mean encoder counts per wheel turn of these motors.
+    """Return the mean number of encoder counts per wheel turn of `motors` (numbers 0 to 3).
 
-    The result is the change of the counts divided by the number of turns, which follows from the
-    reported speeds. It is negative if the counts fall while the reported speeds are positive, and
-    None if the motors turned too little.
+    The number of turns is computed from the reported speeds. Return None if the motors turned too
+    little. The result is negative if the counts fall while the reported speeds are positive.
     """
     counts = angle = 0.0
     for step in steps(replies):
@@ -53,13 +61,14 @@ def per_turn(replies: Sequence[Reply], motors: Sequence[int]) -> float | None:
 
 
 def coarse(replies: Sequence[Reply], motors: Sequence[int]) -> float | None:
-    """Estimate the counts per turn of coarse encoders from the jumps of the reported speeds.
+    """Estimate the counts per wheel turn of coarse encoders from the jumps of the reported speeds.
 
-    Use this function if the replies contain no counts. It returns None if the encoders are not
-    coarse, if there are too few speeds, or if the replies are too rare (`LONGEST_S`).
+    This function is for replies that contain no counts. `motors` are numbers from 0 to 3. Return
+    None if the encoders are not coarse, if too few replies contain a speed other than 0, or if the
+    replies are too rare (`LONGEST_S`).
     """
     course = [step for step in steps(replies) if 0.0 < step.seconds <= GLANCE_S]
-    # The time of a single line may be wrong if this computer is late.
+    # Use the median, because the arrival time of a single reply is wrong if this computer is late.
     period = median([step.seconds for step in course] or [math.inf])
     if period > LONGEST_S:
         return None
@@ -79,8 +88,9 @@ def coarse(replies: Sequence[Reply], motors: Sequence[int]) -> float | None:
 def finding(board: Board, motors: Sequence[int]) -> Finding:
     """Return the finding about `mcu.encoder_counts`, the configured counts per wheel turn.
 
-    The configured value is compared with the value in the board's identification, if there is one,
-    and with the value measured from the replies. `motors` are the motors that turned as commanded.
+    The configured value is compared with the value that is measured from the replies. If the
+    board's identification also states a value, that value must agree with the measurement. `motors`
+    are the numbers of the motors that turned as commanded.
     """
     if not board.sampled:
         about = coarse(board.replies, motors)

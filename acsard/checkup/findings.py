@@ -1,4 +1,4 @@
-"""Results of `acsard mcu check`: one `Finding` per subject, and errors that end the check early."""
+"""Results of the steps of `acsard mcu check`, and errors that end the check early."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from acsard.core.values import WHEELS, AcsardError
 Verdict = Literal["PASS", "WARN", "FAIL", "SKIPPED"]
 
 REST = "the rest"
-"""Name of the finding that lists the steps that were not run because the check ended early."""
+"""Name of the finding that lists the steps without a result after an early end of the check."""
 
 
 class Finding(Struct, frozen=True):
-    """The result for one subject of the check. Its texts come from `outcomes.py`.
+    """The result of one step of the check, for example of the test of one motor.
 
-    `figure` is the measurement, and `text` is its meaning. `mend` is the remedy, or "" if there is
-    none. `keys` maps dotted keys of the configuration to suggested values. A suggested value may be
-    configured already.
+    `figure` is the measurement, and `text` explains it. `mend` is the remedy, or "" if no remedy is
+    needed. `keys` maps dotted keys of the configuration, such as "mcu.baud_rate", to suggested
+    values. A suggested value can be equal to the configured value. `outcomes.py` has the texts.
     """
 
     name: str
@@ -34,7 +34,7 @@ class Finding(Struct, frozen=True):
 
 
 class StoppedError(AcsardError):
-    """Ends the check early. `finding` tells the operator the reason."""
+    """The check must end early. The finding `finding` gives the reason."""
 
     def __init__(self, finding: Finding) -> None:
         super().__init__(finding.text)
@@ -42,13 +42,14 @@ class StoppedError(AcsardError):
 
 
 class WireLostError(AcsardError):
-    """The serial port was lost: the device was unplugged, or its driver hangs."""
+    """The serial port no longer works: the device was unplugged, or its driver hangs."""
 
 
 def wheel_of(mcu: McuConfig, motor: int) -> tuple[str, int]:
-    """Return the wheel that a motor (0 to 3) turns according to the configuration, and a sign.
+    """Return a pair: the wheel that a motor turns according to the configuration, and a sign.
 
-    The sign is -1 if a positive speed of the motor turns the wheel backward, else 1.
+    `motor` is the number of the motor, 0 to 3. The sign is -1 if a positive speed of the motor
+    turns the wheel backward, else 1.
     """
     for wheel in WHEELS:
         entry = getattr(mcu.wheels, wheel)

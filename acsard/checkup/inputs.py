@@ -1,7 +1,8 @@
-"""Asks the operator to press the emergency stop and each bumper, and checks the status lines.
+"""Asks the operator to press the emergency stop and each bumper, and checks the board's reports.
 
-The board reports these inputs in status lines (`core/link/board_status.py`). This step comes last,
-because the emergency stop cuts the motors, and some motor drivers must be enabled again afterward.
+The emergency stop and the bumpers are called the inputs of the board. The board reports them in
+status lines (`core/link/board_status.py`). This step is the last step of the check, because the
+emergency stop cuts the motors, and some motor drivers must be enabled again afterward.
 """
 
 from __future__ import annotations
@@ -14,23 +15,26 @@ from acsard.checkup.findings import Finding
 from acsard.core.config.settings import SafetyConfig
 
 PRESS_S = 20.0
-"""Time within which the operator must press and release an input, s."""
+"""Time within which the operator must press and release the emergency stop or a bumper, s."""
 
 NEWS_S = 0.5
-"""Time within which every board reports each of its inputs at least once, s."""
+"""Time within which every board reports its emergency stop and each bumper at least once, s."""
 
 
 class Input(Struct, frozen=True):
+    """The emergency stop or one bumper of the board."""
+
     number: int
-    """0 for the emergency stop, and 1, 2, ... for the bumpers in the order of the status line."""
+    """0 for the emergency stop, or 1, 2, ... for a bumper, in the order of the status line."""
     name: str
 
 
 def finding(board: Board, operator: Operator, safety: SafetyConfig) -> Finding:
     """Let the operator press each input, and check that the board reports each press and release.
 
-    The inputs are those that the configuration requires or that the board reports. A bumper has the
-    name of its place on the robot, or its number on the board if no places are configured.
+    The inputs are the emergency stop and the bumpers that the configuration requires or that the
+    board reports. The operator sees a bumper's configured place on the robot as its name, or its
+    number if the configuration gives no places. The inputs are not tested if no operator is ready.
     """
     board.ask(NEWS_S)
     estop = safety.estop == "required" or (safety.estop == "auto" and 0 in board.inputs)
@@ -38,7 +42,7 @@ def finding(board: Board, operator: Operator, safety: SafetyConfig) -> Finding:
     counted = 0 if safety.bumper == "off" else sum(number > 0 for number in board.inputs)
     names = [f"{place} bumper" for place in places]
     names = names or [f"bumper {number}" for number in range(1, counted + 1)]
-    # Two bumpers at one place are distinguished by their numbers.
+    # Two bumpers can have the same place. Then their names also contain their numbers.
     same = [names.count(name) > 1 for name in names]
     inputs = [Input(0, "emergency stop")] if estop else []
     inputs += [
@@ -64,9 +68,9 @@ def finding(board: Board, operator: Operator, safety: SafetyConfig) -> Finding:
 
 
 def _pressed(board: Board, operator: Operator, asked: Input, inputs: list[Input]) -> str:
-    """Let the operator press and release the input `asked`.
+    """Let the operator press and release the input `asked`, and describe wrong reports.
 
-    Returns a text that says what the board reported wrongly, or "" if its reports were right.
+    Return "" if the board reported exactly this press and its release, within `PRESS_S`.
     """
     operator.doing(f"press the {asked.name} and release it, within {PRESS_S:g} s")
     end_s, seen = board.now_s + PRESS_S, set[int]()

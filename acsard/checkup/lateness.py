@@ -1,10 +1,10 @@
-"""Measures the lateness of this computer, and decides which findings may be wrong because of it.
+"""Records when this computer ran the check too late, and decides which findings are doubtful then.
 
-An overloaded computer sends and receives late, so that the check finds faults which the board does
-not have. If the board is a program on this computer, the time for which this program waits for a
-processor counts as lateness too. If this computer was late during a step, the step is repeated
-(`procedure.py`). If this computer is late each time, the finding says so and does not blame the
-board.
+An overloaded computer sends and receives late. The check would then find faults that the board does
+not have. `procedure.py` therefore repeats a step with a doubtful finding. If every attempt is
+doubtful, the finding says that the step was not judged, and does not blame the board. The board can
+also be a simulator on this computer. The time for which the simulator waits for a processor counts
+as a delay of this computer too.
 """
 
 from __future__ import annotations
@@ -16,21 +16,26 @@ from acsard.checkup.findings import Finding
 from acsard.checkup.outcomes import Unsure
 
 LEAST_S = 0.005
-"""Smallest delay that is recorded, s. Every computer has smaller delays now and then."""
+"""Shortest delay of this computer that `Lateness` records, s. Shorter delays are normal."""
 
 SPOILS_S = motion.PERIOD_S
-"""Smallest delay of this computer that can cause a bad finding, s: the time between two lines."""
+"""Shortest delay of this computer that makes a finding doubtful if its verdict is not PASS, s.
+
+It is the time from one line of the check to the next.
+"""
 
 PAUSE_S = motion.WATCHDOG_LEAST_S
-"""Smallest delay of this computer that makes even a good finding doubtful, s. During such a delay
-the board's watchdog may have stopped the motors."""
+"""Shortest delay of this computer that makes even a finding with the verdict PASS doubtful, s.
+
+During such a delay the board's watchdog may have stopped the motors.
+"""
 
 
 LATE = "late: not judged"
 
 
 class Lateness:
-    """Record of delays: how much too late this computer woke up from each wait."""
+    """Record of the delays of this computer: the times by which it returned too late from waits."""
 
     def __init__(self) -> None:
         self._seen: list[tuple[float, float]] = []
@@ -38,39 +43,49 @@ class Lateness:
     def look(self, late_s: float, now_s: float) -> None:
         """Record a delay of `late_s` s that ended at the monotonic time `now_s`, s.
 
-        Delays that are shorter than `LEAST_S` are ignored.
+        A delay that is shorter than `LEAST_S` is ignored.
         """
         if late_s >= LEAST_S:
             self._seen.append((now_s, late_s))
 
     def since(self, began_s: float) -> float:
-        """Return the largest delay that ended at `began_s` or later, s; 0 if there was none."""
+        """Return the longest delay, s, of those that ended at or after the time `began_s`.
+
+        `began_s` is a monotonic time, s. Return 0 if no delay is recorded from then on.
+        """
         return max((late_s for at_s, late_s in self._seen if at_s >= began_s), default=0.0)
 
 
 def spoilt(found: Unsure, late_s: float) -> bool:
     """Return whether the finding may be wrong because this computer was late.
 
-    `late_s` is the largest delay of this computer during the step, s. The finding may be wrong if
-    this delay is at least half of `found.margin_s`, because this computer may have been late both
-    at the start and at the end of the measurement. Delays below `PAUSE_S` do not spoil a finding
-    with the verdict PASS, and delays below `SPOILS_S` do not spoil any other finding.
+    `late_s` is the longest delay of this computer during the step, s. The result is True if the
+    delay reaches both half of `found.margin_s` and a minimum. The minimum is `PAUSE_S` for a
+    finding with the verdict PASS, else `SPOILS_S`.
     """
+    # Half of the margin is enough, because this computer may have been late by the same time at the
+    # start and at the end of the measurement.
     least_s = PAUSE_S if found.verdict == "PASS" else SPOILS_S
     return late_s >= max(least_s, found.margin_s / 2)
 
 
 def finding(name: str, late_s: float) -> Finding:
-    """Return the finding that the step `name` was not judged because this computer was late."""
+    """Return the finding that the step `name` was not judged because this computer was late.
+
+    `late_s` is the longest delay of this computer during the step, s.
+    """
     return outcomes.find(LATE, name=name, late=late_s * 1000)
 
 
 def judged(found: Finding) -> bool:
-    """Return False if the finding says that this computer was too late to judge the step."""
+    """Return whether the step was judged: False if this computer was too late for a judgment."""
     return found.figure != outcomes.MANUAL[LATE].figure
 
 
 def unjudged(findings: Iterable[Finding]) -> list[str]:
-    """Return the names of the steps whose last finding says that they were not judged."""
+    """Return the names of the steps that were not judged because this computer was too late.
+
+    If several findings have the same name, only the last one counts.
+    """
     last = {found.name: found for found in findings}
     return [name for name, found in last.items() if not judged(found)]

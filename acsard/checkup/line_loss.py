@@ -1,9 +1,9 @@
-"""Counts lost and damaged lines, and finds long silences and the direction in which lines are lost.
+"""Counts lost and damaged lines, and finds out in which direction lines are lost.
 
-A reply that arrives damaged was damaged on its way from the board. If a line has no reply, either
-the line or its reply was lost. To find out which of the two, the check sends single lines, each of
-which turns standing motors for a moment. If the motors obey a line that has no reply, the reply was
-lost. If they do not obey it, the line was lost.
+A reply that arrives damaged was damaged on its way from the board. If a line has no reply, the line
+or its reply was lost. To distinguish these two cases, the check sends pulses: single lines that
+turn the motors for a moment. The reply was lost if the motors obey a pulse that has no reply. The
+line was lost if the motors do not obey the pulse.
 """
 
 from __future__ import annotations
@@ -24,21 +24,28 @@ from acsard.core.link.link_diagnosis import SHOWN
 from acsard.core.link.session import IDENTITY
 
 MOST = 0.02
-"""Largest fraction of lost lines that the check accepts. A sound link loses no line."""
+"""Largest fraction of lost lines that the check accepts. A good link loses no line."""
 
 FEW = 2
-"""Smallest number of lost lines that counts as a fault. A smaller number may be a coincidence."""
+"""Smallest number of lost lines that shows a fault. A single lost line may be a coincidence."""
 
 LINES, LEAST_S, MOST_S = 300, 3.0, 10.0
-"""Lost lines are counted for at least `LEAST_S` s. If a line is lost, the count goes on until there
-are `LINES` lines, enough to show a loss of 2 %, or until `MOST_S` s have passed."""
+"""Limits of the count of lost lines: a number of lines, and a shortest and a longest time, s.
+
+The count takes `LEAST_S` if no line is lost. Otherwise it ends after `LINES` lines, which are
+enough to show a loss of 2 %, or after `MOST_S`.
+"""
 
 SILENT = 2.0
-"""A gap between two replies counts as a silence only if it exceeds the mean gap by this factor."""
+"""A gap between two replies is a silence only if it exceeds the mean gap times this number."""
 
 
 class Count(Struct, frozen=True):
-    """Numbers of all lines, of lost lines and of damaged lines. Damaged lines count as lost too."""
+    """Result of counting lines.
+
+    `lines` is the number of all lines, and `lost` the number of lost lines. `damaged` is the number
+    of lines that arrived damaged. A damaged line counts as lost too.
+    """
 
     lines: int
     lost: int
@@ -46,20 +53,22 @@ class Count(Struct, frozen=True):
 
     @property
     def share(self) -> float:
-        """Fraction of lost lines; 0 if the loss may be a coincidence."""
+        """Fraction of lost lines, 0 to 1. It is 0 if fewer than `FEW` lines are lost."""
         return self.lost / self.lines if self.lost >= FEW else 0.0
 
 
 def finding(board: Board) -> Finding:
     """Send zeros at the control rate, count the lost lines, and set `board.lost`.
 
-    Raises `StoppedError` if the loss exceeds `MOST`, lines arrive damaged, and lines have no
-    checksum: a damaged line to the board could then command any speed. If the rate of the replies
-    was not measured, the finding says that the loss was not judged.
+    Raises `StoppedError` if more than `MOST` of the lines are lost, some lines arrive damaged, and
+    the lines have no checksum. On such a link, a damaged line could command any speed. If an
+    earlier step could not measure the rate of the replies, the finding says that the loss was not
+    judged.
     """
     if not board.paced:
         return lateness.finding("lost lines", board.lateness.since(0.0))
-    board.listen(motion.GLANCE_S)  # wait for replies to earlier lines
+    # Wait until the replies to earlier lines have arrived.
+    board.listen(motion.GLANCE_S)
     began_s, sent, others = board.now_s, board.sent_lines, len(board.others)
     board.drive(ZERO, LEAST_S, _period_s(board))
     silent_s = _silence_s(board, motion.since(board.replies, began_s))
@@ -91,9 +100,9 @@ def finding(board: Board) -> Finding:
 
 
 def _period_s(board: Board) -> float:
-    """Return the time between two lines, s.
+    """Return the time from one sent line to the next, s.
 
-    It is the control period, or longer if the wire or the board needs more time for a line.
+    It is the control period of the daemon, or longer if the wire or the board is too slow for it.
     """
     longest = line_bytes(board.comma, board.sealed, board.sampled)
     period_s = 1 / min(board.rate_hz, highest_rate(board.baud_rate, longest, COMFORTABLE_USE))
@@ -116,12 +125,10 @@ def _gaps(replies: Sequence[Reply]) -> list[float]:
 
 
 def _left_out(replies: Sequence[Reply]) -> int:
-    """Return the number of missing replies of a board that sends them at regular intervals.
-
-    The number is computed from the time between the first and the last reply. A single long gap
-    does not show a lost reply, because a reply that is received late makes one gap longer and the
-    next gap shorter.
-    """
+    """Return how many replies are missing, for a board that sends them at regular intervals."""
+    # Compute the number from the time between the first and the last reply. A single long gap does
+    # not show a lost reply, because a reply that is received late makes one gap longer and the next
+    # gap shorter.
     gaps = _gaps(replies)
     usual = median(gaps) if gaps else 0.0
     alike = [gap for gap in gaps if abs(gap - usual) < usual / 2]
@@ -129,39 +136,53 @@ def _left_out(replies: Sequence[Reply]) -> int:
 
 
 def _silence_s(board: Board, replies: Sequence[Reply]) -> float:
-    """Return the longest gap between replies, s; 0 if the daemon would tolerate this gap."""
+    """Return the longest gap between two replies, s, or 0 if the daemon would tolerate the gap."""
     longest = max(_gaps(replies), default=0.0)
     quiet_s = max(0.1, 4 / board.rate_hz, 3 * board.mcu.reply_period)
     return longest if longest > max(quiet_s, SILENT * board.gap_s) else 0.0
 
 
 PULSE_S = 0.08
-"""Time from a pulse (a single line that turns the motors) to the zeros that follow, s. In this time
-the encoders can show the movement, and the board's watchdog does not act yet."""
+"""Time from a pulse (a single line that turns the motors) to the zeros that follow, s.
+
+This time is long enough for the encoders to show the movement. It is too short for the board's
+watchdog to act.
+"""
 
 TOLD, PULSES_S = 8, 20.0
-"""To find out in which direction lines are lost, the check sends pulses until `TOLD` of them have
-had no reply, but for at most `PULSES_S` s."""
+"""Limits of the search for the direction in which lines are lost.
+
+The check sends pulses (single lines that turn the motors) until `TOLD` pulses have had no reply, or
+until `PULSES_S` s have passed.
+"""
 
 SPREAD, STRIDE = 12, 5
-"""The pause after pulse n is the shortest pause plus (n * `STRIDE`) % `SPREAD` line periods. If all
-pauses were equal, losses at regular intervals could miss every pulse."""
+"""Numbers from which the pauses between pulses are computed, in periods of the check's lines.
+
+The pause after pulse n is the shortest pause plus (n * `STRIDE`) % `SPREAD` periods. If all pauses
+were equal, a link that loses every n-th line might never lose a pulse.
+"""
 
 OBEYED = 0.5
-"""The motors obeyed a pulse if they turned by at least this fraction of the median angle of all
-pulses."""
+"""Smallest angle of the motors that shows that they obeyed a pulse.
+
+It is a fraction of the median angle by which all pulses turned the motors.
+"""
 
 SEEN, GRAINS = 0.02, 4
-"""The pulses show which lines arrived only if the median angle of all pulses is at least `SEEN` rad
-and at least `GRAINS` encoder steps."""
+"""Smallest median angle of the pulses from which the check can tell which pulses arrived.
+
+The median must be at least `SEEN` rad, and at least `GRAINS` times the smallest angle that the
+encoders showed between two replies.
+"""
 
 
 class Ways(Struct, frozen=True):
-    """Numbers of pulses (see `pulsed`).
+    """Numbers of pulses. A pulse is a single line that turns the motors for a moment.
 
-    `sent` counts all pulses whose movement was measured. `there` counts the pulses that were lost
-    on their way to the board. `back` counts the pulses that the motors obeyed although no reply
-    arrived.
+    `sent` is the number of pulses whose movement was measured. `there` is the number of pulses that
+    were lost on their way to the board. `back` is the number of pulses that the motors obeyed,
+    although no reply arrived.
     """
 
     sent: int
@@ -172,8 +193,9 @@ class Ways(Struct, frozen=True):
 def direction(board: Board, operator: Operator, motors: Sequence[int]) -> Finding | None:
     """Find out whether lines are lost on the way to the board, or replies on the way back.
 
-    `motors` are the motors that turn as commanded, so that their encoders show which lines arrived.
-    Returns None without a search if the board replies to lines and `board.lost` is at most `MOST`.
+    The motors turn briefly, several times. `motors` are the numbers of the motors that turn as
+    commanded: their encoders show which lines arrived. If the board replies to lines and loses at
+    most `MOST` of them, return None, and do not turn the motors.
     """
     if not (board.own_clock or board.lost > MOST):
         return None
@@ -191,19 +213,20 @@ def direction(board: Board, operator: Operator, motors: Sequence[int]) -> Findin
 
 
 def pulsed(board: Board, motors: Sequence[int]) -> Ways | None:
-    """Send pulses and count the lost pulses and replies.
+    """Send pulses, and count the lost pulses and the lost replies.
 
-    A pulse is a single line that turns standing motors for a moment. Returns None if the movement
-    of `motors` does not show which pulses arrived.
+    A pulse is a single line that turns `motors` for a moment from a standstill. Return None if the
+    measured movement does not show which pulses arrived.
     """
     on = motion.each(lambda motor: motion.SPEED if motor in motors else 0.0)
-    # If the board reports by its own clock, no loss is known yet, so a shorter search is enough.
+    # If the board reports by its own clock, no earlier step has found a loss of lines to the board,
+    # so a shorter search is enough.
     end_s = board.now_s + (10.0 if board.own_clock else PULSES_S)
     every: list[float] = []
     unanswered: list[float] = []
     count = 0
     while len(unanswered) < TOLD and board.now_s < end_s:
-        # An answer to an earlier line must not be taken for the answer to this one.
+        # The reply to an earlier line must not be taken for the reply to this pulse.
         board.listen(motion.GLANCE_S / 4)
         since_s, coasting = board.now_s, board.replies[-1].motors
         answered = bool(board.drive(on, PULSE_S, PULSE_S))
@@ -229,7 +252,10 @@ def pulsed(board: Board, motors: Sequence[int]) -> Ways | None:
 
 
 def _whole(board: Board, since_s: float) -> bool:
-    """Return whether no periodic report of the board is missing since the time `since_s`, s."""
+    """Return whether all reports since the monotonic time `since_s`, s, have arrived.
+
+    Use this only for a board that reports by its own clock.
+    """
     times = [reply.at_s for reply in motion.since(board.replies, since_s - board.gap_s)]
     return all(after - before < 1.5 * board.gap_s for before, after in pairwise(times))
 
@@ -242,7 +268,10 @@ def _grain(board: Board, motors: Sequence[int]) -> float:
 
 
 def _stand(board: Board) -> bool:
-    """Send zeros until the motors stand. Return False if they coast too long for further pulses."""
+    """Send zeros until the motors stand still.
+
+    Return True if they stop soon enough for a further pulse, else False.
+    """
     began_s = board.now_s
     while board.turning():
         if board.now_s - began_s > motion.MOTOR_S / 2:

@@ -1,4 +1,4 @@
-"""The texts of all findings of the check. `find` inserts the measured values into the texts."""
+"""Contains the texts of all findings of the check. `find` inserts the measured values into them."""
 
 from __future__ import annotations
 
@@ -8,10 +8,12 @@ from msgspec import Struct, convert
 
 from acsard.checkup.findings import Finding, Verdict
 
+# Each entry has this form:
 # VERDICT step: outcome | figure
 #     the meaning
 #     -> the remedy
-# A "?" after the verdict marks an outcome that a late computer can cause, whatever the board does.
+# A "?" after the verdict marks an outcome that this computer can cause by running the check too
+# late, even if the board works correctly.
 OUTCOMES = """
 PASS baud rate: right | {rate} baud
 FAIL baud rate: other | {rate}, not {configured} baud
@@ -360,10 +362,10 @@ FAIL serial line: lost | lost
 
 
 class Unsure(Finding, frozen=True):
-    """A finding that may be wrong if this computer was late.
+    """A finding that may be wrong if this computer ran the check too late.
 
-    `margin_s` is the time by which the measurement exceeds its bound, s. A delay of this computer
-    that is shorter than half of `margin_s` cannot have caused the finding.
+    `margin_s` is the time by which the measurement exceeds its limit, s. A delay that is shorter
+    than half of this time cannot have caused the finding.
     """
 
     margin_s: float = 0.0
@@ -372,8 +374,9 @@ class Unsure(Finding, frozen=True):
 class Outcome(Struct, frozen=True):
     """One possible outcome of a step, with the texts of its finding.
 
-    `figure`, `text` and `mend` are format strings, into which `find` inserts the measured values.
-    `unsure` says whether a late computer can cause this outcome.
+    `figure` (the measurement), `text` (its meaning) and `mend` (the remedy) are format strings,
+    into which `find` inserts the measured values. `unsure` says whether a computer that runs the
+    check too late can cause this outcome.
     """
 
     verdict: Verdict
@@ -396,6 +399,7 @@ def _read(manual: str) -> dict[str, Outcome]:
 
 
 MANUAL = _read(OUTCOMES)
+"""Maps the name of each outcome, such as "baud rate: right", to the outcome."""
 
 
 def find(outcome: str, keys: dict[str, object] | None = None, **seen: object) -> Finding:
@@ -404,8 +408,8 @@ def find(outcome: str, keys: dict[str, object] | None = None, **seen: object) ->
     Args:
         outcome: a key of `MANUAL`. The part before the colon is the name of the finding.
         keys: the configuration values that the finding suggests, by dotted key.
-        seen: the measured values. A value called `name` replaces the name of the finding. A value
-            called `margin_s` becomes the margin of an `Unsure`.
+        seen: the measured values by name. The value `name` replaces the name of the finding. The
+            value `margin_s` is stored in the finding if the outcome is unsure (see `Unsure`).
     """
     entry = MANUAL[outcome]
     name = str(seen.get("name", outcome.partition(":")[0]))
@@ -417,5 +421,5 @@ def find(outcome: str, keys: dict[str, object] | None = None, **seen: object) ->
 
 
 def plain(found: Finding) -> Finding:
-    """Return a copy of the finding as a plain `Finding`, without the margin of an `Unsure`."""
+    """Return a copy of the finding as a `Finding`, even if it is an `Unsure`."""
     return Finding(*(getattr(found, name) for name in Finding.__struct_fields__))

@@ -1,4 +1,9 @@
-"""Runs the steps of the check in order, repeats a step if needed, and may end the check early."""
+"""Runs the steps of the check in order.
+
+A step is repeated if the board restarts, or if this computer ran the step too late. The check ends
+early if the operator quits, after a danger such as a motor that runs away, if the serial port is
+lost, or if this program stalls. The check sends zeros before it ends.
+"""
 
 from __future__ import annotations
 
@@ -44,8 +49,8 @@ STEPS = (
     "lost lines", "motors", "trailing comma", "wheel map", "encoder counts", "watchdog",
     "damaged lines", "inputs",
 )  # fmt: skip
-"""Names of all steps. If the check ends early, the finding `REST` lists the steps without a result.
-"""
+"""Names of all steps. After an early end of the check, the finding `REST` lists the steps without a
+result."""
 
 SILENT: tuple[tuple[str, Callable[[Board], Finding | None]], ...] = (
     ("listening for 3 s at the configured baud rate, then at other baud rates", dialect.baud),
@@ -57,27 +62,35 @@ SILENT: tuple[tuple[str, Callable[[Board], Finding | None]], ...] = (
     ("asking whether the board supports the link check", dialect.check),
     ("counting lost lines for 3 s or more", line_loss.finding),
 )
-"""The first steps of the check, in order, each with a message for the operator. These steps send
-only zeros and questions."""
+"""The first steps of the check, in order, each with a message for the operator.
+
+They send only zeros and questions.
+"""
 
 Tell = Callable[[Finding], None]
 Step = Callable[[], Finding | None]
 
 LATE_AGAIN, LATE_MOST = 2, 8
-"""The check runs late if this computer is too busy to run the tool in time. If the finding of a
-step is therefore doubtful, the check repeats the step, up to `LATE_AGAIN` times. A check has at
-most `LATE_MOST` such repetitions in total. Without this second limit, a check could take four
-minutes."""
+"""Largest numbers of repetitions because this computer ran the check too late.
+
+A step is repeated up to `LATE_AGAIN` times. All steps together are repeated up to `LATE_MOST`
+times, because a check could otherwise take four minutes.
+"""
 
 STALL_S, ZEROS_STALL_S = 0.5, 5.0
-"""Longest stalls of this program that do not end the check, s. `ZEROS_STALL_S` applies until the
-check has seen all motors stand still, because the check sends only zeros until then. Later
-`STALL_S` applies. A longer stall ends the check, because the operator may have left the robot. A
-shorter stall may only cause a step to be repeated (see `LATE_AGAIN`)."""
+"""Longest stalls of this program that do not end the check, s.
+
+A longer stall ends the check, because the operator may have left the robot meanwhile.
+`ZEROS_STALL_S` applies while the check sends only zeros, until it has seen all motors stand still.
+Later `STALL_S` applies. A shorter stall can only cause a repetition of the step.
+"""
 
 AGAIN, MOST = 1, 5
-"""If the board restarts during a step, the step is repeated, up to `AGAIN` times. One more restart
-in the same step ends the check. The check also ends after `MOST` restarts in all steps together."""
+"""Limits for restarts of the board: `AGAIN` for one step, and `MOST` for all steps together.
+
+If the board restarts during a step, the step is repeated up to `AGAIN` times. One more restart in
+the same step ends the check. The restart number `MOST` ends the check too.
+"""
 
 
 def run(
@@ -90,20 +103,26 @@ def run(
     """Check one microcontroller, and call `tell` with each finding as soon as it is known.
 
     Until the operator confirms that the wheels are lifted, the check sends only zeros. The last
-    lines are always zeros, unless the serial port is lost. The check ends early if this program
-    stalls for longer than `STALL_S` or `ZEROS_STALL_S`; the wait for an answer of the operator is
-    not a stall. Raises `KeyboardInterrupt` if the operator types `QUITS`, even while a motor turns.
+    lines are zeros, unless the serial port is lost. The check ends early if this program stalls for
+    longer than `STALL_S` or `ZEROS_STALL_S`. The wait for an answer of the operator is not a stall.
+    Raises `KeyboardInterrupt` if the operator types `QUITS`, even while a motor turns, and
+    `MendableError` if the port cannot be opened.
 
-    `asleep_ns` returns for how long this computer has been suspended since its start, ns. The
-    clock of `wire` stops while the computer is suspended.
+    Args:
+        wire: the connection to the board, which is not open yet.
+        operator: the person near the robot, who confirms and answers.
+        config: the configuration of the robot, with which the check compares the board.
+        tell: function that receives each finding.
+        asleep_ns: function that returns for how long this computer has been suspended since its
+            start, ns. The clock of `wire` does not count this time.
     """
     told: set[str] = set()
     unjudged: set[str] = set()
 
     def once(finding: Finding | None) -> None:
-        """Report a finding, unless a finding with the same name has been reported already.
+        """Pass a finding to `tell`, unless an earlier finding has the same name.
 
-        If the earlier finding was not judged, a judged finding is still reported.
+        If the earlier finding says that the step was not judged, a later judgment is passed on too.
         """
         if finding is None:
             return
@@ -139,24 +158,28 @@ def run(
 
 
 class _Watched:
-    """The operator during the steps, watched by `look`.
+    """The operator during the steps of the check.
 
-    `look` ends the check if the operator quits, or if a stall may have made the operator leave.
+    `look` ends the check if the operator quits, or after a stall of this program, because the
+    operator may have left the robot during the stall.
     """
 
     def __init__(self, operator: Operator, board: Board, asleep_ns: Callable[[], int]) -> None:
-        """Begin to watch for stalls. `asleep_ns` is the argument of this name of `run()`."""
+        """Begin to look for stalls.
+
+        `asleep_ns` returns for how long this computer has been suspended since its start, ns.
+        """
         self.doing, self.keys = operator.doing, operator.keys
         self._operator, self._board, self._asleep_ns = operator, board, asleep_ns
         self._ran_s = self._now_s()
-        """Time of the last call of `look` or of the last answer, whichever is later, s."""
+        """Time of the last call of `look`, or of the operator's last answer if that is later, s."""
 
     def _now_s(self) -> float:
         """Return a monotonic time, s, that advances even while the computer is suspended."""
         return self._board.now_s + self._asleep_ns() / NS_PER_S
 
     def ask(self, question: str, answers: Sequence[str]) -> str | None:
-        """Ask the operator. The time until the answer does not count as a stall."""
+        """Ask the operator, as `Operator.ask` does. The wait for the answer is not a stall."""
         answer = self._operator.ask(question, answers)
         self._ran_s = self._now_s()
         return answer
@@ -168,7 +191,8 @@ class _Watched:
         if stalled_s > (STALL_S if self._board.armed else ZEROS_STALL_S):
             raise StoppedError(outcomes.find("stall: seen", seconds=stalled_s))
         if stalled_s > STALL_S:
-            # `Board` does not measure the time of a suspended computer or of a stalled terminal.
+            # `Board` measures neither the time for which the computer was suspended, nor the time
+            # for which the terminal did not accept the tool's output.
             self._board.lateness.look(stalled_s, self._board.now_s)
         if QUITS in self.keys(0.0).lower():
             raise KeyboardInterrupt
@@ -177,8 +201,8 @@ class _Watched:
 class _Steps:
     """Runs the steps of the check.
 
-    A step is repeated if the board restarts during the step, or if the finding of the step is
-    doubtful because the check ran late.
+    It repeats a step if the board restarts during the step, or if the finding is doubtful because
+    this computer ran the step too late.
     """
 
     def __init__(
@@ -190,7 +214,7 @@ class _Steps:
     ) -> None:
         self._board, self._operator, self._tell = board, operator, tell
         self._seen = seen
-        """The restarts of the board so far. The caller reads this list after the last step."""
+        """All restarts of the board so far. The caller of `all` reads this list afterward."""
         self._channels: list[Channel] = []
         self._late_left = LATE_MOST
 
@@ -218,11 +242,10 @@ class _Steps:
         self._board.armed = True
 
     def _turn(self, motor: int) -> Finding:
-        """Test one motor, ask the operator which wheel it turned, and return the finding.
+        """Test one motor, ask the operator which wheel the motor turned, and return the finding.
 
-        The question is left out if the check ran too late in every attempt at the test. The
-        measured motion of the motor is then doubtful, and the finding says that the check could not
-        judge the motor.
+        If this computer was too late in every attempt at the test, do not ask the operator. The
+        finding then says that the motor was not judged.
         """
         board, operator, channels = self._board, self._operator, self._channels
         operator.doing(f"{motor_name(board.mcu, motor)} turns: briefly, then forward and back")
@@ -239,19 +262,19 @@ class _Steps:
         return encoder_finding(board.mcu, channels[motor])
 
     def _measure(self, doing: str, step: Step) -> None:
-        """Run a step and report its finding.
+        """Run a step and report its finding. `doing` is the message about it for the operator.
 
-        The step is repeated if the board restarts, or if the finding is doubtful because the check
-        ran late.
+        Repeat the step if the board restarts, or if the finding is doubtful because this computer
+        ran the step too late.
         """
         self._take(doing, partial(self._in_time, step))
 
     def _in_time(self, step: Step) -> Finding | None:
         """Run a step, and return its finding.
 
-        The step is repeated if the finding is doubtful because the check ran late during the step
-        (`lateness.spoilt`). If the last permitted attempt is doubtful too, the returned finding
-        says that the step was not judged. Raises `StoppedError` if the step ends the check.
+        Repeat the step if its finding is doubtful because this computer ran the step too late
+        (`lateness.spoilt`). If the last permitted attempt is doubtful too, return the finding that
+        the step was not judged. Raises `StoppedError` if the step ends the check.
         """
         board, known, late_s = self._board, self._board.known, 0.0
         for _ in range(1 + min(LATE_AGAIN, self._late_left)):
@@ -263,10 +286,11 @@ class _Steps:
                     board.rest()
             began_s = board.now_s
             found, ends = _ended(step)
-            # If the board is a program on this computer, its lateness is known only when that
-            # program runs again. If the board does not answer, lateness does not explain it.
+            # A finding that is not `Unsure` is right even if this computer was late.
             if board.fled or not isinstance(found, Unsure):
                 break
+            # The delay of a simulated board is known only when its program runs again, so wait for
+            # an answer. If the board does not answer at all, a delay is not the cause.
             if found.verdict != "PASS" and not board.wakes(BOOT_S):
                 break
             meanwhile_s = board.lateness.since(began_s)
@@ -275,7 +299,8 @@ class _Steps:
             late_s = max(late_s, meanwhile_s)
             told = lateness.finding(found.name, late_s)
             if ends and board.armed:
-                # After an early end no motor may be turned again, even if lateness was the cause.
+                # The step has ended the check. So do not turn a motor again, even if the cause was
+                # only a delay of this computer.
                 found, board.known = told, known
                 break
         else:
@@ -287,8 +312,8 @@ class _Steps:
     def _take(self, doing: str, step: Step) -> None:
         """Run a step and report its finding. Repeat the step if the board restarts.
 
-        `doing` is the text about this step that the operator sees; "" shows no text. Raises
-        `StoppedError` if the board restarts too often.
+        `doing` is the message about the step for the operator, or "" for no message. Raises
+        `StoppedError` if the step ends the check, or if the board restarts too often.
         """
         board, again = self._board, 0
         known = board.known
@@ -310,8 +335,8 @@ class _Steps:
     def _tried(self, step: Step) -> Finding | None:
         """Run a step and return its finding.
 
-        If the finding is bad, first wait until a silent board answers, because it may have
-        restarted.
+        If the finding is bad and the board is silent, first wait until the board answers, because a
+        restart may be the cause. Raises `RestartedError` if the board has restarted.
         """
         try:
             finding = step()
@@ -323,10 +348,10 @@ class _Steps:
         return finding
 
     def _await_return(self, silent_s: float) -> None:
-        """If the board is silent, send zeros until it answers or has had enough time to boot.
+        """If the board is silent, send zeros until it answers, for at most `BOOT_S`.
 
-        The board counts as silent if its last reply is older than `silent_s` s, and also older than
-        four times `gap_s`.
+        The board is silent if its last reply is older than `silent_s`, s, and older than four times
+        the mean time between replies.
         """
         board = self._board
         if board.silent_s > max(silent_s, 4 * board.gap_s):
@@ -335,8 +360,8 @@ class _Steps:
     def _come_back(self) -> None:
         """Send zeros until a restarted board answers.
 
-        Once the check has seen all motors stand still (`Board.armed`), also send zeros until they
-        stand still again.
+        Then also wait until all motors stand still, unless the check has not yet seen that they do
+        (`Board.armed`). Raises `StoppedError` if the board does not answer within `BOOT_S`.
         """
         board = self._board
         board.forget()

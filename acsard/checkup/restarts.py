@@ -1,8 +1,8 @@
 """Detects restarts of the board during the check, from the lines that the board sends.
 
-A restart falsifies the measurements of the present step, so that the cable, a motor or the watchdog
-seems to be at fault. The step is therefore repeated (`procedure.py`). At the end of the check, a
-finding gives the probable cause of the restarts.
+During a restart, the present step of the check measures wrong values. The cable, a motor or the
+watchdog would then seem to be at fault. `procedure.py` therefore repeats the step. At the end of
+the check, a finding gives the probable cause of the restarts.
 """
 
 from __future__ import annotations
@@ -22,46 +22,58 @@ from acsard.core.link.session import IDENTITY
 from acsard.core.values import AcsardError
 
 ASKED_S = 1.0
-"""Longest time from a request for the identification to the board's answer, s. If an identification
-arrives later, the board sent it without a request."""
+"""Longest time from a request for the board's identification to the answer, s.
+
+If an identification arrives later, the board sent it without a request, because it booted.
+"""
 
 UNANSWERED = 5
-"""A text from the board shows a restart if at least this many successive lines had no reply. With
-fewer such lines, the text may be a debug print of the firmware."""
+"""Smallest number of successive lines without a reply after which a text shows a restart.
+
+If the board has left fewer lines without a reply, the text may be a debug print of the firmware.
+"""
 
 AHEAD_S = 2.0
-"""Tolerance for the board's clock, s. Between two replies, this clock may advance by up to this
-much more than this computer's clock, for example because a line was delayed. A larger advance shows
-a restart, because the jump back to 0 looks like a large advance modulo `CLOCK`."""
+"""Tolerated difference between the board's clock and this computer's clock, s.
+
+Between two replies, the board's clock may advance by this time more than this computer's clock, for
+example because a reply was delayed. If it advances by more, the board has restarted: the jump of
+its clock back to 0 looks like a large advance modulo `CLOCK`.
+"""
 
 CLOCK = 65536
-"""Time after which the board's clock starts again at 0, ms."""
+"""Time after which the board's clock overflows and continues at 0, ms."""
 
 SILENT_S = 0.25
-"""Shortest time without a sent line after which a watchdog may restart the whole board, s."""
+"""Shortest time without a line to the board that can make its watchdog restart the board, s."""
 
 CAUSES = {"power": "supply", "brown-out": "supply", "watchdog": "watchdog", "pin": "pin"}
-"""Maps each cause of a restart that the reference firmware reports to an outcome of the check."""
+"""Maps each cause of a restart that the reference firmware reports to an outcome in `outcomes.py`.
+
+The value is the part of the outcome's name after "restarts: ".
+"""
 
 _WORD = re.compile(rb"[a-z]{3}|[G-Z]{3}")
-"""Pattern that occurs in printed texts, but in no reply, not even in a damaged one."""
+"""Pattern of a word, as texts contain it. A reply does not contain such a word, even if damaged."""
 
 _CAUSE = re.compile(rb" reset=([a-z-]{1,20})")
 
 
 class Restart(Struct, frozen=True):
+    """One restart of the board."""
+
     sign: str
-    """The observation that revealed the restart, in words."""
+    """The observation that shows the restart, in words."""
     turned: Motors = ZERO
-    """Speeds that were commanded just before the restart, rad/s; zeros if the motors stood."""
+    """Speeds that were commanded shortly before the restart, rad/s; zeros if no motor turned."""
     silent_s: float = 0.0
-    """Longest time without a line to the board, between its last reply and the restart, s."""
+    """Longest time in which no line was sent, from the board's last reply to the restart, s."""
     cause: str = ""
-    """Cause of the restart as the board reports it, or "" if the board reports no cause."""
+    """Cause of the restart as the board reports it, or "" if the board does not report a cause."""
 
 
 class RestartedError(AcsardError):
-    """The board restarted, so the present measurement is worthless."""
+    """The board restarted, so the measurements of the present step are wrong."""
 
     def __init__(self, restart: Restart) -> None:
         super().__init__(restart.sign)
@@ -69,41 +81,43 @@ class RestartedError(AcsardError):
 
 
 class Restarts:
-    """Detector of restarts since the port was opened. All times are monotonic, in s."""
+    """Detector of restarts of the board. All times are monotonic times, s."""
 
     def __init__(self) -> None:
         self.watched = True
-        """Whether `look()` reports restarts."""
+        """Whether `look` reports restarts. If false, it always returns None."""
         self._asked_s = self._turned_s = float("-inf")
         self._turned: Motors = ZERO
-        """The last commanded speeds that were not all zero, rad/s."""
+        """The last commanded speeds, rad/s, that were not all zero."""
         self._sent_s: float | None = None
         self._silent_s = 0.0
-        """Longest time between two lines to the board since the last reply, s."""
+        """Longest time from one line to the next since the board's last reply, s."""
         self._unanswered = 0
         self._replied_s: float | None = None
-        """Time of the last reply, s, or None before the first reply. Before the first reply, a text
-        from the board does not show a restart: the opening of the port resets many boards, and
-        they print texts when they boot."""
+        """Time of the board's last reply, s, or None before the first reply.
+
+        Before the first reply, a text from the board does not show a restart. Many boards are reset
+        when the port is opened, and print texts while they boot.
+        """
         self._clock: tuple[int, float] | None = None
-        """Pair: the board's clock, ms, in the last reply that contained it, and the time of that
-        reply, s."""
+        """Pair from the last reply that contained the board's clock: this clock, ms, and the time
+        of that reply, s. None if no reply has contained the clock."""
 
     def asked(self, at_s: float) -> None:
-        """Record that the check requested the identification at the monotonic time `at_s`, s."""
+        """Record that the check requested the board's identification at the time `at_s`, s."""
         self._asked_s = at_s
 
     def sent(self, motors: Motors, at_s: float) -> None:
-        """Record that the check sent these speeds, rad/s, at the monotonic time `at_s`, s."""
+        """Record that the check sent the speeds `motors`, rad/s, at the time `at_s`, s."""
         self._unanswered += 1
         self._silent_s, self._sent_s = self._silence_s(at_s), at_s
         if any(motors):
             self._turned, self._turned_s = motors, at_s
 
     def look(self, line: bytes, at_s: float, reply: Reply | None) -> Restart | None:
-        """Return the restart that a received line reveals, or None.
+        """Return the restart that a received line shows, or None if it does not show a restart.
 
-        `at_s` is the monotonic time of its arrival, s. `reply` is the decoded line, or None if the
+        `at_s` is the time at which `line` arrived, s. `reply` is the decoded line, or None if the
         line is not a valid reply.
         """
         sign = ""
@@ -137,20 +151,25 @@ class Restarts:
         if before is None:
             return ""
         most_ms = 1000 * (reply.at_s - before[1] + AHEAD_S)
-        # After half a minute without a reply, an overflow may have set the clock back to 0.
+        # After half a minute without a reply, the difference modulo `CLOCK` proves nothing, because
+        # the clock may have overflowed.
         if most_ms < CLOCK / 2 and (reading.mcu_ms - before[0]) % CLOCK > most_ms:
             return "the board's clock and encoder counts started again from 0"
         return ""
 
 
 def cause(lines: Sequence[bytes]) -> str:
-    """Return the cause of a restart that these lines report, or "" if they report none."""
+    """Return the cause of a restart that `lines` of the board report, or "" without a report."""
     said = [match[1].decode() for line in lines if (match := _CAUSE.search(line))]
     return said[-1] if said else ""
 
 
 def finding(mcu: McuConfig, restarts: Sequence[Restart], back: bool = True) -> Finding:
-    """Return the finding about `restarts`. `back` says whether the board answers again."""
+    """Return the finding that reports `restarts` and their probable cause.
+
+    `restarts` contains at least one restart. `back` is false if the board did not answer after the
+    last restart.
+    """
     each = Counter(_told(mcu, one) for one in restarts)
     seen: dict[str, object] = {
         "times": f"restarted{_times(len(restarts))}",
@@ -173,7 +192,7 @@ def _outcome(restarts: Sequence[Restart]) -> str:
 
 
 def _silent(restarts: Sequence[Restart]) -> bool:
-    """Return whether there are several restarts, each after `SILENT_S` without a sent line."""
+    """Return whether `restarts` are several, each after `SILENT_S` or more without a sent line."""
     return len(restarts) > 1 and all(one.silent_s >= SILENT_S for one in restarts)
 
 

@@ -3,10 +3,10 @@
 The watchdog must also act if the board receives only damaged lines, as with a half-broken cable.
 
 The check brings the motors to speed, sends nothing (or damaged lines) for some time, and then sends
-zeros. The delay after which the watchdog acts is computed from the distance by which the motors ran
-on, minus the distance of an ordinary stop. Some firmware does not show these distances, because it
-replies only to lines and reports momentary speeds. In this case the check tries silences of
-different lengths. After each silence it tests whether the motors still turn.
+zeros. It compares the distance by which the motors run on with the distance in an ordinary stop.
+The difference gives the delay after which the watchdog acts. Some firmware does not show these
+distances, because it replies only to lines and reports momentary speeds. For such firmware, the
+check tries silences of different durations, and tests after each whether the motors still turn.
 """
 
 from __future__ import annotations
@@ -26,47 +26,62 @@ from acsard.core.config.wire_time import FIELD
 from acsard.core.link.codec import LETTERS, Motors
 
 FEEDING = ("a wrong letter", "neither p nor n", "cut short")
-"""Kinds of damaged lines that the check sends to find out whether they feed the watchdog."""
+"""Kinds of damaged lines that must not feed the watchdog. The check sends lines of these kinds."""
 
 TURNING, STOPPED = 0.9, 0.1
-"""Fractions of the commanded speed. A motor at `TURNING` or more has not slowed down. A motor below
-`STOPPED` stands."""
+"""Limits for the speed of a motor, as fractions of the commanded speed.
+
+A motor at `TURNING` or above has not slowed down. A motor below `STOPPED` stands still.
+"""
 
 UNKNOWN = math.inf
+"""Upper bound of the watchdog's delay if the motors did not stop even in the longest silence."""
 
 Between = tuple[float, float]
-"""Pair: lower and upper bound of the time for which the motors run on after the last line, s."""
+"""Pair: a lower and an upper bound of the time for which motors run on after the last line, s."""
 
 
 class Run(Struct, frozen=True):
-    """Behavior of the motors in a silence after the last line that turned them.
+    """Behavior of the motors during and after a silence, in which no valid line is sent.
 
-    `silent_s` is the duration of the silence, s. It is about 0 for an ordinary stop, in which zeros
-    follow immediately. Each distance is given as the time, s, in which a motor at full speed covers
-    it. Each speed is given as a fraction of full speed.
+    The silence begins after the last line that turned the motors, and ends with zeros. Full speed
+    is the speed of the motors before the silence.
     """
 
     silent_s: float
+    """Duration of the silence, s. It is about 0 for an ordinary stop, without a silence."""
     ran_s: float
-    """Largest distance by which a motor ran on until it stood, as a time at full speed, s."""
+    """Largest distance by which a motor ran on until it stood still.
+
+    It is given as the time in which a motor at full speed covers this distance, s.
+    """
     slow_s: float
-    """Time from the last line that turned the motors until all motors were slower than `STOPPED`
-    of full speed, s. For an ordinary stop, the time begins with the zeros instead."""
+    """Time from the last line that turned the motors until all motors are slower than `STOPPED`, s.
+
+    For an ordinary stop, the time begins with the line of zeros instead.
+    """
     first: float
-    """Speed in the first reply after the silence, as a fraction of full speed. Some firmware
-    computes the speed from the movement since the previous line, and so reports the mean speed in
-    the silence. Other firmware measures by its own clock, and reports the momentary speed."""
+    """Speed in the first reply after the silence, as a fraction of the commanded speed.
+
+    Some firmware computes the speed from the movement since the previous line, and so reports the
+    mean speed during the silence. Other firmware reports the momentary speed.
+    """
     second: float
-    """Speed in the second reply after the silence, as a fraction of full speed. By then a quick
-    motor has obeyed the first line of zeros."""
+    """Speed in the second reply after the silence, as a fraction of the commanded speed.
+
+    By then, a motor that slows down quickly has obeyed the first line of zeros.
+    """
     grain_s: float
-    """Resolution of the speeds, as a time, s. See `motion.grain_s`."""
+    """Resolution of the reported speeds, expressed as a time, s. `motion.grain_s` computes it."""
 
 
 def finding(board: Board, motors: Sequence[int]) -> Finding:
-    """Measure the time after which the watchdog stops `motors`, and leave them at rest.
+    """Measure the time after which the watchdog stops the motors, and return the finding.
 
-    Unless the result is a failure, also test whether damaged lines feed the watchdog.
+    Unless its verdict is FAIL, also test whether damaged lines keep the watchdog from acting.
+    `motors` are the numbers of the motors that turned as commanded. At the end, all motors stand
+    still. Raises `StoppedError` if no motor reaches half of the commanded speed when all of
+    `motors` turn together.
     """
     if not motors:
         return outcomes.find("watchdog: untested")
@@ -79,8 +94,8 @@ def finding(board: Board, motors: Sequence[int]) -> Finding:
     broken = cycle(line for what, line in lines if what in FEEDING)
     fed = run(board, motors, max(motion.CUT_S, 2 * most_s) + stop.slow_s, broken)
     if fed.ran_s >= 0.75 * fed.silent_s:
-        # The damaged lines fed the watchdog. Otherwise the watchdog would have stopped the motors
-        # earlier, after a smaller distance.
+        # The motors ran on during most of the silence, so the damaged lines fed the watchdog.
+        # Without them, the watchdog stops the motors after a smaller distance.
         beyond_s = fed.ran_s - stop.ran_s - most_s
         return outcomes.find("watchdog: fed", figure=judged.figure, margin_s=beyond_s)
     return judged
@@ -106,10 +121,11 @@ def _judged(least_s: float, most_s: float) -> Finding:
 
 
 def measured(board: Board, motors: Sequence[int], stop: Run) -> Between:
-    """Return the bounds of the time for which `motors` run on when no lines are sent, s.
+    """Measure for how long motors run on when no lines are sent.
 
-    `stop` is the behavior of the motors in an ordinary stop. If the motors do not stop even in the
-    longest silence, the upper bound is `UNKNOWN`.
+    Return a lower and an upper bound of this time, s. If the motors do not stop even in the longest
+    silence, the upper bound is `UNKNOWN`. `motors` are numbers from 0 to 3. `stop` is the behavior
+    of these motors in an ordinary stop.
     """
     least_s = 0.0
     for length_s in (motion.CUT_S + stop.slow_s, motion.STOOD_S + stop.slow_s):
@@ -123,19 +139,20 @@ def measured(board: Board, motors: Sequence[int], stop: Run) -> Between:
     by_counts = _per_turn(board, motors) > 0
     if not (board.own_clock or by_counts or found.first >= STOPPED):
         return _asked(board, motors, stop, (least_s, found.silent_s))
-    # Each of the two distances may be wrong by one jump of the readings, and a coasting motor may
-    # add half a jump.
+    # Each of the two distances may be wrong by one jump of the reported speeds, and a motor that
+    # slows down may add half a jump.
     about_s = max(2.5 * stop.grain_s, 0.0 if by_counts else board.gap_s / 2)
     return max(0.0, ran_on_s - about_s), max(0.0, ran_on_s + about_s)
 
 
 def _asked(board: Board, motors: Sequence[int], stop: Run, between: Between) -> Between:
-    """Return narrower bounds than `between`, found by bisection with silences of other lengths.
+    """Return narrower bounds than `between`, by bisection with silences of other durations.
 
     `stop` is the behavior of the motors in an ordinary stop.
     """
     least_s, most_s = between
-    for _ in range(8):  # each run halves the interval, unless this computer pauses
+    # Each run halves the interval between the bounds, unless this computer is late.
+    for _ in range(8):
         if most_s - least_s <= max(0.03, 0.1 * most_s):
             break
         answer = run(board, motors, (least_s + most_s) / 2)
@@ -143,8 +160,9 @@ def _asked(board: Board, motors: Sequence[int], stop: Run, between: Between) -> 
             least_s = max(least_s, answer.silent_s)
         else:
             most_s = min(most_s, answer.silent_s)
-    # The reply that decides describes a moment after the end of the silence. In the same way, the
-    # reply that shows the end of the ordinary stop arrives after that end.
+    # The replies with the speeds `first` and `second` describe moments after the end of the
+    # silence. In the same way, the reply that shows the end of the ordinary stop arrives after that
+    # end.
     least_s -= stop.slow_s - board.period_s + 2 * stop.grain_s
     most_s -= stop.slow_s - board.period_s - motion.PERIOD_S - 2 * stop.grain_s
     return max(0.0, least_s), max(0.0, most_s)
@@ -153,8 +171,8 @@ def _asked(board: Board, motors: Sequence[int], stop: Run, between: Between) -> 
 def run(board: Board, motors: Sequence[int], length_s: float, instead: Iterable[bytes] = ()) -> Run:
     """Bring the motors to speed, send no valid line for `length_s` s, and stop them with zeros.
 
-    If `length_s` is 0, this is an ordinary stop. `instead` are damaged lines, which are sent during
-    the time `length_s`. Raises `StoppedError` if no motor reaches half of the commanded speed.
+    If `length_s` is 0, this is an ordinary stop. The damaged lines `instead` are sent during the
+    time `length_s`. Raises `StoppedError` if no motor reaches half of the commanded speed.
     """
     began_s = board.now_s
     full = run_up(board, command(motors))
@@ -162,7 +180,7 @@ def run(board: Board, motors: Sequence[int], length_s: float, instead: Iterable[
         board.rest()
         letters = ", ".join(LETTERS[motor] for motor in motors)
         raise StoppedError(outcomes.find("watchdog: weak", letters=letters))
-    # The ramp is over by the second half of the time.
+    # The ramp is over in the second half of the time since `began_s`.
     grain_s = motion.grain_s(motion.since(board.replies, (began_s + board.now_s) / 2), motors)
     told_s, lines = board.sent_s, iter(instead)
     while (left_s := told_s + length_s - board.now_s) > 0:
@@ -178,7 +196,8 @@ def run(board: Board, motors: Sequence[int], length_s: float, instead: Iterable[
     slow_s = next(
         (r.at_s - told_s for r in course if _share(r, motors) < STOPPED), motion.PATIENCE_S
     )
-    # The reply to the last line contains speeds from the moment at which that line took effect.
+    # If the board replies to lines, its reply to the last line contains the speeds at the moment at
+    # which this line took effect. The motors run on from that moment.
     answered = not board.own_clock and course[0].at_s < told_s + motion.PERIOD_S + 2 * board.gap_s
     since_s = course[0].at_s if answered else told_s
     ran = motion.covered(board.replies, since_s, _per_turn(board, motors))
@@ -187,14 +206,14 @@ def run(board: Board, motors: Sequence[int], length_s: float, instead: Iterable[
 
 
 def command(motors: Sequence[int]) -> Motors:
-    """Return the command that turns all of these motors at `motion.SPEED`."""
+    """Return the speeds that turn all `motors` at `motion.SPEED`, and no other motor."""
     return motion.each(lambda motor: motion.SPEED if motor in motors else 0.0)
 
 
 def _per_turn(board: Board, motors: Sequence[int]) -> float:
-    """Return the measured encoder counts per wheel turn.
+    """Return the measured number of encoder counts per wheel turn.
 
-    Returns 0 if they are not known, or if the counter could overflow in the longest silence.
+    Return 0 if it is not known, or if the board's counters could overflow in the longest silence.
     """
     per_turn = encoder_counts.per_turn(board.replies, motors) or 0.0
     wraps = per_turn * motion.RUNAWAY / math.tau * motion.STOOD_S >= FIELD / 2

@@ -1,8 +1,8 @@
 """Turns one motor at a time forward and backward, and asks the operator which wheel turned.
 
-A channel is a motor with its encoder and its wheel. From the speeds that the encoders show and from
-the answers, the check finds out whether these three parts belong together. `Channel`,
-`encoder_finding` and `wheel_map` compute this without any I/O.
+A channel is a motor with its encoder and its wheel. The check finds out whether these three parts
+belong together, from the speeds that the encoders measure and from the operator's answers.
+`Channel`, `encoder_finding` and `wheel_map` compute this without any I/O.
 """
 
 from __future__ import annotations
@@ -22,52 +22,67 @@ from acsard.core.link.codec import LETTERS, Motors
 from acsard.core.values import WHEELS
 
 TOLERANCE = 0.25
-"""If an encoder's speed differs from the commanded speed by more than this fraction, the check
+"""Relative error of an encoder's speed, compared with the commanded speed, above which the check
 fails."""
 
 OFF = 0.05
-"""If an encoder's speed differs from the commanded speed by more than this fraction, the check
+"""Relative error of an encoder's speed, compared with the commanded speed, above which the check
 warns."""
 
 Kind = Literal["right", "reversed", "dead", "other", "several", "one way", "size", "off", "late"]
+"""Kind of the result for one motor.
+
+- right: only the motor's own encoder moved, in the commanded direction and at the commanded speed
+- reversed: only the motor's own encoder moved, but against the commanded direction
+- dead: no encoder moved
+- other: only the encoder of another motor moved
+- several: several encoders moved, or different encoders forward and backward
+- one way: encoders moved in only one of the two directions
+- size: the relative error of the speed is larger than `TOLERANCE`
+- off: the relative error of the speed is larger than `OFF`
+- late: this computer was too late to judge the motor
+"""
 
 FOLLOWS: tuple[Kind, ...] = ("right", "off", "size")
-"""The values of `Channel.kind` for a motor that moves only its own encoder, in the commanded
-direction."""
+"""Values of `Channel.kind` for a motor that moves only its own encoder, in the right direction."""
 
 
 class Channel(Struct, frozen=True):
-    """Behavior of one motor, as the four encoders showed it and the operator saw it.
+    """Behavior of one motor in its test, as the four encoders and the operator report it.
 
-    `forth` and `back` are the speeds of the four encoders, rad/s, while the motor was commanded
-    forward (letter p) and backward (letter n).
+    `motor` is the number of the motor, 0 to 3. `forth` contains the speeds of the four encoders,
+    rad/s, while the motor was commanded to turn forward (letter p). `back` contains their speeds
+    while the motor was commanded to turn backward (letter n).
     """
 
     motor: int
     forth: Motors
     back: Motors
     wheel: str | None = None
-    """Wheel that the operator saw turn; "" if no wheel turned, None if no person watched."""
+    """Wheel that the operator saw turn; "" if no wheel turned, None if nobody was asked."""
     forward: bool = True
-    """Whether the wheel turned forward first, as the operator saw it."""
+    """Whether the operator saw the wheel turn forward first. False means backward first."""
     probed: bool = False
-    """Whether the motor was only probed (turned slowly and briefly), because its own encoder did
-    not follow. Then `forth` contains the speeds of the probe, and `back` is zero."""
+    """Whether the motor was only probed (turned slowly and briefly).
+
+    This is the case if its own encoder did not follow. Then `forth` contains the speeds in the
+    probe, and `back` contains zeros.
+    """
     unsure: float = 0.0
-    """Possible relative error of the measured speeds because of a coarse encoder."""
+    """Possible relative error of the measured speeds, because the encoder is coarse."""
     judged: bool = True
-    """Whether this computer was on time. If it was late, the other fields may be wrong."""
+    """False if this computer was too late, so that the other fields are doubtful."""
 
     @property
     def moved(self) -> list[int]:
-        """Numbers of the encoders that moved."""
+        """Numbers (0 to 3) of the encoders that moved while this motor was commanded to turn."""
         if not self.probed:
             return moving(self.forth) or moving(self.back)
         return moving(self.forth, max(PROBE_MOVES, max(map(abs, self.forth)) / 4))
 
     @property
     def kind(self) -> Kind:
-        """Result for this motor from the encoders alone, without the operator's answer."""
+        """Kind of the result for this motor. The operator's answers do not influence it."""
         if not self.judged:
             return "late"
         moved, own = self.moved, self.motor
@@ -87,8 +102,10 @@ class Channel(Struct, frozen=True):
 
     @property
     def error(self) -> float:
-        """Relative difference between the speed of the motor's own encoder and the commanded speed:
-        the larger of the values for forward and backward."""
+        """Relative difference between the speed of the motor's own encoder and the commanded speed.
+
+        The value is the larger of the differences forward and backward.
+        """
         own = self.motor
         return max(abs(self.forth[own] / SPEED - 1), abs(self.back[own] / SPEED + 1))
 
@@ -97,8 +114,9 @@ def encoder_finding(mcu: McuConfig, channel: Channel) -> Finding:
     motor, moved = channel.motor, channel.moved
     forth, back = channel.forth[motor], channel.back[motor]
     there = moved[0] if moved else motor
-    # A delay of `beyond_s` would explain the error, because in half of the measurements the motor
-    # would have seemed to stand for that time.
+    # If a motor seems to stand still for half of `beyond_s` in a measurement of `GLANCE_S`, then it
+    # seems too slow by the part of the error that exceeds `TOLERANCE`. `lateness.spoilt` compares a
+    # delay of this computer with half of this margin.
     beyond_s = 2 * GLANCE_S * (channel.error - TOLERANCE) if channel.kind == "size" else 0.0
     loose = channel.kind in FOLLOWS and channel.wheel == ""
     return outcomes.find(
@@ -119,9 +137,10 @@ def encoder_finding(mcu: McuConfig, channel: Channel) -> Finding:
 
 
 def _whose(mcu: McuConfig, channel: Channel) -> str:
-    """Return the end of the outcome's name that says what the operator saw, for example ", motor".
+    """Return the end of the outcome's name that depends on the operator's answer.
 
-    Returns "" if the outcome does not depend on that.
+    It says what the operator saw, such as ", still", or which part is at fault: ", motor" or
+    ", encoder". Return "" if the outcome does not depend on the answer.
     """
     wheel, sign = wheel_of(mcu, channel.motor)
     seen = channel.wheel
@@ -143,8 +162,9 @@ def _whose(mcu: McuConfig, channel: Channel) -> str:
 def wheel_map(mcu: McuConfig, found: Sequence[Channel]) -> Finding:
     """Return the finding that compares `[mcu.wheels]` with the wheels that the operator saw turn.
 
-    If a channel must be repaired first, or if the operator saw no wheel turn, the finding keeps the
-    configured entry of this channel.
+    The finding suggests an entry for each wheel. It is the configured entry if the motor does not
+    work correctly, or if the operator saw no wheel turn. If no operator answered, the finding has
+    no entries.
     """
     if any(channel.wheel is None for channel in found):
         return outcomes.find("wheel map: not seen")
@@ -166,14 +186,16 @@ def wheel_map(mcu: McuConfig, found: Sequence[Channel]) -> Finding:
 
 
 NEAR = 0.8
-"""If the error of a speed exceeds this fraction of `OFF`, the speed is measured again over a longer
-time, because the first measurement is too inaccurate."""
+"""Fraction of `OFF` above which the relative error of a speed causes a second measurement.
+
+The first measurement is then too inaccurate to decide. The second one takes longer.
+"""
 
 LOOK_S = 0.75 * motion.MOTOR_S
-"""Time over which the second measurement averages the speed, s."""
+"""Time over which the second, longer measurement of a speed averages the speed, s."""
 
 LOOKS = 8
-"""Largest number of short measurements whose mean is the present speed in `run_up`."""
+"""Largest number of short measurements that `run_up` averages to get the present speed."""
 
 ANSWERS = {
     "fr": "front_right", "fl": "front_left", "rl": "rear_left", "rr": "rear_right", "none": "",
@@ -181,20 +203,21 @@ ANSWERS = {
 
 
 def one(motor: int, speed: float) -> Motors:
-    """Return the command that turns only this motor, at `speed` rad/s."""
+    """Return the speeds that turn only the motor number `motor`, at `speed` rad/s."""
     return motion.each(lambda index: speed if index == motor else 0.0)
 
 
 def turn(board: Board, motor: int, speed: float) -> tuple[Motors, float]:
     """Bring a motor to `speed`, rad/s, and measure the speeds of all encoders.
 
-    Returns a pair: these speeds, rad/s, and the possible relative error of the motor's measured
-    speed. The error comes from the encoder, which counts only whole steps.
+    Return a pair: the measured speeds, rad/s, and the possible relative error of this motor's
+    measured speed. This error exists because an encoder counts only whole steps.
     """
     means = run_up(board, one(motor, speed))
     unsure = _unsure(board, motor, 2 * _look_s(board))
     if NEAR * OFF + unsure < abs(means[motor] / speed - 1) <= TOLERANCE:
-        # The motor is weak, or heavy and not yet at its speed. A longer measurement decides.
+        # The motor is weak, or its wheel is heavy and has not yet reached its speed. A longer
+        # measurement shows which of the two is the case.
         board.drive(one(motor, speed), motion.MOTOR_S)
         means = motion.mean(motion.since(board.replies, board.now_s - LOOK_S))
         unsure = _unsure(board, motor, LOOK_S)
@@ -202,7 +225,8 @@ def turn(board: Board, motor: int, speed: float) -> tuple[Motors, float]:
 
 
 def _unsure(board: Board, motor: int, seconds: float) -> float:
-    look = motion.since(board.replies, board.now_s - seconds / 2)  # the ramp is over by then
+    # The ramp is over in the second half of the time.
+    look = motion.since(board.replies, board.now_s - seconds / 2)
     return motion.grain_s(look, [motor]) / seconds
 
 
@@ -213,8 +237,8 @@ def _look_s(board: Board) -> float:
 def run_up(board: Board, motors: Motors) -> Motors:
     """Ramp up to the speeds `motors`, rad/s, and return each encoder's mean speed, rad/s.
 
-    The function waits until the speeds are steady. It stops waiting after some time, or earlier if
-    no encoder moves.
+    The function returns when the speeds are steady, when they are not steady after
+    `motion.MOTOR_S` (`motion.PATIENCE_S` while a motor speeds up), or earlier if no encoder moves.
     """
     steps = max(1, int(motion.GLANCE_S / board.period_s))
     for step in range(1, steps + 1):
@@ -232,15 +256,16 @@ def run_up(board: Board, motors: Motors) -> Motors:
         near = [m for m in moving(means) if abs(abs(means[m]) / motion.SPEED - 1) < 0.4 * TOLERANCE]
         steady = steady + 1 if len(near) >= len(told) else 0
         if looks * look_s >= motion.CUT_S and not moving(means, motion.STANDING):
-            break  # do not go on: without an encoder, the speed control may wind up
+            # Do not go on: without an encoder, the firmware's speed control may command ever more.
+            break
     return means
 
 
 def _patience_s(board: Board, told: list[int]) -> float:
     """Return the longest wait for steady speeds, s.
 
-    `told` are the motors that were commanded to turn. The wait is longer while one of them still
-    speeds up.
+    `told` contains the numbers of the motors that were commanded to turn. The wait is longer while
+    one of these motors speeds up.
     """
     shares = motion.trend(board.replies, board.now_s, board.gap_s)
     rises = any(shares[motor] > 1 / motion.FALLS for motor in told)
@@ -250,7 +275,8 @@ def _patience_s(board: Board, told: list[int]) -> float:
 def channel(board: Board, motor: int) -> Channel:
     """Turn a motor forward and backward, and return how the encoders moved.
 
-    If motor d seems dead, the test is repeated with the other line ending: a comma or none.
+    If motor d (number 3) does not move, repeat the test with the other line ending: a comma or
+    none. If motor d moves then, use that ending for all later lines too.
     """
     found = _both_ways(board, motor)
     if motor == 3 and found.kind == "dead" and not board.latched:
@@ -261,7 +287,7 @@ def channel(board: Board, motor: int) -> Channel:
 def _both_ways(board: Board, motor: int) -> Channel:
     """Turn a motor forward, then backward, stop it, and return how the encoders moved.
 
-    First the motor is probed. If its own encoder does not follow, the motor is not turned further.
+    Probe the motor first. If its own encoder does not follow, do not turn the motor further.
     """
     shown = probe(board, motor)
     if shown is not None:
@@ -280,19 +306,20 @@ def _both_ways(board: Board, motor: int) -> Channel:
 def probe(board: Board, motor: int) -> Motors | None:
     """Turn a motor slowly and briefly, to find out whether its own encoder follows.
 
-    If the encoder follows, the result is None, and the motor may still turn. Otherwise the function
-    stops the motor and returns the speeds that the encoders showed, rad/s.
-
-    The firmware may drive a motor without a working encoder to full speed, but the probe is too
-    short for that. If the encoder does not follow, the probe is repeated, because a coarse encoder
-    may need more movement. If several readings show a reversed encoder, the probe is not repeated.
+    Return None if the encoder follows. The motor may then still turn. Otherwise stop the motor, and
+    return the speeds of the four encoders in the probe, rad/s.
     """
+    # The firmware may drive a motor without a working encoder to full speed, but the probe is too
+    # short for that. If the encoder does not follow, repeat the probe, because a coarse encoder may
+    # need more movement.
     began_s = board.now_s
     shown = _probe(board, motor, motion.SPEED / 2)
     own = [reply.motors[motor] for reply in motion.since(board.replies, began_s)]
     seen = [speed for speed in own if speed]
     if shown is None or (len(seen) >= 3 and max(seen) < 0):
-        return shown  # the motor is reversed; a second probe would make it run away again
+        # Several replies show that the motor or its encoder is reversed. A second probe would make
+        # the motor run away again.
+        return shown
     if not moving(shown, motion.PROBE_MOVES):
         return _probe(board, motor, motion.SPEED)
     again = _probe(board, motor, motion.SPEED / 2)
@@ -307,7 +334,7 @@ def _probe(board: Board, motor: int, speed: float) -> Motors | None:
     def shown() -> Motors:
         """Return each encoder's mean speed in the probe, rad/s.
 
-        The speed at which the motor coasted before the probe is subtracted.
+        The speed at which a motor still turned before the probe is subtracted.
         """
         seconds = board.now_s - began_s
         ran = motion.covered(board.replies, began_s)
@@ -320,8 +347,9 @@ def _probe(board: Board, motor: int, speed: float) -> Motors | None:
         own = shown()[motor]
     if own >= motion.PROBE_MOVES:
         return None
-    # The firmware may drive a motor to full speed although it receives zeros, until its watchdog
-    # cuts the motor. So a motor that was seen to turn must stand before the next zeros are sent.
+    # Without a correct encoder, the firmware may drive the motor to full speed although it receives
+    # zeros. Only its watchdog stops the motor. So a motor that has moved must stand still before
+    # the next zeros are sent.
     moved = moving(shown(), motion.PROBE_MOVES)
     board.let_go(motion.STOOD_S if moved else motion.CUT_S)
     board.rest()
@@ -330,9 +358,10 @@ def _probe(board: Board, motor: int, speed: float) -> Motors | None:
 
 
 def _with_other_comma(board: Board, dead: Channel) -> Channel:
-    """Test motor d, which did not move, again with the other line ending: a comma or none.
+    """Test motor d again with the other line ending (a comma or none), because it did not move.
 
-    Returns the new result if the motor moves now, else the old result `dead`.
+    If the motor moves now, return the new result and keep the new ending. Otherwise return `dead`,
+    the result with the old ending.
     """
     configured, board.comma = board.comma, not board.comma
     channel = _both_ways(board, dead.motor)
@@ -346,10 +375,10 @@ def _with_other_comma(board: Board, dead: Channel) -> Channel:
 
 
 def seen(board: Board, operator: Operator, channel: Channel) -> Channel:
-    """Ask the operator which wheel turned, and return the channel with the answer.
+    """Ask the operator which wheel turned and in which direction. Add the answers to `channel`.
 
-    The wheels stand during the question. If no person watches the robot, the function returns
-    `channel` unchanged.
+    The wheels stand still during a question. If the operator wants to see the movement again, the
+    motor turns once more. If no operator answers, return `channel` without a change.
     """
     question = (
         f"which wheel did motor {LETTERS[channel.motor]} turn: front right (fr), front left (fl), "

@@ -1,9 +1,10 @@
 """The command line of acsard: one module for each subcommand.
 
-The docstring of such a module is the text of its `--help`. Its function `add_options` declares the
-options, and its function `main` runs the subcommand. Each action of a subcommand, such as `init` of
-`acsard tls`, has its own main function. Only the module of the typed subcommand is imported. That
-module imports everything it needs at its top, except libraries that may be missing.
+The docstring of such a module is the text of the subcommand's `--help`. The function `add_options`
+of the module declares the options, and `main` runs the subcommand. If a subcommand has actions,
+such as `acsard tls init`, each action has its own main function. Only the module of the typed
+subcommand is imported. At its top, a module imports everything that it needs, except libraries that
+may be missing.
 """
 
 from __future__ import annotations
@@ -56,8 +57,10 @@ VERBS = {
     "completion": "print the script that lets a shell complete acsard commands with Tab",
     "man": "print the text of every --help as a man page",
 }
-"""Maps each subcommand to its line in `acsard --help`, in the order of that list. The name of a
-subcommand is also the name of its module in this package."""
+"""Maps each subcommand to its description in `acsard --help`, in the order in which they appear.
+
+The name of a subcommand is also the name of its module in this package.
+"""
 
 _EPILOG = """\
 exit codes: 0 done, 1 failure, 2 wrong usage, 65 part of the recording was left out, 66 no such
@@ -73,19 +76,20 @@ try:  acsard run                (start the robot on the built-in simulator)
 
 class _Parser(argparse.ArgumentParser):
     _intermixed = False
-    """Whether `parse_known_intermixed_args` is running. That method may call `parse_known_args`,
-    which must then not start it a second time."""
+    """Whether `parse_known_intermixed_args` is running. It may call `parse_known_args`, which must
+    then not call it again."""
 
     def parse_known_args(  # type: ignore[override]
         self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None
     ) -> tuple[argparse.Namespace, list[str]]:
-        """Parse the words of the command line, `args`.
+        """Parse the words of the command line.
 
-        Argparse does not accept positional arguments on both sides of an option, such as `1` and
-        `cal.csv` in `export 1 --csv cal.csv`. If a word is unknown, this method therefore parses
-        all words again with `parse_known_intermixed_args`. If a word is unknown even then, it ends
-        the program with an error that names the `--help` to read.
+        If a word in `args` is unknown, end the program with an error that names the `--help` to
+        read.
         """
+        # `parse_known_args` of argparse does not accept positional arguments on both sides of an
+        # option, such as `1` and `cal.csv` in `export 1 --csv cal.csv`. So if a word is unknown,
+        # parse all words again with `parse_known_intermixed_args`.
         if self._intermixed:
             return super().parse_known_args(args, namespace)
         found, unknown = super().parse_known_args(args, copy(namespace))
@@ -111,7 +115,8 @@ class _Parser(argparse.ArgumentParser):
 def parser(called: Collection[str] = VERBS) -> argparse.ArgumentParser:
     """Return the parser for the command line of `acsard`.
 
-    It knows the names of all subcommands, but the options of only those in `called`.
+    The parser accepts the names of all subcommands. It has the options of the subcommands in
+    `called` only, because the modules of other subcommands are not imported.
     """
     whole = _Parser(
         prog="acsard",
@@ -151,8 +156,8 @@ def main(argv: list[str] | None = None) -> int:
     except OSError as error:
         if not isinstance(error, BrokenPipeError) and error.errno != errno.ENOSPC:
             raise
-        # The program that reads this output (head, less) has ended, or the disk is full. So print
-        # no message, because it would be lost too.
+        # The program that reads this output (head, less) has ended, or the disk is full. Do not
+        # print a message, because it would be lost too.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return code if isinstance(error, BrokenPipeError) else code or int(Exit.FAILURE)
     except KeyboardInterrupt:
@@ -164,20 +169,18 @@ _EXPONENT = re.compile(r"-(\d+\.?\d*|\.\d+)[eE][+-]?\d{1,3}")
 
 
 def _decimal(word: str) -> str:
-    """Return a negative number such as `-1e-3` without its exponent, as `-0.001`.
+    """Return a word of the command line without an exponent: `-0.001` for `-1e-3`.
 
-    Argparse would mistake `-1e-3` for an option. Any other word is returned unchanged.
+    Argparse would mistake `-1e-3` for an option. Any word that is not a negative number with an
+    exponent is returned unchanged.
     """
     return f"{Decimal(word):f}" if _EXPONENT.fullmatch(word) else word
 
 
 def entry() -> NoReturn:
-    """Run `main`, then end the process. This is the entry point of the `acsard` script.
-
-    The process ends with `os._exit`, because Zenoh's threads may still call into Python. During
-    a normal shutdown of the interpreter, such a call would abort the process. Standard output and
-    standard error are flushed before the process ends.
-    """
+    """Run `main`, flush the output, and end the process. This is the entry point of `acsard`."""
+    # The process ends with `os._exit`, because Zenoh's threads may still call into Python. During a
+    # normal shutdown of the interpreter, such a call would abort the process.
     _fill_closed_streams()
     try:
         code = main()
@@ -195,11 +198,9 @@ def entry() -> NoReturn:
 
 
 def _fill_closed_streams() -> None:
-    """Open /dev/null in the place of each standard stream that is closed.
-
-    Otherwise the serial port would get the file descriptor of the closed stream, and printed text
-    would go to the motors.
-    """
+    """Open /dev/null in the place of each standard stream that is closed."""
+    # Otherwise the serial port could get the file descriptor of the closed stream, and printed text
+    # would go to the motors.
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         try:
             os.fstat(number)

@@ -55,8 +55,8 @@ def main(args: argparse.Namespace) -> int:
 def _config(robot: Client, path: str | None) -> Config:
     """Return the daemon's configuration.
 
-    If the daemon does not send it, load the configuration file of this machine instead, and say so.
-    `path` is the value of --config, or None.
+    If the daemon does not send it, print a note and load the configuration file of this machine
+    instead. `path` is the value of --config, or None.
     """
     try:
         return msgspec.convert(robot.get("config"), Config)

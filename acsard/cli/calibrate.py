@@ -54,10 +54,10 @@ from acsard.terminal.prompt import NobodyError, Prompt, ended_by_signals
 from acsard.terminal.terminal_prompt import NoPrompt, TerminalPrompt
 
 TRUE_POSE = "sim/pose"
-"""Key of the true pose, below the robot's id. Only the built-in simulator has a true pose."""
+"""Key of the true pose, without the robot's id. Only the built-in simulator publishes it."""
 
 DRIVE_OPTIONS = ("method", "positions", "positions_at", "imu", "yes", "json_lines")
-"""Names of the options for a drive that this tool guides. They cannot be used with `--log`."""
+"""Names of the options for a guided drive. They cannot be used together with `--log`."""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -128,7 +128,8 @@ def _calibrate(args: argparse.Namespace, lines: JsonPrompt | None) -> int:
         try:
             change(Path(where), keys(found))
             written = where
-        except MendableError as error:  # print the result of the long drive before the error
+        except MendableError as error:
+            # Print the result of the long drive before the error.
             trouble = error
     told = report(source, found, config.drive, written)
     words = parts(told, found, where, guided=not args.log)
@@ -152,9 +153,9 @@ def _calibrate(args: argparse.Namespace, lines: JsonPrompt | None) -> int:
 
 
 def _require_fitting(args: argparse.Namespace) -> None:
-    """Raise `UsageError` if options of a recorded drive (`--log`) and of a guided drive are mixed.
+    """Raise `UsageError` if an option does not fit the kind of drive.
 
-    Also raise it if an option needs `--log` and `--log` is missing.
+    The drive is a recorded drive with `--log`, and otherwise a drive that this tool guides.
     """
     if not args.log and args.distance:
         raise UsageError(
@@ -223,11 +224,11 @@ def _add_drive_options(parser: argparse.ArgumentParser) -> None:
 def _guided(
     args: argparse.Namespace, config: Config, where: str, lines: JsonPrompt | None
 ) -> tuple[Calibration, Config]:
-    """Guide a person through a calibration drive of the robot.
+    """Guide a person through a drive of the robot, and compute the calibration from this drive.
 
-    Return a pair: the calibration, and the configuration of the robot's daemon. A key press or
-    Ctrl-C stops the robot with zero commands. `config` is the configuration in the file `where`.
-    `lines` is the prompt for --json-lines, or None without that option.
+    Return a pair: the calibration, and the configuration of the robot's daemon. Raises `GuideError`
+    if the operator ends the drive. `config` is the configuration in the file `where`. `lines` is
+    the prompt for --json-lines, or None without that option.
     """
     require_one(args)
     endpoint, robot_id, tls = address_of(config, args.connect, args.id, args.tls)
@@ -295,10 +296,10 @@ def _usable(args: argparse.Namespace, odometry: str) -> None:
 
 
 def _differing(config: Config, mine: Config, where: str) -> str:
-    """Compare the wheel radius and the wheel separation of two configurations.
+    """Return an error text if two configurations have different wheel radii or separations.
 
-    `config` is the daemon's configuration, and `mine` is the configuration in the file `where`.
-    Returns an error text if they have different values, else "".
+    `config` is the configuration of the daemon, and `mine` is the configuration in the file
+    `where`. Return "" if both values are equal.
     """
     same = config.drive.wheel_radius, config.drive.wheel_separation
     if same == (mine.drive.wheel_radius, mine.drive.wheel_separation):

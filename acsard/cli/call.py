@@ -21,7 +21,7 @@ from acsard.daemon.bus.robot_discovery import named
 from acsard.host.errors import UsageError
 
 CALLED = tuple(service for service in SERVICES if service != "set")
-"""The services that `acsard call` can call. `acsard set` calls the service `set`."""
+"""Names of the services that `acsard call` can call. `acsard set` calls the service `set`."""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -29,7 +29,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     forms = [f"{service} {names.upper()}" for service, names in fields.items() if names]
     parser.add_argument(
         "service",
-        # Accept `srv/stop` too, as `state` and the key table write it.
+        # Accept `srv/stop` too, because the messages on `state` and the table of keys contain the
+        # name in this form.
         type=lambda word: word.removeprefix("srv/"),
         choices=CALLED,
         metavar="SERVICE",
@@ -71,10 +72,10 @@ def _fields(service: Verb) -> tuple[str, ...]:
 
 
 def for_one(service: str, values: Sequence[float], ids: tuple[str, ...]) -> str:
-    """Return the error text that says that `service` can be called on only one robot at a time.
+    """Return the error text for a service that can be called on only one robot at a time.
 
     The text contains the command to type for each robot in `ids`. `values` are the numbers that the
-    operator typed after the service.
+    operator typed after the name of the service.
     """
     typed = " ".join(["acsard call", service, *(f"{value:g}" for value in values), "--id"])
     each = [one for one in ids if one != "*"] or ["robot1"]
@@ -87,8 +88,8 @@ def for_one(service: str, values: Sequence[float], ids: tuple[str, ...]) -> str:
 
 
 def _stop_all(robot: Client, ids: tuple[str, ...], *, as_json: bool) -> int:
-    # First send the stop to every named robot. `of_each` may look up which robots are present, and
-    # this would delay the stop.
+    # First stop every named robot without waiting for answers. `of_each` may first look up which
+    # robots are present, which would delay the stop.
     robot_discovery.stop(robot.session, ids, robot.caller)
     replies = of_each(robot, ids, lambda one: one.call("stop"))
     silence = "NO ANSWER: go to the robot, or use its emergency switch ({error})"

@@ -1,4 +1,4 @@
-"""Shared code of the subcommands: common options, types of option values, and the configuration."""
+"""Shared code of the subcommands: common options, argparse types, and loading the configuration."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ def add_config(parser: argparse.ArgumentParser) -> None:
 
 
 def add_outcome(parser: argparse.ArgumentParser, result: str) -> None:
-    """Add --json, --json-lines and --write to a subcommand that asks a person questions.
+    """Add the options --json, --json-lines and --write to the subcommand of `parser`.
 
-    The help text of --write is "also write {result} into the configuration file".
+    `result` names the values that --write stores, such as "the result", for the help text.
     """
     form = parser.add_mutually_exclusive_group()
     form.add_argument("--json", action="store_true", help="print one JSON object")
@@ -59,7 +59,7 @@ def require_asking(args: argparse.Namespace) -> None:
 
 
 def count(text: str) -> int:
-    """Return the whole number in `text`, from 1 to 999999999. This is an argparse type."""
+    """Parse a whole number from 1 to 999999999. This function is an argparse type."""
     if not text.isascii() or not text.isdecimal() or len(text) > 9 or int(text) < 1:
         words = f"{text[:40]} is not a whole number from 1 to 999999999"
         raise argparse.ArgumentTypeError(words)
@@ -67,9 +67,9 @@ def count(text: str) -> int:
 
 
 def between(least: float, most: float, units: str) -> Callable[[str], float]:
-    """Return an argparse type for a number from `least` to `most`.
+    """Return an argparse type: a function that parses a number from `least` to `most`.
 
-    `units` is the unit in the error message, such as "seconds".
+    `units` is the unit for the error message, such as "seconds".
     """
 
     def number(text: str) -> float:
@@ -86,14 +86,16 @@ def between(least: float, most: float, units: str) -> Callable[[str], float]:
 
 
 seconds = between(1.0, 600.0, "seconds")
-"""Argparse type for the duration of a measurement. The limit is 600 s because all measured values
-stay in memory, which takes 60 MB after 600 s at 100 Hz."""
+"""Argparse type for the duration of a measurement, from 1 to 600 s.
+
+The limit is 600 s because all measured values stay in memory, and need 60 MB after 600 s at 100 Hz.
+"""
 
 
 def whole(units: str, most: int, hint: str = "") -> Callable[[str], int]:
-    """Return an argparse type for a whole number from 1 to `most`.
+    """Return an argparse type: a function that parses a whole number from 1 to `most`.
 
-    `units` is the noun in the error message, such as "days". `hint` is appended to that message.
+    `units` is the unit for the error message, such as "days". `hint` is appended to that message.
     """
 
     def number(text: str) -> int:
@@ -106,10 +108,10 @@ def whole(units: str, most: int, hint: str = "") -> Callable[[str], int]:
 
 
 def by_environment() -> dict[str, dict[str, object]]:
-    """Return the configuration tables with the values that environment variables set.
+    """Return the configuration values that environment variables set, as nested dictionaries.
 
-    The only such variable is `ACSARD_TLS`, which sets `bus.tls`. A systemd unit sets this variable
-    to the directory of its credentials.
+    The only such variable is `ACSARD_TLS`, which sets `bus.tls`. The result is empty without it. A
+    systemd unit sets this variable to the directory of its credentials.
     """
     return {"bus": {"tls": os.environ["ACSARD_TLS"]}} if "ACSARD_TLS" in os.environ else {}
 
@@ -117,10 +119,11 @@ def by_environment() -> dict[str, dict[str, object]]:
 def tables(
     options: Mapping[str, object], before: Mapping[str, Mapping[str, object]]
 ) -> dict[str, dict[str, object]]:
-    """Return a copy of the configuration tables `before`, overridden by `options`.
+    """Return a copy of the configuration tables `before`, with the values of `options`.
 
-    A configuration table maps keys to values. `options` maps dotted keys, such as "mcu.port", to
-    values. A value of None changes nothing.
+    `before` maps the name of each table, such as "mcu", to its keys and values. `options` maps
+    dotted keys, such as "mcu.port", to values, which replace those in `before`. A key with the
+    value None is ignored.
     """
     given = {table: dict(values) for table, values in before.items()}
     for key, value in options.items():
@@ -141,15 +144,19 @@ OPTIONS = {
     "control.rate": "--rate",
     "bus.tls": "--tls",
 }
-"""Maps each configuration key that an option can set to the name of the option."""
+"""Maps dotted keys of the configuration to the command-line option that sets the key."""
 
 
 def load(path: str | None, options: Mapping[str, object] | None = None) -> tuple[str, Config]:
-    """Return a pair: the path of the configuration file, and the configuration.
+    """Load the configuration, and return a pair: the path of its file, and the configuration.
 
-    `path` is the value of --config, or None. `options` maps dotted keys of `OPTIONS` to values that
-    override the file; a value of None changes nothing. If the configuration has problems, this
-    function prints each problem with the file or the option that causes it, and raises `ExitError`.
+    If the configuration has problems, print each problem after the name of the file or option that
+    causes it, and raise `ExitError`.
+
+    Args:
+        path: the value of --config, or None to search for the file.
+        options: maps dotted keys of `OPTIONS` to values, which replace those of the file. A key
+            with the value None is ignored.
     """
     where, text = find(path)
     given = tables(options or {}, by_environment())
@@ -169,12 +176,13 @@ def load(path: str | None, options: Mapping[str, object] | None = None) -> tuple
 
 
 def recorded(config: Config) -> Config:
-    """Return a copy of `config` in which the path of the recording directory is absolute.
+    """Return a copy of `config` with an absolute path of the recording directory.
 
     If no directory is configured, the path comes from the environment variable ACSARD_RECORD, which
-    the systemd units set. Without this variable, the path stays "". The path is absolute because a
-    client that receives it over the bus may run in another working directory.
+    the systemd units set. Without this variable, the path is "".
     """
+    # The path is absolute because a client that receives it over the bus may run in another working
+    # directory.
     told = config.record.directory or os.environ.get(RECORD, "")
     directory = os.path.abspath(told) if told else ""
     return replace(config, record=replace(config.record, directory=directory))

@@ -23,10 +23,10 @@ SHELLS = {
     "zsh": "the file _acsard in a directory of your $fpath",
     "fish": "~/.config/fish/completions/acsard.fish",
 }
-"""Maps each shell to the file from which it loads the completion script of a program."""
+"""Maps each shell to the file from which the shell loads the completion script of acsard."""
 
 _NUMBERS = "acsard recording 2>/dev/null | sed -n 's/^0*\\([0-9][0-9]*\\)-.*/\\1/p'"
-"""Shell command that prints the numbers of the recordings."""
+"""Shell command that prints the numbers of all recordings, one per line."""
 
 _RECORDING: dict[str, str | dict[str, str]] = {
     "bash": "_acsard_recordings",
@@ -45,8 +45,10 @@ _acsard_recordings() {{
 }}""",
     },
 }
-"""Maps each shell to code that completes the number or the file name of a recording. shtab defines
-the format of this table."""
+"""Maps each shell to code that completes the number or the file name of a recording.
+
+shtab defines the format of this mapping.
+"""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -70,8 +72,8 @@ def main(args: argparse.Namespace) -> int:
         if kind:
             action.complete = kind  # type: ignore[attr-defined]
         elif (verb, action.dest) in known:
-            # The choices serve only the completion. They refuse no other word, because this parser
-            # parses no arguments.
+            # The choices are only for the completion. They cannot refuse other words, because this
+            # parser does not parse a command line.
             action.choices = known[verb, action.dest]
     script = shtab.complete(whole, args.shell)
     if args.shell == "zsh":
@@ -106,10 +108,10 @@ def _words() -> Mapping[tuple[str, str], list[str]]:
 def _actions(
     parser: argparse.ArgumentParser, verb: str = ""
 ) -> Iterator[tuple[str, argparse.Action]]:
-    """Yield a pair for each option and argument below `parser`: its subcommand, and the option.
+    """Yield each option and argument of a parser as a pair: its subcommand, and the option.
 
-    `parser` is the parser of the subcommand `verb`, or of the whole program if `verb` is "". The
-    options of an action such as `recording show` count as options of `recording`.
+    `parser` is the parser of the subcommand `verb`, or of the whole program if `verb` is "". An
+    option of an action, such as `recording show`, is yielded with the subcommand `recording`.
     """
     for action in parser._actions:
         yield verb, action

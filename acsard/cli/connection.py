@@ -1,5 +1,7 @@
-"""Shared code of the subcommands that use the bus: their options, their connection, checks of keys,
-and the explanation why no message arrives.
+"""Shared code of the subcommands that use the bus.
+
+It consists of their options, their connection to robots, checks of the typed key, and explanations
+why no message arrives.
 """
 
 from __future__ import annotations
@@ -29,7 +31,7 @@ MANY = "; several ids separated by commas, or '*' for all robots"
 
 
 def add_bus(parser: argparse.ArgumentParser, more: str = "") -> None:
-    """Add the options of tools that talk to a running daemon.
+    """Add the options of a subcommand that connects to a daemon: which robot, and where.
 
     `more` is appended to the help text of `--id`.
     """
@@ -48,9 +50,10 @@ def add_bus(parser: argparse.ArgumentParser, more: str = "") -> None:
 
 @contextmanager
 def connected(args: argparse.Namespace, source: str = "app") -> Iterator[Client]:
-    """Connect to the one robot that the options name, and yield a client.
+    """Connect to the one robot that the options name, and yield a client of this robot.
 
-    The client sends its commands as the command source `source`.
+    The client sends commands as the command source `source`. Raises `UsageError` if `--id` names
+    several robots.
     """
     endpoint, robot_id, tls = robot_address(args)
     with connect(endpoint, robot_id=robot_id, source=source, tls=tls) as robot:
@@ -58,7 +61,7 @@ def connected(args: argparse.Namespace, source: str = "app") -> Iterator[Client]
 
 
 def robot_address(args: argparse.Namespace) -> Address:
-    """Return the address of the robot that the options name.
+    """Return the address of the one robot that the options name, or else of the configured robot.
 
     Raises `UsageError` if `--id` names several robots.
     """
@@ -78,11 +81,12 @@ def require_one(args: argparse.Namespace) -> None:
 
 @contextmanager
 def connected_to_many(args: argparse.Namespace) -> Iterator[tuple[Client, tuple[str, ...]]]:
-    """Connect to the bus, and yield a pair: a client, and a tuple of robot ids.
+    """Connect to the bus, and yield a pair: a client, and the ids of the robots to use.
 
-    If `--id` names several robots, the tuple contains their ids; for `--id '*'` it is ("*",).
-    Otherwise the tuple is empty, and the client is for the robot that `--id` names. Without `--id`,
-    the client is for the configured robot.
+    If `--id` names one robot, the client is for this robot, and the tuple of ids is empty. Without
+    `--id`, the client is for the configured robot. If `--id` names several robots, the tuple
+    contains their ids, or only "*" for `--id '*'`. Then use `Client.like` to get a client of one of
+    these robots.
     """
     many = named(args.id or "")
     _, config = load(args.config)
@@ -92,10 +96,10 @@ def connected_to_many(args: argparse.Namespace) -> Iterator[tuple[Client, tuple[
 
 
 def require_followed(key: str) -> None:
-    """Raise `UsageError` if no messages are published on `key`.
+    """Raise `UsageError` if `key` is a known key on which no messages are published.
 
-    The text of the error contains the command to type instead. If `key` is not in the topic table,
-    print a warning. Without the warning, a misspelt key would look like a robot that sends nothing.
+    The text of the error contains the command to type instead. If `key` is unknown, only print a
+    warning. Without this warning, a misspelt key would look like a robot that sends nothing.
     """
     if unknown(key):
         words = f"{key} is not in the topic table ({key_hint(key)}); waiting for messages anyway"
@@ -119,8 +123,8 @@ def require_followed(key: str) -> None:
 def require_asked(key: str) -> None:
     """Raise `UsageError` if `acsard get` cannot query this key.
 
-    Some keys do not answer queries. A query to the key of a service would call the service. A key
-    with a wildcard has several answers, but `get` prints only one answer.
+    Some keys do not answer queries, and a query on the key of a service would call the service. A
+    key with a wildcard is refused too, because `get` prints only one answer.
     """
     if set(key.partition("?")[0]) & set("*$"):
         raise UsageError(
@@ -150,20 +154,21 @@ def explained(
     after_s: float = FIRST_S,
     timeout_s: float = math.inf,
 ) -> Iterator[Callable[[], None]]:
-    """Print why no messages arrive. Yield a function that the caller must call for each message.
+    """Print why no messages arrive, during a `with` block that receives messages.
 
-    A separate thread finds the reason and prints it on standard error, so that the caller can go on
-    receiving. A reason that is "" is not printed.
+    Yield a function, which the block must call for each message. A separate thread finds the reason
+    and prints it on standard error, so the block can go on receiving.
 
     Args:
-        look: Function that returns why no message has arrived yet. It is called if no message
-            arrives in the first `after_s` s.
-        ceased: Function that returns why no further message arrives. It is called after each
-            `after_s` s without a message, until it returns a reason. If it is None, only the
-            silence before the first message is explained.
-        after_s: Shortest silence that is explained, s.
-        timeout_s: Silence after which the caller ends the context, s. If no message has arrived by
-            then, the reason is printed before the context ends.
+        look: function that returns why no message has arrived yet, or "" to print nothing. It is
+            called once if no message arrives in the first `after_s` s.
+        ceased: function that returns why no further message arrives, or "" to print nothing. It is
+            called after each `after_s` s without a message, until a reason has been printed. After
+            the next message it is called again. None explains only the silence before the first
+            message.
+        after_s: time without a message after which a reason is printed, s.
+        timeout_s: time without a message after which the block ends by itself, s. If no message
+            has arrived by then, the reason is printed before the block is left.
     """
     come, end, looked = Event(), Event(), Event()
     began_s = time.monotonic()
@@ -198,11 +203,12 @@ def explained(
 def silence_explained(
     robot: Client, key: str = "", timeout_s: float | None = None
 ) -> AbstractContextManager[Callable[[], None]]:
-    """Print why no message arrives on a key, and later report if the connection is lost.
+    """Return a context that prints why no message arrives on a key, or that the connection is lost.
 
-    The context yields a function that the caller calls for each message. If `key` is "", only a
-    lost connection is reported. The texts go to standard error. If the caller ends the context
-    after a silence of `timeout_s` s, the reason is printed before the context ends.
+    The context yields a function, which the caller must call for each message. Texts go to standard
+    error. If `key` is "", only a lost connection is reported. `timeout_s` is the time without a
+    message after which the caller leaves the context, s, or None without such a limit. If no
+    message has arrived by then, the reason is printed before the context ends.
     """
     return explained(
         lambda: _none_yet(robot, key) if key else "",
@@ -232,9 +238,9 @@ def _ceased(robot: Client) -> str:
 
 
 def _of_link(where: Address) -> str:
-    """Return the fault of the TLS connection to `where`, such as an expired certificate.
+    """Return a text about the fault of the TLS connection, such as an expired certificate.
 
-    Returns "" if the connection has no fault, or does not use TLS.
+    Return "" if the connection to `where` has no such fault, or does not use TLS.
     """
     secured = where.tls and where.endpoint.startswith(TLS)
     return trouble(where.endpoint, where.tls) if secured else ""

@@ -93,7 +93,8 @@ def main(args: argparse.Namespace) -> int:
             unexplained = ""
         elif robot.where.tls and (why := robot.whoami().silence):
             print(f"acsard: {why}. Waiting.", file=sys.stderr)
-            unexplained = ""  # the reason for the silence has just been printed
+            # The reason for the silence has just been printed.
+            unexplained = ""
         with silence_explained(robot, unexplained, args.timeout) as heard:
             return _print(samples, short_form, quota, bool(many), args.timeout, heard)
 
@@ -104,13 +105,13 @@ class Quota:
     def __init__(self, most: int | None, robots: Collection[str]) -> None:
         """Allow `most` messages of each robot, or any number if `most` is None.
 
-        The limit is used up when each robot in `robots` has reached it. If `robots` is empty, only
-        the robots whose messages have been printed must reach it.
+        `robots` contains the ids of the robots that must reach this number before `used_up` is
+        true. If it is empty, these are the robots of which a message has been printed.
         """
         self._most, self._robots, self._counts = most, robots, dict[str, int]()
 
     def take(self, robot: str) -> bool:
-        """Return whether a message of this robot may be printed. If so, count the message."""
+        """Return whether one more message of this robot may be printed. If so, count it."""
         count = self._counts.get(robot, 0)
         if count == self._most:
             return False
@@ -134,16 +135,11 @@ def _print(
 ) -> int:
     """Print one line per message in `samples`, and return the exit code.
 
-    The exit code is 0 after Ctrl-C or when `quota` is used up. It is 1 when `samples` ends or when
-    no message was printed for `timeout` s.
+    The exit code is 0 after Ctrl-C, or when `quota` is used up. It is 1 if `samples` ends, or if no
+    message was printed for `timeout` s.
 
-    Args:
-        samples: the messages, as they arrive.
-        decoder: decodes a message for its short form; None to print JSON.
-        quota: limits the number of lines for each robot.
-        of_many: whether each line must name its robot.
-        timeout: longest time without a line, s, or None for no limit.
-        heard: function that is called for each message.
+    `decoder` decodes messages for the short form; None prints JSON. `of_many` says whether each
+    line must contain the id of its robot. `heard` is called for each message, printed or not.
     """
     printed_s = time.monotonic()
     try:
@@ -172,10 +168,10 @@ def _shortened(key: str) -> Decoder[Any]:
 
 
 def _shown(decoder: Decoder[Any] | None, encoding: str, payload: bytes, whose: str) -> str:
-    """Return a message as one line: the short form, or JSON.
+    """Return a message as one line of text, in the short form or as JSON.
 
-    The line is JSON if `decoder` is None or cannot decode the message. `whose` is the robot id that
-    the line must name, or "".
+    The line is in the short form if `decoder` can decode the message. It is JSON if `decoder` is
+    None or cannot decode it. `whose` is the robot id that the line must contain, or "".
     """
     if decoder is not None:
         try:
@@ -195,10 +191,11 @@ def _record(
     timeout: float | None,
     heard: Callable[[], None],
 ) -> int:
-    """Print the messages on `keys` as rows of one CSV log, and return the exit code.
+    """Print the messages on several keys as rows of one CSV log, and return the exit code.
 
-    The exit code is 0 after Ctrl-C or after `most` rows, and 1 if no message arrives for `timeout`
-    s. None means no limit. `heard` is called for each message.
+    The exit code is 0 after Ctrl-C or after `most` rows. It is 1 if no message arrives for
+    `timeout` s. For both limits, None means that there is no limit. `heard` is called for each
+    message.
     """
     queues = [(robot.subscribe(key), decoder(key)) for key in keys]
     print(HEADER, flush=True)
@@ -219,11 +216,13 @@ def _record(
 
 
 def _expected(robot: Client, ids: tuple[str, ...]) -> Collection[str]:
-    """Return `ids`. If they contain "*", return the ids of the robots that are present now.
+    """Return the ids of the robots from which messages are expected, and print which are present.
 
-    Also print which robots are present. Otherwise the operator could not distinguish a silent robot
-    from an absent robot.
+    The result is `ids`. If `ids` contains "*", the result is the ids of the robots that are present
+    now.
     """
+    # Without the printed text, the operator could not distinguish a silent robot from an absent
+    # robot.
     there: list[str] = []
     try:
         there = present(robot.session, ids, robot.where.endpoint)

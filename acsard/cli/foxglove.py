@@ -17,7 +17,7 @@ from acsard.host.errors import Exit, UsageError
 from acsard.host.extras import missing
 
 DEFAULT = "127.0.0.1:8765"
-"""The address that Foxglove and Lichtblick try by default."""
+"""Address and port to which Foxglove and Lichtblick connect by default."""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -58,7 +58,10 @@ def main(args: argparse.Namespace) -> int:
 
 
 def loopback(text: str) -> tuple[str, int]:
-    """Return host and port of a loopback address. Raises `UsageError` for any other address."""
+    """Return the host and the port in the text HOST:PORT. The host must be a loopback address.
+
+    Raises `UsageError` if it is not a loopback address, or if the text has another form.
+    """
     host, _, digits = text.rpartition(":")
     try:
         address = ipaddress.IPv4Address("127.0.0.1" if host == "localhost" else host)

@@ -16,11 +16,14 @@ from acsard.cli.common import count
 from acsard.cli.connection import add_bus, connected, require_followed, silence_explained
 
 SPAN_S = 10.0
-"""Time that each line covers, s."""
+"""Time before the present whose messages each line of output covers, s."""
 
 MAX_TIMES = 1_000_000
-"""Maximum number of arrival times in memory (32 MB). Python receives fewer messages in `SPAN_S`, so
-the limit counts only while the output is blocked."""
+"""Largest number of arrival times in memory (32 MB).
+
+Python receives fewer messages in `SPAN_S`. So the limit takes effect only while the output is
+blocked.
+"""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -58,11 +61,12 @@ def main(args: argparse.Namespace) -> int:
 
 
 def rate(times: list[float]) -> dict[str, float]:
-    """Return statistics of messages that arrived at `times`, s, in this order.
+    """Return the rate of messages, and statistics of the gaps from one message to the next.
 
-    The statistics are the number of messages, their rate in Hz, and the minimum, percentiles,
-    maximum and standard deviation of the gap from one message to the next, ms. With fewer than two
-    messages, the rate is 0 and the gaps are left out.
+    `times` are the arrival times in their order, s. The keys of the result are `count` (number of
+    messages), `hz` (rate, Hz), and `gap_min_ms`, `gap_p50_ms`, `gap_p99_ms`, `gap_max_ms` and
+    `gap_std_ms` (minimum, percentiles, maximum and standard deviation of the gaps, ms). With fewer
+    than two different times, `hz` is 0 and the gaps are left out.
     """
     if len(times) < 2 or times[-1] <= times[0]:
         return {"count": len(times), "hz": 0.0}

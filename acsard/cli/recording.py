@@ -61,7 +61,7 @@ from acsard.report.page import drawn
 from acsard.terminal.output import show, table
 
 MAX_NAMES = 10
-"""A search prints at most this many names of recordings. It also prints at most this many gaps."""
+"""Largest number of recordings, and of times without a recording, that a search prints."""
 
 SERVICE = Path("/var/lib/acsard/record")
 """The directory in which the systemd service stores its recordings."""
@@ -94,8 +94,10 @@ _MISNAMED = {
     ("html", ".mcap"): "let the name end in .html; `acsard recording export` writes MCAP",
     ("html", ".txt"): "let the name end in .html; `acsard recording show` prints text",
 }
-"""Maps a pair to the advice for the operator. The pair consists of the output format, and of the
-suffix in the file name that the operator typed, which does not fit this format."""
+"""Advice for an operator who typed a file name that does not fit the output format.
+
+The key is a pair: the output format, and the suffix of the typed file name.
+"""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -179,8 +181,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         _times(action, argparse.SUPPRESS, f"{EXAMPLES} (not with FILE `all`)")
     for action in (shown, replay, recover, exported, report):
         _directory(action, argparse.SUPPRESS)
-    # Not for `replay` and `export`: their own option --config names a configuration to try, not the
-    # one that names the directory of the recordings.
+    # `replay` and `export` do not get this option. Their own option --config names a configuration
+    # to try, and not the one that names the directory of the recordings.
     for action in (shown, recover, report):
         _own_config(action, argparse.SUPPRESS)
 
@@ -254,7 +256,7 @@ def main(args: argparse.Namespace) -> int:
             if begin_ns / NS_PER_S <= last and first <= end.last_ns / NS_PER_S:
                 rows.append(_row(path, end, note))
         except FileNotFoundError:
-            # The daemon has just renamed or removed the file.
+            # The daemon has renamed or removed the file after it was listed.
             continue
         except RecordingError as error:
             rows.append((path.name, "", "", "", printable(str(error))))
@@ -295,25 +297,27 @@ def main_show(args: argparse.Namespace) -> int:
 def _is_being_recorded(recording: Recording) -> bool:
     """Return whether a daemon is still writing to this recording.
 
-    Call this only after all steps of the recording have been read.
+    Call this only after all steps of the recording have been read, because its ending is not known
+    before.
     """
     if recording.ending != UNFINISHED:
         return False
-    with suppress(OSError):  # the daemon has just renamed or removed the file
+    # The daemon may have renamed or removed the file in the meantime.
+    with suppress(OSError):
         return is_being_recorded(recording.paths[-1], time.time())
     return False
 
 
 def _show(recording: Recording, part: Span, as_json: bool) -> bool:
-    """Print the events in the time span `part`, as JSON or as text.
+    """Print the events of a recording that happened in the time span `part`.
 
-    Return whether the recording has steps in this span.
+    Return whether the recording has steps in this span. `as_json` selects JSON instead of text.
     """
     story = TimelineWriter(_config_of(recording))
     found, over = False, False
     for step in steps(recording):
         if over:
-            # Read the remaining steps too, so that `recording.missing` counts every damaged place.
+            # Read the remaining steps too, so that `recording.missing` covers the whole recording.
             continue
         seconds = (step.inputs.now.mono_ns - recording.about.mono_ns) / NS_PER_S
         over = seconds > part.end
@@ -330,7 +334,7 @@ def _show(recording: Recording, part: Span, as_json: bool) -> bool:
 
 
 def _config_of(recording: Recording) -> Config | None:
-    """Return the recorded configuration, or None if this version cannot read it."""
+    """Return the recorded configuration, or None if this version of acsard cannot read it."""
     try:
         return config_of(recording)
     except RecordingError:
@@ -353,10 +357,10 @@ def _tell(one: TimelineEntry, as_json: bool) -> None:
 
 
 def main_replay(args: argparse.Namespace) -> int:
-    """Replay a recording and compare the result with the recorded one.
+    """Replay a recording, print the differences to the recorded results, and return the exit code.
 
-    Returns 1 if the results differ and --config was not given, 65 if a part was not compared, else
-    0.
+    The exit code is 0 if all results are equal. It is 1 if results differ, unless --config was
+    given. Otherwise it is 65 if a part was not compared.
     """
     _refuse_times(args, "replay")
     recording = _recording(args)
@@ -409,8 +413,8 @@ def main_export(args: argparse.Namespace) -> int:
     parts, code = _files_to_write(args), Exit.OK
     other = None if args.config is None else load(args.config)[1]
     for recording, part in parts:
-        # The default is the working directory, because the directory of the recordings belongs to
-        # the service.
+        # By default, write into the working directory, because the directory of the recordings may
+        # belong to the service.
         new = Path(args.new or recording.path.name.partition(".")[0] + SUFFIX[kind])
         with _written(new), _progress(recording) as tell:
             done = export(recording, new, kind, other, part, tell, args.force)
@@ -452,7 +456,10 @@ def _refuse_times(args: argparse.Namespace, subcommand: str) -> None:
 
 
 def _require_suffix(new: str | None, kind: Kind | Literal["html"]) -> None:
-    """Raise `UsageError` if the file to write, `new`, has the suffix of another format."""
+    """Raise `UsageError` if the typed file name `new` has a suffix that does not fit the format.
+
+    `kind` is the format of the output. `new` is None if the operator did not type a name.
+    """
     suffix = Path(new or "").suffix.lower()
     if mend := _MISNAMED.get((kind, suffix)):
         form = "a directory" if kind == "rosbag2" else f"{kind.upper()}, not {suffix}"
@@ -471,9 +478,9 @@ def _files_to_write(args: argparse.Namespace) -> list[tuple[Recording, Span]]:
 
 
 def _parts(args: argparse.Namespace) -> list[tuple[Recording, Span]]:
-    """Return the recordings that the arguments name, each with the span of time to read in it.
+    """Return the recordings that the arguments select, each with the span of time to read.
 
-    --from and --to limit this span.
+    The options --from and --to limit this span of time.
     """
     times = [when for when in (args.begin, args.end) if when is not None]
     by_clock = bool(times) and not any(isinstance(when, Offset) for when in times)
@@ -488,10 +495,10 @@ def _parts(args: argparse.Namespace) -> list[tuple[Recording, Span]]:
 
 
 def _range(args: argparse.Namespace) -> tuple[float, float]:
-    """Return a pair: the times of --from and --to, s since 1970.
+    """Return a pair: the time of --from and the time of --to, s since 1970.
 
-    The time of a missing option is minus or plus infinity. Raises `UsageError` for options that
-    count seconds from the beginning of a recording.
+    Without the option --from the first time is minus infinity, and without --to the second time is
+    plus infinity. Raises `UsageError` if an option counts seconds from the start of a recording.
     """
     if any(isinstance(when, Offset) for when in (args.begin, args.end)):
         raise UsageError(
@@ -506,9 +513,9 @@ def _range(args: argparse.Namespace) -> tuple[float, float]:
 
 
 def _search(args: argparse.Namespace) -> list[tuple[Recording, Span]]:
-    """Return the recordings with steps between --from and --to, each with the span of these steps.
+    """Return the recordings with steps between --from and --to, each with the span of time to read.
 
-    Also print the names of these recordings, and the times that no recording covers.
+    Also print the names of these recordings, and the times in which nothing was recorded.
     """
     first, last = _range(args)
     where, files = _files(args)
@@ -575,9 +582,9 @@ def _when(text: str) -> When:
 
 @contextmanager
 def _progress(recording: Recording) -> Iterator[Callable[[int], None]]:
-    """Show the progress of reading a recording, if standard error is a terminal.
+    """Show how far a recording has been read, if standard error is a terminal.
 
-    Yield a function that the caller calls to report progress. Its argument is the recorded
+    Yield a function that the caller must call to report the progress. Its argument is the recorded
     wall-clock time, ns, up to which the recording has been read.
     """
     if not sys.stderr.isatty():
@@ -607,10 +614,10 @@ def _written(new: Path) -> Iterator[None]:
 
 
 def _percent(recording: Recording) -> Callable[[int], None]:
-    """Return a function that prints the progress in percent on standard error.
+    """Return a function that prints the progress of reading a recording, in percent.
 
-    The page's server, which starts this program, reads the percentage there. The argument of the
-    returned function is the recorded wall-clock time, ns, up to which the recording has been read.
+    The numbers go to standard error, where the server of the web page reads them. The argument of
+    the function is the recorded wall-clock time, ns, up to which the recording has been read.
     """
     last, began = read_end(recording.path), recording.about.wall_ns / 1e9
     end = last.last_ns / 1e9 if last else recording.path.stat().st_mtime

@@ -1,4 +1,4 @@
-"""Turns messages into lines of JSON, and calls a service of several robots at the same time."""
+"""Formats messages as lines of JSON, and calls a service of several robots at the same time."""
 
 from __future__ import annotations
 
@@ -19,16 +19,21 @@ from acsard.host.errors import Exit
 
 
 def of_robot(whose: str, line: str) -> str:
-    """Return the JSON line `{"robot": whose, "message": line}`.
+    """Return a line of JSON that contains a message and the id of its robot.
 
-    `whose` is the id of a robot, and `line` is its message as JSON.
+    The line has the form `{"robot": "robot1", "message": ...}`. `whose` is the id, and `line` is
+    the message as JSON.
     """
     told = {"robot": whose, "message": msgspec.Raw(line.encode())}
     return formatting.json_line(msgspec.json.encode(told).decode())
 
 
 def json_line(encoding: str, payload: bytes) -> str:
-    """Return a message's payload as a line of JSON, or `{"undecodable": ...}` if decoding fails."""
+    """Return the payload of a message as a line of JSON.
+
+    `encoding` is the Zenoh encoding of the message. If the payload cannot be decoded, or if it is
+    CDR, return `{"undecodable": ...}` with the payload as text.
+    """
     try:
         form = detect(encoding, payload)
         if form == "cdr":
@@ -40,7 +45,7 @@ def json_line(encoding: str, payload: bytes) -> str:
 
 
 Replies = Mapping[str, ServiceReply | AcsardError]
-"""Maps the id of each robot to its reply, or to the error that says why the robot did not reply."""
+"""Maps the id of each robot to its reply, or to the error that explains why a reply is missing."""
 
 
 def of_each(
@@ -48,9 +53,13 @@ def of_each(
 ) -> dict[str, ServiceReply | AcsardError]:
     """Call a service of several robots at the same time, and return the replies by robot id.
 
-    `ids` names the robots; "*" in it means all robots that are present. `call` takes a client of
-    one robot, and calls the service of this robot. Raises `NoAnswerError` if "*" is given and no
-    robot is present.
+    If a robot does not reply, its entry is the error. Raises `NoAnswerError` if `ids` contains "*"
+    and no robot is present.
+
+    Args:
+        robot: a client that is connected to the bus of the robots.
+        ids: the ids of the robots. An id "*" stands for all robots that are present.
+        call: function that gets a client of one robot, and calls the service of this robot.
     """
     wanted = present(robot.session, ids, robot.where.endpoint) if ALL in ids else list(ids)
 
@@ -69,9 +78,15 @@ def print_each(
 ) -> int:
     """Print one line for the reply of each robot, and return the exit code.
 
-    The exit code is `UNREACHABLE` if any robot did not answer. Otherwise it is `FAILURE` if any
-    robot refused, else `OK`. `ids` are the ids that the operator named. `silence` is a template for
-    the line of a robot that did not answer; `{error}` in it is replaced by the reason.
+    The exit code is `OK` if all robots did as asked. It is `UNREACHABLE` if any robot did not
+    answer, and otherwise `FAILURE` if any robot refused.
+
+    Args:
+        replies: the replies by robot id.
+        robot: the client with which the robots were called.
+        ids: the ids that the operator typed. If they contain "*", the number of robots is printed.
+        silence: text for a robot that did not answer. `{error}` in it stands for the reason.
+        as_json: whether to print each reply as JSON instead of text.
     """
     for one, reply in replies.items():
         if isinstance(reply, AcsardError):

@@ -25,8 +25,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "file", type=Path, metavar="FILE", help="Zenoh's configuration file (JSON5)"
     )
-    # The subcommand starts itself as a child process with this option. The child is the router, and
-    # ends when its standard input is closed.
+    # The subcommand starts itself as a child process with this option. The child process is the
+    # router. It ends when its standard input is closed.
     parser.add_argument("--supervised", action="store_true", help=argparse.SUPPRESS)
 
 
@@ -43,9 +43,10 @@ def main(args: argparse.Namespace) -> int:
 
 
 async def _kept(file: str, log: Log) -> int:
-    """Keep a router process with the configuration `file` running, and return the exit code.
+    """Run a router process with Zenoh's configuration file `file`, and restart it when it ends.
 
-    Return when a signal arrives, or when the configuration or the certificates cannot be used.
+    Return 0 after a signal. If the router cannot use its configuration or its certificates, return
+    the exit code of the router process.
     """
     keeper = asyncio.ensure_future(keep_running(["router", file], log.event, ROUTER))
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
@@ -53,4 +54,5 @@ async def _kept(file: str, log: Log) -> int:
     try:
         return await keeper
     except asyncio.CancelledError:
-        return 0  # a signal ended this process; the router process has been released
+        # A signal must end this process. The router process has been released already.
+        return 0

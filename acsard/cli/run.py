@@ -72,9 +72,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def options(args: argparse.Namespace) -> dict[str, object]:
-    """Return a mapping from dotted configuration keys to the values of the options.
+    """Return the values of the options, by dotted configuration key such as "mcu.port".
 
-    The value of an option that was not given is None.
+    The value is None if the option was not typed.
     """
     return {
         "mcu.port": args.port,
@@ -94,8 +94,10 @@ def main(args: argparse.Namespace) -> int:
 
     def announce(device: str, trouble: str) -> None:
         simulated = config.mcu.simulated
-        if "INVOCATION_ID" not in os.environ:  # under systemd, the log line below says the same
-            # Do not use print: a full pipe that no program reads would block the control loop.
+        # Under systemd, the log line below contains the same information as the banner.
+        if "INVOCATION_ID" not in os.environ:
+            # Do not use print, because a full pipe that no program reads would block the control
+            # loop.
             told = banner(config, where, device, trouble, reach(args), served=served is not None)
             screen.write(told + "\n")
         log.info(
@@ -119,8 +121,9 @@ def main(args: argparse.Namespace) -> int:
     ]
     gateway += ["--namespace", config.ros.namespace]
     # The systemd watchdog ends a hanging daemon with SIGABRT. With this handler, the daemon then
-    # writes a traceback of the hang to standard error.
-    if sys.stderr is not None:  # it is None if standard error was closed before the start
+    # writes a traceback of the hang to standard error. `sys.stderr` is None if standard error was
+    # closed before the start.
+    if sys.stderr is not None:
         faulthandler.enable()
     try:
         asyncio.run(
@@ -140,11 +143,14 @@ def main(args: argparse.Namespace) -> int:
 
 
 def settings_file(where: str, config: Config, given: dict[str, object]) -> SettingsFile:
-    """Return the `SettingsFile` of the configuration file at `where`.
+    """Return the `SettingsFile` with which the daemon changes its own configuration file.
 
-    The result can parse the file as the daemon would after a restart. `config` is the present
-    configuration. `given` maps dotted keys to the values from the command line, which override the
-    file.
+    It parses the file as the daemon would after a restart.
+
+    Args:
+        where: the path of the configuration file, or another text if there is no file.
+        config: the present configuration.
+        given: maps dotted keys to values from the command line, which replace those of the file.
     """
     overrides = tables(given, by_environment())
     file = Path(where).absolute() if Path(where).is_file() else None
@@ -152,10 +158,10 @@ def settings_file(where: str, config: Config, given: dict[str, object]) -> Setti
 
 
 def page(config: Config, where: str) -> list[str] | None:
-    """Return the arguments with which to start `acsard web`, or None to serve no page.
+    """Return the arguments of `acsard` that serve the robot's web page, or None to serve no page.
 
-    The robot's page is served if `web.page` is set, standard output is a terminal, the daemon is
-    not a systemd service, and the page's libraries are installed. `where` is the path of the
+    The page is served if `web.page` is true, standard output is a terminal, the daemon is not a
+    systemd service, and the libraries of the page are installed. `where` is the path of the
     configuration file.
     """
     looked_at = sys.stdout is not None and sys.stdout.isatty() and "INVOCATION_ID" not in os.environ
@@ -181,7 +187,10 @@ def _bus(config: Config) -> str:
 
 
 def reach(args: argparse.Namespace) -> str:
-    """Return the options that another tool needs to reach this daemon, as text for the banner."""
+    """Return the options that another tool needs to connect to this daemon.
+
+    The result is text for a command line, such as " --id robot2", or "" if no option is needed.
+    """
     listens = args.listen and reachable(args.listen)
     given = (("--config", args.config), ("--connect", listens), ("--id", args.id))
     return "".join([f" {option} {shlex.quote(value)}" for option, value in given if value])
@@ -202,8 +211,8 @@ def banner(
         config: the daemon's configuration.
         where: the path of the configuration file.
         device: the path of the serial device.
-        trouble: why the serial device `device` cannot be opened yet, or "".
-        reach: the options that another tool needs to reach this daemon.
+        trouble: the reason why the serial device cannot be opened yet, or "" if it is open.
+        reach: the options that another tool needs to connect to this daemon.
         served: whether the robot's web page is served.
     """
     port = f"{device} at {config.mcu.baud_rate} baud"

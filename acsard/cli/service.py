@@ -74,7 +74,8 @@ def main_uninstall(args: argparse.Namespace) -> int:
         stateful=[unit for unit, (where, _) in service.STATES.items() if where.exists()],
     )
     _do(steps, args.dry_run)
-    if sys.prefix != sys.base_prefix:  # a venv: never advise to delete a Python of the system
+    # Give this advice only in a venv, because outside of it the directory is the system's Python.
+    if sys.prefix != sys.base_prefix:
         print(
             f"\nThe program itself is still in {sys.prefix}; to remove the program, delete that "
             "directory"
@@ -83,9 +84,9 @@ def main_uninstall(args: argparse.Namespace) -> int:
 
 
 def main_status(args: argparse.Namespace) -> int:
-    """Print the state of the service's files and units.
+    """Print the state of the service's files and units, and return the exit code.
 
-    Return 0 if the daemon's unit is active, else 1.
+    The exit code is 0 if the systemd unit of the daemon is active, else 1.
     """
     show(table((file.condition(), str(file.path)) for file in service.files()))
     state = service.state(service.UNIT)

@@ -39,7 +39,7 @@ from acsard.host.errors import Exit, MendableError, UsageError
 from acsard.host.extras import install
 
 _CHANGE = re.compile(r"([\w.-]+) = (.+?) \(was (.+?)\)(?:, |$)")
-"""Pattern of one change in the daemon's answer, such as "rates.state = 5 (was 10)"."""
+"""Pattern of one changed setting in the daemon's answer, such as "rates.state = 5 (was 10)"."""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -96,10 +96,10 @@ def main(args: argparse.Namespace) -> int:
 
 
 def pairs(words: Sequence[str]) -> dict[str, Plain]:
-    """Return the settings in the words KEY VALUE KEY VALUE ...
+    """Return the settings in the words that the operator typed: KEY VALUE KEY VALUE ...
 
-    A value is read as TOML; a bare word is a string. Raises `UsageError` if a value is missing, or
-    if it contains NaN or infinity.
+    A value is read as TOML. If it is not valid TOML, it is a string. Raises `UsageError` if the
+    last value is missing, or if a value contains NaN or infinity.
     """
     if len(words) % 2:
         raise UsageError("give pairs of KEY VALUE, for example acsard set limits.linear_speed 0.8")
@@ -132,7 +132,7 @@ def _require_for_many(args: argparse.Namespace, settings: dict[str, Plain]) -> N
 
 
 def _lasting(message: str) -> str:
-    """Return the daemon's answer, followed by how long the changed settings stay in force."""
+    """Return the daemon's answer, with an added text on how long the new settings stay in force."""
     until = _until(message)
     return f"{message}; {until}" if until else message
 
@@ -140,8 +140,8 @@ def _lasting(message: str) -> str:
 def _until(message: str) -> str:
     """Return a text that says how long the changed settings stay in force.
 
-    `message` is the daemon's answer: "KEY = NEW (was OLD), KEY = NEW (was OLD)". Returns "" if the
-    daemon has changed nothing.
+    `message` is the daemon's answer, such as "KEY = NEW (was OLD), KEY = NEW (was OLD)". Return ""
+    if the daemon has not changed a setting.
     """
     changes = {key: (new, old) for key, new, old in _CHANGE.findall(message)}
     if not changes:
@@ -162,10 +162,10 @@ def _until(message: str) -> str:
 
 
 def _limits(pairs: Mapping[str, Sequence[str]], at: int) -> LimitsConfig:
-    """Return the limits with the new or the old values of all changed keys.
+    """Return the limits with the new or the old values of the changed keys.
 
-    `pairs` maps each changed key to the pair (new value, old value). `at` is 0 for the new values
-    and 1 for the old values. Limits that were not changed have their defaults.
+    `pairs` maps each changed key to a pair: the new value and the old value. `at` is 0 to use the
+    new values, and 1 to use the old values. All other limits have their default values.
     """
     return LimitsConfig(**{key.removeprefix(TABLE): float(pair[at]) for key, pair in pairs.items()})
 
@@ -184,9 +184,10 @@ def _set_all(
 
 
 def _file(path: str | None, settings: dict[str, Plain]) -> Path:
-    """Return the file that --write changes; `path` is the value of --config, or None.
+    """Return the path of the configuration file that --write changes.
 
-    Raises `UsageError` if --write cannot write these `settings`.
+    `path` is the value of --config, or None. Raises `UsageError` if --write cannot write
+    `settings`.
     """
     if not settings:
         raise UsageError("--write needs a setting: acsard set limits.linear_speed 0.8 --write")

@@ -29,7 +29,7 @@ NUMBERS = {
     "bumper_pressed": "BUMPER:START:SECONDS",
     "battery": "PERCENT:MINUTES",
 }
-"""Maps each fault that takes numbers to the names of its arguments, for the help of `--fault`."""
+"""Maps each fault with numbers as arguments to the names of the arguments, for the help text."""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -61,7 +61,7 @@ def _with_names() -> list[str]:
 
 
 def fault(text: str) -> NamedFault:
-    """Parse a fault with its arguments, such as `bias=a:0.9`, as an argparse type."""
+    """Parse a fault with its arguments, such as `bias=a:0.9`. This function is an argparse type."""
     try:
         return named(text)
     except ValueError as error:
@@ -74,9 +74,10 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _make_link(link: Path, device: str) -> None:
-    """Make the symbolic link `link` to `device`. Replace an existing symbolic link.
+    """Make a symbolic link with the path `link` to the path `device`.
 
-    Raises `UsageError` if the link cannot be made, for example because `link` is another file.
+    Replace an existing symbolic link. Raises `UsageError` if the link cannot be made, for example
+    because there is another kind of file at this path.
     """
     try:
         if link.is_symlink():
@@ -91,10 +92,8 @@ def _make_link(link: Path, device: str) -> None:
 
 
 def _remove_link(link: Path, device: str) -> None:
-    """Remove the symbolic link if it still leads to `device`.
-
-    Another program may have replaced it in the meantime.
-    """
+    """Remove the symbolic link `link`, unless it no longer leads to `device`."""
+    # Another program may have replaced the link in the meantime.
     if link.is_symlink() and os.readlink(link) == device:
         link.unlink()
 

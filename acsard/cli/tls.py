@@ -146,8 +146,8 @@ def main_init(args: argparse.Namespace) -> int:
         require_tomlkit()
         require_changeable(args.write, keys, new=True)
     else:
-        # Set bus.tls in this call, because the file may already have https:// or tls/ addresses,
-        # which are not valid without certificates.
+        # Set bus.tls in this call, because the file may already contain https:// or tls/ addresses.
+        # Without bus.tls, such addresses are not valid.
         wanted: Mapping[str, object] = keys(load(None, {"bus.tls": str(directory)})[1])
     names = certificates.init(args.directory, args.address, args.days, force=args.force)
     if args.write:
@@ -227,7 +227,7 @@ def _certified(names: list[str]) -> str:
 def _admit_service(directory: Path) -> None:
     """Write a systemd drop-in that lets the TLS gateway use the certificates in `directory`.
 
-    Does nothing if the service is not installed or if this user is not root.
+    Do nothing if the service is not installed, or if the user of this program is not root.
     """
     step = service.admitting(directory)
     if step is None:
@@ -238,8 +238,8 @@ def _admit_service(directory: Path) -> None:
 
 
 def _name(text: str) -> str:
-    # The names in `[access]` follow the same rule, because the name becomes a part of keys on the
-    # bus. Here it also becomes the name of a directory.
+    # The names in the table [access] of acsard.toml follow the same rule, because a name becomes a
+    # part of keys on the bus. Here the name also becomes the name of a directory.
     if not NAME.fullmatch(text) or text in (".", ".."):
         raise argparse.ArgumentTypeError(
             f"{text!r} is not a name for a certificate: 1 to 64 letters, digits, spaces and "

@@ -34,7 +34,10 @@ def main(args: argparse.Namespace) -> int:
 
 
 def ros_table(config: Config) -> Topics:
-    """Return the ROS topics and services that the configuration enables, each with its bus key."""
+    """Return the ROS topics and services that the configuration enables, as a table.
+
+    The note of a topic names the Zenoh key that has the same messages.
+    """
     ros = config.ros
     known = source_keys(source.name for source in config.commands.sources)
     rows = []

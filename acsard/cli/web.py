@@ -148,7 +148,10 @@ def _listen(args: argparse.Namespace, config: Config) -> tuple[Listen, ...]:
 
 
 def _invite(args: argparse.Namespace, config: Config, where: str) -> int:
-    """Make a token, and print the link that contains it. `where` is the configuration's path."""
+    """Make a token, and print the link that contains the token, and its QR code.
+
+    `where` is the path of the configuration file, for an error text.
+    """
     import segno
 
     from acsard.web.listen import invitations, require_certificate
@@ -185,8 +188,8 @@ def _vault(args: argparse.Namespace, config: Config) -> Vault:
 
 
 def _list(vault: Vault) -> int:
-    # Import this here and not at the top: the page's server never prints a table, and would lose
-    # 5 MB of memory for months.
+    # Do not import this at the top. The server of the page never prints a table, and the import
+    # would use 5 MB of memory while the server runs.
     from acsard.terminal.output import show, table
 
     tokens, now_s = vault.all(), time.time()

@@ -29,7 +29,10 @@ async def connect_async(
     source: str = "app",
     tls: str | None = None,
 ) -> AsyncIterator[AsyncClient]:
-    """Connect to a daemon without blocking the event loop. The arguments are those of `connect`."""
+    """Connect to a daemon without blocking the event loop, and yield an `AsyncClient`.
+
+    The arguments are those of `connect`.
+    """
     where = await in_thread(lambda: address_by_environment(endpoint, robot_id, tls), 5.0)
     session = await in_thread(lambda: client_session(where.endpoint, where.tls), 10.0, late=close)
     robot = Client(session, where.robot_id, source, where.tls, where.endpoint)
@@ -40,7 +43,7 @@ async def connect_async(
 
 
 class AsyncClient:
-    """A client with methods like those of `Client`. Create it with `connect_async`."""
+    """A client for asyncio, with methods like those of `Client`. Create it with `connect_async`."""
 
     def __init__(self, client: Client) -> None:
         self._client = client
@@ -50,7 +53,7 @@ class AsyncClient:
         self._client.send(linear, angular)
 
     async def drive(self, linear: float, angular: float = 0.0, *, seconds: float) -> None:
-        """Drive as `Client.drive` does. If the task is cancelled, send zeros immediately."""
+        """Drive for `seconds`, as `Client.drive` does. If the task is cancelled, send zeros."""
         try:
             with closing(drive(self._client, linear, angular, seconds)) as steps:
                 for pause in steps:
@@ -64,17 +67,17 @@ class AsyncClient:
             raise
 
     async def call(self, service: str, **fields: float) -> schema.ServiceReply:
-        """Call a service, as `Client.call` does."""
+        """Call a service and return its reply, as `Client.call` does."""
         return await in_thread(lambda: self._client.call(service, **fields), 2 * REPLY_TIMEOUT_S)
 
     async def set(
         self, settings: Mapping[str, Plain], *, keep: bool = False
     ) -> schema.ServiceReply:
-        """Change settings, as `Client.set` does."""
+        """Change settings of the daemon and return the reply, as `Client.set` does."""
         return await in_thread(lambda: self._client.set(settings, keep=keep), 2 * REPLY_TIMEOUT_S)
 
     async def get(self, name: str) -> Any:
-        """Return the last message on a key, as `Client.get` does."""
+        """Return the last message on a key, decoded to its type, as `Client.get` does."""
         return await in_thread(lambda: self._client.get(name), 2 * REPLY_TIMEOUT_S)
 
     async def whoami(self) -> Identity:
@@ -86,7 +89,7 @@ class AsyncClient:
         return await in_thread(self._client.pose, 2 * REPLY_TIMEOUT_S)
 
     async def messages(self, name: str) -> AsyncIterator[Any]:
-        """Yield the typed messages of a published key as they arrive."""
+        """Yield the messages of a published key as they arrive, decoded to their types."""
         reader = decoder(name)
         async with aclosing(self._client.subscribe(name).arriving()) as samples:
             async for sample in samples:

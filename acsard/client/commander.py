@@ -1,10 +1,12 @@
 """The rules for a sender of commands: what it sends and when, and why a command has no effect.
 
-This module is pure. Every program that commands the robot uses its time limits. A program that
-forwards the commands of a person, for example from a panel in a browser, passes each command as a
-`Wish` to a `Commander`. A `Commander` never repeats a command, so the robot stops when the person,
-the panel or the network falls silent. A new command replaces a command that still waits to be sent.
-A zero is sent even if it is old. A drive ends with a zero.
+This module is pure: times and commands come in as arguments. Every program that commands the robot
+uses its time limits. A program that forwards the commands of a person, for example from a panel in
+a browser, passes each command as a `Wish` to a `Commander`.
+
+A `Commander` never repeats a command, so the robot stops when the person, the panel or the network
+falls silent. A new command replaces a command that still waits to be sent. A zero is sent even if
+it is old. A drive ends with a zero.
 """
 
 from __future__ import annotations
@@ -20,20 +22,20 @@ SEND_PERIOD_S = 0.05
 default timeout of 0.25 s."""
 
 SPACING_S = 0.003
-"""Shortest pause between two commands on one connection, s. The daemon drops commands that come
-faster than 1000 per second."""
+"""Shortest pause between two commands on one connection, s. The daemon drops commands at rates
+above 1000 per second."""
 
 AGAIN_S = 0.02
 """Pause before a zero is sent a second time, s. The first zero may be lost: a busy daemon may
 receive several commands in a burst, and drops some because they seem to come too fast."""
 
 OPENING_S, OPENING_PERIOD_S = 0.4, 0.01
-"""Duration and period of the zeros at the beginning of a drive, s. The daemon checks for 0.25 s
-whether the commands of a new sender are late. With many zeros in this time, the jitter of a busy
-machine does not prolong the check."""
+"""Duration and period of the zeros that a client sends at the beginning of a drive, s. The daemon
+checks for 0.25 s whether the commands of a new sender are late. With many zeros in this time, the
+jitter of a busy machine does not prolong the check."""
 
 OPENED_S = 4.0
-"""Time within which the daemon must accept the zeros at the beginning of a drive, s; otherwise the
+"""Time within which the daemon must accept the zeros at the beginning of a drive, s. Otherwise the
 drive fails. If the source has a long timeout, the daemon checks the delay of a new sender for up to
 2 s. In the rest of the time, another sender can finish its drive."""
 
@@ -43,37 +45,38 @@ ZEROS = 3
 GRACE_S = 0.5
 """Longest time for which commands may have no effect, s. After this time, the program informs the
 operator or ends the drive. A drive also ends if the program itself sends no command for longer than
-this. During the first 0.25 s, the commands of a new sender have no effect yet, so this time must be
+this. The commands of a new sender have no effect during the first 0.25 s, so this time must be
 longer. It must also be longer than a short delay of a known sender."""
 
 SILENCE_NS = 3 * NS_PER_S // 10
-"""Time without a command, ns, after which the robot is assumed to brake. It is a little longer than
+"""Time without a command after which the robot is assumed to brake, ns. It is a little longer than
 a source's default timeout of 0.25 s."""
 
 RELEASED_NS = 3 * NS_PER_S // 2
-"""Time without input, ns, after which a button or a key that was held counts as released. A shorter
+"""Time without input after which a button or a key that was held counts as released, ns. A shorter
 silence may be a pause of the network. A panel that publishes once a second, as a panel of Foxglove
 does by default, must not seem released between its messages. But the daemon forgets the zero of a
 new sender that is then silent for 2 s, so this time must be shorter."""
 
 GATHER_NS = NS_PER_S // 25
-"""Time for which the first command after a silence waits, ns, to see whether a burst follows. A
-panel that sends at 20 Hz sends at most one command in this time. After a burst of more than `CROWD`
-commands, the next command waits too."""
+"""Time for which the first command after a silence waits to be sent, ns. The wait shows whether a
+burst follows: a panel that sends at 20 Hz sends at most one command in this time. After a burst of
+more than `CROWD` commands, the next command waits too."""
 
 CROWD = 5
 """Largest number of commands that a panel is assumed to send within `GATHER_NS` (125 Hz). If more
-commands arrive, they have waited in a queue, which may contain further commands."""
+commands arrive, these commands have waited in a queue, which may contain further commands."""
 
 STALE_NS = NS_PER_S // 10
-"""Age of a nonzero command, ns, above which it is dropped, because the operator may no longer want
-it."""
+"""Largest age of a nonzero command that is still sent, ns. An older one is dropped, because the
+operator may no longer want it."""
 
 DRIVES_NS = NS_PER_S // 2
-"""Time for which a sender counts as driving after its last nonzero command, ns."""
+"""Time for which a sender still counts as driving after its last nonzero command, ns."""
 
 LONGEST_S = 10.0
-"""Longest timeout that a source may have, s. The robot follows no command older than this."""
+"""Longest timeout that a command source may have, s. The robot follows no command older than
+this."""
 
 NEVER = ("inactive", "stopped", "fault", "shutdown")
 """Modes in which no command moves the robot, and which do not end by themselves."""
@@ -82,36 +85,37 @@ NEVER = ("inactive", "stopped", "fault", "shutdown")
 class Wish(Struct, frozen=True):
     """A command to forward: the twist that a person requests.
 
-    `stamp_ns` is the time of the command on the sender's clock, ns, or None for a sender without a
+    `stamp_ns` is the time of the command on the sender's clock, ns; None if the sender has no
     clock.
     """
 
     twist: Twist
     stamp_ns: int | None = None
     steady: bool = False
-    """Whether `stamp_ns` is from a steady clock, which nothing adjusts."""
+    """Whether the clock of `stamp_ns` is steady, which means that nothing adjusts it."""
 
 
 class Commander:
-    """Decides when to send the commands of one sender, and which of them to drop.
+    """Decides when to send the commands of one sender, and which commands to drop.
 
     At most one command waits to be sent. A newer command replaces the waiting command.
 
     Args:
         leads: whether to send a zero before the first command, and before the first command after
             each silence longer than `RELEASED_NS`. Set this for a sender that sends no zeros of its
-            own. After a shorter silence a zero could let the robot drive by a button that was held
-            through a stop and a `clear`.
+            own. There is no zero after a shorter silence: with such a zero, a button that was held
+            through a stop and a `clear` could drive the robot.
         gathers: whether the first command after a silence waits for `GATHER_NS`. If several
-            commands arrive in this time, a congested link or a stalled process has delayed them. In
-            this case, none of them is sent, except the last one if it is a zero. Set this for a
-            sender without stamps, because the daemon cannot measure the delay of its commands.
+            commands arrive in this time, a congested link or a stalled process has delayed these
+            commands. In this case they are dropped, except the last one if it is a zero. Set this
+            for a sender without stamps, because the daemon cannot measure the delay of its
+            commands.
     """
 
     def __init__(self, *, leads: bool = False, gathers: bool = False) -> None:
         self.replaced = self.stale = 0
-        """Two counters of commands that were not sent. `replaced` counts those that a newer command
-        replaced, and `stale` counts those that were too old or came in a burst."""
+        """Two counters of commands that were not sent. `replaced` counts the commands that a newer
+        command replaced, and `stale` counts the commands that were too old or came in a burst."""
         self._leads, self._gather_ns = leads, GATHER_NS if gathers else 0
         self._wish: Wish | None = None
         self._last = Wish(REST)
@@ -121,8 +125,8 @@ class Commander:
         self._lead = False
         self._hold_until_ns = 0
         self._burst = 0
-        """Number of commands that have arrived while the first of them waits (see `GATHER_NS`).
-        `send()` resets it."""
+        """Number of commands that have arrived while the first of these commands waits (see
+        `GATHER_NS`). The method `send()` resets this number."""
         self._crowded = False
         """Whether the last burst had more than `CROWD` commands."""
         self._moved_ns: int | None = None
@@ -133,8 +137,9 @@ class Commander:
     def take(self, wish: Wish, now_ns: int) -> int | None:
         """Store a command that has arrived. It replaces a command that still waits to be sent.
 
-        `now_ns` is the monotonic time, ns. Returns the time since the previous command arrived, ns,
-        if this time is longer than `SILENCE_NS`. Returns None otherwise, and for the first command.
+        Returns the time since the previous command arrived, ns, if this time is longer than
+        `SILENCE_NS`. Returns None after a shorter time, and for the first command. `now_ns` is the
+        monotonic time, ns.
         """
         silence = None if self._heard_ns is None else now_ns - self._heard_ns
         begins = silence is None or silence > SILENCE_NS
@@ -155,14 +160,14 @@ class Commander:
     def due_ns(self) -> int | None:
         """Return the monotonic time at which the caller must call `send`, ns.
 
-        Returns None if no command waits to be sent.
+        Returns None if nothing waits to be sent.
         """
         if self._lead:
             return self._came_ns
         return None if self._wish is None else self._hold_until_ns
 
     def send(self, now_ns: int) -> Wish | None:
-        """Return the command that the caller must send at `now_ns`, or None.
+        """Return the command that the caller must send at the monotonic time `now_ns`, or None.
 
         A nonzero command that is too old, or that came in a burst, is dropped.
         """
@@ -185,11 +190,12 @@ class Commander:
         return wish
 
     def end(self, now_ns: int, timeout_s: float = LONGEST_S) -> Wish | None:
-        """Discard the command that waits to be sent, and end the drive of this sender.
+        """End the drive of this sender, and return a zero to send, or None.
 
-        Returns a zero to send if the robot may still follow a nonzero command of this sender, else
-        None. `timeout_s` is the timeout of this sender's source, s. When this time has passed since
-        the last nonzero command, a zero would only stop the next sender.
+        The command that waits to be sent is discarded. The result is a zero if the robot may still
+        follow a nonzero command of this sender. It is None if the timeout has passed since the last
+        nonzero command, because a zero would then only stop the next sender. `timeout_s` is the
+        timeout of this sender's source, s, and `now_ns` is the monotonic time, ns.
         """
         moved_ns, self._moved_ns = self._moved_ns, None
         self._wish = self._asked_ns = None
@@ -202,9 +208,10 @@ class Commander:
     def _zero(self, at_ns: int) -> Wish:
         """Return a zero whose stamp is the monotonic time `at_ns`, converted to the sender's clock.
 
-        With a stamp from another clock, the daemon would assume that the sender's clock has jumped.
-        If the sender sends no stamps, the zero does not get a stamp either.
+        The zero has no stamp if the sender sends no stamps.
         """
+        # With a stamp from another clock, the daemon would assume that the sender's clock has
+        # jumped.
         stamp_ns = self._last.stamp_ns
         if stamp_ns is not None:
             stamp_ns += at_ns - self._came_ns
@@ -224,24 +231,26 @@ class Commander:
 
 
 class Sender:
-    """Signs the commands of one sender with its id, and numbers them."""
+    """Signs and numbers the commands of one sender."""
 
     def __init__(self, sender_id: str) -> None:
         self._id, self._sequence, self._newest_ns = sender_id, 0, 0
 
     def sign(self, stamp_ns: int | None, *, steady: bool, zero: bool = False) -> Signature:
-        """Return the signature of the next command.
+        """Return the signature of the next command, with its sequence number.
 
-        The daemon refuses a command whose stamp is older than that of an earlier command. If a
-        sender uses two sources, its commands may be signed in another order than their stamps. A
-        zero must never be refused, so its stamp is at least the newest stamp of this sender.
+        The stamp of a zero is raised to the newest stamp of this sender, if that is later. So the
+        daemon never refuses the zero because of an older stamp.
 
         Args:
-            stamp_ns: the time of the command on the sender's clock, ns, or None without a clock.
-            steady: whether this is a steady clock, which nothing adjusts.
+            stamp_ns: the time of the command on the sender's clock, ns; None if the sender has no
+                clock.
+            steady: whether this clock is steady, which means that nothing adjusts it.
             zero: whether the command is a zero.
         """
         self._sequence += 1
+        # The daemon refuses a command whose stamp is older than that of an earlier command. If a
+        # sender uses two sources, its commands may be signed in another order than their stamps.
         if stamp_ns is not None:
             newest_ns = max(stamp_ns, self._newest_ns)
             self._newest_ns, stamp_ns = newest_ns, newest_ns if zero else stamp_ns
@@ -249,10 +258,12 @@ class Sender:
 
 
 def objection(state: RobotState, source: str, sender: str) -> str:
-    """Return why the robot does not follow the commands of a sender, or "" if it follows.
+    """Return why the robot does not follow the commands of a sender; "" if it follows them.
 
-    `state` is the newest state of the robot. `sender` is the public name of the sender, and
-    `source` is the command source of its commands.
+    Args:
+        state: the newest state of the robot.
+        source: the command source of the sender's commands.
+        sender: the public name of the sender.
     """
     if state.mode in NEVER:
         return state.reason
@@ -281,7 +292,7 @@ def objection(state: RobotState, source: str, sender: str) -> str:
 
 
 def no_command(source: str) -> str:
-    """Return the text that tells the operator that the daemon receives no command of `source`."""
+    """Return the text which says that the daemon receives no command of `source`."""
     return (
         f"the daemon receives no command of source {source}; `acsard top` shows whether the daemon "
         "refuses commands"
@@ -289,10 +300,11 @@ def no_command(source: str) -> str:
 
 
 def ends_hold(state: RobotState, source: str) -> bool:
-    """Return whether a key that was pressed before `state` must not drive the robot any more.
+    """Return whether the operator must release a held key and press it again to drive.
 
-    The robot does not follow the commands of `source`, and an operator may not expect it to drive
-    when it can follow them again. The operator must press the key again.
+    This is so if the robot cannot drive in its present mode (a mode in `NEVER`, or "waiting"), or
+    if `source` must first send a zero. When the robot can drive again, an operator who still holds
+    the key may not expect it to move.
     """
     ours = next((one for one in state.sources if one.name == source), None)
     zero_first = ours is not None and "must send a zero" in ours.waits_for
@@ -300,7 +312,7 @@ def ends_hold(state: RobotState, source: str) -> bool:
 
 
 def heard(state: RobotState, source: str) -> bool:
-    """Return whether `state` shows that commands of this source arrive at the daemon.
+    """Return whether `state` shows that the daemon receives commands of this source.
 
     Late commands count too.
     """
@@ -308,5 +320,9 @@ def heard(state: RobotState, source: str) -> bool:
 
 
 def hopeless(state: RobotState, source: str) -> bool:
-    """Return whether the daemon will keep refusing this source, so that waiting cannot help."""
+    """Return whether the daemon will keep refusing the commands of this source.
+
+    If so, waiting cannot help: no command moves the robot in its present mode, or the source is not
+    configured.
+    """
     return state.mode in NEVER or all(one.name != source for one in state.sources)

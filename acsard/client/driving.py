@@ -1,9 +1,9 @@
 """Sends the commands of one drive of `acsard.client`, and checks that the robot follows them.
 
-The daemon does not answer commands. It reports in `state` why the robot does not follow a command.
-A drive therefore subscribes to `state`. If the robot does not follow, the drive ends with an error
-that gives the daemon's reason. A drive also ends with an error if this program sent no command for
-some time, because the operator may no longer want the drive.
+The daemon does not answer commands. It reports in `state` why the robot does not follow a command,
+so a drive subscribes to `state`. If the robot does not follow, the drive ends with an error that
+gives the daemon's reason. A drive also ends with an error if this program sent no command for some
+time, because the operator may no longer want the drive.
 """
 
 from __future__ import annotations
@@ -31,31 +31,31 @@ from acsard.host import clock
 from acsard.host.errors import NoAnswerError, NotDrivenError, UsageError
 
 SETTLED_S = 0.2
-"""Longest time that a message on `state` takes to arrive, s. If a state arrives more than this time
+"""Longest time that a message on `state` takes to arrive, s. If a state arrives later than this
 after an action, the daemon sent it after the action."""
 
 STANDS = 0.01, 0.02
-"""Linear speed, m/s, and turn rate, rad/s. The robot counts as standing still if it moves more
-slowly than the first and turns more slowly than the second."""
+"""Linear speed, m/s, and turn rate, rad/s. The robot counts as standing still if both of its speeds
+are below these values."""
 
 SLOWER, SLOWS_S = 0.97, 1.0
-"""The robot counts as slowing down if, within `SLOWS_S` s, its speed falls below `SLOWER` times the
-lowest speed that it had since the drive ended."""
+"""The robot counts as slowing down if its speed falls enough within `SLOWS_S` s: below `SLOWER`
+times the lowest speed since the end of the drive."""
 
 
 CLOSED = "the connection to the daemon was closed while the robot was driving"
 
 
 class UnheardError(NotDrivenError):
-    """The daemon receives no commands from the source of this client, so a drive has failed."""
+    """Error of a drive because the daemon receives no commands from the source of this client."""
 
 
 class Driven(Followed, Protocol):
-    """The methods and attributes of a client that `drive` uses."""
+    """The part of a client that `drive` uses."""
 
     source: str
     sender: str
-    """Public name by which the daemon identifies the commands of this client."""
+    """Public name by which the daemon identifies the sender of this client's commands."""
 
     def send(self, linear: float, angular: float = 0.0) -> None:
         """Send one command: `linear` m/s, `angular` rad/s (left is +)."""
@@ -66,8 +66,8 @@ def drive(
 ) -> Generator[float, None, None]:
     """Drive for `seconds`, then send zeros until the robot stands still.
 
-    Before the drive, the generator sends zeros until the daemon accepts the commands. It yields the
-    time, s, for which the caller must wait before it resumes the generator.
+    This is a generator. It yields the time, s, for which the caller must wait before it resumes the
+    generator. Before the drive, it sends zeros until the daemon accepts the commands.
 
     Args:
         robot: the client that sends the commands.
@@ -132,9 +132,9 @@ def _opening(checks: _Drive) -> Iterator[float]:
 def _stopping(checks: _Drive) -> Iterator[float]:
     """Send zero commands until the robot stands still.
 
-    After each command, the generator yields the time, s, for which the caller must wait before it
-    resumes the generator. The generator also ends if the robot has not become slower for `SLOWS_S`
-    s. Then something else moves the robot, or the board sends no feedback.
+    This is a generator. After each command, it yields the time, s, for which the caller must wait
+    before it resumes the generator. The generator also ends if the robot has not become slower for
+    `SLOWS_S` s. Then something else moves the robot, or the board sends no feedback.
 
     Raises `NotDrivenError` if the daemon will keep refusing the commands, and `NoAnswerError` if
     the daemon is silent.
@@ -169,12 +169,12 @@ class _Drive:
         # Read the clock again here, because the subscription above may take long.
         self._fine = self._stepped = clock.steady_s()
         self.objection: str | None = None
-        """Why the robot does not follow the commands; "" if it follows, None before the first
-        state."""
+        """Reason why the robot does not follow the commands; "" if it follows them, None before the
+        first state."""
 
     @property
     def hopeless(self) -> bool:
-        """Whether the daemon will keep refusing the commands, so that waiting cannot help."""
+        """Whether the daemon will keep refusing the commands. Waiting cannot help then."""
         state = self.watch.state
         return state is not None and hopeless(state, self._robot.source)
 
@@ -186,12 +186,10 @@ class _Drive:
             raise NoAnswerError(CLOSED) from None
 
     def require_no_pause(self) -> None:
-        """Raise `NotDrivenError` if the previous call was more than `GRACE_S` s ago.
-
-        The process may have been stopped, its computer may have been suspended, or the bus may not
-        have accepted the command. The received states cannot reveal such a pause, because old
-        states that waited in the queue seem to arrive now.
-        """
+        """Raise `NotDrivenError` if the previous call was more than `GRACE_S` s ago."""
+        # The process may have been stopped, its computer may have been suspended, or the bus may
+        # not have accepted the command. The received states cannot reveal such a pause, because old
+        # states that waited in the queue seem to arrive now.
         now = clock.steady_s()
         paused, self._stepped = now - self._stepped, now
         if paused > GRACE_S:
@@ -202,7 +200,10 @@ class _Drive:
             )
 
     def look(self) -> None:
-        """Process the received states. Raises `NoAnswerError` if the daemon counts as silent."""
+        """Process the states that have arrived, and update `objection`.
+
+        Raises `NoAnswerError` if the daemon counts as silent, or if the connection was closed.
+        """
         now, watch = clock.steady_s(), self.watch
         try:
             news = watch.look(now)
@@ -223,10 +224,11 @@ class _Drive:
             )
 
     def require(self, grace: float) -> None:
-        """Process the received states, and raise `NotDrivenError` if the robot does not follow.
+        """Raise `NotDrivenError` if the robot does not follow, after processing the new states.
 
-        The method raises this error if the robot has not followed the commands for `grace` s, or if
-        the state shows that the daemon will keep refusing the commands.
+        The error is raised if the robot has not followed the commands for `grace` s, or if the
+        state shows that the daemon will keep refusing the commands. If the daemon receives no
+        commands, the error is the subclass `UnheardError`.
         """
         self.look()
         if not self.objection:

@@ -1,8 +1,8 @@
 """Follows many robots: whether each daemon is present, its newest state and its version.
 
 A daemon is present while Zenoh shows its liveliness token. Zenoh's threads store the newest states
-undecoded, and the thread that calls `Fleet.rows()` decodes them. Of the methods that this thread
-calls repeatedly, only `Fleet.ask()` may wait for the bus.
+undecoded, and the thread that calls `Fleet.rows()` decodes them. This thread also calls
+`Fleet.due()` and `Fleet.ask()`. Of these three methods, only `Fleet.ask()` may wait for the bus.
 """
 
 from __future__ import annotations
@@ -26,19 +26,20 @@ from acsard.host import clock
 from acsard.host.mailbox import Mailbox
 
 MOST = 1000
-"""Maximum number of robots. It is limited because any client of the bus can invent robot ids."""
+"""Default of the maximum number of robots. It is limited because any client of the bus can invent
+robot ids."""
 
 
 class Row(Struct, frozen=True):
-    """A robot on the bus: its id, its newest state and its version."""
+    """A robot on the bus, with its id, its newest state and its version."""
 
     robot_id: str
     here: bool | None
-    """Whether the liveliness token of the robot's daemon is present; None if no token was ever
+    """Whether the liveliness token of the robot's daemon is present; None before any token was
     seen."""
     state: RobotState | None
     age: float
-    """Age of `state`, s; infinite as long as no state has proved that the daemon runs."""
+    """Age of `state`, s; infinite until a state has proved that the daemon runs."""
     version: str
     silent: bool = False
     """Whether the robot counts as silent, because no state has arrived for too long a time."""
@@ -49,13 +50,13 @@ class _Known:
         self.here: bool | None = None
         self.version = ""
         self.newest = Mailbox[tuple[zenoh.Sample, float]](1)
-        """The newest published state, undecoded, and its arrival time, s."""
+        """The newest published state, undecoded, with its time of arrival, s."""
         self.begin()
 
     def begin(self) -> None:
         """Start to follow the robot, or start again when it reappears.
 
-        After this call, the queries of its keys `state` and `info` are due immediately.
+        The queries of its keys `state` and `info` are then due immediately.
         """
         self.since = self.info_due = clock.steady_s()
         self.follower = Follower(self.since, FLEET_ASK_S)
@@ -63,7 +64,7 @@ class _Known:
 
 
 class Fleet:
-    """Follows many robots, or all robots on the bus, and returns a row for each."""
+    """Follows several robots, or all robots on the bus, and returns a row for each."""
 
     def __init__(
         self, robot: Client, ids: Sequence[str], most: int = MOST, forget_s: float = math.inf
@@ -74,15 +75,16 @@ class Fleet:
 
         Args:
             robot: A client of any robot on the same bus.
-            ids: The ids of the robots, or "*" for all. A robot that is named here is never dropped.
+            ids: The ids of the robots, or "*" for all robots. A robot that is named here is never
+                dropped.
             most: Maximum number of robots.
-            forget_s: Time without a state, s, after which a robot that `ids` does not name is
-                dropped, unless its liveliness token is present.
+            forget_s: Time without a state, s, after which a robot is dropped. A robot that `ids`
+                names, or whose liveliness token is present, is never dropped.
         """
         self._robot, self._ids, self._most, self._forget_s = robot, ids, most, forget_s
         self._lock = Lock()
         self.left_out = False
-        """Whether a robot was left out because there were more than `most`."""
+        """Whether a robot was left out because there were already `most` robots."""
         self._known = {one: _Known() for one in ids if one != ALL}
         self._states, self._infos = Decoder(RobotState), Decoder(Info)
         self._declared: list[Any] = []
@@ -99,7 +101,7 @@ class Fleet:
             raise
 
     def rows(self) -> list[Row]:
-        """Return one row per robot. First drop the robots that have been silent for `forget_s` s.
+        """Return one row for each robot. First drop robots that have been silent for `forget_s` s.
 
         A robot that `ids` names, or whose liveliness token is present, is never dropped.
         """
@@ -113,9 +115,9 @@ class Fleet:
             return [self._row(name, one, now) for name, one in self._known.items()]
 
     def due(self) -> list[tuple[str, str]]:
-        """Return the queries that are due, as pairs of robot id and key, for the method `ask()`.
+        """Return the queries that are due now, as pairs of robot id and key. Pass them to `ask()`.
 
-        Also set the times of the next queries.
+        The method also sets the times of the next queries, so a query is returned only once.
         """
         now, due = clock.steady_s(), []
         with self._lock:
@@ -129,7 +131,7 @@ class Fleet:
         return due
 
     def ask(self, due: Sequence[tuple[str, str]]) -> None:
-        """Send the queries that `due()` returned; this may wait for the bus. Raises `ZError`."""
+        """Send the queries that `due()` returned. This may wait for the bus. Raises `ZError`."""
         for name, key in due:
             self._robot.like(name).ask(key, self._answer if key == "state" else self._info)
 
@@ -139,7 +141,7 @@ class Fleet:
         return one is not None and bool(one.here)
 
     def end(self) -> None:
-        """Unsubscribe; this may wait for the bus. Raises `ZError`."""
+        """Unsubscribe from all robots. This may wait for the bus. Raises `ZError`."""
         for one in self._declared:
             one.undeclare()
 

@@ -1,11 +1,11 @@
 """Follows the `state` of one robot: its newest value, its age, and whether the daemon is silent.
 
 `Follower` is pure, and `Watch` connects it to the bus. All programs use the time limits of this
-module, so all of them report a silent robot after the same time.
+module, so all programs report a silent robot after the same time.
 
-A storage on a router answers queries too. For a robot that is off, it sends the last state of that
-robot. A published state never comes from a storage, so it always proves that the daemon runs. An
-answer to a query proves this only if it is newer than an earlier state.
+A storage on a router answers queries too. If the robot is off, the storage sends the last state of
+this robot. A published state never comes from a storage, so it always proves that the daemon runs.
+An answer to a query proves this only if it is newer than an earlier state.
 """
 
 from __future__ import annotations
@@ -22,65 +22,68 @@ from acsard.daemon.bus.subscription import QUEUED, Subscription, encoded
 from acsard.host.mailbox import Mailbox
 
 ASK_S = 0.3
-"""Time without a new state, s, after which the client queries `state`. The query is for a robot
-that is configured to publish its state seldom."""
+"""Time without a new state after which the client queries `state`, s. Such queries are necessary if
+the robot is configured to publish its state seldom."""
 
 QUIET_S = 0.5
-"""Age of a state, s, above which a program must not base an action on the state."""
+"""Age of a state above which a program must not base an action on it, s."""
 
 SILENT_S = 1.0
-"""Age of the last state, s, above which the robot counts as silent, and a drive ends."""
+"""Age of the last state above which the robot counts as silent and a drive ends, s."""
 
 FIRST_S = 2.0
-"""Time, s, within which the first message on a key arrives if the robot works normally."""
+"""Time within which the first message on a key arrives if the robot works normally, s."""
 
 FLEET_ASK_S = 2.0
-"""Time without a new state of a robot, s, after which a program that follows many robots queries
-the robot's `state`. It is longer than `ASK_S`, because such a program sends many queries."""
+"""Time without a new state of a robot after which a program that follows many robots queries the
+robot's `state`, s. It is longer than `ASK_S`, because such a program sends many queries."""
 
 STATE = "state"
 
 ANSWERS = 16
-"""Maximum number of waiting replies. The daemon and each storage send one reply to a query."""
+"""Maximum number of replies that wait to be processed. The daemon and each storage send one reply
+to a query."""
 
 STEADY = ("lines", "lines_sent", "commands")
 """Names of counters in `state` that decrease only when the daemon restarts."""
 
 
 class Follower:
-    """The newest state of one robot. All times are in s on the same monotonic clock.
+    """The newest state of one robot, with its age. All times are in s on the same monotonic clock.
 
     This clock must also advance while the computer is suspended, as `clock.steady_s` does.
     """
 
     def __init__(self, now: float, ask_s: float = ASK_S) -> None:
         self.state: RobotState | None = None
-        """The newest state, or None before the first one. Until `heard` is true, it may be an old
-        one from the storage of a router."""
+        """The newest state; None before the first state. Until `heard` is true, it may be an old
+        state from the storage of a router."""
         self.heard = False
-        """Whether any state has proved that the daemon runs (see `answered()`)."""
+        """Whether a state has proved that the daemon runs (see `answered()`)."""
         self.last_seen = now
-        """Time of the last state that proved that the daemon runs. Before the first such state, it
-        is the time at which this object was created."""
+        """Time at which the last state arrived that proved that the daemon runs. Before the first
+        such state, it is the time at which this object was created."""
         self.due = now + ask_s
         """Time of the next query, unless a state arrives before this time."""
         self.unreadable = 0
-        """Number of consecutive messages that could not be decoded."""
+        """Number of consecutive messages on `state` that could not be decoded."""
         self._ask_s = ask_s
         self._answer: RobotState | None = None
 
     def published(self, state: RobotState, now: float) -> None:
-        """Store a state that the daemon published and that arrived at the time `now`."""
+        """Store a state that the daemon published. It arrived at the time `now`, s."""
         self.state, self.last_seen, self.heard = state, now, True
         self.due, self.unreadable = now + self._ask_s, 0
 
     def answered(self, state: RobotState, now: float) -> bool:
-        """Process an answer to a query of `state`; return whether it proves that the daemon runs.
+        """Process an answer to a query of `state`. Return whether it proves that the daemon runs.
 
-        A storage may have sent an old answer. So an answer is a proof only if its stamp is newer
-        than that of `self.state` or of the previous answer. The previous answer is compared too,
-        because the robot's clock may have been set back since `self.state`.
+        `state` is the answer, which arrived at the time `now`, s. It may be an old state from a
+        storage. Therefore it is a proof only if its stamp is newer than that of `self.state` or of
+        the previous answer.
         """
+        # The previous answer is compared too, because the robot's clock may have been set back
+        # since `self.state`.
         held, before, self._answer = self.state, self._answer, state
         known = [one for one in (held, before) if one is not None]
         repeated = held is not None and held.stamp == state.stamp
@@ -93,7 +96,10 @@ class Follower:
         return False
 
     def asks(self, now: float) -> bool:
-        """Return whether the caller must query `state` now. If so, set the next query's time."""
+        """Return whether the caller must query `state` now. If so, set the time of the next query.
+
+        `now` is the present time, s.
+        """
         if now < self.due:
             return False
         self.due = now + self._ask_s
@@ -102,13 +108,14 @@ class Follower:
     def age(self, now: float) -> float:
         """Return the time since the last state that proved that the daemon runs, s.
 
-        Before the first such state, return the time since this object was created.
+        Before the first such state, return the time since this object was created. `now` is the
+        present time, s.
         """
         return max(0.0, now - self.last_seen)
 
     @property
     def patience_s(self) -> float:
-        """Age of the newest state, s, above which the robot counts as silent."""
+        """Age of the last state above which the robot counts as silent, s."""
         # If a robot publishes seldom, only answers arrive, at intervals of `ask_s`.
         return (SILENT_S if self.heard else FIRST_S) + self._ask_s - ASK_S
 
@@ -118,7 +125,7 @@ class Follower:
 
 
 def restarted(before: RobotState | None, state: RobotState) -> bool:
-    """Return whether the daemon restarted between the two states `before` and `state`.
+    """Return whether the daemon restarted between the states `before` and `state`.
 
     The sign of a restart is that a counter in `STEADY` is lower in `state` than in `before`.
     Returns False if `before` is None.
@@ -129,13 +136,13 @@ def restarted(before: RobotState | None, state: RobotState) -> bool:
 
 
 class Followed(Protocol):
-    """The methods of a client that a `Watch` uses."""
+    """The part of a client that a `Watch` uses."""
 
     def subscribe(self, name: str) -> Subscription:
         """Subscribe to a key."""
 
     def ask(self, name: str, take: Callable[[zenoh.Sample], object]) -> None:
-        """Query a key, and call `take` with the reply if one arrives."""
+        """Query a key. Call `take` with each reply that arrives."""
 
 
 class Watch(Follower):
@@ -144,9 +151,9 @@ class Watch(Follower):
     def __init__(
         self, robot: Followed, now: float, wake: Callable[[], object] | None = None
     ) -> None:
-        """Subscribe to `state`; `robot` is a client that is connected to the robot.
+        """Subscribe to the state of the robot to which the client `robot` is connected.
 
-        `now` is the present time, s. `wake` is called on a thread of Zenoh when a state arrives.
+        `now` is the present time, s. A thread of Zenoh calls `wake` each time a state arrives.
         """
         super().__init__(now)
         self._robot, self._decoder = robot, Decoder(RobotState)
@@ -154,13 +161,13 @@ class Watch(Follower):
         if wake is not None:
             self._states.wakes(wake)
         self._answers = Mailbox[zenoh.Sample](ANSWERS)
-        """Replies to queries, which a thread of Zenoh puts here."""
+        """Replies to queries, which a thread of Zenoh adds."""
 
     def look(self, now: float) -> list[RobotState]:
-        """Process the received states, and return the new ones.
+        """Process the states that have arrived, and return the new states.
 
-        If no state has arrived for some time, send a query. A later call processes its reply. `now`
-        is the present time, s. Raises `ZError` if the session was closed.
+        If no state has arrived for some time, also send a query. A later call processes its reply.
+        `now` is the present time, s. Raises `ZError` if the session was closed.
         """
         news = []
         for _ in range(QUEUED):  # bounded, so that a flood cannot block the caller
@@ -189,10 +196,14 @@ class Watch(Follower):
             return None
 
     def objection(self, source: str, sender: str, now: float) -> str:
-        """Return why the robot does not follow a sender's commands at the time `now`, s.
+        """Return why the robot does not follow the commands of a sender; "" if it follows them.
 
-        Returns "" if the robot follows, or if no state has arrived yet. `sender` is the public name
-        of the sender, and `source` is the command source of its commands.
+        Also returns "" if no state has arrived yet and the robot does not count as silent.
+
+        Args:
+            source: the command source of the sender's commands.
+            sender: the public name of the sender.
+            now: the present time, s.
         """
         if self.silent(now):
             return (

@@ -17,11 +17,11 @@ from acsard.core.values import NS_PER_S
 from acsard.host import clock
 
 Put = Callable[[Wish], object]
-"""Function that sends one command on the bus. It may block."""
+"""A function that sends one command on the bus. It may block."""
 
 
 class Outbox:
-    """The senders that command the robot, and the thread that sends their commands."""
+    """Sends the commands of several senders to the robot from a thread of its own."""
 
     def __init__(self, dropped: Callable[[], object] = lambda: None) -> None:
         """Start the thread. It calls `dropped` for each command that `Commander.send` drops."""
@@ -31,13 +31,13 @@ class Outbox:
         self._news = Condition()
         self._busy = self._ended = False
         self.dead: Future[Never] = Future()
-        """Future that receives the exception if an exception ends the thread. After that, no
-        command is sent."""
+        """Future that receives the exception that ended the thread. After that, no command is sent.
+        It stays pending while the thread runs, and if `end` ends the thread."""
         self._thread = Thread(target=self._live, name="outbox", daemon=True)
         self._thread.start()
 
     def take(self, commander: Commander, put: Put, wish: Wish) -> int | None:
-        """Queue a command of the sender `commander`. The thread sends the command with `put`.
+        """Queue a command of the sender `commander`. The thread sends it by a call of `put`.
 
         Returns the time since the sender's previous command, ns, or None (see `Commander.take`).
         """
@@ -48,8 +48,9 @@ class Outbox:
         return silence
 
     def release(self, commander: Commander, timeout_s: float = LONGEST_S) -> None:
-        """Remove a sender. If the robot may still follow its last command, queue a zero.
+        """Remove the sender `commander`, and queue a zero if necessary.
 
+        A zero is necessary if the robot may still follow the last command of this sender.
         `timeout_s` is the timeout of the sender's source, s.
         """
         with self._news:
@@ -60,14 +61,14 @@ class Outbox:
             self._news.notify_all()
 
     def flush(self, seconds: float) -> None:
-        """Wait until all queued commands are sent, but at most `seconds`."""
+        """Wait until all queued commands have been sent, but at most `seconds`."""
         with self._news:
             self._news.wait_for(
                 lambda: not (self._busy or self._zeros or self._times()), timeout=seconds
             )
 
     def end(self, seconds: float) -> None:
-        """End the thread after it has sent the commands that are due; wait at most `seconds`."""
+        """End the thread after it has sent the commands that are due. Wait at most `seconds`."""
         with self._news:
             self._ended = True
             self._news.notify_all()

@@ -1,4 +1,4 @@
-"""The client for scripts. Its methods block the calling thread until they are done."""
+"""The client for scripts. Each method blocks the calling thread until it has finished."""
 
 from __future__ import annotations
 
@@ -51,7 +51,8 @@ from acsard.host.own_identity import new_secret, own_name, sender_id
 REPLY_TIMEOUT_S = 3.0
 
 TIMED_OUT = "Timeout"
-"""Text of Zenoh's error reply if the other side received a query but did not answer it in time."""
+"""Text of Zenoh's error reply to a query that reached the other side but was not answered in
+time."""
 
 
 @contextmanager
@@ -62,15 +63,20 @@ def connect(
     source: str = "app",
     tls: str | None = None,
 ) -> Iterator[Client]:
-    """Connect to the daemon at `endpoint`, and yield a client until the end of the `with` block.
-
-    The client sends its commands as the command source `source`, a name in `[[commands.sources]]`.
-    `tls` is the directory with your certificate, for an endpoint like "tls/robot.local:7449".
+    """Connect to a daemon, and yield a client that is connected until the end of the `with` block.
 
     If an argument is None, its value comes from the configuration file that the environment
     variable ACSARD_CONFIG names. The variable ACSARD_TLS overrides the certificate directory in
-    that file. Without these variables, `endpoint` is "tcp/127.0.0.1:7448", `robot_id` is "acsar",
-    and the client uses no certificate.
+    that file.
+
+    Args:
+        endpoint: the endpoint of the daemon or a router, such as "tls/robot.local:7449". Without a
+            configuration file, it is "tcp/127.0.0.1:7448".
+        robot_id: the id of the robot. Without a configuration file, it is "acsar".
+        source: the command source as which the client sends its commands, a name in
+            `[[commands.sources]]`.
+        tls: the directory with your certificate, for an endpoint that begins with "tls/". Without
+            the two variables, the client uses no certificate.
     """
     where = address_by_environment(endpoint, robot_id, tls)
     session = client_session(where.endpoint, where.tls)
@@ -82,7 +88,7 @@ def connect(
 
 
 def close(session: zenoh.Session) -> None:
-    """Close a session. Ignore the error that Zenoh raises if the other side does not respond."""
+    """Close a Zenoh session. Ignore the error if the other side does not respond."""
     try:
         session.close()
     except zenoh.ZError:
@@ -92,23 +98,23 @@ def close(session: zenoh.Session) -> None:
 class _Puts:
     """Keeps a minimum pause between the commands on one connection.
 
-    The daemon accepts at most 1000 commands a second per connection and key. Without the pause, it
-    would drop a zero that is sent directly after another command. All clients of a connection share
-    one instance, because the other command may come from any of these clients.
+    All clients of a connection share one instance. The daemon accepts at most 1000 commands a
+    second per connection and key. Without the pause, it would drop a zero that is sent directly
+    after a command of any of these clients.
     """
 
     def __init__(self) -> None:
         # The lock is reentrant: a signal handler may also send while the same thread holds it.
         self._lock, self._next_s, self._last_s = threading.RLock(), 0.0, 0.0
         self.moving: dict[Client, float] = {}
-        """Maps each client whose last command was not zero to the monotonic time of that command,
-        s."""
+        """The monotonic time of the last command, s, for each client whose last command was not
+        zero."""
 
     @contextmanager
     def turn(self) -> Iterator[None]:
         """Wait until the next command may be sent. The caller sends it in the `with` block.
 
-        No other thread sends a command in the meantime.
+        No other thread sends a command during the block.
         """
         # Each thread reserves a time and waits for it without the lock. Otherwise a thread that
         # sends without end would take the lock again and again before the others.
@@ -126,7 +132,7 @@ class _Puts:
 
 
 class Client:
-    """A connection to one robot; create it with `connect`."""
+    """A connection to one robot. Create it with `connect`."""
 
     def __init__(
         self,
@@ -139,11 +145,12 @@ class Client:
         self.session, self.source = session, source
         self.where = Address(endpoint, robot_id, tls)
         self.name = own_name()
-        """Name that the daemon's log shows for this client's service calls. You may change it."""
+        """Name of this client in the daemon's log of service calls. You may change it."""
         self._opened = False
         self._puts = _Puts()
         self.certificate = shown_at(endpoint, tls)
-        """Common name of the certificate that this client shows to the daemon, "" without one."""
+        """Common name of the certificate that this client shows to the daemon; "" if it shows no
+        certificate."""
         # The secret identifies this program as a caller of services. Clients made by `like` share
         # it, although they may send commands under another name.
         self._secret = new_secret()
@@ -156,11 +163,12 @@ class Client:
         whole = sender_id(name)
         self._sender = Sender(whole)
         self.sender = public_name(whole, self.certificate)
-        """Public name of this client. While the client drives, `state.sender` has this value."""
+        """Public name of this client as a sender of commands. While the client drives,
+        `state.sender` has this value."""
 
     @property
     def caller(self) -> str:
-        """The sender id in this client's service calls and queries: `name/SECRET`.
+        """The sender id, `NAME/SECRET`, in this client's service calls and queries.
 
         The daemon's log shows a public name without the secret.
         """
@@ -169,8 +177,10 @@ class Client:
     def like(self, robot_id: str, name: str = "") -> Client:
         """Return a new client on the same connection, which is a separate sender of commands.
 
-        `robot_id` is the id of the new client's robot, which may be the robot of this client.
-        `name` is the new client's name as a sender; "" means the host name and the process id.
+        Args:
+            robot_id: the id of the robot that the new client commands. It may be the robot of this
+                client.
+            name: the name of the new client as a sender; "" means the host name and the process id.
         """
         other = Client(self.session, robot_id, self.source, self.where.tls, self.where.endpoint)
         other.name, other._secret, other._puts = self.name, self._secret, self._puts
@@ -179,11 +189,11 @@ class Client:
         return other
 
     def key(self, name: str) -> str:
-        """Return the full key on the bus for a key of the topic table, such as "odom"."""
+        """Return the full Zenoh key for a key of the topic table, such as "odom"."""
         return full_key(self.where.robot_id, name)
 
     def command_key(self, source: str) -> str:
-        """Return the key, below the robot's id, on which this client puts commands as `source`.
+        """Return the key, without the robot's id, on which this client sends commands as `source`.
 
         Over TLS, the key ends with the common name of this client's certificate.
         """
@@ -204,10 +214,10 @@ class Client:
                 self._put(0.0, 0.0, stamp_ns)
 
     def end(self) -> None:
-        """Close the connection, as `connect` does at the end of its block.
+        """Close the connection. `connect` calls this at the end of its `with` block.
 
-        First send a zero to each robot that may still follow a client of this connection. Without
-        the zero, the robot would drive on until the timeout of the source, which may be 10 s.
+        First send zeros to each robot that may still follow a client of this connection. Without a
+        zero, the robot would drive on until the timeout of the source, which may be 10 s.
         """
         begun_s = clock.steady_s()
         # When the longest timeout has passed, a zero would only stop the next sender that drives.
@@ -223,16 +233,17 @@ class Client:
             close(self.session)
 
     def drive(self, linear: float, angular: float = 0.0, *, seconds: float) -> None:
-        """Drive for `seconds` (above 0), then slow down, and return when the robot stands.
+        """Drive for `seconds` (above 0), then slow down, and return when the robot stands still.
 
         `linear` is in m/s and `angular` in rad/s (left is +). Speeds above the robot's `[limits]`
         are not an error: the robot drives at its limits. `get("config")` returns the limits, and
         `get("cmd_vel_out")` returns the applied speed.
 
         Raises:
-            NotDrivenError: The robot does not follow the commands; the text is the daemon's
-                reason. Or this program sent no command for more than 0.5 s during the drive,
-                because the program was suspended or the network failed.
+            NotDrivenError: The robot does not follow the commands; the text is the daemon's reason.
+                It is also raised if this program sent no command for more than 0.5 s during the
+                drive, because the program was suspended or the network failed.
+            NotPermittedError: The role of this client may not drive the robot.
             NoAnswerError: The daemon is silent.
             UsageError: An argument is not valid.
         """
@@ -248,35 +259,40 @@ class Client:
             raise
 
     def zero_again(self) -> None:
-        """Send a zero a second time, because a busy daemon may have dropped the first one."""
+        """Send one more zero, because a busy daemon may have dropped the previous one."""
         with suppress(NoAnswerError):
             self.send(0.0)
 
     def call(self, service: str, **fields: float) -> schema.ServiceReply:
-        """Call a service, such as "stop", with the fields of its payload.
+        """Call a service, such as "stop", and return its reply.
 
-        `clear` releases the stop or fault that `state` shows at the time of the call, and
-        `activate` switches on a robot that is inactive at that time. If a person saw an earlier
-        state and decided to make the call, pass `latch=state.latch` of that earlier state. The
-        daemon then refuses the call if the robot was stopped or switched off again in between.
+        `fields` are the fields of the payload. `clear` releases the stop or fault that `state`
+        shows at the time of the call, and `activate` switches on a robot that is inactive at that
+        time. If a person decided to make the call after looking at an earlier state, pass
+        `latch=state.latch` of that earlier state. The daemon then refuses the call if the robot was
+        stopped or switched off again in between.
         """
         if service in ("clear", "activate") and "latch" not in fields:
             fields["latch"] = self.get("state").latch
         return self.request(service, fields)
 
     def set(self, settings: Mapping[str, Plain], *, keep: bool = False) -> schema.ServiceReply:
-        """Change settings until the next start of the daemon, for example `{"rates.state": 5.0}`.
+        """Change settings of the daemon, for example `{"rates.state": 5.0}`, and return the reply.
 
-        The daemon changes all of the settings or none. Unlike other settings, a lowered speed,
-        acceleration or jerk in `limits` stays lowered after the next start. With `keep`, the daemon
-        also writes the settings into its configuration file. The reply names the file, or says why
-        the settings are refused or not written.
+        The daemon changes all of the settings or none. The change lasts until the next start of the
+        daemon. Unlike other settings, a lowered speed, acceleration or jerk in `limits` stays
+        lowered after the next start. If `keep` is true, the daemon also writes the settings into
+        its configuration file. The reply names the file, or says why the settings are refused or
+        not written.
         """
         fields: dict[str, object] = {"settings": settings}
         return self.request("set", fields | {"keep": True} if keep else fields)
 
     def request(self, service: str, fields: Mapping[str, object]) -> schema.ServiceReply:
-        """Call any service with `fields` as its payload, and return its reply."""
+        """Call the service `service` with `fields` as its payload, and return its reply.
+
+        Unlike `call`, this does not add the field `latch`.
+        """
         payload = msgspec.json.encode(fields) if fields else None
         return Decoder(schema.ServiceReply).decode(*self._ask(service_key(service), payload))
 
@@ -285,7 +301,7 @@ class Client:
         return decoder(name).decode(*self.reply(name))
 
     def reply(self, name: str) -> tuple[str, bytes]:
-        """Return a pair: the encoding and the undecoded payload of the last message on a key."""
+        """Return the last message on a key, not decoded, as a pair of encoding and payload."""
         return self._ask(name)
 
     def whoami(self) -> Identity:
@@ -302,23 +318,25 @@ class Client:
         return Pose(state.x, state.y, state.yaw)
 
     def messages(self, name: str, timeout: float | None = None) -> Iterator[Any]:
-        """Yield the typed messages of a published key as they arrive.
+        """Yield the messages of a published key as they arrive, decoded to their types.
 
-        The iterator ends after `timeout` s of silence, and when the connection is closed.
+        The iterator ends after `timeout` s without a message, and when the connection is closed.
+        Without a `timeout`, it ends only when the connection is closed.
         """
         reader = decoder(name)
         for sample in self.subscribe(name).until_silence(timeout):
             yield reader.decode(*encoded(sample))
 
     def samples(self, name: str, timeout: float | None = None) -> Iterator[zenoh.Sample]:
-        """Yield the raw samples of any key or wildcard below the robot's id.
+        """Yield the undecoded samples of any key or wildcard below the robot's id, as they arrive.
 
-        The iterator ends after `timeout` s of silence, and when the connection is closed.
+        The iterator ends after `timeout` s without a sample, and when the connection is closed.
+        Without a `timeout`, it ends only when the connection is closed.
         """
         yield from Subscription(self._queue(name)).until_silence(timeout)
 
     def listen(self, name: str, callback: Callable[[zenoh.Sample], None]) -> Any:
-        """Subscribe to a key; `callback` is called with each sample on a thread of Zenoh.
+        """Subscribe to a key. A thread of Zenoh calls `callback` with each sample.
 
         To end the subscription, call `undeclare` on the returned subscriber.
         """
@@ -328,11 +346,17 @@ class Client:
             raise self._refused(name) from None
 
     def subscribe(self, name: str) -> Subscription:
-        """Subscribe to a key; return a queue of raw samples that can be read without waiting."""
+        """Subscribe to a key. Return the subscription, a queue of samples that are not decoded.
+
+        A caller can read the queue without waiting.
+        """
         return Subscription(self._queue(name), self.key(name))
 
     def ask(self, name: str, take: Callable[[zenoh.Sample], object]) -> None:
-        """Send a query and return immediately. A thread of Zenoh calls `take` with each reply."""
+        """Query a key, and return immediately. A thread of Zenoh calls `take` with each reply.
+
+        Error replies are ignored.
+        """
         self.session.get(
             self.key(name),
             lambda reply: take(reply.ok) if reply.ok is not None else None,
@@ -351,7 +375,7 @@ class Client:
     def put(
         self, twist: schema.Twist | schema.TwistStamped, signature: Signature, source: str = ""
     ) -> None:
-        """Forward a command of another sender, which `signature` identifies.
+        """Forward a command of another sender. `signature` identifies that sender.
 
         `source` is the command source; "" means the source of this client.
         """
@@ -385,10 +409,8 @@ class Client:
             self._puts.moving.pop(self, None)
 
     def _ask(self, name: str, payload: bytes | None = None) -> tuple[str, bytes]:
-        """Return a pair: the encoding and the payload of the first reply to a query.
-
-        Later replies are ignored, because any client on the bus may send any number of replies.
-        """
+        """Return the first reply to a query of the key `name`: a pair of encoding and payload."""
+        # Ignore later replies, because any client on the bus may send any number of replies.
         end_s = time.monotonic() + REPLY_TIMEOUT_S
         while True:
             reply = self._first(name, payload)
@@ -430,7 +452,7 @@ class Client:
         return UsageError(f"{name!r} is not a key; `acsard topics` lists them")
 
     def _unanswered(self, name: str) -> MendableError:
-        """Return the error for a query of the key `name` that got no reply. Its text says why."""
+        """Return the error for a query of the key `name` without a reply. Its text says why."""
         key, no_answer = name.partition("?")[0], f"no answer on the Zenoh key {self.key(name)}"
         if unknown(key):
             return NoAnswerError(f"{no_answer}: {key} is not in the topic table ({key_hint(key)})")
@@ -477,7 +499,7 @@ class Client:
 
 @lru_cache(maxsize=64)
 def decoder(name: str) -> Decoder[Any]:
-    """Return the decoder for the messages of a key.
+    """Return the decoder for the messages of the key `name`.
 
     Messages of keys without a message type (config, schema/…) are decoded to dictionaries.
     """

@@ -1,1 +1,1 @@
-"""The robot as a pure function. No module of this package does any I/O."""
+"""The robot as a pure function. No module of this package does I/O or reads a clock."""

@@ -1,4 +1,4 @@
-"""Formats texts and values for people to read. The functions do no I/O.
+"""Formats texts and values for people to read.
 
 Before untrusted text is written to a terminal, it must go through `printable`, `lines` or
 `json_line`.
@@ -13,20 +13,23 @@ from itertools import accumulate
 
 
 def printable(text: str) -> str:
-    """Return the text on one line: white space becomes " ", other unprintable characters U+FFFD."""
+    """Return the text as one line without control characters, which is safe to print.
+
+    White space becomes " ". Other unprintable characters become U+FFFD.
+    """
     return "".join(" " if c.isspace() else c if c.isprintable() else "\ufffd" for c in text)
 
 
 def lines(text: str) -> str:
-    """Return a text of several lines, with `printable` applied to each line."""
+    """Return a text of several lines with `printable` applied to each line."""
     return "\n".join(map(printable, text.split("\n")))
 
 
 def printable_bytes(data: bytes, most: int, last: bool = False) -> str:
-    r"""Return bytes as a text of at most `most` characters, plus "…" if some bytes are left out.
+    r"""Return bytes as a text of at most `most` characters, with "…" for the bytes left out.
 
-    If the text is too long, it shows the first bytes, or the last bytes if `last` is true. An
-    unprintable byte is written as an escape such as `\x00`.
+    If the text is too long, it shows the first bytes, or the last bytes if `last` is true. The "…"
+    is an additional character. An unprintable byte is written as an escape such as `\x00`.
     """
     shown = [repr(bytes([byte]))[2:-1] for byte in (reversed(data) if last else data)]
     ends = accumulate(map(len, shown))
@@ -39,7 +42,10 @@ _ABOVE_ASCII = re.compile(r"[^\x00-\x7e]")
 
 
 def json_line(text: str) -> str:
-    """Escape the unprintable characters in a JSON text without changing the value it encodes."""
+    """Escape the unprintable characters of a JSON text without changing the encoded value.
+
+    Characters above U+FFFF stay as they are.
+    """
     return _ABOVE_ASCII.sub(
         lambda m: m[0] if m[0].isprintable() or ord(m[0]) > 0xFFFF else f"\\u{ord(m[0]):04x}", text
     )
@@ -48,15 +54,15 @@ def json_line(text: str) -> str:
 def many(count: int, one: str, more: str = "") -> str:
     """Return a count with its noun, such as `no lines`, `1 line` or `2 changes of mode`.
 
-    `one` is the noun in the singular, such as `line` or `change of mode`. `more` is the plural. It
-    may be omitted if the plural only adds an "s" to the noun.
+    `one` is the noun in the singular, such as `line` or `change of mode`. `more` is the plural.
+    Leave it out if the plural only adds an "s".
     """
     noun, of, rest = one.partition(" of ")
     return f"{count or 'no'} {one if count == 1 else more or f'{noun}s{of}{rest}'}"
 
 
 def listed(items: Sequence[str], most: int, joint: str = ", ") -> str:
-    """Join the first `most` texts with `joint`. If there are more, append "and N more"."""
+    """Join the first `most` items with `joint`. If there are more items, append "and N more"."""
     more = [f"and {len(items) - most} more"] if len(items) > most else []
     return joint.join([*items[:most], *more])
 
@@ -64,7 +70,8 @@ def listed(items: Sequence[str], most: int, joint: str = ", ") -> str:
 def signed(value: float | None, decimals: int, width: int) -> str:
     """Format a number with its sign, right-aligned in `width` characters.
 
-    None and NaN become "-". A number that is too long for `width` is written with an exponent.
+    `decimals` is the number of decimals. None and NaN become "-". A number that is too long for
+    `width` is written with an exponent.
     """
     if value is None or math.isnan(value):
         return "-".rjust(width)
@@ -76,7 +83,10 @@ _UNITS = (("d", 86_400), ("h", 3_600), ("min", 60), ("s", 1))
 
 
 def lasting(seconds: float) -> str:
-    """Format a duration in its two largest units ("2 h 5 min"). Below 1 min, use s ("7.3 s")."""
+    """Format a duration in s with its two largest units, such as "2 h 5 min".
+
+    A duration below 1 min is written with one decimal, such as "7.3 s".
+    """
     if seconds < 59.95:
         return f"{round(seconds, 1):g} s"
     parts: list[tuple[int, str]] = []
@@ -92,15 +102,15 @@ _ROUGH = (
     ("µs", 1e-6, 999.5e-6), ("ms", 1e-3, 0.9995), ("s", 1.0, 99.5), ("min", 60.0, 99.5 * 60),
     ("h", 3600.0, 99.5 * 3600), ("d", 86400.0, math.inf),
 )  # fmt: skip
-"""Units for `rough`. Each row contains a unit, its size in s, and a duration in s. From this
-duration on, the unit of the next row is used."""
+"""Units for `rough`. Each row contains a unit, its size in s, and the duration in s from which on
+the next row applies."""
 
 
 def rough(seconds: float | None, finest: float = 1.0) -> str:
-    """Format a duration or an age with one unit, such as "2.5 min", in at most 7 characters.
+    """Format a duration in s with one unit, such as "2.5 min", in at most 7 characters.
 
-    None and infinity become "never". NaN, negative values and values of 1e9 s or more become "?".
-    `finest` is the size of the smallest unit to use, s.
+    `finest` is the size of the smallest unit to use, s. None and infinity become "never". NaN,
+    negative values and values of 1e9 s or more become "?".
     """
     if seconds is None or seconds == math.inf:
         return "never"

@@ -4,8 +4,8 @@ The guard shares no code with `limits.py`, `codec.py` or `checked_line.py`. It p
 bytes in the same way as the MCU, and passes a line only if all of these conditions hold:
 
 - The line has the complete format, no wheel exceeds `limits.wheel_speed`, and the checksum is
-  correct if the line has one. With `link_check = "require"`, a line that moves a wheel must have a
-  checksum.
+  correct if the line has a checksum. With `link_check = "require"`, a line that moves a wheel must
+  have a checksum.
 - No wheel is faster than in the last line sent, and no wheel turns the other way, unless there is a
   fresh command, the link is up and the mode is `driving` (rule 2 of `acsard/README.md`).
 - Without a link, all wheel speeds are zero.
@@ -40,27 +40,27 @@ HALTED = ("stopped", "fault", "shutdown")
 
 MARGIN_NS = 300_000_000
 """Extra time after the computed end of a ramp to rest, ns. During this time, the guard still passes
-lines that move a wheel. It equals the watchdog time of the board: a board that receives no line for
-longer stops the motors by itself."""
+lines that move a wheel. The time equals the watchdog time of the board: a board that receives no
+line for longer stops the motors by itself."""
 
 
 class Memory(Struct, frozen=True):
     """The state that a guard keeps from one line to the next."""
 
     last: bytes = b""
-    """The last line that was written to the serial port; empty before the first one."""
+    """The last line that was written to the serial port; b"" before the first line."""
     commanded_ns: int | None = None
-    """Monotonic time, ns, of the last control step with a fresh command in mode `driving`. None
+    """Monotonic time of the last control step that had a fresh command in mode `driving`, ns. None
     before the first such step."""
     halted_ns: int | None = None
     """Monotonic time at which the robot began to brake for a stop, a fault or a shutdown, ns. None
     if the mode is not one of `HALTED`."""
     ramp_ns: int = 0
     """Duration of a ramp from full speed to rest, ns. If the limits have changed since the robot
-    was last at rest, this is the longest duration under any of these limits."""
+    was last at rest, this is the longest duration under the old and the new limits."""
     stop_ramp_ns: int = 0
     """Duration of a stop from full speed, ns. If the limits have changed since the robot was last
-    at rest, this is the longest duration under any of these limits."""
+    at rest, this is the longest duration under the old and the new limits."""
 
 
 class Guard:
@@ -83,9 +83,9 @@ class Guard:
     def use(self, config: Config) -> None:
         """Use the configuration `config` from now on.
 
-        A moving robot may still brake by the old limits. So until the robot is at rest, the guard
-        allows the longer of two times for a ramp: the one by the old limits and the one by the new
-        limits.
+        A moving robot may still brake by the old limits. Until the robot is at rest, the guard
+        therefore allows the longer of two braking times: the time by the old limits and the time by
+        the new limits.
         """
         self._require_check = config.mcu.link_check == "require"
         self._most = int(config.limits.wheel_speed * 100 + 1)
@@ -99,20 +99,20 @@ class Guard:
 
     @property
     def memory(self) -> Memory:
-        """The state of this guard. A new `Guard` that gets it makes the same decisions."""
+        """The state of this guard. A new `Guard` that starts with it makes the same decisions."""
         return Memory(self._last, self._commanded_ns, self._halted_ns, *self._longest)
 
     def left(self, line: bytes) -> None:
-        """Record that this line was written to the port."""
+        """Record that `line` was written to the serial port."""
         self._last, self._wheels = line, _wheels(line[:31])
         if self._wheels == _ZERO:
             self._longest = self._ramps
 
     def check(self, outputs: Outputs) -> tuple[bytes | None, str]:
-        """Return a pair: the line to send, and the reason why the guard replaced the robot's line.
+        """Return the line to send, and the reason why the guard replaced the robot's line.
 
         The guard replaces a forbidden line with the stop line. The reason is "" if the guard did
-        not replace the line. If `outputs` does not contain a line, the pair is (None, "").
+        not replace the line. If `outputs` does not contain a line, the result is (None, "").
         """
         if outputs.mode == "driving":
             if self._commanded(outputs):
@@ -211,7 +211,7 @@ def _ramp_ns(config: Config, *, stop: bool) -> int:
 # A steady command repeats the same columns in each line, so a cache of a few lines saves most work.
 @lru_cache(4)
 def _wheels(columns: bytes) -> Wheels | None:
-    """Return the four speeds in 0.01 rad/s, or None if a column is malformed.
+    """Return the speeds of the motors a to d, in 0.01 rad/s, or None if a column is malformed.
 
     `columns` are the first 31 bytes of a line: its wheel speeds, without the sequence number and
     the checksum, which differ from line to line.
@@ -235,7 +235,7 @@ def _crc(data: bytes) -> int:
 
 
 def _crc_of(byte: int) -> int:
-    """Return the CRC of one byte, computed with bit shifts as in the notes of avr-libc."""
+    """Return the CRC-16/XMODEM of one byte, computed by shifts as in the notes of avr-libc."""
     x = byte ^ byte >> 4
     return (x << 12 ^ x << 5 ^ x) & 0xFFFF
 

@@ -1,10 +1,10 @@
-"""The robot as one pure object: `Robot.step(Inputs) -> Outputs` calls all its parts in order.
+"""The robot as one pure object. `Robot.step(Inputs) -> Outputs` calls all its parts in order.
 
 A step updates the odometry with the feedback, chooses one command, checks that the mode allows it,
-limits this command, converts it to wheel speeds and reports. A step does no I/O: its inputs are
-time, bytes and commands, and its outputs are decisions. Only `step` changes the state of a `Robot`,
-with one exception: the control loop also adds to `counters`. The control loop reads and writes the
-port, and `core/guard.py` checks each line before it is written.
+limits it, converts it to wheel speeds and reports. A step does no I/O: its inputs are time, bytes
+and commands, and its outputs are decisions. Only `step` changes the state of a `Robot`, with one
+exception: the control loop also adds to `counters`. The control loop reads and writes the port,
+and `core/guard.py` checks each line before it is written.
 """
 
 from __future__ import annotations
@@ -64,21 +64,22 @@ from acsard.core.values import (
 )
 
 MAX_DT = 0.05
-"""Longest time between two lines for which a step accelerates the robot, s. If the process stalls
-for longer, the step ignores the rest of the time, so that the speed does not jump. If 1.5 control
-periods are longer than this constant, the limit is 1.5 periods."""
+"""Longest time between two lines for which the robot accelerates, s. If the process stalls for
+longer, the rest of the time is ignored, so that the speed does not jump. If 1.5 control periods
+are longer than this constant, they are the limit."""
 
 UNHEARD_S = WATCHDOG_S - 0.05
-"""If no line was written to the port for this time, s, the next acceleration starts from rest. The
-reason is that the board stops the motors if it receives no line for `WATCHDOG_S`. The margin of
-0.05 s allows for a board whose clock runs a little fast."""
+"""Time without a line written to the port, s, after which the next acceleration starts from rest.
+The board stops the motors if it receives no line for `WATCHDOG_S`. The margin of 0.05 s allows for
+a board whose clock is slightly fast."""
 
 REPORTS = {
     "estop": "its emergency stop",
     "bumpers": "its bumpers",
     "driver": "its motor drivers",
 }
-"""Words for each input of the board in the text "wait until the board has reported ..."."""
+"""Maps each input of the board to its words in the text "wait until the board has reported
+..."."""
 
 HALTED = (Mode.STOPPED, Mode.FAULT, Mode.SHUTDOWN)
 """Modes in which the robot brakes at the stop deceleration."""
@@ -86,15 +87,18 @@ HALTED = (Mode.STOPPED, Mode.FAULT, Mode.SHUTDOWN)
 NS_PER_MS = 1_000_000
 
 MAX_TEXT = 200
-"""Largest number of characters of a refusal's text in `state`. The text may quote a message from a
-client, which can be long."""
+"""Largest number of characters of the text in `state` about a refused message. The text may quote
+the message of a client, which can be long."""
 
 
 class Robot:
-    """The state of one robot: its link to the board, its pose, its mode and its command sources."""
+    """One robot: its link to the board, its pose, its mode and its command sources."""
 
     def __init__(self, config: Config, latches: Latches = Latches()) -> None:  # noqa: B008
-        """Start in the mode that the latches require, with the limits in `latches.lowered`."""
+        """Create a robot as it is after a start of the daemon.
+
+        `latches` decides the first mode, and its lowered limits replace those in `config`.
+        """
         self._file_limits = config.limits
         config, self._first_events = with_lowered(config, latches.lowered)
         self.config = config
@@ -122,23 +126,24 @@ class Robot:
         self._choice = Choice()
         self._speeds = STILL
         self._computed = self._written = STILL
-        """Wheel speeds of two lines: `_computed` belongs to the last line that was computed, and
-        `_written` to the last line that was written to the port. The wheels still turn as in
-        `_written` if the emergency stop was pressed, but the line of zeros is not written yet."""
+        """`_computed` are the wheel speeds of the last computed line. `_written` are those of the
+        last line that was written to the port. After a press of the emergency stop, the wheels
+        still turn as in `_written` until the line of zeros is written."""
         self._made_of: tuple[int | None, Mode] | None = (None, self._life.mode)
-        """The command and the mode for which the last line was computed. The command is represented
-        by its arrival time, monotonic ns, or None without a command. After a press of the emergency
+        """The command and the mode from which the last line was computed. The command is given by
+        its arrival time (monotonic, ns), or None without a command. After a press of the emergency
         stop or a bumper, the whole pair is None, so that a new line is due immediately."""
         self._made_ns = 0
         """Monotonic time at which the last line was computed, ns."""
         self._made = self._said = (self._limiter.state, 0)
-        """Two pairs, each of a state of the limiter and its monotonic time, ns. `_made` belongs to
-        the last line that was computed, `_said` to the last line that was written to the port. If a
-        line was not written, `_settle` sets `_made` back to `_said`. While the link is not up, and
-        after a press of the emergency stop or a bumper, both are the state of a robot at rest."""
+        """Two pairs of a limiter state and the monotonic time of this state, ns. `_made` is the
+        pair of the last computed line. `_said` is the pair of the last line that was written to
+        the port. If a line was not written, `_settle` sets `_made` back to `_said`. Both are the
+        state of a robot at rest after a press of the emergency stop or a bumper, and while the
+        link is not up."""
         self._status = ("", "", "", "")
         self._battery_level = ""
-        """The level of the battery in the previous step, "" before the board's first report."""
+        """Level of the battery in the previous step; "" before the board's first report."""
         self.counters: Counter[str] = Counter()
         """Counters since the start of the daemon. `commands` counts accepted commands, and
         `command_<reason>` counts refused commands. `commands_of_new_senders` counts the commands of
@@ -153,22 +158,25 @@ class Robot:
         self._bumpers = Bumpers(config.safety)
         self._battery = Battery(config.battery, any(why.startswith(EMPTY) for why in causes))
         self._unreported = {name: why for why in causes if (name := _input(why))}
-        """Inputs of the board that caused a latch before the daemon started, and that the board has
-        not reported since. The keys are those of `REPORTS`, and the values are the causes in words.
-        While an input is in this map, a `clear` is refused."""
+        """Inputs of the board that have caused a latch in an earlier run of the daemon and that
+        the board has not reported since. The keys are those of `REPORTS`, and the values are the
+        causes in words. While the map is not empty, a `clear` is refused."""
         self._answered = UnansweredLines(config.mcu.reply_period)
         self._tally = EventThrottle()
         self._asked: tuple[str, str, int | None] = ("", "", None)
         """Verb, client and arrival time (monotonic, ns) of the last request. A call of `srv/stop`
-        reaches the robot as two requests: the first one stops the robot, and the second one leads
-        to the reply. With this value, the robot recognizes the second one, and does not log it."""
+        arrives as two requests: the first one stops the robot, and the second one leads to the
+        reply. The robot recognizes the second request by this value and does not log it."""
         self._told = CommandEvents(self._life.mode)
         self._port_trouble = ""
         self._linked_once = False
         self._arbiter.require_neutral()
 
     def snapshot(self, now_ns: int) -> Snapshot:
-        """Return the values for `state` and `diagnostics`. It is too slow to call in every step."""
+        """Return the values that `state` and `diagnostics` need beyond the outputs of a step.
+
+        `now_ns` is the monotonic time, ns. The method is too slow to call in every step.
+        """
         session, since, silent = self.session, self._refused_ns, self.session.silent(now_ns)
         counters = {"lines": session.good_lines} | self._odometry.missed()
         counters |= {f"line_{reason}": count for reason, count in session.rejects.items() if count}
@@ -200,21 +208,24 @@ class Robot:
 
     @property
     def latches(self) -> Latches:
-        """The latches in force. The value is correct even after an exception in a step."""
+        """The stop, the fault and the other latches in force, and the lowered limits.
+
+        The value is correct even after an exception in a step.
+        """
         return self._life.latches
 
     @property
     def travelled(self) -> float:
-        """Distance driven since the daemon started, m, according to the odometry.
+        """Distance that the robot has driven since the daemon started, m, by odometry.
 
-        Forward and backward motion both add to it.
+        Both forward and backward motion increase it.
         """
         return self._odometry.travelled
 
     def step(self, inputs: Inputs) -> Outputs:
-        """Process all inputs since the last step, and return the decisions of this step.
+        """Process the inputs since the previous step, and return the decisions of this step.
 
-        They include the line for the board, the odometry and the events to log.
+        The decisions include the line for the board, the odometry and the events to log.
         """
         events = list(inputs.events)
         self._life.begin(inputs.now)
@@ -275,7 +286,7 @@ class Robot:
     # The outcome of the previous line.
 
     def _settle(self, inputs: Inputs) -> None:
-        """Undo the last line's effect on the limiter if that line was not written to the port."""
+        """Undo the effect of the last line on the limiter if the line was not written."""
         if inputs.guard_trip:
             # The guard has replaced the line with STOP.
             self._limiter.cut()
@@ -346,7 +357,7 @@ class Robot:
     def _watch_inputs(self, now: Instant, events: list[Event]) -> None:
         """React to the board's reports of its emergency stop, bumpers, motor drivers and battery.
 
-        The emergency stop or a bumper stops the robot even if it was pressed and released again
+        A press of the emergency stop or of a bumper stops the robot even if it began and ended
         between two steps.
         """
         estop, bumpers, statuses = self._estop, self._bumpers, self.session.statuses
@@ -389,11 +400,11 @@ class Robot:
         self._life.hold(*held, now.mono_ns)
 
     def _awaited_report(self) -> tuple[str, str]:
-        """Return a pair of texts: why a latch cannot be cleared yet, and what a person must do.
+        """Return the cause of a latch that cannot be cleared yet, and what a person must do.
 
-        An input of the board may have caused a latch before the daemon started. Such a latch cannot
-        be cleared until the board has reported this input. The first text is the cause of the
-        latch. Both texts are "" if no latch waits for a report.
+        An input of the board may have caused this latch in an earlier run of the daemon. The latch
+        cannot be cleared until the board has reported the input again. Both texts are "" if there
+        is no such latch.
         """
         reported = {
             "estop": self._estop.use == "off" or bool(self._estop.state),
@@ -407,11 +418,11 @@ class Robot:
         return "", ""
 
     def _keep_away(self, now_ns: int) -> None:
-        """Reduce the chosen command to the part that leads away from the pressed bumpers.
+        """Reduce the chosen command to motion that leads away from the pressed bumpers.
 
-        If no part of it leads away, the command is dropped, and each sender must send a zero before
-        it drives again. Without this rule, the robot would drive against the obstacle as soon as
-        the bumper is released.
+        If no part of the command leads away, the command is dropped, and each sender must send a
+        zero before it drives again. Otherwise, the robot would drive against the obstacle as soon
+        as the bumper is released.
         """
         twist = self._choice.twist
         if twist is None:
@@ -425,9 +436,10 @@ class Robot:
             self._choice = replace(self._choice, twist=away)
 
     def _board(self, now_ns: int) -> dict[str, str]:
-        """Return the last value of each field of the status lines as text, by name.
+        """Return the last value of each field of the board's status lines, as text by field name.
 
-        `age_s` is the age of the last status line, s. The result is empty before the first line.
+        The entry `age_s` is the age of the last status line, s. The result is empty before the
+        first status line.
         """
         status_ns = self.session.status_ns
         if status_ns is None:
@@ -438,9 +450,9 @@ class Robot:
     def _plausible(self, line: Feedback, now: Instant, events: list[Event]) -> list[Feedback]:
         """Return the feedback lines that the odometry may use now, the oldest first.
 
-        An impossible `line` is rejected. A line after a long gap is kept for later if nothing else
-        confirms its speeds. It is returned together with the later line that confirms it, or
-        dropped if later lines contradict it.
+        A line with impossible speeds is rejected. A line after a long gap may need a confirmation
+        of its speeds. It is then kept until a later line confirms it, and is returned together
+        with this later line. If later lines contradict it, it is dropped.
         """
         why = self._sanity.impossible(line)
         if self._sanity.warning is not None:
@@ -464,7 +476,6 @@ class Robot:
         )
 
     def _believe(self, line: Feedback, now: Instant, events: list[Event]) -> Estimate:
-        """Update the odometry with a plausible line, and return the estimate."""
         checks = self._odometry.checks
         wheels = checks.wheels
         # While the emergency stop counts as pressed, the motors may have no power, so wheels that
@@ -627,10 +638,10 @@ class Robot:
     # Report.
 
     def _with_bumper(self, reason: str) -> str:
-        """Return `reason` with a note that says in which direction the robot may still drive.
+        """Return `reason` with the directions in which the pressed bumpers let the robot drive.
 
-        The pressed bumpers forbid the other directions. `reason` is the reason of the mode, in
-        words.
+        `reason` is the reason of the mode, in words. It stays as it is in modes other than driving
+        and ready.
         """
         match self._life.mode:
             case Mode.DRIVING:
@@ -661,7 +672,8 @@ class Robot:
 def _input(why: str) -> str:
     """Return the input of the board that caused a latch, as a key of `REPORTS`.
 
-    `why` is the cause of the latch, in words. The result is "" if no input caused the latch.
+    `why` is the cause of the latch, in words. The result is "" if an input of the board is not the
+    cause.
     """
     if why in (PRESSED, SILENT):
         return "estop"

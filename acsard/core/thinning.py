@@ -1,8 +1,8 @@
-"""Containers that thin out curves, bands and paths while data arrives.
+"""Containers that store long curves, bands and paths in bounded memory.
 
 A curve is a value over time, a band is a state over time, and a path is a series of poses. Times
-are in s and never decrease. Each container holds a bounded number of entries. A full container
-merges neighboring entries and halves its resolution. A curve keeps every peak.
+are in s and never decrease. A full container merges neighboring entries and halves its resolution.
+A curve keeps every peak.
 """
 
 from __future__ import annotations
@@ -14,19 +14,19 @@ from itertools import islice
 from typing import NamedTuple
 
 MOST_BINS = 1500
-"""Maximum number of bins (time intervals) of a curve. It is twice the width of a picture in
-pixels."""
+"""Largest number of bins of a curve. A bin is a time interval. The number is twice the width of a
+picture in pixels."""
 
 FIRST_WIDTH = 0.001
-"""Bin width of a new curve, s. It is shorter than the interval between the robot's steps,
-so a short recording is not thinned."""
+"""Width of a bin in a new curve, s. It is shorter than the interval between the robot's steps, so
+a short recording is not thinned."""
 
 MOST_SPANS = 1500
 
 MOST_PLACES = 4000
 
 FIRST_STRIDE = 0.001
-"""Minimum distance between consecutive kept places of a new path, m. It doubles when the path is
+"""Smallest distance between neighboring places in a new path, m. It doubles when the path is
 full."""
 
 
@@ -44,7 +44,10 @@ class _Bin(NamedTuple):
 
 
 class Curve:
-    """A value over time. Each bin, an interval of time, keeps its lowest and its highest value."""
+    """A value over time, divided into bins.
+
+    A bin is a time interval of which only the lowest and the highest value are kept.
+    """
 
     def __init__(self, most: int = MOST_BINS) -> None:
         self._most, self._bins = most, list[_Bin]()
@@ -52,7 +55,7 @@ class Curve:
         """Width of a bin, s. It doubles when the curve has too many bins."""
 
     def add(self, t: float, value: float | None) -> None:
-        """Add the value at the time `t`, s. None, NaN or infinity makes a gap in the curve."""
+        """Add a value at the time `t`, s. If it is None, NaN or infinite, the curve gets a gap."""
         bins = self._bins
         if value is None or not math.isfinite(value):
             if bins:
@@ -80,10 +83,10 @@ class Curve:
 
 
 def _merged(one: _Bin, other: _Bin) -> _Bin:
-    """Merge two neighboring bins, of which `one` is the earlier.
+    """Merge two neighboring bins, `one` and the later `other`.
 
-    A gap between the two bins would be too short to see, so it is dropped. A gap after `other`
-    stays.
+    A gap between these bins would be too short to see, so it is dropped. A gap after `other` is
+    kept.
     """
     low = other.low if other.low.value < one.low.value else one.low
     high = other.high if other.high.value > one.high.value else one.high
@@ -104,7 +107,7 @@ def _halved(bins: list[_Bin]) -> Iterator[_Bin]:
 
 
 class Span(NamedTuple):
-    """A time span, from `begin` to `end`, s, in which the state is `kind`.
+    """A time interval in which the state is `kind`. `begin` and `end` are in s.
 
     `words` is the reason of the state.
     """
@@ -116,16 +119,16 @@ class Span(NamedTuple):
 
 
 class Band:
-    """A state over time, as time spans.
+    """A state over time, as a series of time spans.
 
     If there are too many spans, short spans are merged with their neighbors.
     """
 
     def __init__(self, ranks: Sequence[str], most: int = MOST_SPANS) -> None:
-        """Create an empty band.
+        """Create an empty band that keeps at most `most` spans.
 
-        `ranks` lists the kinds of state from the most to the least important. If two spans are
-        merged, the result has the more important kind. At most `most` spans are kept.
+        `ranks` lists the kinds of state, the most important first. If two spans are merged, the
+        result has the more important kind of the two.
         """
         self._rank = {kind: at for at, kind in enumerate(ranks)}
         self._most, self._least = most, FIRST_WIDTH
@@ -134,7 +137,7 @@ class Band:
     def add(self, t: float, kind: str, words: str = "") -> None:
         """Record that the state is `kind` from the time `t` on, s.
 
-        The kind "" means that there is no state. `words` is the reason of the state.
+        If `kind` is "", there is no state from this time on. `words` is the reason of the state.
         """
         spans = self._spans
         if spans:
@@ -147,11 +150,11 @@ class Band:
             self._spans = spans = self._wider(spans)
 
     def end(self, t: float) -> None:
-        """End the last span at `t`."""
+        """End the last span at the time `t`, s."""
         self.add(t, "")
 
     def spans(self) -> list[Span]:
-        """Return the time spans in which there is a state, in order."""
+        """Return the time spans in order. Times in which there is no state are left out."""
         return [span for span in self._spans if span.kind]
 
     def _wider(self, spans: list[Span]) -> list[Span]:
@@ -168,9 +171,9 @@ class Band:
 
 
 class Place(NamedTuple):
-    """A pose in the odom frame, m and rad, at the time `t`, s.
+    """A pose in the frame odom at the time `t`, s: `x` and `y` in m, `yaw` in rad.
 
-    `new` is True if the robot did not drive from the previous place to this one, for example
+    `new` is True if the robot did not drive to this place from the previous place, for example
     because a client has set the pose.
     """
 
@@ -184,8 +187,9 @@ class Place(NamedTuple):
 class Track:
     """A path that keeps only some of the places that are added to it.
 
-    A place that is not kept is less than `2 * self.stride` m away from one that is kept. Places
-    that are too old, and those before a jump, are dropped without this condition.
+    Each place that is not kept is less than `2 * self.stride` m away from a kept place. Two kinds
+    of places are exceptions, because they are dropped in any case: places that are too old, and
+    places before a jump.
     """
 
     def __init__(
@@ -197,10 +201,13 @@ class Track:
     ) -> None:
         """Create an empty path.
 
-        The minimum distance between kept places is `stride` m at first. It is doubled when more
-        than `most` places would be kept. A place is dropped when it is more than `lasts` s
-        older than the newest one. All earlier places are dropped when a new place is more than
-        `jump` m away from the previous one.
+        Args:
+            most: the largest number of kept places. If there are more, the minimum distance is
+                doubled.
+            stride: the minimum distance between neighboring kept places at first, m.
+            lasts: the age, s, compared with the newest place, from which on a place is dropped.
+            jump: a distance, m. If a new place is farther than this from the previous place, all
+                earlier places are dropped.
         """
         self._most, self._lasts, self._jump = most, lasts, jump
         self._kept = deque[Place]()

@@ -1,7 +1,7 @@
 """The value types that all modules share, in SI units and with the wheel order `WHEELS`.
 
-This module reads no clock, does no I/O and decides nothing. For speed, Python's garbage collector
-ignores the types with `gc=False`; they are never part of a reference cycle.
+This module reads no clock, does no I/O and decides nothing. Types with `gc=False` are ignored by
+Python's garbage collector, which saves time. They are never part of a reference cycle.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 WHEELS = ("front_right", "front_left", "rear_left", "rear_right")
-"""The order of every four-wheel value, index 0 to 3."""
+"""Names of the wheels, in the order of every value with one item per wheel."""
 
 NS_PER_S = 1_000_000_000
 
@@ -33,7 +33,7 @@ class AcsardError(Exception):
 class Instant(Struct, frozen=True, gc=False):
     """One moment, by the monotonic clock and by the wall clock, ns.
 
-    Ages and periods are computed from `mono_ns`. The stamps of messages come from `wall_ns`.
+    Ages and periods are differences of `mono_ns`. The stamps of messages come from `wall_ns`.
     """
 
     mono_ns: int
@@ -41,14 +41,21 @@ class Instant(Struct, frozen=True, gc=False):
 
 
 class Twist(Struct, frozen=True, gc=False):
-    """Velocity of base_link: `linear` along x, m/s, and `angular` about z to the left, rad/s."""
+    """Velocity of base_link.
+
+    `linear` is the speed along x, m/s. `angular` is the turn rate about z, positive to the left,
+    rad/s.
+    """
 
     linear: float = 0.0
     angular: float = 0.0
 
 
 class Pose(Struct, frozen=True, gc=False):
-    """Planar pose of base_link in odom: `x`, `y` in m, `yaw` in rad within [-pi, pi]."""
+    """Planar pose of base_link in the frame odom.
+
+    `x` and `y` are in m, and `yaw` is in rad, from -pi to pi.
+    """
 
     x: float = 0.0
     y: float = 0.0
@@ -73,7 +80,10 @@ STILL = WheelSpeeds()
 
 
 class PoseCovariance(Struct, frozen=True, gc=False):
-    """Upper triangle of the covariance of (x, y, yaw) in odom: m2, m rad and rad2."""
+    """Upper triangle of the covariance matrix of (x, y, yaw) in the frame odom.
+
+    The units are m2, m rad and rad2.
+    """
 
     xx: float
     xy: float
@@ -84,9 +94,9 @@ class PoseCovariance(Struct, frozen=True, gc=False):
 
 
 class TwistVariances(Struct, frozen=True, gc=False):
-    """Variances of the twist that one feedback line gives, in base_link.
+    """Variances of the velocity of base_link that one feedback line gives.
 
-    `linear` and `lateral` are in m2/s2, `angular` is in rad2/s2.
+    `linear` and `lateral` are in m2/s2, and `angular` is in rad2/s2.
     """
 
     linear: float
@@ -95,19 +105,22 @@ class TwistVariances(Struct, frozen=True, gc=False):
 
 
 class Received(Struct, frozen=True):
-    """The bytes that one read of the serial port returned, and the moment of this read."""
+    """The bytes that one read of the serial port returned, and the time of this read."""
 
     at: Instant
     data: bytes
 
 
 class Command(Struct, frozen=True):
-    """A velocity that one sender requests.
+    """A velocity that a sender requests.
 
-    - source: one of `commands.sources`, such as `app` for the key `cmd/app`.
-    - sender: public name of the program that sent the command, as far as it is known.
-    - arrived_ns: monotonic time of arrival, ns. The command's age is computed from this time alone.
+    - source: name of the command source, such as `app` for the key `cmd/app`.
+    - sender: public name of the program that sent the command. If the program is unknown, another
+      name takes its place (see `shared`).
+    - arrived_ns: monotonic time of arrival, ns. The age of the command is computed from this time
+      alone.
     - stamp_ns: time of sending, ns, by a clock that is not synchronized with the daemon's clock.
+      None if the command has no stamp.
     - clock: name of the clock that gave `stamp_ns`.
     """
 
@@ -118,52 +131,55 @@ class Command(Struct, frozen=True):
     clock: str = ""
     sender: str = ""
     cancelled: bool = False
-    """Whether `twist` is zero only because the robot cannot make the requested motion, for example
-    a motion along y. Such a command does not count as the zero that a sender must send first."""
+    """True if `twist` is zero only because the robot cannot make the requested motion, for example
+    a motion along y. Such a command does not arm its sender, although it is zero."""
     sequence: int | None = None
-    """Number that the sender gave to this command; None if the sender does not number its commands.
-    A missing number means that a command was lost."""
+    """Number that the sender gave to this command; None if the sender does not number its
+    commands. A gap in the numbers means that a command was lost."""
     shared: bool = False
-    """Whether several programs may have the same `sender`, because the command contains neither a
-    sender id nor a GID. Then `sender` names only the Zenoh session that stamped the command, which
-    may be the session of a router or a bridge, or only the key."""
+    """True if several programs may have the same `sender`, because the command contains neither a
+    sender id nor a GID. Then `sender` is only the name of the Zenoh session that stamped the
+    command, or only the key. The session may belong to a router or a bridge."""
     ros: bool = False
-    """Whether the command came from ROS. Some ROS tools never send a zero. If such a tool must send
-    one, the text about the wait says so."""
+    """True if the command came from ROS. Some ROS tools never send a zero. If such a tool must
+    send a zero first, the text about this condition says so."""
     stamp_replaced: bool = False
-    """Whether Zenoh replaced the stamp, because the sender's clock is ahead of the daemon's."""
+    """True if Zenoh replaced the stamp, because the sender's clock is ahead of the daemon's
+    clock."""
     steady: bool = False
-    """Whether the sender declares that the clock of its stamps is never adjusted."""
+    """True if the sender declares that the clock of its stamps is never adjusted."""
 
 
 Verb = Literal["stop", "clear", "activate", "deactivate", "reset_odometry", "set_pose", "set"]
 
 Plain = bool | int | float | str | list[float | str]
-"""The value of a setting, as a client writes it."""
+"""Value of a setting in a request of a client."""
 
 
 class Request(Struct, frozen=True):
-    """A service call, or a stop that was published on the bus.
+    """A call of a service, or a stop that was published on the bus.
 
-    `id` is the ticket of the query that the robot must answer; 0 for a stop that is no query.
+    `id` identifies the query to which the robot must reply. It is 0 for a stop that was published,
+    because such a stop gets no reply.
     """
 
     verb: Verb
     id: int = 0
     pose: Pose | None = None
     asked_ns: int | None = None
-    """Monotonic time at which the request arrived, ns. None means the time of the control step that
-    serves the request. A `clear` does not release a stop that came after this time."""
+    """Monotonic time at which the request arrived, ns. None means the time of the control step
+    that processes the request. A `clear` does not release a stop that came after this time."""
     by: str = ""
     """Name of the client that sent the request, as `core/incoming/commands.py` forms it."""
     settings: dict[str, Plain] = {}
-    """The new values of the settings that `set` changes, by dotted key ("limits.linear_speed")."""
+    """The new values for the verb `set`, by dotted key such as "limits.linear_speed"."""
     latch: int | None = None
-    """Number of the latch that `clear` or `activate` releases; None if the client names none."""
+    """Number of the latch to be released, for the verbs `clear` and `activate`. None if the client
+    gives no number."""
 
 
 class Answer(Struct, frozen=True):
-    """The result of the `Request` with the same `id`."""
+    """The robot's answer to the `Request` with the same `id`."""
 
     id: int
     success: bool
@@ -171,11 +187,11 @@ class Answer(Struct, frozen=True):
 
 
 class Refusal(Struct, frozen=True):
-    """A client's message that was refused.
+    """A message from a client that the daemon refused.
 
-    `text` explains the refusal. The robot adds 1 to the counter `command_<reason>`, or to
-    `commands_of_new_senders` if the reason is `unproven`. `source` and `sender` are "" if they are
-    unknown.
+    `reason` is a short code, and `text` explains the refusal. The robot adds 1 to the counter
+    `command_<reason>`, or to `commands_of_new_senders` if the reason is `unproven`. `source` and
+    `sender` are "" if they are unknown.
     """
 
     reason: str
@@ -183,9 +199,9 @@ class Refusal(Struct, frozen=True):
     source: str = ""
     sender: str = ""
     arrived_ns: int = 0
-    """Monotonic time at which the command arrived, ns; 0 if it is unknown."""
+    """Monotonic time at which the message arrived, ns; 0 if this time is unknown."""
     shared: bool = False
-    """Whether several programs may have the same `sender` (see `Command.shared`)."""
+    """True if several programs may have the same `sender` (see `Command.shared`)."""
 
 
 EventName = Literal[
@@ -204,7 +220,7 @@ EventName = Literal[
     Verb,
     "mode", "commander", "commands_without_effect", "new_sender", "command_refused", "fault",
 ]  # fmt: skip
-"""All names of log events. `deploy/systemd/README.md` explains each of them."""
+"""All names of events in the log. `deploy/systemd/README.md` explains each name."""
 
 Level = Literal["info", "warning", "error"]
 
@@ -212,26 +228,29 @@ Level = Literal["info", "warning", "error"]
 class Event(Struct, frozen=True):
     """An event for the log.
 
-    `event_throttle.py` joins frequent events that have the same name into one log line per second.
+    If events of the same name are frequent, `event_throttle.py` joins them into about one log line
+    per second.
     """
 
     name: EventName
     text: str
     level: Level = "info"
     by: str = ""
-    """Name of the client that caused the event, "" if no client did."""
+    """Name of the client that caused the event; "" if no client caused it."""
     kind: str = ""
-    """A finer distinction than `name`, such as the reason of a refusal. A log line that combines
-    several events states the number of events of each kind."""
+    """Finer distinction than `name`, such as the reason of a refusal. A log line about several
+    events gives the number of events of each kind."""
     count: int = 1
-    """Number of occurrences that this event stands for."""
+    """Number of occurrences that this object stands for."""
     news: bool = True
-    """False if the event only repeats an earlier one. The log line of such an event may be
-    delayed."""
+    """False if the event only repeats an earlier event. Its log line may then be delayed."""
 
 
 class Estimate(Struct, frozen=True, gc=False):
-    """The estimate that the odometry computes from one feedback line, valid at the time `at`."""
+    """The estimate that the odometry computes from one feedback line.
+
+    It is valid at the time `at`.
+    """
 
     at: Instant
     pose: Pose
@@ -243,16 +262,16 @@ class Estimate(Struct, frozen=True, gc=False):
     angle is not wrapped: each full turn forward adds 2 pi."""
     speeds: WheelSpeeds
     asked_ns: int | None = None
-    """Monotonic time at which the daemon wrote the command line that the feedback line answers, ns.
-    None if the daemon does not know which command line that is."""
+    """Monotonic time at which the daemon wrote the command line that the board answered with the
+    feedback line, ns. None if the daemon cannot tell which command line that is."""
     heard_ns: int = 0
-    """Monotonic time, ns, at which the daemon had received the complete feedback line."""
+    """Monotonic time at which the daemon had received the complete feedback line, ns."""
 
 
 class Wait(Struct, frozen=True):
-    """The condition that a command source waits for before it drives the robot.
+    """The condition that must be met before a command source drives the robot.
 
-    `arbiter_text.py` makes a sentence of it.
+    `arbiter_text.py` turns it into a sentence.
     """
 
     what: Literal[
@@ -268,7 +287,7 @@ class Wait(Struct, frozen=True):
         "senders",
     ]
     source: str = ""
-    """The source that the condition `what` is about; "" if the condition is not in this list.
+    """The source that the condition `what` is about; "" if `what` is not in this list.
 
     - neutral: The waiting source, which must send a zero.
     - proof: The waiting source, which must show that its delays are steady.
@@ -278,34 +297,35 @@ class Wait(Struct, frozen=True):
     - higher, equal: The source that controls the robot with a higher or an equal priority.
     """
     seconds: float = 0.0
-    """A duration, s, whose meaning depends on `what`.
+    """A duration in s, whose meaning depends on `what`.
 
-    - neutral: After its zero, a sender with a shared identity must send no speed for this time.
+    - neutral: A sender with a shared identity must send no speed for this time after its zero.
     - proof: The delays of the commands must be steady for this time.
-    - late: The commands arrive with a delay that is longer than this time.
+    - late: The delay of the commands is longer than this time.
     """
     senders: int = 0
     """Number of senders that wait while the robot follows another sender of the same source."""
     lasts: float = 0.0
     """Time for which the source has sent speeds without a zero (if `what` is `neutral`), or only
     zeros (if `what` is `zeros`), s. It is rounded down to one of a few values, so that the text
-    about the wait seldom changes. It is 0 for a shorter time, and for all other conditions."""
+    about the condition seldom changes. It is 0 if the time is shorter than these values, and for
+    all other conditions."""
     kept: str = ""
     """Name of a source that sends speeds without effect, because `self.source` controls the robot
-    and sends only zeros. It is "another sender of NAME" if both senders belong to the source NAME,
-    and "" if no sender is kept from driving in this way."""
+    and sends only zeros. It is "another sender of NAME" if the speeds come from another sender of
+    the same source NAME. It is "" if no source sends speeds without effect for this reason."""
     ros: bool = False
-    """Whether the sender that must send a zero uses ROS."""
+    """True if the sender that must send a zero uses ROS."""
     shared: bool = False
-    """Whether several programs may share the identity of the sender that must send a zero."""
+    """True if several programs may share the identity of the sender that must send a zero."""
 
 
 class SourceStatus(Struct, frozen=True):
-    """A command source.
+    """The state of a command source.
 
-    `age_s` is the time since the last accepted command of the source, s. After some events, such as
-    the start or a `clear`, each sender must first command zero speed. From such an event until the
-    next accepted command, the age is None.
+    `age_s` is the time since the last accepted command of the source, s. Some events, such as the
+    start or a `clear`, require a zero from each sender. After such an event, the age is None until
+    the next command is accepted.
     """
 
     name: str
@@ -315,39 +335,43 @@ class SourceStatus(Struct, frozen=True):
 
 
 class WheelsStatus(Struct, frozen=True):
-    """Wheel faults, slip and slow wheels.
+    """The result of the checks for wheel faults, slip and slow wheels.
 
-    If the checks find nothing wrong, all fields except `differ` are empty.
+    If the checks find no problem, all fields except `differ` are empty.
     """
 
     text: str = ""
-    """Description of the faults and the slip, "" if there are none."""
+    """Description of the faults and the slip; "" if there are none."""
     left_out: tuple[str, ...] = ()
     """The names of the wheels that the odometry ignores."""
     slipping: tuple[str, ...] = ()
-    """The sides, `left` or `right`, whose wheels have slipped within the last half second."""
+    """The sides, `left` or `right`, whose wheels have slipped in the last half second."""
     differ: tuple[float, float] = (0.0, 0.0)
-    """Learned difference between the front and the rear wheel, for the left and for the right side.
-    0.01 means that the front wheel rolls 1 % farther than the rear wheel."""
+    """Learned difference between the front and the rear wheel of the left side, and of the right
+    side. 0.01 means that the front wheel rolls 1 % farther than the rear wheel."""
     slow: tuple[str, ...] = ()
-    """A text for each wheel that is slower than commanded, such as "front_left 60%" if it reaches
-    60 % of the expected speed."""
+    """A text for each wheel that turns slower than commanded. For example, "front_left 60%" means
+    that the wheel reaches 60 % of the expected speed."""
 
 
 class RoutersStatus(Struct, frozen=True):
-    """The endpoints in `bus.connect`: those that are connected, and those that are missing."""
+    """The state of the connections to the endpoints in `bus.connect`.
+
+    `connected` and `missing` are the endpoints with and without a connection.
+    """
 
     connected: tuple[str, ...] = ()
     missing: tuple[str, ...] = ()
     peers: tuple[str, ...] = ()
-    """Connected endpoints that are peers, not routers, so they do not forward messages."""
+    """Connected endpoints that belong to peers. A peer is not a router, so it does not forward
+    messages."""
 
 
 class GyroSample(Struct, frozen=True, omit_defaults=True):
-    """A turn rate about base_link's z axis, measured by a gyro.
+    """A turn rate about the z axis of base_link, measured by a gyro.
 
-    `rate` is in rad/s and positive to the left. `variance` is in rad2/s2, or 0 if the gyro does not
-    report it. `anew` is true for the first sample after a change from one gyro to another.
+    `rate` is in rad/s and positive to the left. `variance` is in rad2/s2, or 0 if the gyro does
+    not report it. `anew` is True for the first sample after a change to another gyro.
     """
 
     at_ns: int
@@ -363,39 +387,43 @@ GyroDoes = Literal[
     "off", "waiting for rest", "used", "silent", "disagrees",
     "reversed", "in degrees", "dead", "not believed",
 ]  # fmt: skip
-"""The state of the gyro. The odometry takes the heading from the gyro only in the states `used` and
-`disagrees`. `disagrees` means that the wheels slip."""
+"""State of the gyro. The odometry takes the heading from the gyro only in the states `used` and
+`disagrees`. In the state `disagrees`, the wheels slip."""
 
 TrackUse = Literal["shown", "uncertain", "too far off", "used"]
-"""`used` if the odometry uses the effective track that it has learned from a gyro, else the reason
-why not. `shown` means that `odometry.learned_track` is false. The effective track is the
-distance between left and right wheels with which the computed turns are true."""
+"""`used` if the odometry uses the effective track that it has learned with a gyro. Any other value
+is the reason why it does not. `shown` means that `odometry.learned_track` is false. The effective
+track is the distance between left and right wheels with which the computed turns are correct."""
 
 
 class GyroStatus(Struct, frozen=True):
-    """The state of the gyro and the values learned from it. A value not known yet is None."""
+    """The state of the gyro and the values that were learned with it.
+
+    A value that is not known yet is None.
+    """
 
     does: GyroDoes = "off"
     bias: float | None = None
     """Turn rate that the gyro reports at rest, rad/s."""
     delay: float = 0.0
-    """Time by which the gyro reports a turn later than the wheels, s; negative if it is earlier."""
+    """Time by which the gyro reports a turn later than the wheels, s. It is negative if the gyro
+    reports the turn earlier."""
     track: float | None = None
-    """Learned effective track divided by the configured one."""
+    """Learned effective track divided by the configured effective track."""
     track_deviation: float = 0.0
-    """Relative standard deviation of `track`."""
+    """Standard deviation of `track`, divided by `track`."""
     track_use: TrackUse = "shown"
 
 
 EstopState = Literal["", "released", "pressed", "silent"]
-"""The state of the emergency-stop input; "" if the board has never reported it. `silent` means that
-the board no longer reports it, which counts as pressed."""
+"""State of the emergency-stop input; "" if the board has never reported this input. `silent` means
+that the board has stopped reporting the input, which counts as pressed."""
 
 
 BatteryLevel = Literal["ok", "warning", "return", "stop", "unknown"]
-"""The level of the battery by the thresholds in `[battery]`; `ok` if no threshold is set. `unknown`
-means that the daemon cannot tell the level: the board does not report the value that the thresholds
-are for (voltage or charge), or has begun to report it only a few seconds ago."""
+"""Level of the battery by the thresholds in `[battery]`; `ok` if no threshold is set. `unknown`
+means that the board does not report the quantity (voltage or charge) that the thresholds use, or
+has reported it only for a few seconds so far."""
 
 
 class BatteryStatus(Struct, frozen=True, gc=False):
@@ -403,7 +431,8 @@ class BatteryStatus(Struct, frozen=True, gc=False):
 
     level: BatteryLevel
     reported_ns: int | None = None
-    """Monotonic time of the last report, ns; None while the board does not report its battery."""
+    """Monotonic time of the board's last report about the battery, ns. None while the board does
+    not report the battery."""
     volts: float | None = None
     percent: float | None = None
     """State of charge, 0 to 100."""
@@ -415,31 +444,33 @@ class BatteryStatus(Struct, frozen=True, gc=False):
 
 
 class Latch(Struct, frozen=True):
-    """One latch: a stop, a fault or the robot being switched off."""
+    """A stop, a fault or a deactivation of the robot, which lasts until a person releases it."""
 
     number: int
-    """Identifies the latch, also after a restart. The number is the time at which the latch was
-    set, ms since 1970. If this time is not later than the number of an earlier latch, a larger
+    """Number that identifies the latch, even after a restart. It is the time at which the latch
+    was set, ms since 1970. If this time is not later than the number of an earlier latch, a larger
     number is used, so that numbers always grow. JavaScript represents the number exactly."""
     at_ns: int
     """Wall-clock time at which the latch was set, ns since 1970."""
     by: str
-    """Name of the client that requested the latch; "" if no client did, as for a fault."""
+    """Name of the client that requested the latch; "" if no client requested it, as for a
+    fault."""
     why: str
     """Reason in words, such as "stopped by NAME" or the cause of a fault."""
     kept: bool = False
-    """True if the latch was set before the daemon's last start."""
+    """True if the latch was set before the present run of the daemon."""
     earlier: tuple[Latch, ...] = ()
-    """The latches with the earlier causes of the same stop, the newest first. A latch moves to this
-    tuple when a later cause replaces it. The field `earlier` of these latches is empty."""
+    """The earlier causes of the same stop, each as a latch, the newest first. When a new cause
+    replaces a latch, the old latch moves to this tuple. The field `earlier` of the latches in this
+    tuple is empty."""
 
     @property
     def causes(self) -> tuple[Latch, ...]:
-        """This latch, and the latches with the earlier causes of the same stop, newest first."""
+        """All causes of the same stop, each as a latch: this latch, then `earlier`."""
         return (self, *self.earlier)
 
     def each(self, change: Callable[[Latch], Latch]) -> Latch:
-        """Apply `change` to this latch and to each latch in `earlier`; return the changed latch.
+        """Return a copy in which `change` has replaced this latch and each latch in `earlier`.
 
         The function `change` gets one latch and returns its replacement.
         """
@@ -447,13 +478,17 @@ class Latch(Struct, frozen=True):
 
 
 class Latches(Struct, frozen=True):
-    """The latches and the lowered limits, which must be kept even if the process is killed."""
+    """The latches and the lowered limits.
+
+    The daemon stores them in a file, so that they last even if its process is killed.
+    """
 
     stop: Latch | None = None
     fault: Latch | None = None
     inactive: Latch | None = None
     lowered: dict[str, float] = {}
-    """The `limits.*` settings that `set` made lower than in the configuration file, by key."""
+    """The settings in `[limits]` that `set` made lower than in the configuration file, by dotted
+    key."""
 
     @property
     def next(self) -> Latch | None:
@@ -466,7 +501,7 @@ class Latches(Struct, frozen=True):
         return self.next or self.inactive
 
     def after_restart(self) -> Latches:
-        """Return a copy for the next start of the daemon, in which each latch has `kept = True`."""
+        """Return the latches for the next run of the daemon, each with `kept = True`."""
         stop, fault, inactive = (
             None if latch is None else latch.each(lambda cause: replace(cause, kept=True))
             for latch in (self.stop, self.fault, self.inactive)
@@ -479,8 +514,8 @@ class Inputs(Struct, frozen=True):
 
     - tick: True if the step must compute the line of a control period.
     - at_once: True if the step may compute an extra line for a new command or mode.
-    - opened: Number of times that the serial port was opened. If the number has grown, the step
-      begins a new session with the board.
+    - opened: Number of times that the serial port was opened so far. If the number has grown, the
+      step begins a new session with the board.
     """
 
     now: Instant
@@ -496,28 +531,29 @@ class Inputs(Struct, frozen=True):
     refusals: tuple[Refusal, ...] = ()
     """The messages from the bus that were refused before they became a `Command`."""
     guard_trip: str = ""
-    """Why the guard replaced the previous line with zeros, in words; "" if it did not. Such a
-    replacement latches a fault."""
+    """Why the guard replaced the previous line with zeros, in words; "" if it did not. If the
+    guard replaced a line, the robot latches a fault."""
     superseded: bool = False
-    """True if the line of the previous step was not written to the port, so it had no effect."""
+    """True if the line of the previous step was not written to the port."""
     missed: int = 0
-    """Number of control periods without a step since the previous step."""
+    """Number of control periods since the previous step in which no step ran."""
     events: tuple[Event, ...] = ()
     """Events of other parts of the daemon, to be logged together with the robot's events."""
     at_once: bool = False
     shutting_down: bool = False
-    """Whether the daemon is going down. The robot then ramps to zero and stays there."""
+    """True if the daemon is shutting down. The robot then ramps to zero and stays there."""
     late_ns: int = 0
-    """Time from the start of the previous step until its line was written, ns. A time
-    below 1 ms is stored as 0. A longer time means that the process has stalled in between."""
+    """Time from the start of the previous step until its line was written, ns. It is 0 if this
+    time is below 1 ms, or if no line was written. A longer time means that the process has stalled
+    in between."""
 
 
 class Outputs(Struct, frozen=True):
-    """Everything that one control step decided."""
+    """All decisions of one control step."""
 
     now: Instant
     due: bool
-    """Whether this step had to compute a line for the board: the line of a control period, or an
+    """True if this step had to compute a line for the board: the line of a control period, or an
     extra line for a new command or mode."""
     line: bytes | None
     """The line for the board; None if no line was due."""
@@ -527,23 +563,25 @@ class Outputs(Struct, frozen=True):
     estimates: tuple[Estimate, ...]
     mode: str
     reason: str
-    """Why the robot moves, or why it does not move, in words."""
+    """Why the robot moves or does not move, in words."""
     link: str
     source: str
-    """The source that the arbiter has selected, "" if it has selected none. The source may still
-    have to send a zero, or a latch may keep the robot from driving."""
+    """Source that the arbiter has selected; "" if no source is selected. A selected source does
+    not always drive: it may still have to send a zero, or a latch may keep the robot from
+    driving."""
     command_ns: int | None
     """Monotonic time at which the selected command arrived, ns; None if no command is selected."""
     status_changed: bool
-    """Whether `mode`, `reason`, `link`, `source` or the battery's level changed in this step."""
+    """True if `mode`, `reason`, `link`, `source` or the level of the battery changed in this
+    step."""
     events: tuple[Event, ...] = ()
     answers: tuple[Answer, ...] = ()
     news: bool = False
-    """Whether an extra line is useful. This is true if the command or the mode has changed since
-    the last computed line, or if the emergency stop or a bumper was pressed."""
+    """True if an extra line is useful: the command or the mode has changed since the last computed
+    line, or the emergency stop or a bumper was pressed."""
     latches: Latches = Latches()
-    """The latches and lowered limits after the step. If this is not the same object as in the
-    previous step, a latch or a lowered limit has changed."""
+    """The latches and lowered limits after the step. A latch or a lowered limit has changed if
+    this is not the same object as in the previous step."""
 
 
 class Spread(Struct, frozen=True):
@@ -556,25 +594,25 @@ class Spread(Struct, frozen=True):
 
 
 class Measured(Struct, frozen=True):
-    """Statistics, us, of one latency of the daemon, such as the time from a command to its line."""
+    """Statistics of one latency of the daemon, us, such as the time from a command to its line."""
 
     since_start: Spread = Spread()
     last_minute: Spread = Spread()
 
 
 class Recording(Struct, frozen=True):
-    """The state of the recorder, which stores every control step in files."""
+    """The state of the recorder, which writes every control step to files."""
 
     where: str = ""
-    """The directory of the recordings, "" if recording is switched off."""
+    """Directory of the recordings; "" if recording is switched off."""
     trouble: str = ""
-    """Why recording fails at present, in words; "" if it does not fail."""
+    """Why recording fails at present, in words; "" if recording works or is switched off."""
     missing: int = 0
     """Number of steps that were not recorded."""
 
 
 class Snapshot(Struct, frozen=True):
-    """Values for the messages `state` and `diagnostics` that are not in `Outputs`."""
+    """The values for the messages `state` and `diagnostics` that are not in `Outputs`."""
 
     pose: Pose
     measured: Twist | None  # None while the feedback is silent
@@ -582,12 +620,12 @@ class Snapshot(Struct, frozen=True):
     sources: tuple[SourceStatus, ...]
     counters: dict[str, int]
     refused: str
-    """The last command that was refused and the reason, "" before the first one."""
+    """The last command that was refused, and the reason; "" if no command was refused yet."""
     refused_age_s: float | None = None
-    """Seconds since a command was last refused, None if none was refused yet. A command that is
-    refused only because its sender is new does not count."""
+    """Time since a command was last refused, s; None if no command was refused yet. A command that
+    is refused only because its sender is new does not count."""
     feedback_age_s: float | None = None
-    """Seconds since the last valid line of the board, None before the first one."""
+    """Time since the last valid feedback line of the board, s; None before the first line."""
     missed_last_minute: int = 0
     """Number of control periods in the last minute in which no control step ran."""
     figures: dict[str, Measured] = {}
@@ -596,25 +634,26 @@ class Snapshot(Struct, frozen=True):
     doubt: WheelsStatus = WheelsStatus()
     estop: EstopState = ""
     bumpers: tuple[bool, ...] | None = None
-    """Whether each bumper counts as pressed, in the order in the board's reports. None if the board
-    has never reported its bumpers."""
+    """Whether each bumper counts as pressed, in the order of the board's reports. None if the
+    board has never reported its bumpers."""
     bumper: str = ""
-    """Why a bumper counts as pressed, in words; "" while none does."""
+    """Why a bumper counts as pressed, in words; "" while no bumper counts as pressed."""
     battery: BatteryStatus | None = None
-    """The battery, None if the board has never reported it."""
+    """State of the battery; None if the board has never reported the battery."""
     board: dict[str, str] = {}
-    """Maps the name of each field of the board's status lines to its last value, as text. The entry
-    `age_s` is the age of the last status line, s. The map is empty before the first status line."""
+    """The last value of each field of the board's status lines, as text by field name. The entry
+    `age_s` is the age of the last status line, s. The map is empty before the first status
+    line."""
     check: str = "plain"
-    """Whether the serial lines carry a checksum, in words, such as "plain" or "checked"."""
+    """Whether the serial lines have a checksum, in words, such as "plain" or "checked"."""
     encoders: tuple[int, ...] = ()
     """Configured encoder counts per wheel turn, in `WHEELS` order. All are 0 if no counts are
     configured. They are also 0 if the reported speeds do not match the configured counts: each
     speed should be an integer number of counts divided by a time."""
     sender: str = ""
-    """The sender that the arbiter has selected, "" if it has selected none."""
+    """Sender that the arbiter has selected; "" if no sender is selected."""
     routers: RoutersStatus = RoutersStatus()
     recording: Recording = Recording()
     latch_file: str | None = None
-    """Why the latches would be lost if the daemon restarted now, in words. "" if they would be
-    kept; None if this daemon has no latch file."""
+    """Why the latches would be lost if the daemon restarted now, in words. It is "" if they would
+    be kept, and None if this daemon has no latch file."""

@@ -1,5 +1,6 @@
-"""The daemon: the control loop, and the bus, serial port and files around it.
+"""The daemon: the process that drives one robot.
 
-`daemon.py` runs all of them, from the start of the process to its end. `serial/port.py` sends the
-last zero speeds when the daemon ends.
+`control_loop.py` runs the control steps, which compute the lines to the board. The other modules
+connect the control loop to the Zenoh bus, to the serial port and to files. `daemon.py` starts and
+ends all of them. When the daemon ends, `serial/port.py` sends the last line of zero speeds (STOP).
 """

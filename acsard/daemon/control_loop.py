@@ -1,7 +1,8 @@
-"""Collects the inputs of `Robot.step`, calls this method, and delivers its outputs.
+"""Collects the inputs of a control step, calls `Robot.step`, and delivers the outputs of the step.
 
-The control loop decides nothing about the motion. It is synchronous, so that the daemon can call
-`step` from one task and the tests can call it in virtual time.
+All decisions about the motion are made in `Robot.step`, not in the control loop. The control loop
+is synchronous, so that the daemon can call `ControlLoop.step` from one task and the tests can call
+it in virtual time.
 """
 
 from __future__ import annotations
@@ -60,19 +61,21 @@ FEEDBACK = ("odom", "tf", "wheel_states")
 """Topics whose messages are made from the feedback lines of the board."""
 
 QUERIES_PER_STEP = 8
-"""Largest number of queries that one step answers. Further queries wait for the next step, so that
-a flood of queries does not make the control loop miss a period."""
+"""Largest number of queries that one control step takes from the bus. One slow query may exceed
+this limit. Further queries wait for the next step, so that a flood of queries does not make the
+control loop miss a period."""
 
 LATE_NS = 1_000_000
-"""The delay from the start of a step to the write of its line is passed to the robot as 0 if it is
-shorter than this time, ns. The estimated sample times are less accurate than that."""
+"""Shortest delay from the start of a step to the write of its line that is reported to the robot,
+ns. For a shorter delay the robot gets 0, because the estimated sample times are less accurate
+anyway."""
 
 NOT_STORED = (
     "the new state is not stored on the disk yet; if the daemon restarts before it is stored, it "
     "may lose a stop"
 )
-"""If the disk is slow, an answer is sent before its latches are in the latch file. This text is
-then added to the answer."""
+"""Text that is added to a successful answer if the answer is sent before the newest latches are in
+the latch file. This happens if the disk is slow."""
 
 BUS_STUCK = Event(
     "bus_stuck",
@@ -82,7 +85,7 @@ BUS_STUCK = Event(
 
 
 class ControlLoop:
-    """The control loop of one robot, between its serial port and its bus."""
+    """The control loop of one robot. It connects the robot to the serial port and to the bus."""
 
     def __init__(
         self,
@@ -113,20 +116,20 @@ class ControlLoop:
             start: the time at which the daemon started.
             log: function that writes an event to the log.
             mono_ns: function that returns the monotonic time, ns.
-            certificate_ends: wall-clock time at which each certificate expires, ns since 1970, by
-                the name of the certificate. None or empty without TLS.
+            certificate_ends: maps the name of each TLS certificate to the time at which the
+                certificate expires, ns since 1970. None or empty without TLS.
             others: list to which other parts of the daemon append events. Each step passes these
                 events to the robot and empties the list.
-            beside: function that returns the present value of a key that another part of the
-                daemon publishes, or None for any other key.
-            adopted: function that is called with each new configuration that comes into force
-                after the start.
-            recorder: records each step. With None nothing is recorded.
+            beside: function that returns the newest message of a key that another part of the
+                daemon, such as the simulator, publishes. It returns None for any other key.
+            adopted: function that is called with each new configuration that comes into force after
+                the start.
+            recorder: the black box, which records each step. With None nothing is recorded.
             latches: the latches with which the robot starts.
-            keeper: stores the latches, so that they survive a restart. With None the latches are
-                not stored.
-            settings_file: writes settings to the configuration file. With None a `set` with `keep`
-                is refused.
+            keeper: stores the latches, so that they survive a restart of the daemon. With None the
+                latches are not stored.
+            settings_file: writes settings to the configuration file. With None, a `set` request
+                with the field `keep` is refused.
             late_watch: finds the causes of late periods. With None no causes are reported.
         """
         self.robot = Robot(config, latches)
@@ -143,12 +146,12 @@ class ControlLoop:
         """`_started` has the limits at the daemon's start. `_speed` handles the key
         `speed_limit`."""
         self._kept: tuple[Latches, LimitsConfig, LimitsConfig, Latches] | None = None
-        """Cache of `_to_keep`: the latches, the two sets of limits that it last compared, and the
-        result."""
+        """Cache of the method `_to_keep`: the latches and the two sets of limits of its last
+        computation, and the result."""
         self._step_answers: tuple[Answer, ...] = ()
         self._answers: deque[tuple[int, Answer]] = deque()
-        """Answers that wait for the latch file. Each is paired with the monotonic time at which it
-        was queued, ns."""
+        """Answers that are not sent yet, because the latch file does not contain the newest
+        latches. Each answer is paired with the monotonic time at which it was queued, ns."""
         self._got = NOTHING
         """The input that the present step has taken from the bus."""
         stop = self.robot.session.codec.stop
@@ -165,9 +168,9 @@ class ControlLoop:
         self._port, self._bus, self._log, self._mono_ns = port, bus, log, mono_ns
         self._superseded, self._trip, self._late_ns = False, "", 0
         """Three facts about the last line to the board. `_superseded` is true if the port did not
-        send it, and a newer line must replace it. `_trip` is the reason why the guard sent zeros
-        instead, or "". `_late_ns` is the delay from the start of the step to the write of the line,
-        ns, or 0 if that is below `LATE_NS`."""
+        send the line, so that a newer line must replace it. `_trip` is the reason why the guard
+        replaced the line with zeros, or "". `_late_ns` is the delay from the start of the step to
+        the write of the line, ns, or 0 if the delay is below `LATE_NS`."""
         # Use the longest line of both directions, because answers must not queue in the MCU either.
         period_ns = int(NS_PER_S / config.rate_hz)
         self._pace = Pace(wire_ns(config.mcu.line_bytes, config.mcu.baud_rate), period_ns)
@@ -175,12 +178,18 @@ class ControlLoop:
 
     @property
     def at_rest(self) -> bool:
-        """True if the last step commanded zero speed. Every step without a link does so."""
+        """True if the last control step commanded zero speed; False before the first step.
+
+        While the serial port is closed, every step commands zero speed.
+        """
         outputs = self.outputs
         return outputs is not None and not any(outputs.speeds.as_tuple())
 
     def totals(self, now_ns: int) -> dict[str, float]:
-        """Return the fields of the log event `ended`: run time in s, distance in m, counters."""
+        """Return the fields of the log event `ended`: run time in s, distance in m, and counters.
+
+        `now_ns` is the present monotonic time, ns.
+        """
         seconds, metres = (now_ns - self._start_ns) / NS_PER_S, self.robot.travelled
         shot = self.robot.snapshot(now_ns)
         return {"seconds": round(seconds, 1), "metres": round(metres, 2), **shot.counters}
@@ -189,21 +198,24 @@ class ControlLoop:
     def retry_ns(self) -> int | None:
         """Monotonic time at which an extra step can send a waiting command, ns.
 
-        A command waits if it came too soon after the last line to the board. None if no command
-        waits.
+        A command waits if it arrived too soon after the last line to the board. The value is None
+        if no command waits.
         """
         return self._pace.retry_ns(self._port.sent_ns) if self._pace.waits else None
 
     @property
     def listens(self) -> bool:
-        """Whether a command that arrives now gets a step at once, not only in the next period."""
+        """Whether the next command gets an extra step immediately.
+
+        If this is False, the next command waits for the next step that another event runs.
+        """
         return self._pace.listens
 
     def step(self, now: Instant, period: Period = NO_PERIOD) -> Outputs:
-        """Run one control step.
+        """Run one control step at the time `now`, and return the robot's outputs.
 
-        `period` says how many periods have ended since the last step. It is `NO_PERIOD` for an
-        extra step between the ends of two periods.
+        `period` says how many periods have ended since the last step. For an extra step between the
+        ends of two periods, it is `NO_PERIOD`.
         """
         self._got = NOTHING
         try:
@@ -223,8 +235,8 @@ class ControlLoop:
             if self._late_watch is not None:
                 self._late_watch.period(now.mono_ns, late_ns, missed)
                 # The log joins events of one name into one line, which shows the text of the last
-                # event. After missed periods that is the robot's own event. It would hide the
-                # cause, because it states only the number of periods.
+                # event. After missed periods, the robot's own event follows in this step. Its text
+                # states only the number of periods, and would hide the cause.
                 if not missed:
                     self._others += self._late_watch.news()
         commands, refusals, requests = self._from_bus(now)
@@ -279,8 +291,8 @@ class ControlLoop:
     def _decided(self, inputs: Inputs) -> tuple[Outputs, bool]:
         """Run the robot's step, send its line, and record the step.
 
-        Return the outputs, and whether a line was sent. The step is recorded even if this method
-        raises.
+        Return the outputs, and whether the port wrote the line. If an exception occurs, the
+        recorder still stores the inputs of the step.
         """
         try:
             outputs = self.outputs = self.robot.step(inputs)
@@ -302,11 +314,11 @@ class ControlLoop:
         return outputs, went is not None
 
     def _to_keep(self, latches: Latches) -> Latches:
-        """Return the robot's latches as the latch file stores them for the next start.
+        """Return the latches that the latch file must store for the next start of the daemon.
 
-        A limit that a `set` request has lowered stays in force over a restart. A limit from a
-        message on the key `speed_limit` does not stay in force, because the program that would
-        lift it may have ended by then.
+        If a `set` request has lowered a limit, the limit stays lowered after a restart, unless it
+        is a deceleration. A limit from a message on the key `speed_limit` is not stored, because
+        the program that would lift it may have ended by then.
         """
         now, file = self._speed.settings.limits, self._settings_file
         if file is not None:
@@ -323,14 +335,14 @@ class ControlLoop:
         return last if latches == last else latches
 
     def finish(self, now: Instant) -> None:
-        """Store the stops that arrived after the last step, and send the remaining answers."""
+        """Store the stops that arrived after the last step, and send the waiting answers."""
         self.keep_last_stops(now)
         self._handover.wait()
         self._answer(now, last=True)
         self._bus.flush()
 
     def keep_last_stops(self, now: Instant) -> None:
-        """Store the stops that arrived after the last step, because no step will process them."""
+        """Store the stops that arrived after the last step, which no step will process."""
         self._handover.take_stops(self._handover.latches, _stops(self._bus.take(0)), now)
 
     def _adopt(self, config: Config) -> None:
@@ -416,8 +428,9 @@ class ControlLoop:
     def _served(self, query: Query, now: Instant, refusals: list[Refusal]) -> Request | None:
         """Answer a query, or return the request that the robot must answer.
 
-        Return None if the query was answered, or if it is a `set` with `keep`, which waits for the
-        settings file. If the query cannot be decoded, add the reason to `refusals`.
+        Return None if the query was answered, or if it is a `set` request with the field `keep`,
+        which waits for the settings file. If the query cannot be decoded, refuse it and add the
+        reason to `refusals`.
         """
         try:
             served = self._queries.serve(query, self._current, self.outputs)
@@ -437,7 +450,10 @@ class ControlLoop:
         return None
 
     def _keep(self, request: Request, now: Instant) -> None:
-        """Pass a `set` with `keep` to the settings file, or refuse it if there is no such file."""
+        """Pass a `set` request with the field `keep` to the settings file.
+
+        If the daemon has no settings file, refuse the request.
+        """
         if self._settings_file is None:
             text = (
                 "nothing is set: this daemon has no configuration file in which to keep settings; "
@@ -448,10 +464,10 @@ class ControlLoop:
             self._settings_file.keep(request, now.mono_ns)
 
     def _keepable(self, now: Instant) -> tuple[Request, ...]:
-        """Return the `set` requests with `keep` whose settings the robot must use now.
+        """Return the `set` requests with the field `keep` whose settings the robot must use now.
 
-        Also queue the answers to those requests whose settings were written to the file, and to
-        those that were refused or took too long.
+        Also queue an answer for each earlier request of this kind whose settings were written to
+        the file, or that was refused or took too long.
         """
         if self._settings_file is None:
             return ()
@@ -464,7 +480,7 @@ class ControlLoop:
         return tuple(requests)
 
     def _send(self, outputs: Outputs, now: Instant, tick: bool) -> bytes | None:
-        """Let the guard check the line in `outputs`, and offer it to the port.
+        """Let the guard check the line in `outputs`, and offer the line to the port.
 
         `now` is the time of the step. `tick` is true for the line of a period, and false for a line
         between two periods. Return the line if the port wrote it, else None.
@@ -509,10 +525,10 @@ class ControlLoop:
             self._log(event)
 
     def _answer(self, now: Instant, *, last: bool = False) -> None:
-        """Send the queued answers that need not wait any longer.
+        """Send each queued answer that need not wait any longer.
 
-        An answer waits until the latches are stored, but at most `ANSWER_NS`. If `last` is true,
-        all queued answers are sent now. `now` is the time of the step.
+        An answer waits until the newest latches are stored, but at most `ANSWER_NS`. If `last` is
+        true, no answer waits. `now` is the time of the step.
         """
         held, before_ns = self._handover.held, now.mono_ns - ANSWER_NS
         trouble = "" if held else self._handover.trouble or NOT_STORED
@@ -546,7 +562,7 @@ class ControlLoop:
 
 
 def _stops(got: BusInput) -> list[str]:
-    """Return the names of the clients that sent the stops in `got`, one name for each stop."""
+    """Return the name of the client for each stop in `got`."""
     puts = [one for one in got.arrivals if one.key == "stop" and one.put]
     calls = [query for query in got.queries if query.topic == "srv/stop"]
     names = [caller_name(put.via, put.attachment, put.sender) for put in puts]

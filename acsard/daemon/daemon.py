@@ -1,10 +1,9 @@
 """Runs the daemon from its start to its end.
 
-The daemon enters the contexts of the simulator, the bus, the port and the control loop, in this
-order. The shutdown leaves these contexts in reverse order: the robot ramps to zero, the port writes
-STOP and closes, and the bus closes. The first signal begins the shutdown, and a second signal cuts
-the ramp short. After an exception in any task, the daemon also leaves the contexts in reverse
-order, but without the ramp.
+The daemon opens the built-in simulator (if it is configured), the bus and the serial port, in this
+order. Then it runs the control loop. At the first signal, the robot ramps to zero speed, and a
+second signal cuts the ramp short. Then the port sends STOP and closes, and the bus closes last. If
+an exception ends a task of the daemon, the robot does not ramp, but the port still sends STOP.
 """
 
 from __future__ import annotations
@@ -44,7 +43,8 @@ from acsard.host.version import version
 from acsard.recording.recorder import Recorder
 
 EXIT_RAMP_S = 0.6
-"""Longest duration of the ramp to zero speed at the shutdown, s. Then STOP is sent in any case."""
+"""Longest time for the ramp to zero speed at the shutdown, s. After this time the daemon sends STOP
+even if the robot still moves."""
 
 
 class Departure:
@@ -61,7 +61,7 @@ class Departure:
         self.hurried = False
 
     def __enter__(self) -> Self:
-        """Handle the signals that end the daemon. A closed terminal sends SIGHUP."""
+        """Handle SIGTERM, SIGINT, SIGQUIT and SIGHUP. A terminal that is closed sends SIGHUP."""
         loop = asyncio.get_running_loop()
         for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT):
             loop.add_signal_handler(number, self._signal, number)
@@ -92,8 +92,12 @@ class Departure:
     def over(self, now_ns: int, at_rest: bool) -> bool:
         """Return whether the daemon may end now.
 
-        It may end when the robot is at rest, after a second signal, or when the ramp has taken
-        `EXIT_RAMP_S`. `at_rest` says whether the last step commanded zero speed.
+        Before the first signal, return False. Afterwards return True if the last step commanded
+        zero speed, if a second signal has arrived, or if the ramp has lasted for `EXIT_RAMP_S`.
+
+        Args:
+            now_ns: the present monotonic time, ns.
+            at_rest: whether the last step commanded zero speed.
         """
         if self.begun_ns is None:
             return False
@@ -109,8 +113,8 @@ LATCHED_PERIOD_S = 5.0
 subscribers cannot query the last sample of a latched topic."""
 
 Announce = Callable[[str, str], None]
-"""Callback that runs when the start is complete. Its arguments are the path of the serial device,
-and the reason why it is not open ("" if it is open)."""
+"""Function that the daemon calls once, when its start is complete. The first argument is the path
+of the serial device. The second is the reason why this device is not open, or "" if it is open."""
 
 
 async def run(
@@ -126,13 +130,16 @@ async def run(
     Raises a `MendableError` if the daemon cannot start.
 
     Args:
+        config: the configuration at the start of the daemon.
         log: the daemon's log.
         announce: function that is called once, when the start is complete.
-        gateway: arguments of the `acsard gateway` process, which this daemon starts if
-            `bus.outside` names endpoints. None if the gateway is a service of its own.
-        page: arguments of the `acsard web` process, or None for no page.
-        settings_file: the configuration file. The daemon compares it with the settings in force,
-            and stores settings in it. With None the daemon does neither.
+        gateway: command-line arguments with which the daemon starts `acsard gateway` if
+            `bus.outside` names endpoints. None if the gateway runs as a service of its own.
+        page: command-line arguments with which the daemon starts `acsard web`. None for no web
+            page.
+        settings_file: the configuration file. The daemon compares the file with the settings in
+            force, and writes settings to it if a client requests that. With None the daemon does
+            neither.
     """
     wake = Wakeup()
     manager = Systemd(os.environ, os.getpid())
@@ -148,7 +155,7 @@ async def run(
         if refused:
             log.info("real_time", text=refused)
         totals: dict[str, object] = {}
-        stack.callback(lambda: log.info("ended", **totals))  # entered early, so it runs late
+        stack.callback(lambda: log.info("ended", **totals))  # runs after `totals` is filled
         urdf = robot_description(config.ros.urdf)
         events, start = list[Event](), clock.now()
         recorder = _recorder(config, events.append, start.wall_ns, stack)
@@ -215,7 +222,7 @@ def _recorder(
 ) -> Recorder | None:
     """Return the recorder of the black box, or None if `[record] directory` is empty.
 
-    `wall_ns` is the wall-clock time at which the daemon started, ns. `stack` closes the recorder.
+    `wall_ns` is the time at which the daemon started, ns since 1970. `stack` closes the recorder.
     """
     if not config.record.directory:
         return None
@@ -225,7 +232,7 @@ def _recorder(
 
 
 def _keeper(config: Config, stack: AsyncExitStack) -> LatchFile | None:
-    """Return the latch file, or None for the built-in simulator, whose latches are not kept.
+    """Return the latch file. Return None for the built-in simulator, whose latches are not stored.
 
     `stack` closes the file after the port, because a slow disk must not delay the last STOP.
     """
@@ -254,9 +261,10 @@ async def _beside(helpers: Iterable[Coroutine[Any, Any, object]]) -> AsyncIterat
 def _certificates(config: Config, ours: bool) -> dict[str, int]:
     """Return the expiry time of each certificate that the daemon uses, ns since 1970.
 
-    The dict key "" stands for the daemon's own certificate, and `tls.AUTHORITY` for that of its
-    authority. Returns {} if the daemon uses no certificate. `ours` is true if the daemon itself
-    starts the TLS gateway. Raises a `MendableError` if the certificates cannot be used.
+    In the returned dict, the key "" stands for the daemon's own certificate, and `tls.AUTHORITY`
+    for the certificate of its authority. Return {} if the daemon uses no certificate. Raises a
+    `MendableError` if the certificate files cannot be used. `ours` says whether this daemon itself
+    starts the TLS gateway.
     """
     bus = config.bus
     if not (any(e.startswith(TLS) for e in bus.connect) or (ours and bus.outside)):
@@ -272,7 +280,7 @@ async def _control(
     wake: Wakeup,
     manager: Systemd,
 ) -> None:
-    """Run a control step in each period and after other events, until the shutdown is over."""
+    """Run a control step for each event in the list of `wakeup.py`, until the shutdown is over."""
     # Let each of the other tasks run once first. This first round is slow, and must end before the
     # first period.
     await asyncio.sleep(0)
@@ -295,9 +303,9 @@ async def _control(
 
 @asynccontextmanager
 async def _patience(config: Config, log: Log, manager: Systemd) -> AsyncIterator[None]:
-    """Report that the daemon waits for its router, while the `async with` block runs.
+    """Log that the daemon waits for its router, and tell systemd so, during the `async with` block.
 
-    The reports go to the log and to systemd. In peer mode there is no such wait and no report.
+    In peer mode the daemon does not wait for a router, so nothing is reported.
     """
     if config.bus.mode == "peer":
         yield

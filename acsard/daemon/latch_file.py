@@ -1,8 +1,8 @@
 """The file that keeps the latches for the next start of the daemon.
 
 A latch is a stop, a fault or "inactive", which lasts until a person releases it. The file also
-keeps the limits that `set` has lowered. `latch_rules.py` decides with which latches the robot
-starts.
+keeps the limits that `set` requests have lowered, except decelerations. `latch_rules.py` decides
+with which latches the robot starts.
 
 The control loop hands the newest latches to a thread that writes the file, and never waits for the
 disk. Once this thread has renamed the new file, a kill of the process loses nothing. A second
@@ -44,9 +44,9 @@ from acsard.host.mailbox import Mailbox
 from acsard.host.threads import NoThreadError, in_thread
 
 START_S = 2.0
-"""If a write or a sync of the file takes longer than this time, s, the daemon reports that the disk
-hangs. At the start of the daemon, this is the limit for the first read and the first write
-together."""
+"""Time limit for the disk, s. If a write or a sync of the latch file takes longer, the daemon
+reports that the disk hangs. At the start of the daemon, the first read and the first write together
+must not take longer."""
 
 PACE_S = 0.05
 """Pause after each successful write, s. Each stop is a new latch, so without this pause a flood of
@@ -61,10 +61,12 @@ CLOSE_S = 0.3
 HANGS = f"the disk did not answer within {START_S:g} s"
 
 EVENTS = 64
-"""Largest number of events that wait until the control loop takes them in its next step."""
+"""Largest number of events that wait for the next control step. A newer event displaces the
+oldest."""
 
 NO_PLACE = "no directory"
-"""Messages show this text in place of the file's path if no directory for the file can be found."""
+"""Text that messages show in place of the file's path if no directory for the latch file is
+found."""
 
 
 def place(config: Config, environ: Mapping[str, str]) -> Path:
@@ -103,30 +105,32 @@ class LatchFile:
 
     def __init__(self, config: Config, environ: Mapping[str, str]) -> None:
         self.where = NO_PLACE
-        """The path of the file as messages show it, or `NO_PLACE`."""
+        """Path of the file as messages show it, or `NO_PLACE`."""
         self._path: Path | None = None
         self._robot = config.robot.id
         self._barred = ""
-        """The reason why the daemon must never write the file; "" if it may write it."""
+        """Reason why the daemon must never write the file; "" if the daemon may write it."""
         try:
             self._path = place(config, environ)
             self.where = str(self._path)
         except OSError as error:
             self._barred = _reason(error)
         self._lock = -1
-        """Descriptor of the lock that keeps other daemons away from the latch file."""
+        """Descriptor of the lock that keeps other daemons away from the latch file; -1 without a
+        lock."""
         self._disk = threading.Lock()
-        """Held by the thread that uses the disk. The control loop never takes it."""
+        """Lock of the thread that reads or writes the latch file. A sync needs no lock. The control
+        loop never takes this lock."""
         self._abandoned = False
-        """True if `start` has stopped waiting for the first read and write of the file."""
+        """True if `start` has timed out while another thread was reading and writing the file."""
         self._found: Latches | None = None
         """The latches that the file contained when the daemon started; None before it is read."""
         self._blind = False
         """True if `start()` could not read the file in time. The writing thread must then read it
         before its first write."""
         self._missed = Latches()
-        """Latches that the file contained, but that the robot did not get, because `start()` could
-        not read the file in time. Each write adds them to the file again."""
+        """Latches in the file that the robot did not get, because `start()` could not read the file
+        in time. Each write adds these latches to the file again."""
         self._box = Mailbox[Latches](1)
         """Passes the latches of the last call of `keep` to the writing thread."""
         self._news = Mailbox[Event](EVENTS)
@@ -152,8 +156,8 @@ class LatchFile:
     async def start(self, now: Instant) -> Latches:
         """Read the file, try to write it, and return the latches with which the robot starts.
 
-        If the file cannot be read or written, these latches contain a stop. `now` is the time of
-        that stop. Raises `InUseError` if another daemon uses this file.
+        If the file cannot be read or written, the returned latches contain a stop. `now` is the
+        time of that stop. Raises `InUseError` if another daemon uses this file.
         """
         try:
             latches = await in_thread(lambda: self._look(now), START_S)
@@ -176,8 +180,8 @@ class LatchFile:
             for thread in threads:
                 thread.start()
         except RuntimeError as error:
-            # The first thread may run already. Without the second thread it must not write, and
-            # must not report a recovery. `_barred` prevents both.
+            # The first thread may run already. Without the second thread, the first one must not
+            # write, and must not report a recovery. `_barred` prevents both.
             self._barred = f"this process cannot start another thread ({error})"
             self._fail(self._barred)
             return doubted(latches, at_start(unwritable(self.where, self._failed)), now)
@@ -197,7 +201,7 @@ class LatchFile:
             return latches
 
     def _read(self, now: Instant) -> Latches:
-        """Lock the file, and return its latches.
+        """Lock the file, and return its latches. Return no latches if the file does not exist.
 
         If the file cannot be read, return a stop that was set at `now`. Raises `InUseError` if
         another daemon has locked the file.
@@ -250,19 +254,27 @@ class LatchFile:
     # The control loop calls the methods below.
 
     def keep(self, latches: Latches) -> None:
-        """Pass the latches in force to the writing thread.
+        """Pass the latches in force to the writing thread, without waiting for the disk.
 
-        If they change again before the thread has written them, it writes only the newest ones.
+        If this method is called again before the thread has written the latches, the thread writes
+        only the newest latches.
         """
         self._handed = latches
         self._box.put(latches)
 
     def holds(self, latches: Latches) -> bool:
-        """Return whether these latches are in the file. They then survive a kill of the process."""
+        """Return whether the file contains these latches. A kill of the process then loses nothing.
+
+        `latches` must be the object that was passed to `keep`. An equal copy does not count.
+        """
         return self._held is latches
 
     def wait(self, latches: Latches, seconds: float) -> None:
-        """Block until the file contains these latches or a write fails, but at most `seconds` s."""
+        """Block until the file contains these latches or a write fails, but at most `seconds` s.
+
+        `latches` must be the object that was passed to `keep`. If the last write or sync has
+        already failed, return immediately.
+        """
         end_ns = clock.mono_ns() + seconds * NS_PER_S
         while not self.holds(latches) and not self._failed and clock.mono_ns() < end_ns:
             time.sleep(0.001)
@@ -279,7 +291,7 @@ class LatchFile:
 
     @property
     def trouble(self) -> str:
-        """The reason why the latches would not survive a restart, in words; "" if they would."""
+        """Reason why the latches would not survive a restart, in words, or "" if they would."""
         if not all(thread.is_alive() for thread in self._threads):
             return "the thread that writes stops to the latch file has ended; restart the daemon"
         failed = self._failed or (HANGS if self._hangs else "")
@@ -289,7 +301,7 @@ class LatchFile:
     def _hangs(self) -> bool:
         """True if the disk hangs: a sync or a needed write has lasted longer than `START_S`.
 
-        A write is needed while the file does not contain the newest latches.
+        A write is needed if the file does not contain the newest latches.
         """
         if self._failed:
             return False
@@ -305,7 +317,10 @@ class LatchFile:
         )
 
     def close(self) -> None:
-        """Wait until the newest latches are written and synced, but at most `CLOSE_S`."""
+        """Wait until the newest latches are written and synced, and end both threads.
+
+        The wait takes at most `CLOSE_S`.
+        """
         end_ns = clock.mono_ns() + CLOSE_S * NS_PER_S
         for box, thread in zip((self._box, self._renamed), self._threads, strict=False):
             box.close()
@@ -344,7 +359,7 @@ class LatchFile:
         return trouble
 
     def _read_late(self, now: Instant) -> None:
-        """Read the file that `start()` could not read in time, and keep its latches in `_missed`.
+        """Read the file that `start()` could not read in time, and store its latches in `_missed`.
 
         Without this call, the next write would overwrite these latches.
         """
@@ -358,7 +373,7 @@ class LatchFile:
         self._missed = replace_fields(self._found, stop=None)
 
     def _replace(self, latches: Latches) -> str:
-        """Replace the file without a sync; return the reason of a failure, or "" on success."""
+        """Write these latches to the file without a sync. Return the reason of a failure, or ""."""
         if self._path is None or self._barred:
             return self._barred
         try:
@@ -377,7 +392,6 @@ class LatchFile:
     # The syncing thread runs the methods below.
 
     def _sync_each(self) -> None:
-        """Sync the file after each write, and report a failure or a recovery."""
         failed = False
         while True:
             # Read `closed` before the latches, so that the last latches are not missed.
@@ -412,10 +426,11 @@ class LatchFile:
         return ""
 
     def _with_missed(self, latches: Latches) -> Latches:
-        """Return `latches` together with the latches in `self._missed`.
+        """Return `latches` together with the missed latches (`_missed`).
 
-        If `latches` has a fault or "inactive" itself, the missed one is dropped. A missed stop is
-        not added either: the robot already has a stop, because `start()` could not read the file.
+        If `latches` contains a fault, the missed fault is dropped for good. The same holds for
+        "inactive". A missed stop is never added, because the robot already has a stop: `start()`
+        could not read the file.
         """
         missed = self._missed
         if latches.fault is not None:

@@ -1,8 +1,8 @@
-"""The rules of the latch file: its content, and the latches with which the daemon starts.
+"""The rules of the latch file: its content, and the latches with which the robot starts.
 
-If the latch file cannot be read or cannot be written, the robot starts stopped until `clear`. Each
-latch is written when it is set, so it does not matter how the process ends. This module is pure;
-`latch_file.py` reads and writes the file.
+If the latch file cannot be read or written, the robot starts stopped, until a `clear` releases the
+stop. Each latch is written when it is set, so it does not matter how the process ends. This module
+is pure; `latch_file.py` reads and writes the file.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ MAX_BYTES = 65_536
 limits take about 1 kB."""
 
 MAX_TEXT = 500
-"""Largest number of characters of a name or a reason in the latch file. The rest is cut off."""
+"""Largest length of a name or a reason in the latch file, characters. The rest is cut off."""
 
 ANSWER_NS = NS_PER_S // 5
 """Longest time for which the answer to a stop waits for the latch file, ns. A longer wait would
 make a client believe that the robot did not receive the stop."""
 
 BY = "acsard"
-"""Stands in place of a client's name in a stop that the daemon itself sets."""
+"""Name of the sender in a stop that the daemon itself sets."""
 
 
 EMPTY = ("earlier", ())
-"""Name and value of the field `earlier` of a latch that has only one cause. Most latches have only
-one, so the file leaves this field out."""
+"""Name and value of the field `earlier` of a latch with only one cause. The file leaves this field
+out, because most latches have only one cause."""
 
 
 class LatchFileError(AcsardError):
@@ -50,7 +50,10 @@ class _Content(Struct, frozen=True):
 
 
 def encode(robot: str, latches: Latches) -> bytes:
-    """Return the content of a robot's latch file, as indented JSON."""
+    """Return the content of a robot's latch file, as indented JSON.
+
+    `robot` is the robot's id. Names and reasons longer than `MAX_TEXT` are cut off.
+    """
     stop, fault, inactive = (
         None if latch is None else latch.each(_with_safe_text)
         for latch in (latches.stop, latches.fault, latches.inactive)
@@ -60,12 +63,12 @@ def encode(robot: str, latches: Latches) -> bytes:
 
 
 def decode(robot: str, data: bytes) -> Latches:
-    """Return the latches in `data`, the content of the robot's latch file.
+    """Return the latches in `data`, the content of the latch file of the robot with the id `robot`.
 
     Each latch is marked as kept over a restart. Raises `LatchFileError` for content that is
-    damaged, of another version or of another robot. Every incomplete file counts as damaged,
-    because a power cut may leave only a part of the file. A file with a missing or unknown field
-    name counts as damaged too: otherwise one wrong letter in a name could make a stop disappear.
+    damaged, of another version or of another robot. An incomplete file counts as damaged, because a
+    power cut may leave only a part of the file. A file with a missing or unknown field name counts
+    as damaged too, because one wrong letter in a name could otherwise make a stop disappear.
     """
     if not data.strip(b"\0 \r\n"):
         raise LatchFileError("it is empty")
@@ -85,7 +88,8 @@ def decode(robot: str, data: bytes) -> Latches:
     found = content.latches
     for latch in (found.stop, found.fault, found.inactive):
         if latch is not None and any(cause.earlier for cause in latch.earlier):
-            # No daemon writes that, and the code below cannot process causes of any depth.
+            # No daemon writes such a file, and the code below cannot process causes that are nested
+            # more deeply.
             raise LatchFileError("it is damaged (an earlier cause has causes of its own)")
     if _plain(content) != raw:
         raise LatchFileError("it is damaged (a field name is missing or unknown)")
@@ -119,13 +123,15 @@ def unwritable(where: str, reason: str) -> str:
 
 
 def stopped(latches: Latches, why: str, now: Instant, by: str = BY, before: int = -1) -> Latches:
-    """Return `latches` with a stop added. If they have a stop already, return them unchanged.
+    """Return `latches` with a stop added, or unchanged if `latches` already contains a stop.
 
     Args:
-        why: the reason of the stop.
+        latches: the latches in force.
+        why: the reason of the stop, in words.
         now: the time of the stop.
-        by: the client that requested the stop, or `BY` for the daemon itself.
-        before: the number of the previous stop, or -1 if there was none. The new number is higher.
+        by: the name of the client that requested the stop, or `BY` for the daemon itself.
+        before: the number of the previous stop, or -1 without a previous stop. The new stop gets a
+            higher number.
     """
     if latches.stop is not None:
         return latches
@@ -137,10 +143,14 @@ def stopped(latches: Latches, why: str, now: Instant, by: str = BY, before: int 
 def doubted(latches: Latches, why: str, now: Instant) -> Latches:
     """Return the latches with which the robot starts if the latch file cannot be written.
 
-    `latches` are those in the file, and `why` is the reason of the added stop. The previous process
-    may have set latches that are not in the file. So the robot starts stopped, and each latch of
-    the file gets a new number. A `clear` or `activate` with an old number then has no effect,
-    because its sender may not know of the lost latches.
+    The previous process may have set latches that are not in the file. So the robot starts stopped,
+    and each latch of the file gets a new number. A `clear` or `activate` with an old number then
+    has no effect, because its sender may not know of the lost latches.
+
+    Args:
+        latches: the latches in the file.
+        why: the reason of the stop that is added if `latches` contains no stop, in words.
+        now: the time of the start.
     """
     found = latches.fault, latches.inactive, latches.stop
     kept = max((latch.number for latch in found if latch), default=-1)
@@ -152,16 +162,19 @@ def doubted(latches: Latches, why: str, now: Instant) -> Latches:
 
 
 class LatchKeeper(Protocol):
-    """The storage that keeps the latches over a restart.
+    """The storage that keeps the latches over a restart of the daemon.
 
-    Of its methods, only `wait` waits for the disk.
+    Only the method `wait` waits for the disk.
     """
 
     def keep(self, latches: Latches) -> None:
-        """Store these latches, which are now in force, in place of all earlier ones."""
+        """Store the latches that are now in force. They replace all earlier ones in the storage."""
 
     def holds(self, latches: Latches) -> bool:
-        """Return whether these latches are stored. They then survive a kill of the process."""
+        """Return whether these latches are stored. A kill of the process then loses nothing.
+
+        `latches` must be the object that was passed to `keep`. An equal copy does not count.
+        """
 
     def wait(self, latches: Latches, seconds: float) -> None:
         """Block until these latches are stored, but at most `seconds` s."""
@@ -171,11 +184,11 @@ class LatchKeeper(Protocol):
 
     @property
     def trouble(self) -> str:
-        """The reason why the latches would not survive a restart, in words; "" if they would."""
+        """Reason why the latches would not survive a restart, in words, or "" if they would."""
 
 
 class Handover:
-    """Hands the latches of the control loop to their keeper, and reports when they are stored.
+    """Hands the latches of the control loop to their keeper, and says whether they are stored.
 
     The robot stops immediately, but the answer to a stop waits until the stop would survive a kill
     of the process. After `ANSWER_NS` the answer is sent in any case. It then says that the stop is
@@ -183,7 +196,7 @@ class Handover:
     """
 
     def __init__(self, latches: Latches, keeper: LatchKeeper | None) -> None:
-        """Begin with the latches with which the robot starts. The keeper has them already.
+        """Begin with the latches with which the robot starts. The keeper must have these already.
 
         If `keeper` is None, latches are not stored.
         """
@@ -191,18 +204,25 @@ class Handover:
         self._keeper = keeper
 
     def take(self, latches: Latches) -> None:
-        """Pass these latches to the keeper, unless the last call passed the same object."""
+        """Pass the latches in force to the keeper, unless the last call passed the same object."""
         if latches is not self.latches:
             self.latches = latches
             if self._keeper is not None:
                 self._keeper.keep(latches)
 
     def take_stops(self, latches: Latches, by: list[str], now: Instant) -> None:
-        """Pass these latches to the keeper, with a new stop if `by` is not empty.
+        """Add unprocessed stops to `latches`, and pass the result to the keeper.
 
-        `by` contains the names of the clients whose stops no control step has processed, one name
-        for each stop. The new stop names all these clients. Its number is new, so a `clear` of an
-        earlier stop does not release it.
+        A stop is unprocessed if it arrived after the last control step, or if that step failed. The
+        result contains one new stop, which names the clients in `by`, up to the limit
+        `lifecycle.MAX_CLIENTS`. This stop has a new number, so a `clear` of an earlier stop does
+        not release it.
+
+        Args:
+            latches: the latches in force.
+            by: the name of the client for each unprocessed stop. If the list is empty, no stop is
+                added.
+            now: the time of the new stop.
         """
         for name in reversed(by):
             last, text = latches.stop, f"stopped by {name or 'request'}"
@@ -214,16 +234,16 @@ class Handover:
 
     @property
     def held(self) -> bool:
-        """Whether all latches that must be stored are stored, so that they survive a kill.
+        """Whether the latches are stored, so that they survive a kill of the process.
 
-        Without a keeper no latch must be stored, so this is always true.
+        Without a keeper this is always True, because no latches need to be stored.
         """
         return self._keeper is None or self._keeper.holds(self.latches)
 
     def wait(self) -> None:
         """Block until the latches are stored, but at most `ANSWER_NS`.
 
-        Call this only after the last control step, because it would delay a step.
+        Call this method only after the last control step, because it would delay a step.
         """
         if self._keeper is not None:
             self._keeper.wait(self.latches, ANSWER_NS / NS_PER_S)
@@ -233,15 +253,15 @@ class Handover:
 
     @property
     def trouble(self) -> str | None:
-        """The reason why the latches would not survive a restart, in words; "" if they would.
+        """Reason why the latches would not survive a restart, in words, or "" if they would.
 
-        None if there is no keeper, so that latches are never stored.
+        The value is None without a keeper, because latches are then never stored.
         """
         return None if self._keeper is None else self._keeper.trouble
 
 
 def _plain(content: Any) -> Any:
-    """Return the content as JSON data, without the field `earlier` of latches with one cause."""
+    """Return the content as JSON data, without the field `earlier` of each latch with one cause."""
     match msgspec.to_builtins(content):
         case dict() as fields:
             pairs = fields.items()

@@ -1,10 +1,12 @@
-"""Names the cause of a late control period from the kernel's counters. This module is pure.
+"""Finds the causes of a late control period in the kernel's counters. This module is pure.
 
-Each cause in the table `CAUSES` has a rule that compares the counters from before the lateness with
-the counters from after the lateness. A rule returns the cause in words, or "" if its cause does not
-apply. A delay counts as a cause only if it lasted for at least the share `SHARE` of the lateness.
-Some causes have another share, such as `DISK_SHARE`. Without such a limit, the small delays of
-normal load would count as causes. Several causes may apply to one lateness, or none.
+The lateness is the time from the due time of the first missed period to the late step. Each cause
+in the table `CAUSES` has a rule, which compares the counters from before the lateness with the
+counters from after the lateness. A rule returns its cause in words, or "" if the counters do not
+show this cause. Several causes may apply to one lateness, or none.
+
+A delay counts as a cause only if it lasted for at least a certain share of the lateness, usually
+`SHARE`. Otherwise the small delays of normal load would count as causes.
 
 The kernel also reports how the control loop's thread spent the lateness: it ran, it was ready and
 waited for a processor, or it slept. A slow processor delays only a thread that runs or waits for a
@@ -22,18 +24,18 @@ from acsard.core.values import NS_PER_S, Event
 from acsard.host.kernel_counters import Conditions, Program, Reading, Scheduled
 
 SHARE = 0.5
-"""A delay counts as a cause only if it lasted for at least this share of the lateness. Some causes
-have another share, such as `DISK_SHARE`."""
+"""Usual limit for a cause: a delay counts as a cause only if it lasted for at least this share of
+the lateness. Some causes have another limit, such as `DISK_SHARE`."""
 
 SLEPT_SHARE = 0.3
-"""A disk counts as the cause only if the loop's thread slept for at least this share of the
-lateness. The share is low, because in a test with a fast virtual disk, a thread that read pages
-from the disk ran on the processor for as long as it slept."""
+"""Limit for the disk as a cause: it counts only if the control loop's thread slept for at least
+this share of the lateness. The limit is low, because in a test with a fast virtual disk, a thread
+that read pages from the disk ran on the processor for as long as it slept."""
 
 DISK_SHARE = 0.25
-"""The time in which any program waited for a disk counts as a cause only if it is at least this
-share of the lateness. The share is low, because in a test a thread wrote to a disk all the time,
-and the kernel counted only 0.28 to 0.45 of this time as waiting."""
+"""Limit for the time in which any program waited for a disk: it counts as a cause only if it is at
+least this share of the lateness. The limit is low, because in a test a thread wrote to a disk all
+the time, and the kernel counted only 0.28 to 0.45 of this time as waiting."""
 
 LEAST_STOLEN_NS = 3 * NS_PER_S // 100
 """Shortest steal time that counts as a cause, ns: three of the kernel's ticks. Steal time is time
@@ -47,39 +49,41 @@ difference varies a little even without a suspend."""
 
 
 class Lateness(Struct, frozen=True, omit_defaults=True):
-    """The lateness of a control period, with the kernel's counters from before and after it."""
+    """The lateness of a control period, and the kernel's counters from before and after it."""
 
     late_ns: int
     """Time from the due time of the first missed period to the late step, ns."""
     loop: Scheduled
-    """Two durations: how long the loop's thread ran, and how long it was ready but waited for a
-    processor. Both are measured from the last period before the lateness to the late step."""
+    """Two durations of the control loop's thread, ns: how long it ran, and how long it was ready
+    but waited for a processor. Both are measured from the last period before the lateness to the
+    late step."""
     before: Reading
     after: Reading
     busiest: Program | None = None
-    """The process that used the most processor time. None if no process used much, or if nothing
-    searched for it."""
+    """The process that used the most processor time. None if no process used much processor time,
+    or if no search was made."""
 
     def explains(self, duration_ns: int, share: float = SHARE) -> bool:
+        """Return whether a duration is at least the share `share` of the lateness."""
         return duration_ns >= share * self.late_ns
 
     @property
     def computed(self) -> bool:
-        """Whether the loop's thread ran or was ready to run for at least half of the lateness."""
+        """Whether the control loop's thread ran or was ready for at least half of the lateness."""
         return self.explains(self.loop.ran_ns + self.loop.waited_ns)
 
     @property
     def slept(self) -> bool:
-        """Whether the loop's thread slept for at least `SLEPT_SHARE` of the lateness."""
+        """Whether the control loop's thread slept for at least `SLEPT_SHARE` of the lateness."""
         return self.explains(self.late_ns - self.loop.ran_ns - self.loop.waited_ns, SLEPT_SHARE)
 
 
 class Cause(Struct, frozen=True):
-    """A possible cause of lateness, with the rule that detects it and advice how to remove it."""
+    """A possible cause of a lateness, with its rule and with advice how to remove the cause."""
 
     name: str
     rule: Callable[[Lateness], str]
-    """Returns the cause in words, or "" if this is not a cause of the lateness."""
+    """Function that returns the cause in words, or "" if it did not cause the lateness."""
     advice: str
 
 
@@ -94,17 +98,17 @@ def suspended(late: Lateness) -> str:
 
 
 def undervoltage(late: Lateness) -> str:
-    """Return the cause in words if a low supply voltage slowed the loop down, else ""."""
+    """Return the cause in words if a low supply voltage slowed the control loop down, else ""."""
     return low_voltage(late.after.conditions) if late.computed else ""
 
 
 def low_voltage(now: Conditions) -> str:
-    """Return the cause in words if the supply voltage is too low now, else ""."""
+    """Return the cause in words if `now` shows that the supply voltage is too low, else ""."""
     return "the supply voltage is too low, which slows the processor" if now.undervoltage else ""
 
 
 def heat(late: Lateness) -> str:
-    """Return the cause in words if a hot processor slowed the loop down, else "".
+    """Return the cause in words if a hot processor slowed the control loop down, else "".
 
     Three signs show heat: a `thermal_throttle` count that has risen, a cooling device that slows
     the processor, and on a Raspberry Pi one of the bits 1 to 3 of `get_throttled`.
@@ -116,24 +120,25 @@ def heat(late: Lateness) -> str:
 def hot(now: Conditions, hotter: bool = False) -> str:
     """Return the cause in words if heat slows the processor down, else "".
 
-    `now.hot` says that heat slows it down at this moment. `hotter` says that the kernel's count of
-    such slow-downs has risen since an earlier reading. One of the two is enough.
+    One of two signs is enough: `now.hot` says that heat slows the processor down at this moment,
+    and `hotter` says that the kernel's count of such slow-downs has risen since an earlier reading.
     """
     return "the processor is too hot and runs slower" if now.hot or hotter else ""
 
 
 def governor(late: Lateness) -> str:
-    """Return the cause in words if a limited clock frequency slowed the loop down, else "".
+    """Return the cause in words if a limited clock frequency slowed the control loop down, else "".
 
     The rule compares the frequency limit (`scaling_max_freq`) with the processor's full frequency
-    (`cpuinfo_max_freq`). If the governor keeps the lowest frequency, it compares `scaling_min_freq`
-    instead.
+    (`cpuinfo_max_freq`). With a governor that keeps the lowest frequency, the limit is
+    `scaling_min_freq` instead. If `heat` applies, return "", because heat also limits the
+    frequency.
     """
     return slow(late.after.conditions) if late.computed and not heat(late) else ""
 
 
 def slow(now: Conditions) -> str:
-    """Return the cause in words if the processor's clock frequency is limited now, else ""."""
+    """Return the cause in words if the conditions `now` show a limited clock frequency, else ""."""
     clock = now.slow_clock
     if clock is None:
         return ""
@@ -144,7 +149,7 @@ def slow(now: Conditions) -> str:
 
 
 def cgroup_quota(late: Lateness) -> str:
-    """Return the cause in words if the daemon's CPU quota (cgroup) was used up, else ""."""
+    """Return the cause in words if the CPU quota of the daemon's cgroup was used up, else ""."""
     without_ns = late.after.quota_ns - late.before.quota_ns
     if not late.explains(without_ns):
         return ""
@@ -162,14 +167,15 @@ def stolen(late: Lateness) -> str:
 def most_stolen(before: Reading, after: Reading) -> int:
     """Return the steal time between two readings, ns, of the processor with the most steal time.
 
-    Steal time is time in which the host of a virtual machine took the processor away.
+    Steal time is time in which the host of a virtual machine took the processor away. Return 0 if
+    the readings contain no steal times.
     """
     pairs = zip(before.steal_ns, after.steal_ns, strict=False)
     return max((new - old for old, new in pairs), default=0)
 
 
 def memory(late: Lateness) -> str:
-    """Return the cause in words if memory pages had to be read from a disk, else ""."""
+    """Return the cause in words if memory of the daemon had to be read from a disk, else ""."""
     pages = late.after.major_faults - late.before.major_faults
     if not pages or not late.slept:
         return ""
@@ -177,12 +183,13 @@ def memory(late: Lateness) -> str:
 
 
 def disk(late: Lateness) -> str:
-    """Return the cause in words if the loop's thread waited for a disk, else "".
+    """Return the cause in words if the control loop's thread waited for a disk, else "".
 
-    One of two times must be long enough. The first is the time for which the loop's own thread
-    waited for a disk, which not every kernel measures. The second is the time in which any program
-    waited for a disk. It counts only if the loop's thread itself read from a disk or wrote to one,
-    because other programs may wait for a disk at any time.
+    If `memory` applies, return "". One of two durations must be long enough:
+
+    - the time for which the thread itself waited for a disk. Not every kernel measures this time.
+    - the time in which any program waited for a disk. It counts only if the thread itself read from
+      a disk or wrote to a disk, because other programs may wait for a disk at any time.
     """
     before, after = late.before, late.after
     own_ns, all_ns = after.own_disk_ns - before.own_disk_ns, after.disk_ns - before.disk_ns
@@ -193,7 +200,10 @@ def disk(late: Lateness) -> str:
 
 
 def other_program(late: Lateness) -> str:
-    """Return the cause in words if other programs used the loop's processor time, else ""."""
+    """Return the cause in words if other programs used the daemon's processor time, else "".
+
+    If `cgroup_quota` or `stolen` applies, return "".
+    """
     if cgroup_quota(late) or stolen(late) or not late.explains(late.loop.waited_ns):
         return ""
     for_s = _seconds(late.loop.waited_ns)
@@ -240,35 +250,38 @@ def causes(late: Lateness) -> tuple[tuple[str, ...], str]:
 
 
 BECAUSE = ", because "
-"""Stands in the text of an event between the duration of the lateness and its causes."""
+"""Separator between the lateness and its causes in the text of an event."""
 
 
 def event_of(late: Lateness, clause: str, *, news: bool) -> Event:
-    """Return the log event that reports a lateness.
+    """Return the log event that reports a lateness and its causes.
 
     `clause` is the text from `causes`. `news` is False if a recent event had the same causes. The
-    log may then delay the event.
+    log may then delay this event.
     """
     text = f"by {late.late_ns / NS_PER_S:.2f} s{BECAUSE}{clause}"
     return Event("missed_periods", text, "warning", kind="late", news=news)
 
 
 def cause_in(text: str) -> str:
-    """Return the lateness and its causes from the text of an event; "" if it names no cause."""
+    """Return the part of an event's text that states a lateness and its causes.
+
+    Return "" if the text names no causes.
+    """
     begin, because, clause = text.partition(BECAUSE)
     return begin.rpartition(": ")[2] + because + clause if because else ""
 
 
 STOLEN_SHARE = 0.02
-"""The function `present` reports steal time if it is more than this share of the time between the
-two readings."""
+"""Limit for the steal time in `present`, which reports it only if it exceeds this share of the time
+between the two readings."""
 
 
 def present(before: Reading, after: Reading, within_ns: int) -> list[tuple[str, str]]:
-    """Return the causes that delay every program on this computer now, each with advice.
+    """Return the causes that slow down every program on this computer now, each with advice.
 
-    The causes are found in two readings of the kernel's counters, which are `within_ns` ns apart.
-    Each pair in the result is a cause in words and the advice how to remove it.
+    The result is a list of pairs: the cause in words, and the advice. `before` and `after` are two
+    readings of the kernel's counters, which were made `within_ns` ns apart.
     """
     now = after.conditions
     stolen_ns = most_stolen(before, after)

@@ -1,12 +1,12 @@
-"""Detects late control periods, and reports the cause if the kernel's counters show a cause.
+"""Detects late control periods, and reports the causes that the kernel's counters show.
 
 In each period the control loop reads only one small file, `schedstat`, with the processor times of
 its thread. The kernel's other files take longer to read, so a thread of this module reads these
 files four times a second, and once more after a late period. `late_causes.py` compares the reading
 from before the lateness with the reading from after the lateness.
 
-The event of this module has the name `missed_periods`, like an event of the robot. The robot's
-event comes first and states the number of missed periods. The cause is known only later.
+A late period leads to two events with the name `missed_periods`. The robot's own event comes first
+and states the number of missed periods. The event of this module follows when the cause is known.
 """
 
 from __future__ import annotations
@@ -31,36 +31,36 @@ OWN_TIMES = "/proc/thread-self/schedstat"
 """File with the processor times of the thread that opens it."""
 
 EVERY_S = 0.25
-"""Time between two readings of the kernel's counters while no period is late, s. If it were longer,
-the counters would also include delays from long before a lateness."""
+"""Time between two readings of the kernel's counters while no period is late, s. If this time were
+longer, the comparison would include delays from long before the late period."""
 
 HISTORY = 12
-"""Number of readings that are kept. Together they cover 3 s. So one of them is from before the
-lateness, unless the lateness was longer than that."""
+"""Number of readings of the kernel's counters that are kept. They cover the last 3 s, so the oldest
+one is from before the lateness, unless the lateness was longer than 3 s."""
 
 SETTLE_S = 0.03
-"""Time from a late period to the reading after it, s. The kernel updates some counters only at its
-next tick, and ticks are at most 10 ms apart."""
+"""Time from a late period to the next reading of the kernel's counters, s. The kernel updates some
+counters only at its next tick, and ticks are at most 10 ms apart."""
 
 PAUSE_NS = NS_PER_S
-"""Shortest time between two reports of a cause, ns. The log shows at most one line a second for
-each event name."""
+"""Shortest time between two reports of causes, ns. For each event name, the log shows at most one
+line a second."""
 
 CONDITIONS_NS = 10 * NS_PER_S
 """Time after which the conditions of the processor, such as its voltage, are read again, ns. They
 are not read more often, because on some computers each reading is a request to the firmware."""
 
 LOOK_S = 0.2
-"""A search for the busiest process reads the processor times of all processes twice. This is the
-time between the two readings, s."""
+"""Time between two readings of the processor times of all processes, s. A search for the busiest
+process compares these two readings."""
 
 LOOK_AGAIN_NS = 10 * NS_PER_S
 """Shortest time between two searches for the busiest process, ns. A search takes 20 us per
 process."""
 
 NEWS_NS = 60 * NS_PER_S
-"""For this time after an event, ns, further events with the same causes are not logged immediately.
-They wait for the next log line about missed periods (`Event.news`)."""
+"""Time after an event, ns, in which a further event with the same causes is not logged immediately.
+The further event waits for the next log line about missed periods (`Event.news`)."""
 
 MOST = 16
 """Size of two queues: the late periods that wait for the thread, and the events that wait for a
@@ -73,6 +73,7 @@ class Late(Struct, frozen=True):
     now_ns: int
     """Monotonic time at which the step of the late period began, ns."""
     late_ns: int
+    """Time from the due time of the first missed period to `now_ns`, ns."""
     before: bytes
     """Content of `OWN_TIMES` in the period before the late period; b"" if it is unknown."""
     after: bytes
@@ -80,23 +81,27 @@ class Late(Struct, frozen=True):
 
     @property
     def loop(self) -> Scheduled:
-        """How long the loop's thread ran, and how long it waited for a processor.
+        """Two durations of the control loop's thread, ns.
 
-        Both are measured from the period before the late period to the late period.
+        They are how long the thread ran, and how long it was ready but waited for a processor. Both
+        are measured from the step before the late period to the late step.
         """
         before, after = scheduled(self.before), scheduled(self.after)
         return Scheduled(after.ran_ns - before.ran_ns, after.waited_ns - before.waited_ns)
 
 
 class LateWatch:
-    """Detects late periods of one control loop, and finds their causes, as a context manager.
+    """Detects late periods of one control loop, and finds their causes. It is a context manager.
 
     The control loop's own thread must create this object, and call `period` and `news`. A second
-    thread reads the kernel's files. It runs from the entry of the context to its exit.
+    thread reads the kernel's files while the context is open.
     """
 
     def __init__(self, kernel: Kernel | None = None) -> None:
-        """Prepare the thread. `kernel` reads the kernel's files; only tests pass one."""
+        """Open the file with the processor times of the calling thread.
+
+        `kernel` reads the kernel's files. Only tests pass this argument.
+        """
         self._kernel = kernel
         self._box = Mailbox[Late](MOST)
         self._news = Mailbox[Event](MOST, lambda: None)
@@ -110,8 +115,8 @@ class LateWatch:
         self._readings: deque[tuple[int, Reading]] = deque(maxlen=HISTORY)
         """The last readings, each with the monotonic time at which it was complete, ns."""
         self._reported: dict[tuple[str, ...], int] = {}
-        """Maps each combination of causes to the monotonic time, ns, of its last event that was
-        logged immediately (`Event.news`)."""
+        """Maps each combination of causes to the monotonic time of its last event that was logged
+        immediately (`Event.news`), ns."""
         self._busiest: Program | None = None
         self._searched_ns: int | None = None
 
@@ -133,12 +138,14 @@ class LateWatch:
     # The control loop's thread calls these methods.
 
     def period(self, now_ns: int, late_ns: int, missed: int) -> None:
-        """Process the step of a period. If periods were missed, pass the lateness to the thread.
+        """Read the processor times of this thread at the start of each period's step.
+
+        If periods were missed, also let the second thread find the causes.
 
         Args:
             now_ns: monotonic time at which the step began, ns.
-            late_ns: time from the due time of this period, or of the first missed period, to
-                `now_ns`, ns.
+            late_ns: time from the due time of this period to `now_ns`, ns. If periods were missed,
+                the time is measured from the due time of the first missed period.
             missed: number of periods just before this one that got no step.
         """
         before, times = self._times, b""
@@ -150,7 +157,7 @@ class LateWatch:
             self._box.put(Late(now_ns, late_ns, before, times))
 
     def news(self) -> list[Event]:
-        """Return the events about causes of lateness since the last call."""
+        """Return the events about causes of late periods since the last call."""
         return self._news.take() if self._news.waiting else []
 
     # The other methods run in the watch's thread.
@@ -180,7 +187,7 @@ class LateWatch:
         self._readings.append((clock.mono_ns(), reading))
 
     def _before(self, now_ns: int) -> Reading | None:
-        """Return the newest reading that was complete at the monotonic time `now_ns`.
+        """Return the newest reading that was complete at the monotonic time `now_ns`, ns.
 
         Return None if all readings are newer.
         """
@@ -204,7 +211,8 @@ class LateWatch:
     def _busiest_of(self, kernel: Kernel) -> Program | None:
         """Return the process that uses the most processor time, or None if no process uses much.
 
-        If the last search is not older than `LOOK_AGAIN_NS`, return its result again.
+        If the last search is not older than `LOOK_AGAIN_NS`, return the result of that search
+        again.
         """
         now_ns = clock.mono_ns()
         if self._searched_ns is None or now_ns - self._searched_ns >= LOOK_AGAIN_NS:

@@ -1,7 +1,7 @@
 """Measures the daemon's latencies, in us, in fixed memory. The control loop supplies all times.
 
-The messages `state` and `diagnostics` publish the median, the 99th percentile and the maximum of
-each latency, since the daemon's start and over the last minute.
+For each latency, the messages `state` and `diagnostics` contain the median, the 99th percentile and
+the maximum, both since the daemon's start and over the last minute.
 """
 
 from __future__ import annotations
@@ -16,21 +16,21 @@ from typing import Literal, get_args
 from acsard.core.values import NS_PER_S, Estimate, Measured, Outputs, Spread
 
 PER_DECADE = 20
-"""Number of buckets of a histogram for each factor of ten. The error of a percentile is at most
-12 %."""
+"""Number of histogram buckets for each factor of ten. With this number, a percentile is at most 12
+% too high."""
 
 DECADES = 7
-"""The buckets of a histogram cover this number of factors of ten, from 1 us to 10 s. The first
+"""Number of factors of ten that the buckets of a histogram cover: from 1 us to 10 s. The first
 bucket also counts shorter durations, and the last bucket also counts longer ones."""
 
 LAST = PER_DECADE * DECADES
-"""Index of the last bucket."""
+"""Index of the last bucket of a histogram."""
 
 
 class Histogram:
-    """A histogram with logarithmic buckets.
+    """A histogram with logarithmic buckets, for the percentiles of any number of values.
 
-    It gives the percentiles of any number of values in fixed memory.
+    Its memory does not grow with the number of values.
     """
 
     def __init__(self) -> None:
@@ -91,19 +91,20 @@ SLOT_NS = 10 * NS_PER_S
 SLOTS = 6
 
 FRESH_NS = NS_PER_S
-"""`Stopwatch.measured` returns cached values until they are this old, ns. It does not compute them
-at each call, because adding up the slots of a minute takes longer than a control step."""
+"""Age up to which `Stopwatch.measured` returns cached values, ns. Computing them takes longer than
+a control step, because all time slots of the last minute are added up."""
 
 
 class Figure:
-    """The durations of one latency, since the daemon's start and over the last minute."""
+    """The measured values of one latency, since the daemon's start and over the last minute."""
 
     def __init__(self) -> None:
         self._past = Histogram()
         self._slots = [Histogram() for _ in range(SLOTS)]
         self._number = -SLOTS
         self._slot, self._ends_ns = self._slots[0], 0
-        """`_slot` is the newest slot. `_ends_ns` is the monotonic time at which it ends, ns."""
+        """`_slot` is the histogram of the newest time slot. `_ends_ns` is the monotonic time at
+        which this slot ends, ns."""
 
     def add(self, now_ns: int, duration_ns: int) -> None:
         if now_ns >= self._ends_ns:
@@ -155,7 +156,7 @@ class Stopwatch:
         self._cached_ns = -FRESH_NS
 
     def measured(self, now_ns: int) -> dict[str, Measured]:
-        """Return all latencies by name. The values are at most 1 s old.
+        """Return the values of each latency, by the name of the latency. They are at most 1 s old.
 
         `now_ns` is the present monotonic time, ns.
         """
@@ -172,12 +173,12 @@ class Stopwatch:
         return self._missed.count(now_ns)
 
     def period(self, now_ns: int, late_ns: int, missed: int = 0) -> None:
-        """Record how late a step began, and how many periods before it were missed.
+        """Record how late a step began, and how many periods were missed before this step.
 
         Args:
             now_ns: monotonic time at which the step began, ns.
-            late_ns: time from the due time of this period, or of the first missed period, to
-                `now_ns`, ns.
+            late_ns: time from the due time of this period to `now_ns`, ns. If periods were missed,
+                the time is measured from the due time of the first missed period.
             missed: number of periods just before this one that got no step.
         """
         self.figures["period_lateness"].add(now_ns, late_ns)
@@ -185,24 +186,32 @@ class Stopwatch:
             self._missed.add(now_ns, missed)
 
     def line(self, outputs: Outputs, sent_ns: int, before_ns: int) -> None:
-        """Record how old the command in a line was when the line was written.
+        """Record how old the command in a line to the board was when the line was written.
 
-        `outputs` are those of the step that made the line. `sent_ns` is the monotonic time at which
-        the line was written, and `before_ns` the time at which the previous line was written, ns.
+        Record nothing if the robot does not drive.
+
+        Args:
+            outputs: the outputs of the step that made the line.
+            sent_ns: monotonic time at which the line was written, ns.
+            before_ns: monotonic time at which the previous line was written, ns.
         """
         command_ns = outputs.command_ns
         if command_ns is None or outputs.mode != "driving":
             return
         self.figures["command_age"].add(sent_ns, sent_ns - command_ns)
-        # An older command was in an earlier line already, or waited until its source was chosen.
+        # A command that is older than the previous line was in that line already, or it had to wait
+        # until its source was chosen.
         if command_ns > before_ns:
             self.figures["command_to_wire"].add(sent_ns, sent_ns - command_ns)
 
     def feedback(self, estimate: Estimate, told_ns: int | None) -> None:
-        """Record the round trip of a feedback line, and its delay to the bus.
+        """Record the latencies `mcu_round_trip` and `feedback_to_bus` of a feedback line.
 
-        `estimate` is computed from the line. `told_ns` is the monotonic time at which the line's
-        messages were queued for the bus, ns. It is None if no client subscribes to them.
+        Args:
+            estimate: the estimate that was computed from the feedback line.
+            told_ns: monotonic time at which the messages of the line were queued for the bus, ns.
+                None if no client subscribes to these messages, so that only the round trip is
+                recorded.
         """
         at_ns, asked_ns = estimate.heard_ns, estimate.asked_ns
         if asked_ns is not None:

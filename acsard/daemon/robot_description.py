@@ -1,7 +1,7 @@
-"""Reads the robot's URDF from the file in `[ros] urdf`, or explains why it cannot be published.
+"""Reads the robot's URDF file (`[ros] urdf`), and explains why a file cannot be published.
 
-The daemon publishes the text unchanged. The checks find mistakes that would otherwise appear only
-in the tools of ROS.
+The daemon publishes the text unchanged. The checks in this module find mistakes that would
+otherwise appear only in the tools of ROS.
 """
 
 from __future__ import annotations
@@ -15,20 +15,21 @@ from acsard.daemon.bus.zenoh_sessions import MESSAGE_BYTES
 from acsard.host.errors import Exit, ExitError
 
 MAX_BYTES = 50_000
-"""Largest size of the URDF file, bytes. It is lower than `MESSAGE_BYTES`, because JSON needs two
+"""Largest size of the URDF file, bytes. It is smaller than `MESSAGE_BYTES`, because JSON needs two
 bytes for each quotation mark and each line end."""
 
 MAX_JSON = MESSAGE_BYTES - 1024
-"""Largest size of the URDF as a JSON message, bytes. The 1024 bytes up to `MESSAGE_BYTES` are for
-the Zenoh key and Zenoh's headers."""
+"""Largest size of the URDF as a JSON message, bytes. The remaining 1024 bytes of `MESSAGE_BYTES`
+are for the Zenoh key and Zenoh's headers."""
 
 XACRO = "/xacro}"
-"""An element whose tag contains this text is a xacro element. ElementTree writes the tag as
-"{NAMESPACE}NAME", with a namespace such as http://www.ros.org/wiki/xacro."""
+"""Text that shows that an element is a xacro element, if the tag of the element contains it.
+ElementTree writes the tag as "{NAMESPACE}NAME", with a namespace such as
+http://www.ros.org/wiki/xacro."""
 
 DOCUMENT_TYPE = "<!DOCTYPE"
-"""Beginning of an XML document type. A URDF file that has a document type is refused, because the
-entities in it could expand to any length."""
+"""Beginning of an XML document type. A URDF file with a document type is refused, because the
+entities in a document type could expand to any length."""
 
 
 def robot_description(path: str) -> str:

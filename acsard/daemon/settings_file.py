@@ -1,8 +1,8 @@
-"""Compares the configuration file with the settings in force, and changes the file.
+"""Compares the configuration file with the settings in force, and writes settings to the file.
 
-A `set` request with the field `keep` changes the settings and the file. It has two stages. First a
-thread checks that the file can be changed. If the file cannot be changed, nothing is set. Then the
-robot uses the settings, and the thread changes the file. The control loop never waits for the disk.
+A `set` request with the field `keep` changes the settings and the file, in two stages. First a
+thread checks that the file can be changed; otherwise nothing is set. Then the robot uses the
+settings, and the thread changes the file. The control loop never waits for the disk.
 """
 
 from __future__ import annotations
@@ -31,17 +31,18 @@ from acsard.host.errors import MendableError
 from acsard.host.mailbox import Mailbox
 
 LOOK_S = 2.0
-"""Time between two checks whether the file has changed, s."""
+"""Time between two checks whether the configuration file has changed, s."""
 
 NAMED = 3
-"""Largest number of settings that `SettingsFile.differ` names. The message `state` contains this
-text, and must stay short."""
+"""Largest number of settings that `SettingsFile.differ` names. The text must stay short, because
+the message `state` contains it."""
 
 MAX_TEXT = 200
+"""Largest length of `SettingsFile.differ`, characters. The rest is cut off."""
 
 PATIENCE_NS = 5 * NS_PER_S // 2
 """Longest time from the arrival of a `set` request with `keep` to the daemon's reply, ns. It is
-shorter than the 3 s for which a client waits."""
+shorter than the 3 s for which a client waits for a reply."""
 
 JOBS = 32
 """Largest number of `set` requests with `keep` that wait for their reply. Further requests are
@@ -54,15 +55,15 @@ _decoder = Decoder(Settings)
 
 
 def keeps(encoding: str, payload: bytes) -> bool:
-    """Return whether a valid `set` request also asks to change the configuration file.
+    """Return whether a valid `set` request has the field `keep`, which asks to change the file too.
 
-    `payload` is the payload of the request, and `encoding` is Zenoh's name of its encoding.
+    `encoding` is Zenoh's name of the encoding of `payload`.
     """
     return _decoder.decode(encoding, payload).keep
 
 
 class _Checked(Struct, frozen=True):
-    """A `set` request whose settings can be written to the file."""
+    """A `set` request whose settings the thread can write to the file."""
 
     request: Request
     edit: Edit
@@ -73,45 +74,50 @@ class _Pending(Struct):
 
     request: Request
     due_ns: int
-    """Monotonic time after which the client gets a reply that the request has failed, ns. This
-    limit does not apply while the robot is deciding about the request."""
+    """Monotonic time after which the client is told that the request has failed, ns. This limit
+    does not apply while the robot decides about the request."""
     edit: Edit | None = None
-    """The prepared change of the file. None until the thread has checked the request."""
+    """The prepared change of the file. It is None until the thread has checked the request."""
     answer: Answer | None = None
-    """The robot's answer. None until the robot has used the settings."""
+    """The robot's answer. It is None until the robot has used the settings."""
 
 
 class SettingsFile:
-    """The configuration file of the daemon. Call `use` whenever the settings in force change."""
+    """The configuration file of the daemon, as it is compared with the settings and changed.
+
+    Call `use` whenever the settings in force change.
+    """
 
     def __init__(
         self, file: Path | None, parse: Callable[[bytes], Config], started: Config
     ) -> None:
-        """Prepare the comparison of the file with the settings. `start` begins it.
+        """Prepare the comparison of the file with the settings. The method `start` begins it.
 
         Args:
-            file: the configuration file that the daemon has read, or None if it has read no file.
+            file: the configuration file that the daemon has read, or None if the daemon has read no
+                file.
             parse: function that takes the content of a file, and returns the configuration with
                 which the daemon would start with this content.
             started: the configuration with which the daemon has started.
         """
         self.differ = ""
         """The settings in force that differ from the file, in words, or the reason why the file
-        cannot be used. The text is "" if no setting differs."""
+        cannot be compared. The text is "" if no setting differs."""
         self._file, self._parse = file, parse
         self._in_force = self._written = started
         self._signature: Signature | None = None
         self._box = Mailbox[Request | Literal["look"]](JOBS)
-        """The requests that the thread must check. The item "look" only wakes the thread, which
-        then writes the changes and compares the file."""
+        """Queue of the thread: the requests that it must check. The item "look" only wakes the
+        thread, which then writes the changes and compares the file."""
         self._changes = deque[tuple[Edit, Answer]]()
         """The changes that the thread must write to the file before it checks another request. Each
-        is paired with the robot's answer."""
+        change is paired with the robot's answer to the client."""
         self._results = Mailbox[_Checked | Answer](JOBS)
         self._pending: dict[int, _Pending] = {}
         self._started = self._limits = started.limits
-        """`_started` has the limits at the start of the daemon. `_limits` has the same limits, but
-        with the new value of each limit that the daemon has written to the file since then."""
+        """`_started` contains the limits at the start of the daemon. `_limits` contains the limits
+        in the file: those in `_started`, except that each limit that the daemon has written to the
+        file since its start has the new value."""
         self._kept: tuple[Latches, LimitsConfig, LimitsConfig, Latches] | None = None
         """Cache of the method `latches`: the two arguments of its last computation, the value of
         `_limits` at that time, and the result."""
@@ -119,7 +125,10 @@ class SettingsFile:
     # The control loop calls the methods below.
 
     def start(self) -> None:
-        """Start the thread. If no thread can be started, the file is not compared or changed."""
+        """Start the thread. If no thread can be started, the file is neither compared nor changed.
+
+        The attribute `differ` then contains the reason.
+        """
         thread = threading.Thread(target=self._work, name="settings file", daemon=True)
         try:
             thread.start()
@@ -129,17 +138,18 @@ class SettingsFile:
     def use(self, config: Config) -> None:
         """Compare the file with `config` from now on, and again whenever the file changes.
 
-        `config` contains the settings in force, but not the lower speed limit that a client may
-        have set with the Zenoh key `speed_limit`.
+        Args:
+            config: the settings in force, but without the lower speed limit that a client may have
+                set with the Zenoh key `speed_limit`.
         """
         self._in_force = config
         self._look()
 
     def keep(self, request: Request, now_ns: int) -> None:
-        """Queue a `set` request with `keep`, so that the thread checks it.
+        """Queue a `set` request with the field `keep`, so that the thread checks it.
 
-        `results` later returns either the request for the robot or an answer for the client.
-        `now_ns` is the present monotonic time, ns.
+        `results` later returns the request, if the robot must use its settings, or an answer for
+        the client. `now_ns` is the present monotonic time, ns.
         """
         full = len(self._pending) >= JOBS
         # A request beyond the limit is overdue from the start, so that `results` refuses it in this
@@ -149,9 +159,9 @@ class SettingsFile:
             self._box.put(request)
 
     def _look(self) -> None:
-        """Wake the thread. Do nothing if it has requests to check, because it is awake then.
+        """Wake the thread. Do nothing if requests wait for the thread, because it is awake then.
 
-        Another item in the queue could displace a request.
+        In a full queue, the item "look" would displace a request.
         """
         if not self._box.waiting:
             self._box.put("look")
@@ -159,12 +169,12 @@ class SettingsFile:
     def obeyed(self, answer: Answer) -> bool:
         """Process the robot's answer to a client's request; return whether the answer must wait.
 
-        The answer must wait if the client sent a `set` request with the field `keep`, and the robot
-        now uses the new settings. In this case, the method returns True, and the caller must not
-        send the answer. The thread of this object first writes the settings to the configuration
-        file, and `results` later returns the answer that the caller must send to the client.
+        If the client sent a `set` request with the field `keep`, and the robot now uses the new
+        settings, return True. The caller must not send the answer. The thread of this object first
+        writes the settings to the configuration file, and then `results` returns the answer for the
+        client.
 
-        For any other answer, the method returns False, and the caller must send the answer now.
+        For any other answer, return False. The caller must send this answer now.
         """
         pending = self._pending.get(answer.id)
         if pending is None or pending.edit is None:
@@ -219,19 +229,24 @@ class SettingsFile:
     def limits(self) -> LimitsConfig:
         """The limits in the configuration file, as far as the daemon has read or written them.
 
-        They are the limits at the start of the daemon. If the daemon has written a limit to the
-        file since its start, that limit has the last written value. Changes of the file by other
-        programs are not included.
+        Each limit has the value that the daemon last wrote to the file or, if the daemon has not
+        written it, the value at the start of the daemon. Changes of the file by other programs are
+        not included.
         """
         return self._limits
 
     def latches(self, latches: Latches, now: LimitsConfig) -> Latches:
-        """Return the robot's latches as they must be stored for the next start of the daemon.
+        """Return the robot's latches as the latch file must store them for the next start.
 
         The next start reads the limits from the configuration file. So if the daemon has written
-        limits to the file, the field `lowered` of the result contains those limits that are lower
-        in `now` than in the file. `now` contains the limits in force, but not the lower speed limit
-        that a client may have set with the Zenoh key `speed_limit`.
+        limits to that file, the field `lowered` of the result contains the limits that are lower in
+        `now` than in the file, except decelerations. For the same arguments, the result is the same
+        object.
+
+        Args:
+            latches: the robot's latches.
+            now: the limits in force, but without the lower speed limit that a client may have set
+                with the Zenoh key `speed_limit`.
         """
         file = self._limits
         if file is self._started:
@@ -245,7 +260,7 @@ class SettingsFile:
         return kept[3]
 
     def close(self) -> None:
-        """Tell the thread to end, without waiting for it."""
+        """Let the thread end. Do not wait for it."""
         self._box.close()
 
     # The thread runs the methods below.
@@ -267,7 +282,7 @@ class SettingsFile:
 
     def _checked(self, request: Request) -> _Checked | Answer:
         try:
-            # Refuse settings that the robot would refuse even at rest.
+            # Refuse settings here if the robot would refuse them even at rest.
             changed(self._in_force, request.settings, at_rest=True)
         except ConfigError as error:
             return Answer(request.id, False, str(error))
@@ -323,7 +338,7 @@ class SettingsFile:
 
 
 def _overdue(pending: _Pending) -> Answer:
-    """Return the answer to a request that took too long, or that came when `JOBS` others waited."""
+    """Return the answer to a request that took too long, or that exceeded the limit `JOBS`."""
     why = (
         f"the disk did not answer within {PATIENCE_NS / NS_PER_S:g} s, or too many changes came at "
         "once"

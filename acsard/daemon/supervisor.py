@@ -1,6 +1,6 @@
-"""Supervises the process of the TLS gateway, of a fleet's router or of the web page.
+"""Runs the process of the TLS gateway, of a fleet's router or of the web page, and restarts it.
 
-A process that sends no signs of life is ended and started again. If the gateway runs as a service,
+A process that sends no signs of life is killed and started again. If the gateway runs as a service,
 systemd supervises it instead (`acsard-gateway.service`), because only systemd can set the limits of
 that service.
 """
@@ -21,19 +21,24 @@ AGAIN_S = 0.1
 """Usual pause between the end of a process and its restart, s."""
 
 LATER_S = 2.0
-"""Pause before a restart after an exit code above 1, or after a failure to start the process, s."""
+"""Longer pause before a restart, s. It applies if the process has ended with an exit code above 1,
+or could not be started."""
 
 
 class Kind(Struct, frozen=True):
+    """A kind of process, with its name in messages and the rules for its restart."""
+
     name: str
     ended: EventName
+    """Name of the log event that reports the end of the process."""
     final: frozenset[int] = frozenset()
     """Exit codes after which the process is not started again."""
     again_s: float = AGAIN_S
     """Pause before a restart, s. After an exit code above 1 the pause is `LATER_S` instead."""
     final_at_first: frozenset[int] = frozenset()
-    """Exit codes after which only the first process is not started again. If a later process ends
-    with such a code, a person may just have been changing its files, so it is started again."""
+    """Exit codes after which the process is not started again if it has never been restarted. A
+    restarted process may end with such a code because a person is changing its files, so it is
+    started again."""
 
 
 GATEWAY = Kind("the TLS gateway", "gateway_ended")
@@ -45,8 +50,8 @@ ROUTER = Kind(
     "router_ended",
     final_at_first=frozenset({Exit.USAGE, Exit.BAD_CONFIG}),
 )
-"""The router of a fleet. If its files are unusable at the first start, it is not started again. At
-a later restart a person may be changing the files, so it is started again."""
+"""The router of a fleet. If its files are unusable at the first start, the router is not started
+again. At a later restart a person may be changing the files, so the router is started again."""
 
 PAGE = Kind(
     "the robot's page",
@@ -54,9 +59,8 @@ PAGE = Kind(
     frozenset({Exit.OK, Exit.USAGE, Exit.IN_USE, Exit.NO_PERMISSION, Exit.BAD_CONFIG}),
     LATER_S,
 )
-"""The process of the web page. The pause before its restart is longer, because a page that fails
-again and again must not take processor time from the robot. The process itself reports why it
-ends."""
+"""The process of the web page, which itself reports why it ends. The pause before its restart is
+longer, because a page that fails again and again must not take processor time from the robot."""
 
 
 async def keep_running(
@@ -64,9 +68,8 @@ async def keep_running(
 ) -> int:
     """Run `acsard` with the arguments `words`, and restart it whenever it ends.
 
-    Run until this task is cancelled, or until the process ends with an exit code that is final
-    according to `kind`. Then return the exit code. `log` is called with an event before each
-    restart.
+    Return the exit code if the process ends with a code that is final according to `kind`.
+    Otherwise run until this task is cancelled. `log` is called with an event before each restart.
     """
     final = kind.final | kind.final_at_first
     while True:

@@ -1,15 +1,15 @@
 """Runs a control step for each of these events, directly in the event loop's callback.
 
 - period: a period has ended. Missed periods are counted, but get no steps of their own.
-- bytes: the port has read data or was lost.
-- retry: a line with a new command may be written now (`pacing.py`).
+- bytes: the serial port has received data or was lost.
+- retry: the line with a waiting command may be written now (`pacing.py`).
 - command: the bus has a sample that may be a command, and `pacing.py` permits an early line.
-  Otherwise the next period processes the command.
-- stop: the bus has a stop. It gets a step even if `pacing.py` permits no early line. In a flood of
-  stops, not every stop gets a step of its own.
+  Otherwise the sample waits for the next step.
+- stop: the bus has a stop, which gets a step even if `pacing.py` permits no early line. In a flood
+  of stops, not every stop gets a step of its own.
 - signal: the shutdown begins.
 
-Waking a task for the step would cost another round of the event loop each time.
+The step does not run in a task, because waking a task would cost another round of the event loop.
 """
 
 from __future__ import annotations
@@ -40,7 +40,8 @@ class _Timer:
         self._timer.close()
 
     def _expire(self) -> None:
-        # Without an expiration there is nothing to do: the timer was set again after it expired.
+        # If the timer was set again after it had expired, it reports no expiration. Then there is
+        # nothing to do.
         if self._timer.expirations():
             self._ring()
 
@@ -58,7 +59,7 @@ class Alarm(_Timer):
     def set(self, at_ns: int | None) -> None:
         """Call `wake` once, at the monotonic time `at_ns`, ns.
 
-        A new time replaces the earlier one. None leaves the timer unchanged.
+        A new time replaces the earlier one. With None, an earlier time is not cancelled.
         """
         if at_ns is not None and at_ns != self._at_ns:
             self._timer.set(at_ns)
@@ -73,7 +74,7 @@ class Alarm(_Timer):
 class Ticker(_Timer):
     """A timer that calls `wake` at the end of every period.
 
-    `take` then returns how many periods have ended. It must be called each time, because it also
+    After each call of `wake`, `take` must be called. It returns how many periods have ended, and
     sets the timer for the next period.
     """
 
@@ -91,7 +92,8 @@ class Ticker(_Timer):
     def take(self, now_ns: int) -> Period:
         """Return how many periods have ended since the last call, and when the first of them ended.
 
-        `now_ns` is the present monotonic time, ns.
+        Also set the timer for the next period. `now_ns` is the present monotonic time, ns. If no
+        period has ended, the result is `NO_PERIOD` or has `expired` = 0.
         """
         if not self._rang and now_ns < self._due_ns:
             return NO_PERIOD
@@ -111,21 +113,23 @@ class Ticker(_Timer):
 
 
 class Next(Struct, frozen=True):
-    """Result of a step. It says which events may run a step before the next period ends."""
+    """Result of a step: the events that may run another step before the present period ends."""
 
     listens: bool
-    """Whether the next command gets a step at once, not only in the next period."""
+    """Whether the next command gets an extra step immediately. If this is False, the next command
+    waits for the next step that another event runs."""
     retry_ns: int | None
     """Monotonic time at which a step can send the waiting command, ns; None if no command waits."""
     period_ended: bool = True
-    """Whether the step ran at the end of a period. If so, the next stop gets a step at once."""
+    """Whether the step ran at the end of a period. If so, the next stop gets an extra step
+    immediately."""
 
 
 class Wakeup:
-    """Runs the control loop's step when the event loop, a timer or the bus asks for it.
+    """Runs a control step whenever the serial port, a timer, the bus or a signal requires one.
 
-    Calling this object runs a step immediately. If a step is running already, the call requests
-    another step, which runs after the present one.
+    Calling this object runs a step immediately, in the thread of the event loop. If a step is
+    running already, another step runs after it.
     """
 
     def __init__(self) -> None:
@@ -143,10 +147,10 @@ class Wakeup:
             self._run(self._step, self._over)
 
     def command(self) -> None:
-        """Tell the loop that a sample has arrived that may be a command. Any thread may call this.
+        """Report that the bus has a sample that may be a command. Any thread may call this method.
 
-        If the last step returned `Next.listens`, the first such sample runs a step. Any other
-        sample waits for the next step.
+        If `listens` was True in the result of the last step, the first such sample runs a step.
+        Every other sample waits for the next step.
         """
         self._heard = True
         if self._listens:
@@ -154,10 +158,10 @@ class Wakeup:
             self._from_thread()
 
     def stop(self) -> None:
-        """Tell the loop that a stop has arrived. Any thread may call this.
+        """Report that the bus has a stop. Any thread may call this method.
 
-        The first stop runs a step. Further stops do not run a step of their own until a step has
-        ended a period or has returned `Next.listens`.
+        The first stop runs a step. A further stop runs no step of its own until a step has run at
+        the end of a period, or has returned a `Next` in which `listens` is True.
         """
         if not self._stop_told:
             self._stop_told = True
@@ -170,9 +174,9 @@ class Wakeup:
             pass  # the event loop has closed, so nothing is left to wake
 
     async def run(self, step: Callable[[], Next | None]) -> None:
-        """Run `step` for every event until `step` returns None or raises an exception.
+        """Run `step` for every event, until `step` returns None.
 
-        The exception is raised here.
+        If `step` raises an exception, this method raises the same exception.
         """
         self._over = self._loop.create_future()
         with self._alarm:
@@ -203,6 +207,6 @@ class Wakeup:
         self._listens = then.listens
         if then.listens or then.period_ended:
             self._stop_told = False
-        # A command came during the step, perhaps too late to be part of it. So run another step.
+        # A command arrived during the step, perhaps too late for this step. So run another step.
         if then.listens and self._heard:
             self._listens, self._again = False, True

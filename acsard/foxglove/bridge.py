@@ -1,4 +1,4 @@
-"""Connects a robot to Foxglove viewers. The main loop of the bridge runs on one thread."""
+"""The bridge between a robot and Foxglove viewers. Its main loop runs on one thread."""
 
 from __future__ import annotations
 
@@ -34,14 +34,16 @@ from acsard.foxglove.server import (
 from acsard.host import clock
 
 GONE = "daemon"
-"""Id of the status message by which viewers learn that the daemon is gone."""
+"""Id of the status message that tells the viewers that the daemon is gone."""
 
 
 RELEASE = "release the button for two seconds, and press it again"
-"""Advice to an operator whose panel must send a zero. See `commander.RELEASED_NS`."""
+"""Advice to an operator whose panel must send a zero command (see `commander.RELEASED_NS`)."""
 
 
 class Bridge:
+    """Connects one robot to the viewers: starts the server, and runs the main loop."""
+
     def __init__(
         self,
         robot: Client,
@@ -50,6 +52,14 @@ class Bridge:
         *,
         acts: bool = False,
     ) -> None:
+        """Query the robot, and start the server.
+
+        Args:
+            robot: the bus client for the robot.
+            address: host name or IP address, and port, at which the server listens.
+            tell: function that prints a message at the terminal.
+            acts: whether viewers may drive the robot, call all services and change settings.
+        """
         self._robot, self._id = robot, robot.where.robot_id
         robot.name += ", a viewer"
         self._wake, self._ended = Event(), Event()
@@ -66,7 +76,7 @@ class Bridge:
         self._relay.offer(facts)
         self._deaf = facts.deaf
         """Reason why the viewers cannot see the commands of other programs, in words. It is "" if
-        they can see them, or after the reason has been sent to the viewers."""
+        they can see these commands, or after the reason has been sent to the viewers."""
         logging.getLogger("foxglove").addHandler(Refusals(self._notices))
         listener = Listener(self._shown, self._drives, self._settings)
         offered = services(robot, ros, CALLED if acts else STOPS)
@@ -79,8 +89,10 @@ class Bridge:
         self._token = robot.session.liveliness().declare_subscriber(key, self._alive, history=True)
 
     def run(self) -> None:
-        """Run the main loop until `end` is called. Raises the error that ended the sender
-        thread."""
+        """Run the main loop until `end` is called.
+
+        If an exception has ended the thread that sends commands, raise this exception.
+        """
         dead = self._drives.outbox.dead
         while not self._ended.is_set():
             if dead.done():
@@ -93,12 +105,12 @@ class Bridge:
             self._round()
 
     def end(self) -> None:
-        """Make `run` return. A signal handler may call this method."""
+        """Let `run` return. A signal handler may call this method."""
         self._ended.set()
         self._wake.set()
 
     def close(self) -> None:
-        """Send a zero command for each viewer that drives, then stop the server."""
+        """Send a zero command for each viewer that may be driving, then stop the server."""
         self._drives.end()
         self._server.stop()
 
@@ -137,9 +149,9 @@ class Bridge:
         return True
 
     def _came_back(self) -> bool:
-        """Query the facts about the robot after a restart of its daemon.
+        """Query the facts about the robot again, after a restart of its daemon.
 
-        Return False if the daemon does not answer yet.
+        Return False if the query fails, for example because the daemon does not answer yet.
         """
         try:
             facts = learn(self._robot)
@@ -175,7 +187,7 @@ class Bridge:
     def _object(self, driving: dict[int, Client]) -> None:
         """Tell all viewers why the robot does not follow the commands of a viewer.
 
-        `driving` maps the id of each viewer that requests a speed to the viewer's bus client.
+        `driving` maps the id of each viewer that requests a speed to the bus client of this viewer.
         """
         now_ns = clock.steady_ns()
         for client in driving.keys() - self._objections.keys():

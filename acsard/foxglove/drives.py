@@ -3,7 +3,7 @@
 A panel repeats its command while a button is held, and sends nothing after the button is released.
 But the daemon lets a sender drive only after a zero command. So this module sends a zero command
 before the first command after each silence of more than 1.5 s. A shorter silence may be a pause of
-the network, in which the button was held.
+the network while the button is held.
 
 If a burst of commands follows a silence, the network has delayed these commands, so this module
 drops them. The daemon could detect the delay only from stamps, which few panels send.
@@ -28,12 +28,12 @@ from acsard.foxglove.notices import Notices
 from acsard.host import clock
 
 SLOW_NS, SLOW_TIMES = 5 * NS_PER_S // 2, 3
-"""Limits by which a panel counts as publishing too rarely. It does so if the silence before each of
+"""Limits that decide whether a panel publishes too rarely. It does if the silence before each of
 `SLOW_TIMES` consecutive messages is longer than `commander.SILENCE_NS` (0.3 s) and at most
 `SLOW_NS` (2.5 s)."""
 
 MAX_CHANNELS = 64
-"""Maximum number of channels of one viewer that are registered at the same time."""
+"""Largest number of channels of one viewer that are registered at the same time."""
 
 TOO_MANY_CHANNELS = (
     f"a viewer may publish on {MAX_CHANNELS} topics at most, so the messages of this panel are "
@@ -47,10 +47,13 @@ not depend on them."""
 
 
 def encoding_of(encoding: str, schema_name: str) -> str:
-    """Return the Zenoh encoding of a channel's messages.
+    """Return the Zenoh encoding of the messages on a viewer's channel.
 
-    `encoding` is "json" or "cdr", and `schema_name` is a ROS type such as "geometry_msgs/Twist".
     Raises `DecodeError` if such messages cannot drive the robot.
+
+    Args:
+        encoding: Foxglove's name of the encoding. Any encoding except "json" and "cdr" is refused.
+        schema_name: ROS type of the messages, such as "geometry_msgs/Twist".
     """
     package, _, name = schema_name.partition("/")
     full = f"{package}/msg/{name.removeprefix('msg/')}"
@@ -70,26 +73,29 @@ def encoding_of(encoding: str, schema_name: str) -> str:
 
 
 def wish(encoding: str, payload: bytes) -> Wish:
-    """Decode a velocity command; `encoding` is a Zenoh encoding. Raises `DecodeError`."""
+    """Return the velocity command in `payload`. Raises `DecodeError` if it is not valid.
+
+    `encoding` is Zenoh's name of the encoding.
+    """
     found = _receiver.command(Arrival("cmd/app", True, payload, encoding, 0, None, ""))
     return Wish(found.twist, found.stamp_ns)
 
 
 class Viewer:
-    """A viewer that publishes commands: its bus client, its newest command and its channels."""
+    """A viewer that publishes commands, with its bus client, its `Commander` and its channels."""
 
     def __init__(self, robot: Client) -> None:
         self.robot, self.commander = robot, Commander(leads=True, gathers=True)
         self.channels: dict[int, tuple[str, str]] = {}
-        """Maps a channel's id to (Zenoh encoding, ""). If commands on the channel cannot drive the
+        """Maps a channel's id to (Zenoh encoding, ""). If messages on the channel cannot drive the
         robot, the value is ("", reason)."""
         self._slow = 0
 
     def is_slow(self, silence_ns: int | None) -> bool:
         """Return whether the panel publishes so rarely that the robot stops between the messages.
 
-        Call this for each message. `silence_ns` is the time since the previous message, ns. It is
-        None if that time is at most `commander.SILENCE_NS`, and for the first message.
+        Call this method once for each message. `silence_ns` is the time since the previous message,
+        ns. It is None for the first message, and if that time is at most `commander.SILENCE_NS`.
         """
         slow = silence_ns is not None and silence_ns <= SLOW_NS
         self._slow = self._slow + 1 if slow else 0
@@ -108,17 +114,24 @@ class Drives:
         self._lock = Lock()
         self.outbox = Outbox()
         self.timeout_s = LONGEST_S
-        """Timeout of the command source under which viewers drive, s."""
+        """Timeout of the command source that the viewers use, s."""
 
     # The server's threads call the methods below.
 
     def advertised(
         self, client: int, channel: int, topic: str, encoding: str, schema_name: str
     ) -> None:
-        """Register the channel with the id `channel` of the viewer with the id `client`.
+        """Register a channel on which a viewer publishes.
 
-        If messages on the channel cannot drive the robot, `came` reports the reason when one
-        arrives. A channel beyond `MAX_CHANNELS` is not registered, which `came` reports too.
+        If messages on the channel cannot drive the robot, `came` reports the reason when a message
+        arrives. A channel beyond `MAX_CHANNELS` is not registered, and `came` reports that.
+
+        Args:
+            client: the id of the viewer.
+            channel: the id of the channel.
+            topic: the topic on which the viewer publishes.
+            encoding: Foxglove's name of the encoding, "json" or "cdr".
+            schema_name: ROS type of the messages, such as "geometry_msgs/Twist".
         """
         found, problem = "", ""
         if topic != self.topic:
@@ -136,10 +149,9 @@ class Drives:
                 viewer.channels[channel] = found, problem
 
     def came(self, client: int, channel: int, data: bytes) -> None:
-        """Queue the command in a viewer's message, or tell the viewers why the command is refused.
+        """Queue the command in a viewer's message. If it is refused, tell the viewers why.
 
-        `client` and `channel` are the ids of the viewer and of its channel, and `data` is the
-        message.
+        `client` and `channel` are the ids of the viewer and of its channel. `data` is the message.
         """
         viewer = self._viewers.get(client)
         if viewer is None:
@@ -172,9 +184,10 @@ class Drives:
             )
 
     def withdrawn(self, client: int, channel: int) -> None:
-        """Remove the channel with the id `channel` of the viewer with the id `client`.
+        """Remove a channel on which a viewer has published.
 
-        If the viewer may still be driving the robot, send a zero command.
+        If the viewer may be driving the robot, send a zero command. `client` is the id of the
+        viewer, and `channel` is the id of the channel.
         """
         with self._lock:
             viewer = self._viewers.get(client)
@@ -196,7 +209,7 @@ class Drives:
             return {one: it.robot for one, it in viewers if it.commander.drives(now_ns)}
 
     def end(self) -> None:
-        """Send a zero command for each viewer that drives, then stop the sending thread."""
+        """Send a zero command for each viewer that may be driving, then stop the sending thread."""
         with self._lock:
             for viewer in self._viewers.values():
                 self.outbox.release(viewer.commander, self.timeout_s)

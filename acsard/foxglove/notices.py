@@ -24,17 +24,17 @@ STATUS: dict[Level, StatusLevel] = {
 }
 
 AGAIN = Rate(0.5)
-"""Limit on the rate of notices with the same text: one per two seconds."""
+"""Largest rate of notices with the same text: one per two seconds."""
 
 WAITING = 100
-"""Maximum number of notices that wait to be sent. If there are more, the oldest are dropped."""
+"""Largest number of notices that wait to be sent. A newer notice displaces the oldest one."""
 
 
 class Notice(Struct, frozen=True):
     """A message to the viewers.
 
-    If `stays` is an id, the viewers show the message until a later notice has the same id and an
-    empty `text`.
+    If `stays` is not "", it is the id of a message that remains visible until a later notice has
+    the same id and an empty `text`.
     """
 
     level: Level
@@ -44,7 +44,7 @@ class Notice(Struct, frozen=True):
 
 
 class Notices:
-    """Collects notices from any thread; the main thread sends them."""
+    """The messages to the viewers. Any thread may add a message, and the main thread sends them."""
 
     def __init__(self, tell: Callable[[str], None], wake: Callable[[], None]) -> None:
         self._tell = tell
@@ -54,10 +54,14 @@ class Notices:
         self._staying: dict[str, Notice] = {}
 
     def say(self, level: Level, name: str, text: str, stays: str = "") -> None:
-        """Queue a message to all viewers; `name` is its subject on the topic `log`.
+        """Queue a message to all viewers.
 
-        If `stays` is an id, the viewers show the message until `over` is called with this id. If it
-        is "", a message whose text is repeated faster than `AGAIN` permits is dropped.
+        Args:
+            level: how serious the message is.
+            name: the subject of the message on the topic `log`.
+            text: the message.
+            stays: id of a message that remains visible until `over` is called with this id. With
+                "", the message is dropped if its text is repeated faster than `AGAIN` permits.
         """
         now_ns = clock.mono_ns()
         with self._lock:
@@ -70,10 +74,13 @@ class Notices:
         self._waiting.put(Notice("info", "", "", stays))
 
     def send(self, server: WebSocketServer, log: Callable[[Log], None], *, newcomers: bool) -> None:
-        """Send and print the waiting notices; `log` publishes each of them on the topic `log`.
+        """Send the waiting notices to the viewers, and print them at the terminal.
 
-        If `newcomers` is true, first repeat the messages that stay visible, because new viewers
-        have not received them.
+        Args:
+            server: the server to which the viewers are connected.
+            log: function that publishes a message on the topic `log`.
+            newcomers: whether new viewers have come. If so, first send the messages that remain
+                visible again.
         """
         if newcomers:
             for one in self._staying.values():
@@ -97,14 +104,18 @@ class Objections:
     def __init__(self) -> None:
         self._since_ns: int | None = None
         self.told = ""
-        """The reported reason why the robot does not follow, in words; "" if none is reported."""
+        """Reason why the robot does not follow the viewer, as it was last reported, in words. It is
+        "" if no reason is reported."""
 
     def look(self, objection: str, now_ns: int) -> bool:
         """Update the reported reason `told`, and return whether it has changed.
 
-        `objection` is the present reason why the robot does not follow the viewer, or "" if it
-        follows. A reason is reported after the robot has not followed for `GRACE_S`. `now_ns` is a
-        monotonic time, ns.
+        A reason is reported if the robot has not followed the viewer for `GRACE_S`.
+
+        Args:
+            objection: the present reason why the robot does not follow the viewer, in words, or ""
+                if the robot follows.
+            now_ns: the present monotonic time, ns.
         """
         if not objection:
             self._since_ns = None

@@ -1,7 +1,7 @@
 """Forwards messages from the bus to the Foxglove viewers.
 
 The relay subscribes only to topics that a viewer shows, so all other topics cost no time here or in
-the daemon. If messages arrive faster than they can be forwarded, the oldest are dropped.
+the daemon. If messages arrive faster than the relay can forward them, the oldest are dropped.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ EVENTS = "events"
 
 
 class News:
-    """Converts the lists of events that the daemon publishes to log messages.
+    """Converts the daemon's lists of events to log messages.
 
-    The lists overlap, but each event becomes one log message.
+    Successive lists overlap, but each event becomes one log message only.
     """
 
     def __init__(self) -> None:
@@ -44,9 +44,10 @@ class News:
         self._told: list[LogEvent] = []
 
     def of(self, events: Events) -> list[Log]:
-        """Return the events that were in no earlier list, as log messages.
+        """Return a log message for each event that was in no earlier list.
 
-        After a restart of the daemon, all events are new.
+        After a restart of the daemon, all events are new. A list that is older than an earlier list
+        adds no messages.
         """
         known, told, stamp_ns = self._total, self._told, events.stamp.to_ns()
         if events.total < known:
@@ -71,20 +72,25 @@ class _Out:
 
 
 class Way(Struct, frozen=True):
-    """How the daemon interprets the commands that arrive on one key of the bus."""
+    """The form in which commands arrive on one key of the bus."""
 
     native: str
-    """The Zenoh key that acsard itself uses for these commands, without the robot's id. "*" stands
-    for the name of a certificate."""
+    """The native key of acsard for these commands, without the robot's id. "*" stands for the name
+    of a certificate."""
     encoding: str = ""
-    """Encoding of all commands on the key; "" if each command names its encoding."""
+    """Encoding of all commands on the key; "" if each command names its own encoding."""
     via: Via = "native"
 
 
 def ways(key_of: Callable[[str], str], ros: RosConfig, source: str) -> dict[str, Way]:
-    """Return a `Way` for each key on which commands of the source `source` may arrive.
+    """Return a `Way` for each full key on which commands of a source may arrive.
 
-    These are the keys of acsard and those of ROS. `key_of` adds the robot's id to a key of acsard.
+    These are the keys of acsard and those of ROS.
+
+    Args:
+        key_of: function that adds the robot's id to a key of acsard.
+        ros: the robot's settings for ROS.
+        source: the name of the command source.
     """
     native = source_keys([source])
     found = {key_of(key): Way(key) for key in (*native, *source_keys([source], "*"))}
@@ -102,16 +108,17 @@ class Reader:
         self._frame = config.odometry.base_frame
 
     def read(self, arrival: Arrival, wall_ns: int) -> TwistStamped:
-        """Return the twist of a command that arrived at `wall_ns`, ns since 1970.
+        """Return the twist of a command, with the time of its arrival.
 
-        Raises `DecodeError`.
+        `wall_ns` is the time at which the command arrived, ns since 1970. Raises `DecodeError` if
+        the command is not valid.
         """
         twist = self._receiver.command(arrival).twist
         return asked(twist, Time.from_ns(wall_ns), self._frame)
 
 
 class Commanders:
-    """Receives the commands that programs send to the robot. Each command source has a topic.
+    """Receives the commands that programs send to the robot, for one topic per command source.
 
     Only one thread may use this class. Zenoh's threads call `wake`.
     """
@@ -123,6 +130,10 @@ class Commanders:
         self._heard: dict[str, _Heard] = {}
 
     def use(self, facts: Facts) -> None:
+        """Use the command sources, keys and permissions in `facts` from now on.
+
+        All subscriptions end, because the keys may have changed.
+        """
         ros, self._deaf = facts.config.ros, bool(facts.deaf)
         self._reader = Reader(facts.config)
         for source in facts.sources:
@@ -138,8 +149,8 @@ class Commanders:
     def follow(self, topics: Collection[str]) -> None:
         """Subscribe to the commands of `topics` only.
 
-        If this program is connected over TLS, it may not receive the commands of other clients and
-        subscribes to none.
+        A program that is connected over TLS may not receive the commands of other clients. In this
+        case, do not subscribe at all.
         """
         wanted = set() if self._deaf else self._ways.keys() & set(topics)
         for topic in self._heard.keys() - wanted:
@@ -148,7 +159,7 @@ class Commanders:
             self._heard[topic] = _Heard(self._robot.session, self._ways[topic], self._wake)
 
     def take(self) -> Iterator[tuple[str, TwistStamped]]:
-        """Yield each valid command that has arrived since the last call, with its topic."""
+        """Yield a pair (topic, command) for each valid command since the last call."""
         for topic, heard in self._heard.items():
             for arrival, wall_ns in heard.take():
                 try:
@@ -158,7 +169,7 @@ class Commanders:
 
 
 class _Heard:
-    """The subscriptions to the commands of one source, and the commands that wait to be read."""
+    """The subscriptions to the commands of one source, and the queue of these commands."""
 
     def __init__(
         self, session: zenoh.Session, by_key: Mapping[str, Way], wake: Callable[[], object]
@@ -238,13 +249,16 @@ class Relay:
 
     @property
     def commanders(self) -> Collection[str]:
+        """The topics that show the commands of programs, one for each command source."""
         return self._commanders.topics
 
     def follow(self, topics: Collection[str], fresh: Collection[str]) -> None:
-        """Subscribe only to the keys of `topics`, the topics that viewers show.
+        """Subscribe to the keys of the topics that viewers show, and to no other keys.
 
-        Each topic in `fresh` has a new viewer. If such a topic is published rarely, its last
-        message is sent again for the new viewer.
+        Args:
+            topics: the topics that viewers show.
+            fresh: the topics with a new viewer. If such a topic is published rarely, its last
+                message is sent again for the new viewer.
         """
         if self.log_topic in fresh:
             self._news = News()  # a viewer that opens the log receives the last events too
@@ -279,6 +293,7 @@ class Relay:
         return Subscription(arrivals, self._robot.key(key))
 
     def pass_on(self) -> None:
+        """Forward the messages and commands that have arrived since the last call."""
         for topic, command in self._commanders.take():
             self._outs[topic].log(command)
         for key, samples in self._followed.items():
@@ -292,6 +307,7 @@ class Relay:
                     out.log(message)
 
     def log(self, line: Log) -> None:
+        """Publish a message on the topic `log`, unless this topic was not offered yet."""
         out = self._outs.get(self.log_topic)
         if out is not None:
             out.log(line)

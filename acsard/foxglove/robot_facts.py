@@ -1,4 +1,4 @@
-"""The robot's configuration and this client's permissions, for the Foxglove bridge."""
+"""The robot's configuration, and the permissions of this program, for the Foxglove bridge."""
 
 from __future__ import annotations
 
@@ -16,24 +16,28 @@ from acsard.host.errors import ReplyError
 
 
 class Facts(Struct, frozen=True):
-    """Facts about a robot.
+    """The configuration of a robot, and the permissions of this program.
 
     If this program may not read the robot's configuration, `config` has the default values.
     """
 
     config: Config
     tables: object
-    """The configuration as nested dicts; None if this program may not read it."""
+    """The robot's configuration as nested dicts. None if this program may not read the
+    configuration."""
     sources: tuple[str, ...]
+    """Names of the robot's command sources."""
     forbidden: str
-    """Reason why this program may not drive, in words; "" if it may drive."""
+    """Reason why this program may not drive the robot, in words; "" if it may drive."""
     deaf: str = ""
-    """Reason why this program cannot receive other programs' commands, in words; "" if it can."""
+    """Reason why this program cannot receive the commands of other programs, in words; "" if it
+    can."""
 
     def rows(self) -> list[tuple[Channel, str]]:
         """Return the topics to offer to the viewers, as pairs (topic, command source).
 
-        `CMD_VEL_IN` appears once for each source. For every other topic, the source is "".
+        `CMD_VEL_IN` appears once for each command source. For every other topic, the command source
+        is "".
         """
         found = []
         for row in published_channels(left_out(self.config)):
@@ -56,7 +60,7 @@ def key_of(row: Channel, source: str) -> str:
 
 
 def learn(robot: Client) -> Facts:
-    """Query the robot for its configuration, its command sources, and this client's permissions.
+    """Query the robot for its configuration, its command sources, and this program's permissions.
 
     Raises the errors of `Client.get`, and `ReplyError` if a reply is not readable.
     """

@@ -1,7 +1,7 @@
-"""Starts the WebSocket server of foxglove-sdk, with its callbacks, settings and services.
+"""Starts the WebSocket server of foxglove-sdk, and contains its callbacks, settings and services.
 
-The protocol has no authentication. So the subcommand (`cli/foxglove.py`) accepts only an address of
-this machine.
+The protocol of Foxglove has no authentication. So the subcommand (`cli/foxglove.py`) accepts only
+an address of this machine.
 """
 
 from __future__ import annotations
@@ -33,14 +33,15 @@ from acsard.host.errors import InUseError, NotPermittedError
 from acsard.host.mailbox import Mailbox
 
 WISHES = 16
-"""Maximum number of requested changes of settings that wait to be sent to the daemon."""
+"""Largest number of requested changes of settings that wait until they are sent to the daemon."""
 
 POLL_NS = 5 * NS_PER_S
-"""Time between two queries for the robot's settings, which other clients may change, ns."""
+"""Time between two queries for the robot's settings while a viewer shows them, ns. The queries are
+needed because other clients may change the settings."""
 
 
 class Shown:
-    """Records which viewers are subscribed to which topics."""
+    """The topics that viewers show, with the viewers that are subscribed to each topic."""
 
     def __init__(self, wake: Callable[[], None]) -> None:
         self._wake = wake
@@ -63,7 +64,10 @@ class Shown:
         self._wake()
 
     def take(self) -> tuple[set[str], set[str]]:
-        """Return a pair: topics with viewers, and topics with a new viewer since the last call."""
+        """Return two sets of topics: those with a viewer, and those with a new viewer.
+
+        A viewer is new if it has subscribed since the last call.
+        """
         with self._lock:
             fresh, self._fresh = self._fresh, set()
             return set(self._viewers), fresh
@@ -74,7 +78,7 @@ class Settings:
 
     The main thread calls `learn` and `refresh`, and the server's threads call `get`, `set`,
     `follow` and `unfollow`. Only the main thread waits for the daemon, because the server's threads
-    must also pass on the viewers' stops without delay.
+    must pass on a viewer's stop without delay.
     """
 
     def __init__(
@@ -91,7 +95,7 @@ class Settings:
         self.learn(tables)
 
     def learn(self, tables: object) -> dict[str, Any]:
-        """Store the configuration, and return the settings that have changed.
+        """Store the robot's configuration, and return the settings that have changed.
 
         `tables` is the configuration as nested dicts, or None if this program may not read it.
         """
@@ -103,9 +107,9 @@ class Settings:
         return news
 
     def get(self, names: Collection[str]) -> dict[str, Any]:
-        """Return the known settings with these names, or all known settings if `names` is empty.
+        """Return the known settings with these names, without a query to the daemon.
 
-        The daemon is not queried.
+        If `names` is empty, return all known settings.
         """
         with self._lock:
             self._asked = True
@@ -120,10 +124,14 @@ class Settings:
             self._followed.difference_update(names)
 
     def set(self, wishes: dict[str, Any]) -> dict[str, Any]:
-        """Queue the change `wishes`, and return the present values of its settings.
+        """Queue a change of settings, and return the present values of these settings.
 
-        `wishes` maps settings to their new values. Later `refresh` makes the change, and
-        a notice tells all viewers whether the change succeeded.
+        `refresh` makes the change later. A notice then tells all viewers whether the change
+        succeeded. If `WISHES` changes wait already, the new change is dropped, and a notice says
+        so.
+
+        Args:
+            wishes: maps settings to their new values.
         """
         with self._lock:
             full = len(self._wishes.waiting) >= WISHES
@@ -136,10 +144,10 @@ class Settings:
             return asked(self._known, wishes.keys()) if wishes else {}
 
     def _change(self, wishes: dict[str, Any]) -> dict[str, Any]:
-        """Change all settings in `wishes` or none; return settings with their present values.
+        """Change all settings in `wishes`, or none. Return settings with their present values.
 
-        The result contains all settings that have changed, and those in `wishes` even if the change
-        has failed. Viewers may show the wished values and need the present ones then.
+        The result contains all settings that have changed. It contains those in `wishes` even if
+        the change has failed, because viewers may already show the new values.
         """
         news = dict[str, Any]()
         try:
@@ -156,10 +164,10 @@ class Settings:
             return news | (asked(self._known, wishes.keys()) if wishes else {})
 
     def refresh(self, here: bool) -> dict[str, Any]:
-        """Make one queued change, or query the settings again if a viewer needs them.
+        """Make one queued change. If no change waits, query the settings if a viewer needs them.
 
-        `here` is false if the daemon is gone. Return the settings that changed. This call waits for
-        at most two replies of the daemon.
+        Return the settings that have changed. This call waits for at most two replies of the
+        daemon. `here` is false if the daemon is gone.
         """
         wishes = self._wishes.pop()
         if wishes is not None:
@@ -180,13 +188,16 @@ class Settings:
 
 
 def live_settings(config: object) -> dict[str, Any]:
-    """Return the settings in `config` that can change at run time, by key. Tuples become lists."""
+    """Return the settings in `config` that can change while the daemon runs, by dotted key.
+
+    `config` is the configuration as nested dicts. Tuples become lists.
+    """
     found = ((key, value) for key, value in flat(config) if live(key))
     return {key: list(value) if isinstance(value, tuple) else value for key, value in found}
 
 
 def asked(known: Mapping[str, Any], names: Collection[str]) -> dict[str, Any]:
-    """Return the settings of `known` that are in `names`, or all if `names` is empty."""
+    """Return those settings in `known` whose names are in `names`, or all if `names` is empty."""
     return {key: value for key, value in known.items() if key in names or not names}
 
 
@@ -195,7 +206,7 @@ def changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, Any]
 
 
 class Listener:
-    """The callbacks that the server runs on its own threads when a viewer sends something."""
+    """The callbacks for requests of viewers. The server runs them on its own threads."""
 
     def __init__(self, shown: Shown, drives: Drives, settings: Settings) -> None:
         self._shown, self._drives, self._settings = shown, drives, settings
@@ -248,10 +259,17 @@ def start(
     *,
     acts: bool,
 ) -> WebSocketServer:
-    """Start the server at `address`.
+    """Start the server, and return it.
 
-    The viewers show `name`. If `acts` is true, they may send commands and change settings. Raises
-    `InUseError` if the port is taken, and `NotPermittedError` if the port needs root.
+    Raises `InUseError` if the port is in use, and `NotPermittedError` if the port needs root.
+
+    Args:
+        name: the name of the server, which viewers show.
+        address: host name or IP address, and port, at which the server listens.
+        listener: the callbacks for requests of viewers.
+        services: the services that viewers may call.
+        context: the context of the channels that viewers can show.
+        acts: whether viewers may send commands and change settings.
     """
     host, port = address
     takes = [Capability.Services]
@@ -282,9 +300,9 @@ def start(
 
 
 class Refusals(logging.Handler):
-    """Log handler that tells viewers about each client that foxglove-sdk refuses.
+    """Log handler that tells the viewers about each client that foxglove-sdk has refused.
 
-    It ignores all other log lines.
+    It ignores all other log messages.
     """
 
     def __init__(self, notices: Notices) -> None:
@@ -302,12 +320,12 @@ class Refusals(logging.Handler):
 
 
 CALLED: tuple[Verb, ...] = tuple(verb for verb in SERVICES if verb != "set")
-"""Services that viewers may call with the option `--drive`: all but `set`, because viewers change
-settings through Foxglove parameters instead."""
+"""Services that viewers may call with the option `--drive`: all except `set`. Viewers change
+settings through the parameters of Foxglove instead."""
 
 STOPS: tuple[Verb, ...] = ("stop",)
-"""Services that viewers may call without the option `--drive`. Any web page in a local browser can
-connect, and this server cannot tell which page it is, so only a stop is safe."""
+"""Services that viewers may call without the option `--drive`. Only a stop is safe, because any web
+page in a local browser can connect, and this server cannot tell which page it is."""
 
 NOTHING = {"type": "object", "title": "std_srvs/srv/Trigger_Request", "properties": {}}
 
@@ -332,7 +350,10 @@ def _service(robot: Robot, verb: Verb, name: str) -> foxglove.Service:
 
 
 def called(robot: Robot, verb: Verb, payload: bytes) -> ServiceReply:
-    """Call a service with a JSON payload. If the call fails, return a reply with the reason."""
+    """Call a service of the robot, and return its reply. If the call fails, the reply says why.
+
+    `payload` is the request in JSON.
+    """
     try:
         fields: dict[str, float] = {}
         if verb not in PLAIN_SERVICES:

@@ -1,4 +1,4 @@
-"""Replaces files atomically, and waits until the disk has stored them."""
+"""Replaces files atomically, and waits until the disk has stored a file or directory."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ def replace(
 ) -> None:
     """Replace the content of a file, or create the file.
 
-    If that fails, raise `OSError` and leave the old file unchanged.
+    Raises `OSError` if that fails, and leaves the old file unchanged.
 
     Args:
-        file: The path. Other processes see the complete old file or the complete new one.
-        content: The new content. Only the owner can read the file until its mode is set.
-        mode: The permission bits. If None, an existing file keeps its mode, and a new file gets
+        file: path of the file. Other processes find the complete old file or the complete new file.
+        content: new content. Only the owner can read the new file until its mode is set.
+        mode: permission bits. If None, an existing file keeps its mode, and a new file gets
             `NEW_MODE`.
-        owner: The uid and the gid of the new file. If None, the file keeps its owner and group, as
-            far as this process has the permission to set them.
-        synced: If True, wait before the rename until the disk has stored the new content. A power
-            cut then leaves the complete old or new file. If False, a power cut may leave a part of
+        owner: uid and gid of the new file. If None, the file keeps its owner and group, as far as
+            this process has the permission to set them.
+        synced: if true, wait before the rename until the disk has stored the new content. A power
+            cut then leaves the complete old or new file. If false, a power cut may leave a part of
             the new file until the caller has called `sync`.
     """
     kept = owner

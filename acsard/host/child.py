@@ -35,11 +35,12 @@ OUR_UNIT = ("NOTIFY_SOCKET", "INVOCATION_ID")
 could send notifications to systemd in its parent's name."""
 
 BEAT_S = 0.5
-"""At least once in this time, s, a child sends a sign of life and its parent looks for one."""
+"""Longest interval, s, at which a child sends a sign of life and its parent looks for one."""
 
 SILENT_NS = 3 * NS_PER_S
 """If a child gives no sign of life for this time, ns, its parent kills it. The TLS gateway already
-ends itself after 1 s without progress, so this limit is for a process that cannot even do that."""
+ends itself after 1 s without progress, so this limit is for a process that cannot even end
+itself."""
 
 START_NS = 15 * NS_PER_S
 """Longest time for which the parent waits for a child's first sign of life, ns. Python starts
@@ -47,10 +48,10 @@ slowly on a busy machine."""
 
 
 class Silence:
-    """Detects that another process has given no sign of life for longer than `most_ns`, ns.
+    """Detector that another process has given no sign of life for longer than `most_ns`, ns.
 
-    If more than 0.5 s passes between two calls of `too_long`, only 0.5 s of it counts as silence:
-    the computer may have stopped both processes in that time.
+    If more than 0.5 s passes between two calls of `too_long`, only 0.5 s of this time counts as
+    silence, because the computer may have stopped both processes meanwhile.
     """
 
     def __init__(self, most_ns: int) -> None:
@@ -59,7 +60,8 @@ class Silence:
     def too_long(self, heard: bool, passed_ns: int) -> bool:
         """Return whether the silence exceeds the limit.
 
-        `heard` says whether a sign of life came in the `passed_ns` since the last call.
+        `heard` is true if a sign of life came since the last call. `passed_ns` is the time since
+        the last call, ns.
         """
         self._ns = 0 if heard else self._ns + min(passed_ns, NS_PER_S // 2)
         return self._ns > self._most_ns
@@ -69,7 +71,7 @@ class Silence:
 
 
 def acsard(*words: str) -> list[str]:
-    """Return the command that runs acsard with these arguments."""
+    """Return the command that runs acsard with the arguments `words`."""
     # With -P Python ignores the working directory, so it runs the installed package.
     return [sys.executable, "-P", "-m", "acsard", *words]
 
@@ -77,7 +79,7 @@ def acsard(*words: str) -> list[str]:
 def environment(hidden: Collection[str] = ()) -> dict[str, str]:
     """Return the environment variables for a child.
 
-    They are those of this process, without the names in `hidden` and `OUR_UNIT`.
+    They are those of this process, without the variables that `hidden` and `OUR_UNIT` name.
     """
     return {key: value for key, value in os.environ.items() if key not in (*OUR_UNIT, *hidden)}
 
@@ -92,7 +94,7 @@ class Limits(Struct, frozen=True):
 def limit(pid: int, limits: Limits) -> None:
     """Set the limits of the child with the process id `pid`.
 
-    If the computer runs out of memory, the kernel kills this child before other processes.
+    The kernel will also kill this child before other processes if the computer runs out of memory.
     """
     try:
         with suppress(OSError):
@@ -105,7 +107,7 @@ def limit(pid: int, limits: Limits) -> None:
 
 
 def how_it_ended(code: int) -> str:
-    """Return in words how a process ended.
+    """Return in words how a process ended, such as "ended with exit code 1".
 
     `code` is its exit code, or the negative number of the signal that ended it.
     """
@@ -161,17 +163,17 @@ async def running(
 
 
 class Child:
-    """The parent's connection to a child. It kills a child that stops sending signs of life."""
+    """The parent's connection to a child. It kills a child that sends no more signs of life."""
 
     def __init__(self, command: Sequence[str]) -> None:
         self._command = command
         self._ours: socket.socket | None = None
         self._over = False
         self.silent = ""
-        """Why the child was killed, or "" if it was not killed."""
+        """The reason why the child was killed, in words; "" if it was not killed."""
 
     def run(self) -> int:
-        """Run the child until it ends, and return its exit code.
+        """Start the child, wait until it ends, and return its exit code.
 
         If a signal ended the child, return the negative number of the signal. Raises `OSError` if
         the child cannot be started.
@@ -194,9 +196,10 @@ class Child:
             return process.wait()
 
     def _falls_silent(self, ours: socket.socket) -> bool:
-        """Wait until the child falls silent, ends, or `release` is called.
+        """Wait until the child falls silent or ends, and return True if it fell silent.
 
-        `ours` is the parent's end of the socket to the child. Return True if the child fell silent.
+        Also return, with False, after `release` was called. `ours` is the parent's end of the
+        socket to the child.
         """
         silence, before_ns, alive = Silence(START_NS), clock.mono_ns(), False
         while True:
@@ -225,7 +228,11 @@ class Child:
 
 
 class Parent:
-    """The child's connection to its parent process. `fd` is the child's standard input."""
+    """The child's connection to its parent process.
+
+    `fd` is the child's standard input. Without a parent that starts it as a `Child`, for example at
+    a terminal, the process sends no signs of life.
+    """
 
     def __init__(self, fd: int) -> None:
         self.fd = fd
@@ -242,7 +249,7 @@ class Parent:
                 os.write(self.fd, b".")  # fails if the buffer is full or the parent has gone
 
     def gone(self) -> bool:
-        """Return whether the parent has closed the socket. Call this only when `fd` is readable."""
+        """Return whether the parent has closed the socket. Call this only if `fd` is readable."""
         try:
             return not os.read(self.fd, 64)
         except BlockingIOError:

@@ -1,8 +1,8 @@
 """Reads the clocks of this computer, and detects that this computer was suspended.
 
-In the daemon, no other module reads a clock. The monotonic clock is CLOCK_MONOTONIC_RAW, because
-NTP makes CLOCK_MONOTONIC up to 8 % faster or slower. With CLOCK_MONOTONIC, distances and delays
-would be wrong by the same percentage.
+In the daemon, no other module reads a clock. The daemon's monotonic clock is CLOCK_MONOTONIC_RAW,
+because NTP makes CLOCK_MONOTONIC up to 8 % faster or slower. With CLOCK_MONOTONIC, distances and
+delays would be wrong by the same percentage.
 
 The times in an `Instant` are whole microseconds. More precision would make a recording twice as
 large. It would also be useless, because reading the clocks takes about 1 us.
@@ -28,12 +28,12 @@ def asleep_ns() -> int:
 
 
 def steady_ns() -> int:
-    """Return the time of a clock that is never adjusted and also runs during a suspend, ns."""
+    """Return the time of a clock that is never adjusted and that also runs during a suspend, ns."""
     return mono_ns() + asleep_ns()
 
 
 def steady_s() -> float:
-    """Return the time of `steady_ns`, s.
+    """Return the time of a clock that is never adjusted and also runs during a suspend, s.
 
     Programs that send commands or show states use this clock for the ages of commands and states.
     With a clock that stands still during a suspend, a command or a state from before the suspend
@@ -46,7 +46,10 @@ NS_PER_US = 1000
 
 
 def now() -> Instant:
-    """Return the time of the monotonic clock and of the wall clock, read almost simultaneously."""
+    """Return the present time by the monotonic clock and by the wall clock.
+
+    The two clocks are read within 50 us of each other, unless that fails five times.
+    """
     for _ in range(5):
         mono, wall = mono_ns(), time.time_ns()
         # Two readings take 1 us, unless another process gets the processor between them.
@@ -70,7 +73,10 @@ class Asleep:
         self._read, self._known_ns = read, read()
 
     def was(self) -> bool:
-        """Return whether the computer has been suspended since the last call."""
+        """Return whether this computer has been suspended since the last call.
+
+        A suspend of less than 0.1 s (`MOMENT_NS`) is added to the time that the next call examines.
+        """
         if self._read() - self._known_ns < MOMENT_NS:
             return False
         # `read` reads two clocks, and the difference is wrong if another process ran in between. So

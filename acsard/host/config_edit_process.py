@@ -23,13 +23,14 @@ from acsard.host.errors import MendableError
 from acsard.host.extras import install
 
 EDIT_S = 2.0
-"""Time limit for the process that computes the change, s. It takes 0.2 s on an idle computer."""
+"""Time limit for the process that computes the change, s. On an idle computer, the process takes
+0.2 s."""
 
 
 class Task(Struct, frozen=True):
     """Input of the process: the text of an `acsard.toml`, and the new values.
 
-    `keys` maps dotted keys, such as "mcu.port", to these values.
+    `keys` maps dotted keys, such as "mcu.port", to their new values.
     """
 
     text: str
@@ -37,12 +38,12 @@ class Task(Struct, frozen=True):
 
 
 class Result(Struct, frozen=True):
-    """Output of the process: the new text, or the reason in `error` why the change failed."""
+    """Output of the process: the new text, or in `error` the reason why the change failed."""
 
     text: str = ""
     error: str = ""
     mendable: bool = False
-    """Whether `error` contains its remedy."""
+    """Whether the text `error` also says how to remove the cause."""
 
 
 def edited_apart(text: str, keys: Mapping[str, object]) -> str:
@@ -50,6 +51,7 @@ def edited_apart(text: str, keys: Mapping[str, object]) -> str:
 
     `keys` maps dotted keys, such as "mcu.port", to their new values. Raises `MendableError` or
     `ValueError` if the text cannot be changed, and `OSError` if the process cannot be started.
+    Raises `MendableError` if the process takes longer than `EDIT_S`.
     """
     task = msgspec.json.encode(Task(text, dict(keys)))
     # With -P Python ignores the working directory, so it runs the installed package.

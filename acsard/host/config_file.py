@@ -1,4 +1,4 @@
-"""Finds the configuration file, and changes its values in place, completely or not at all."""
+"""Finds the configuration file, and changes values in the file, completely or not at all."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ PLACES = (Path("acsard.toml"), Path("/etc/acsard/acsard.toml"))
 def find(path: str | None) -> tuple[str, bytes]:
     """Return the path and the content of the configuration file.
 
-    If `path` is None or "", the file is the one in $ACSARD_CONFIG, or else the first existing one
-    of `PLACES`. If there is no such file, return ("built-in defaults", b""). Raises `ExitError` if
-    the file cannot be read.
+    If `path` is None or "", the file is the one that $ACSARD_CONFIG names. If this variable is not
+    set, it is the first existing file of `PLACES`. If there is no such file, return ("built-in
+    defaults", b""). Raises `ExitError` if the file cannot be read.
     """
     named = path or os.environ.get("ACSARD_CONFIG")
     if named:
@@ -56,9 +56,9 @@ def find(path: str | None) -> tuple[str, bytes]:
 def writable(path: str | None) -> Path:
     """Return the path of the configuration file that the option --write changes.
 
-    `path` is the value of --config, or None. Raises `MendableError` if there is no configuration
-    file, if it is the `acsard.toml` of a clone of acsard, if this user may not change it, or if the
-    library tomlkit is missing.
+    `path` is the value of the option --config, or None. Raises `MendableError` if there is no
+    configuration file, if it is the `acsard.toml` of a clone of acsard, if this user may not change
+    it, or if the library tomlkit is missing.
     """
     require_tomlkit()
     where, text = find(path)
@@ -97,9 +97,13 @@ class Edit(Struct, frozen=True):
 def keepable(file: Path | None, keys: Keys) -> Edit:
     """Prepare the change that writes settings into the configuration file of the running daemon.
 
-    `file` is this file, or None if the daemon runs without one. `keys` are the settings with their
-    new values. Raises `MendableError` if `file` is None, read-only or tracked by git, if the
-    library tomlkit is missing, or if the old or the new text is not a valid configuration.
+    `file` is this file, or None if the daemon runs without a configuration file. `keys` are the
+    settings with their new values. Raises `MendableError` in these cases:
+
+    - `file` is None, missing, read-only or tracked by git.
+    - `keys` contains a timeout in [[commands.sources]].
+    - The old or the new text is not a valid configuration.
+    - The library tomlkit is missing, or computing the new text takes too long.
     """
     if file is None:
         raise MendableError(
@@ -125,8 +129,9 @@ def keepable(file: Path | None, keys: Keys) -> Edit:
 def keep(edit: Edit) -> None:
     """Write a prepared change to the configuration file.
 
-    If another program has changed the file since then, prepare the change again for the new
-    content. If the change cannot be written, raise `MendableError` and leave the file unchanged.
+    If another program has changed the file since the change was prepared, prepare the change again
+    for the new content. If the change cannot be written, raise `MendableError` and leave the file
+    unchanged.
     """
     try:
         # A change takes 0.2 s to compute, and a person's editor may write the file meanwhile.
@@ -165,7 +170,8 @@ def is_tracked(place: Path) -> bool:
     """Return whether git tracks the file at `place`, a path without symbolic links.
 
     The `acsard.toml` of a clone of acsard always counts as tracked. If git is missing or does not
-    answer, no other file counts as tracked.
+    answer, all other files count as not tracked. The same holds for files in a repository of
+    another user, because git refuses to read it.
     """
     if not any((parent / ".git").exists() for parent in place.parents):
         return False
@@ -191,7 +197,7 @@ def _is_reference(file: Path) -> bool:
 def require_tomlkit() -> None:
     """Raise `MendableError` if the library tomlkit is missing.
 
-    A tool that works for a long time should call this before that work.
+    A tool that works for a long time should call this first, to avoid failing at the end.
     """
     try:
         import tomlkit  # noqa: F401
@@ -203,7 +209,7 @@ def require_tomlkit() -> None:
 
 
 def change(file: Path, keys: Keys | Callable[[Config], Keys], *, new: bool = False) -> Keys:
-    """Set keys in an `acsard.toml`, and return the keys with their values.
+    """Set keys in an `acsard.toml`, and return the keys with their new values.
 
     `keys` maps the keys to the new values, or is a function that computes this mapping from the
     file's configuration. If `new` is true, a missing file is created. If the file cannot be
@@ -220,9 +226,9 @@ def change(file: Path, keys: Keys | Callable[[Config], Keys], *, new: bool = Fal
 def require_changeable(
     file: Path, keys: Keys | Callable[[Config], Keys], *, new: bool = False
 ) -> None:
-    """Raise `MendableError` if `change` would raise it for the same arguments.
+    """Raise `MendableError` if `change` would fail with the same arguments.
 
-    A tool that works for a long time should call this before that work.
+    A tool that works for a long time should call this first, to avoid failing at the end.
     """
     try:
         place, _, _ = _changed(file, keys, new)

@@ -38,7 +38,7 @@ WORDS: dict[int, str] = {
     Exit.NO_PERMISSION: "no permission",
     Exit.BAD_CONFIG: "bad configuration",
 }
-"""Maps each exit code to its meaning in words, for messages."""
+"""Maps each exit code to its meaning in words, for messages to the user."""
 
 
 class MendableError(AcsardError):
@@ -67,13 +67,13 @@ class NoAnswerError(MendableError, TimeoutError):
 
 
 class ReplyError(MendableError, RuntimeError):
-    """The daemon's reply says that the request failed, or cannot be decoded."""
+    """The daemon's reply says that the request failed, or the reply cannot be decoded."""
 
 
 class NotDrivenError(MendableError, RuntimeError):
     """The robot does not follow this client's commands. The text of the error says why.
 
-    One reason is that the client has sent no command for some time.
+    For example, the client may have sent no command for some time.
     """
 
 
@@ -112,7 +112,10 @@ class RecordingError(MendableError, ValueError):
 
 
 class ExitError(MendableError):
-    """Error with the exit code `code`. The text says what is wrong and how to fix it."""
+    """Error that ends acsard with the exit code `code`.
+
+    `text` says what is wrong and how to fix it.
+    """
 
     def __init__(self, code: Exit, text: str) -> None:
         super().__init__(text)

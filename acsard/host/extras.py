@@ -22,7 +22,10 @@ Extra = Literal["foxglove", "report", "shell", "tls", "web", "write"]
 
 
 def install(extra: Extra) -> str:
-    """Return the shell command that installs an extra. Errors about missing libraries show it."""
+    """Return the shell command that installs an extra.
+
+    Error messages about missing libraries show this command.
+    """
     try:
         wanted = wanted_by(distribution("acsard"), extra)
     # acsard runs from its source directory and has not been installed.
@@ -39,10 +42,11 @@ def missing(library: str, extra: Extra) -> MendableError:
 
 
 def wanted_by(installed: Distribution, extra: Extra) -> list[str]:
-    """Return the arguments of `pip install` that install an extra, such as ["DIRECTORY[EXTRA]"].
+    """Return the arguments of `pip install` that install an extra.
 
-    DIRECTORY is the directory from which acsard was installed. If it no longer exists, return the
-    names of the extra's libraries instead. `installed` is the metadata of the installed acsard.
+    They are like ["DIRECTORY[EXTRA]"], with the directory from which acsard was installed. If this
+    directory no longer exists, they are the names of the extra's libraries. `installed` is the
+    metadata of the installed acsard.
     """
     told = json.loads(installed.read_text("direct_url.json") or "{}")
     url = urlsplit(told.get("url", ""))

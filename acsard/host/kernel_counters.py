@@ -1,7 +1,7 @@
 """Reads the kernel's counters that can explain why a program was late.
 
-A value is 0 if this computer does not have the value's file, or if this user may not read the file.
-A reading can take a few milliseconds, so the control loop never reads the counters.
+A counter is 0 if this computer does not have the file of this counter, or if this user may not read
+the file. A reading can take a few milliseconds, so the control loop never reads the counters.
 """
 
 from __future__ import annotations
@@ -18,12 +18,13 @@ from acsard.core.values import NS_PER_S
 from acsard.host import clock
 
 SLOWED_BITS = 0b1110
-"""Mask for three bits of the Raspberry Pi's `get_throttled`: the clock frequency is limited, the
-processor is throttled, and the soft temperature limit is active."""
+"""Mask for three bits of the Raspberry Pi's `get_throttled` that are set while the processor is
+slowed down: the clock frequency is limited, the processor is throttled, or the soft temperature
+limit is active."""
 
 OWN_SCALING = ("intel_pstate", "amd-pstate", "amd-pstate-epp")
 """The cpufreq drivers whose governor `powersave` adapts the frequency to the load. With every other
-driver, this governor keeps the lowest frequency."""
+driver, the governor `powersave` keeps the lowest frequency."""
 
 COOLERS = ("Processor", "cpufreq", "thermal-cpufreq", "thermal-idle", "intel_powerclamp")
 """A cooling device slows a processor down if its type (in sysfs) begins with one of these texts."""
@@ -72,10 +73,10 @@ class Reading(Struct, frozen=True, omit_defaults=True):
 
 
 class Scheduled(Struct, frozen=True, omit_defaults=True):
-    """Two totals of a thread, ns.
+    """The time for which a thread ran, and the time for which it waited for a processor.
 
-    They are the time for which it ran, and the time for which it was ready to run but waited for a
-    processor.
+    Both are totals since the start of the thread, ns. A thread waits if it is ready to run, but no
+    processor runs it.
     """
 
     ran_ns: int = 0
@@ -90,7 +91,7 @@ class Program(Struct, frozen=True):
     ran_ns: int
     priority: int = 20
     """Kernel priority of the process's first thread. A smaller number is a higher priority. It is
-    20 plus the nice value, or a negative number for a real-time thread."""
+    20 plus the nice value for an ordinary thread, and negative for a real-time thread."""
 
     @property
     def real_time(self) -> bool:
@@ -99,7 +100,7 @@ class Program(Struct, frozen=True):
 
 
 def scheduled(text: bytes) -> Scheduled:
-    """Decode the text of `/proc/PID/task/TID/schedstat`. Return zeros if it is empty."""
+    """Decode the text of `/proc/PID/task/TID/schedstat`. Return zeros if the text is empty."""
     words = text.split()
     return Scheduled(int(words[0]), int(words[1])) if len(words) > 1 else Scheduled()
 
@@ -107,17 +108,19 @@ def scheduled(text: bytes) -> Scheduled:
 def steal(text: str, tick_ns: int) -> tuple[int, ...]:
     """Return the steal time of each processor, ns.
 
-    `text` is the content of `/proc/stat`, which counts clock ticks. `tick_ns` is the
-    duration of a clock tick, ns.
+    In this time, the host of this virtual machine ran other work on the processor. `text` is the
+    content of `/proc/stat`, which counts clock ticks. `tick_ns` is the duration of a clock tick,
+    ns.
     """
     return tuple([int(row[8]) * tick_ns for row in _processors(text) if len(row) > 8])
 
 
 def iowait(text: str, tick_ns: int) -> int:
-    """Return how long a processor was idle while a program waited for I/O, ns.
+    """Return the time for which a processor was idle while a program waited for I/O, ns.
 
-    Each processor has its own counter. The result is the largest of these counters. `text` is the
-    content of `/proc/stat`. `tick_ns` is the duration of its unit, a clock tick, ns.
+    Each processor has its own counter, and the result is the largest of these counters. `text` is
+    the content of `/proc/stat`, which counts clock ticks. `tick_ns` is the duration of a clock
+    tick, ns.
     """
     return max((int(row[5]) * tick_ns for row in _processors(text)), default=0)
 
@@ -129,9 +132,9 @@ def _processors(text: str) -> list[list[str]]:
 
 
 def stalled(text: str) -> int:
-    """Return the total time in which at least one task waited, ns.
+    """Return the total time in which at least one task waited for the resource, ns.
 
-    `text` is the content of a file such as `/proc/pressure/io`.
+    `text` is the content of a file such as `/proc/pressure/io`, which names the resource.
     """
     for line in text.splitlines():
         if line.startswith("some "):
@@ -140,7 +143,7 @@ def stalled(text: str) -> int:
 
 
 def quota(text: str) -> int:
-    """Return the total time for which a CPU quota has stopped a cgroup, ns.
+    """Return the total time for which a cgroup was stopped by its CPU quota, ns.
 
     `text` is the content of the cgroup's file `cpu.stat` (cgroup v1 or v2).
     """
@@ -154,7 +157,7 @@ def quota(text: str) -> int:
 
 
 def disk_bytes(text: str) -> int:
-    """Return how many bytes a thread has read from disks and written to disks.
+    """Return the number of bytes that a thread has read from disks and written to disks.
 
     `text` is the content of `/proc/PID/task/TID/io`.
     """
@@ -163,7 +166,7 @@ def disk_bytes(text: str) -> int:
 
 
 def fields(text: str) -> list[str]:
-    """Return the fields in the text of `/proc/PID/stat`, without the first two.
+    """Return the fields in the text of `/proc/PID/stat`, without the first two fields.
 
     Item 0 is therefore `state`, which is field 3 in the manual page proc(5).
     """
@@ -173,7 +176,8 @@ def fields(text: str) -> list[str]:
 def program(text: str, tick_ns: int) -> Program:
     """Decode the text of `/proc/PID/stat`. A clock tick lasts `tick_ns` ns.
 
-    Raises `ValueError` or `IndexError` if the text has another form.
+    Raises `ValueError` or `IndexError` if the text has another form, for example because it is
+    empty.
     """
     rest = fields(text)
     before = text.rpartition(")")[0]
@@ -187,14 +191,14 @@ def busiest(
 ) -> Program | None:
     """Return the process that used the most processor time between two readings.
 
+    In the result, `ran_ns` is the time for which the process ran between the readings, ns. Return
+    None if no process used at least a quarter of one processor.
+
     Args:
         before: all processes at the first reading.
         after: all processes at the second reading.
         within_ns: time between the two readings, ns.
         priority: kernel priority of a thread. Processes that cannot delay this thread are ignored.
-
-    Returns None if no process used a quarter of one processor. In the result, `ran_ns` is the time
-    for which the process ran between the readings, ns.
     """
     # A process whose nice value is higher by 9 can still delay the thread noticeably. At a
     # difference of 10, the kernel gives the process only a tenth of the thread's weight.
@@ -210,7 +214,7 @@ def busiest(
 
 
 def slow_clock(policy: Mapping[str, str]) -> SlowClock | None:
-    """Return the frequency limit of a processor if it is below 0.6 of the full frequency.
+    """Return the frequency limit of a processor if the limit is below 0.6 of the full frequency.
 
     Otherwise return None. `policy` maps the names of the files in the processor's `cpufreq`
     directory to their contents. The present frequency is not used, because an idle processor runs
@@ -228,10 +232,10 @@ def slow_clock(policy: Mapping[str, str]) -> SlowClock | None:
 
 
 class Kernel:
-    """Reads the kernel's counters from its files. Only one thread may call the methods."""
+    """Reader of the kernel's counters. Do not call its methods from several threads."""
 
     def __init__(self, root: Path = Path("/")) -> None:
-        """Find the kernel's files below the directory `root`. Only tests change this directory."""
+        """Find the kernel's files below the directory `root`. Only tests pass another `root`."""
         self._root, self._proc = root, root / "proc"
         # The first thread of a process has the same id as the process.
         self._io = root / f"proc/self/task/{os.getpid()}/io"
@@ -257,7 +261,8 @@ class Kernel:
     def read(self, conditions: Conditions | None = None) -> Reading:
         """Read all counters.
 
-        If `conditions` is None, read the present conditions of the processor too.
+        The result contains `conditions`. If it is None, read the present conditions of the
+        processors too.
         """
         stat = _text(self._proc / "stat")
         own = fields(_text(self._proc / "self/stat"))
@@ -293,9 +298,9 @@ class Kernel:
     def busiest(self, seconds: float) -> Program | None:
         """Return the process that uses the most processor time during the next `seconds` s.
 
-        This call blocks for that time. It ignores this process, processes whose priority is too low
-        to delay it, and processes that the kernel hides from this user. Returns None if no other
-        process uses a quarter of a processor.
+        This call blocks for `seconds`. It ignores this process, processes whose priority is too low
+        to delay this process, and processes that the kernel hides from this user. Return None if no
+        other process uses at least a quarter of a processor.
         """
         before, began_ns = list(self.programs()), clock.mono_ns()
         time.sleep(seconds)

@@ -39,7 +39,8 @@ _PRIORITIES = {"debug": 7, "info": 6, "warning": 4, "error": 3}
 def is_journal(stream: TextIO, environ: Mapping[str, str]) -> bool:
     """Return whether systemd has connected the stream to its journal.
 
-    systemd says so in the variable JOURNAL_STREAM of the environment `environ`.
+    systemd writes the device and inode of the journal's stream to the variable JOURNAL_STREAM of
+    the environment `environ`.
     """
     try:
         found = os.fstat(stream.fileno())
@@ -49,9 +50,9 @@ def is_journal(stream: TextIO, environ: Mapping[str, str]) -> bool:
 
 
 def render(logger: object, method: str, line: MutableMapping[str, Any]) -> str:
-    """Return a log entry of structlog in the journal's protocol: one line NAME=VALUE per field.
+    """Return a log entry in the journal's protocol: one line NAME=VALUE for each field.
 
-    structlog calls this function. `line` contains the fields of the entry.
+    structlog calls this function as a processor. `line` contains the fields of the entry.
     """
     fields = {
         "MESSAGE": _message(line),
@@ -71,9 +72,9 @@ def _message(line: Mapping[str, Any]) -> str:
 
 
 class JournalStream(io.StringIO):
-    """Stream whose `write` sends each text to the journal as a datagram.
+    """Stream whose `write` sends each text to the systemd journal as a datagram.
 
-    `__init__` raises `OSError` if there is no journal at `path`.
+    `path` is the socket of the journal. Raises `OSError` if there is no journal at `path`.
     """
 
     def __init__(self, path: str = "/run/systemd/journal/socket") -> None:
@@ -93,14 +94,15 @@ class JournalStream(io.StringIO):
 Form = Literal["console", "json", "logfmt", "journal"]
 
 MAX_VALUE = 500
-"""Largest number of characters of a logged value. The rest is cut off, because a value from another
-program may have any length."""
+"""Largest number of characters of a logged value. The rest of a longer value is cut off, because a
+value from another program may have any length."""
 
 
 class Writer:
-    """Stream whose `write` never blocks and never raises.
+    """Stream whose `write` never blocks and never raises an error.
 
-    `write` only queues the text, and a thread writes it to the real stream.
+    `write` only queues the text, and a thread writes the text to the real stream. If the queue is
+    full, the text is dropped.
     """
 
     def __init__(self, stream: TextIO) -> None:
@@ -123,7 +125,10 @@ class Writer:
         """Do nothing: the thread flushes each line."""
 
     def close(self, timeout: float) -> None:
-        """Wait for at most `timeout` s until the queued lines are written."""
+        """Wait for at most `timeout` s until the queued lines are written.
+
+        If the queue is full, return immediately.
+        """
         try:
             self._lines.put_nowait(None)
         except queue.Full:
@@ -142,8 +147,8 @@ class Writer:
 def write_through(stream: TextIO, text: str) -> None:
     """Write a text directly to the stream's file descriptor, without the stream's buffer.
 
-    If a thread hung in a write through the buffer, it would hold the buffer's lock. Python could
-    then not flush the stream when the process ends.
+    A thread that hung in a write through the buffer would keep the buffer's lock. Python could then
+    not flush the stream when the process ends.
     """
     try:
         fd = stream.fileno()
@@ -170,7 +175,7 @@ class Log:
         self.use(settings)
 
     def use(self, settings: LogConfig) -> None:
-        """Use the log level in these settings from now on.
+        """Use the log level in `settings` from now on.
 
         The destination and the format of the log stay as they were at the start.
         """
@@ -192,8 +197,8 @@ class Log:
     def event(self, event: Event) -> None:
         """Log an event.
 
-        The log entry also contains the client that caused the event, and the number of occurrences
-        if there were several.
+        The log entry also contains the client that caused the event, if known, and the number of
+        occurrences if the event occurred several times.
         """
         fields: dict[str, object] = {"text": event.text}
         if event.by:
@@ -207,7 +212,7 @@ class Log:
         self._logger.info(name, **fields)
 
     def close(self) -> None:
-        """Wait for at most 0.2 s until the queued lines are written."""
+        """Wait for at most 0.2 s until the queued lines are written. Then the process may end."""
         self._writer.close(0.2)
 
 
@@ -217,7 +222,7 @@ _LEVELS = {"info": logging.INFO, "warning": logging.WARNING, "error": logging.ER
 def _in_order(logger: object, method: str, line: MutableMapping[str, Any]) -> dict[str, Any]:
     """Return the fields of a log entry with time, level, event and text as the first fields.
 
-    structlog calls this function for each entry `line`.
+    structlog calls this function as a processor. `line` contains the fields of the entry.
     """
     first = ("timestamp", "level", "event", "text")
     return {key: line[key] for key in first if key in line} | dict(line)

@@ -1,8 +1,8 @@
 """Passes items from any threads to one reader through a bounded queue, and wakes the reader.
 
-A writer never waits, neither for the reader nor for a lock. If the queue is full, each new item
-displaces the oldest one. A writer stores its item before it wakes the reader, and the reader looks
-for items after it wakes, so no wake-up is lost. The reader may also wake without an item.
+A writer never waits for the reader or for a lock. If the queue is full, each new item displaces the
+oldest item. A writer stores its item before it wakes the reader, and the reader looks for items
+after it wakes, so no wake-up is lost. The reader may also wake without an item.
 
 Do not use a mailbox if old items are worth more than new ones (the log, the recording), or if no
 item may be lost (replies to queries).
@@ -22,9 +22,9 @@ T = TypeVar("T")
 
 
 class Bell:
-    """Signal with which one thread wakes another one.
+    """Signal with which a thread wakes another thread.
 
-    A `ring` ends the `wait` of the other thread. If no thread waits, it ends the next `wait`.
+    `ring` ends the `wait` of the other thread. If no thread waits, `ring` ends the next `wait`.
     """
 
     def __init__(self) -> None:
@@ -32,7 +32,7 @@ class Bell:
         self._lock.acquire()
 
     def ring(self) -> None:
-        """Wake the thread that waits. If none waits, the next `wait` returns immediately.
+        """Wake the thread that waits. If no thread waits, the next `wait` returns immediately.
 
         Any thread may call this.
         """
@@ -57,11 +57,11 @@ class Mailbox(Generic[T]):
     def __init__(self, most: int, wake: Callable[[], object] | None = None) -> None:
         """Create a mailbox for at most `most` items.
 
-        `wake` is a function that `put` calls after it has stored an item, in the thread of the
-        writer. If `wake` is None, `put` wakes a reader that waits in the method `wait`.
+        `wake` is a function that `put` calls in the thread of the writer, after it has stored an
+        item. If `wake` is None, `put` wakes a reader that waits in the method `wait`.
         """
         self.waiting: deque[T] = deque(maxlen=most)
-        """The items that wait, the oldest one at index 0. Only the reader may remove items. The
+        """The items that wait, the oldest item at index 0. Only the reader may remove items. The
         attribute is public, because a control step reads forty mailboxes, and forty method calls
         would be slow."""
         self.lost = 0
@@ -110,16 +110,17 @@ class Mailbox(Generic[T]):
     # The reader's side
 
     def wakes(self, wake: Callable[[], object]) -> None:
-        """Replace the function that wakes the reader. A reader that does so must not call `wait`.
+        """Replace the function that wakes the reader.
 
-        If an item waits already or the mailbox is closed, call `wake` immediately.
+        A reader that calls this method must not call `wait`. If an item waits already or the
+        mailbox is closed, `wake` is called immediately.
         """
         self.wake = wake
         if self.waiting or self.closed:
             wake()
 
     def pop(self) -> T | None:
-        """Remove and return the oldest item, or return None if none waits."""
+        """Remove and return the oldest item, or return None if no item waits."""
         # No other thread can take the item in between, because there is one reader.
         return self.waiting.popleft() if self.waiting else None
 
@@ -129,7 +130,7 @@ class Mailbox(Generic[T]):
         return [items.popleft() for _ in range(len(items))]
 
     def wait(self, seconds: float | None = None) -> bool:
-        """Wait until an item waits or the mailbox is closed, and return True.
+        """Wait until the mailbox contains an item or is closed, and return True.
 
         Return False if neither happens within `seconds` s. None means no time limit.
         """

@@ -28,22 +28,22 @@ def own_name() -> str:
 
 
 def sender_id(name: str, secret: str = "") -> str:
-    """Return the id of a sender of commands, in the form `NAME/SECRET`.
+    """Return a sender id for commands, in the form `NAME/SECRET`.
 
-    If `secret` is "", the id contains a new random secret.
+    If `secret` is "", the id contains a new random secret. A long name is cut off.
     """
     return f"{name[:MAX_NAME]}/{secret or new_secret()}"
 
 
 def new_secret() -> str:
-    """Return 128 random bits, encoded as 22 characters. None of them is "/"."""
+    """Return 128 random bits as 22 characters that do not include "/"."""
     return secrets.token_urlsafe(16)
 
 
 def own_addresses() -> list[str]:
     """Return this machine's IP addresses, except loopback and link-local addresses.
 
-    Returns [] if the command `ip` fails.
+    The list is empty if the command `ip` fails.
     """
     try:
         found = json.loads(called(("ip", "-json", "address"), 5.0).stdout or "[]")

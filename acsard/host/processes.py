@@ -1,7 +1,8 @@
 """Finds the processes that have a device open, and runs commands.
 
-The module reads the open files of each process from /proc, and opens no device. It examines only
-files below /dev, because a call for a file on a network disk that hangs would block this process.
+The module reads the open files of each process from /proc, and does not open any device. It
+examines only files below /dev: a call for a file on a network disk might hang and block this
+process.
 """
 
 from __future__ import annotations
@@ -26,7 +27,11 @@ class Holder(Struct, frozen=True):
 
 
 class _Open(Struct, frozen=True):
-    """A device that a process has open as descriptor `fd`."""
+    """A device that a process has open.
+
+    `process` is the directory of the process in /proc, and `fd` is the file descriptor of the
+    device.
+    """
 
     process: Path
     fd: str
@@ -39,7 +44,7 @@ class _Open(Struct, frozen=True):
 
 
 def holders(path: str) -> Iterator[Holder]:
-    """Yield each process that has opened the device at `path`."""
+    """Yield each process that has the device at `path` open."""
     for process in dict.fromkeys(one.process for one in _having_open(path)):
         try:
             yield _holder(process)
@@ -49,7 +54,7 @@ def holders(path: str) -> Iterator[Holder]:
 
 
 def holder_of(path: str) -> Holder | None:
-    """Return another process that has opened the device at `path`, or None if there is none.
+    """Return another process that has the device at `path` open, or None if there is none.
 
     If there are several, prefer a process that has locked the device.
     """
@@ -97,7 +102,10 @@ def name_of(pid: int) -> str:
 
 
 def waited_ns(pid: int) -> int:
-    """Return how long the first thread of a process waited for a processor, ns; 0 if unknown."""
+    """Return the total time for which the first thread of a process waited for a processor, ns.
+
+    Return 0 if this time is unknown.
+    """
     try:
         return int((PROC / str(pid) / "schedstat").read_text().split()[1])
     except (OSError, IndexError, ValueError):
@@ -120,7 +128,10 @@ def _processes() -> Iterator[Path]:
 
 
 def _open_devices(part: str) -> Iterator[_Open]:
-    """Yield the open files of all processes whose path contains both "/dev/" and `part`."""
+    """Yield each device that a process has open, if the path of the device contains `part`.
+
+    A file counts as a device if its path contains "/dev/".
+    """
     for process in _processes():
         try:
             numbers = os.listdir(process / "fd")
@@ -160,9 +171,9 @@ def _holder(process: Path) -> Holder:
 
 
 def _name(process: Path) -> str:
-    """Return the program name of the process with the directory `process` in /proc.
+    """Return the program name of a process, whose directory in /proc is `process`.
 
-    The name is "acsard" for a process that Python runs as the module acsard, too.
+    The name of a process that runs `python -m acsard` is "acsard" too.
     """
     words = (process / "cmdline").read_bytes().split(b"\0")
     if any(Path(os.fsdecode(word)).name == "acsard" for word in words[:4]):

@@ -1,4 +1,4 @@
-"""Token buckets that limit rates, and a limit on how many things exist at the same time.
+"""Limits rates with token buckets, and limits the number of simultaneous uses, such as connections.
 
 A bucket with room for one unit enforces a shortest time between two units. This module reads no
 clock: the caller passes the time.
@@ -31,7 +31,8 @@ class Bucket:
         self._unit_ns = round(NS_PER_S / rate.hz)
         self._burst_ns = round((rate.most - 1.0) * self._unit_ns)
         self._paid_ns = 0
-        """Time at which the bucket is full again, ns. Taking a unit moves it by `_unit_ns`."""
+        """Time at which the bucket is full again, ns. Each unit that is taken makes this time later
+        by `_unit_ns`."""
 
     def room(self, now_ns: int) -> bool:
         """Return whether the bucket contains at least one unit now."""
@@ -49,13 +50,13 @@ class Bucket:
 
 
 class Buckets:
-    """Token buckets that limit the rate for each name, and the rate for all names together."""
+    """A token bucket for each name, and optionally a bucket that all names share."""
 
     def __init__(self, of_one: Rate, in_all: Rate | None = None) -> None:
         """Create the buckets.
 
         `of_one` is the permitted rate of each name. `in_all` is the permitted rate of all names
-        together. If it is None, only the rates of single names are limited.
+        together; None means that this rate is not limited.
         """
         self._of_one = of_one
         self._shared = None if in_all is None else Bucket(in_all)
@@ -65,7 +66,7 @@ class Buckets:
         return name not in self._buckets or self._buckets[name].room(now_ns)
 
     def take(self, name: str, now_ns: int) -> bool:
-        """Take a unit from the bucket of `name` and one from the shared bucket, and return True.
+        """Take a unit from the bucket of `name` and from the shared bucket, and return True.
 
         If either bucket is empty, take no unit and return False.
         """
@@ -81,7 +82,7 @@ class Buckets:
 
 
 class Places:
-    """A limit on how many places may be in use at the same time. A place can be a connection.
+    """A limit on the number of simultaneous uses, such as connections. Each use takes a place.
 
     At most `most` places may be in use in total, and at most `of_one` of them for the same name.
     """
@@ -111,7 +112,7 @@ class Places:
 
     @contextmanager
     def held(self, name: str = "") -> Iterator[bool]:
-        """Take a place for `name` until the `with` block ends, and yield True.
+        """Take a place for `name` during a `with` block, and yield True.
 
         If no place is free, yield False.
         """

@@ -12,16 +12,17 @@ import resource
 from pathlib import Path
 
 PRIORITY = 10
-"""Real-time priority of the control loop. The kernel's interrupt threads have a higher one, 50."""
+"""Real-time priority of the control loop. The kernel's interrupt threads have the higher priority
+50."""
 
 SPIN_S = 1
 """If the control loop runs for longer than this without a pause, s, the kernel ends the process.
-Otherwise a loop that hangs would block all ordinary programs, because it has priority over them. A
-step takes a thousandth of this time. The systemd service has no such limit: systemd's watchdog ends
-a daemon that hangs."""
+Otherwise a loop that hangs would block all ordinary programs, because the loop has priority over
+them. A step takes a thousandth of this time. The systemd service has no such limit: systemd's
+watchdog ends a daemon that hangs."""
 
 DOZE = "/dev/cpu_dma_latency"
-"""Device file through which a process limits the time that a processor takes to wake up."""
+"""Device file with which a process limits the time that a processor takes to wake up."""
 
 _CAP_IPC_LOCK, _CAP_SYS_NICE = 14, 23
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
@@ -30,8 +31,8 @@ _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
 def ask() -> str:
     """Ask the kernel for real-time scheduling, locked memory and a processor that stays awake.
 
-    If the kernel refuses a request, return a text for the user that names the refused requests and
-    says what to do. Otherwise return "".
+    Return "" if the kernel grants all three requests. Otherwise return a text for the user that
+    names the refused requests and the ways to get permission.
     """
     asked = {
         "real-time scheduling": _schedule(),
@@ -65,8 +66,8 @@ def has(pid: int) -> bool | None:
 def allowed() -> bool:
     """Return whether a daemon started by this user would get real-time scheduling.
 
-    The capability CAP_SYS_NICE or the limit RLIMIT_RTPRIO permits it. In a container, even root may
-    lack this capability.
+    It would if the process has the capability CAP_SYS_NICE, or if the limit RLIMIT_RTPRIO is high
+    enough. In a container, even root may lack this capability.
     """
     limit = resource.getrlimit(resource.RLIMIT_RTPRIO)[0]
     return _capable(_CAP_SYS_NICE) or limit == resource.RLIM_INFINITY or limit >= PRIORITY
@@ -91,10 +92,9 @@ def _schedule() -> bool:
 
 
 def _stay_awake() -> bool:
-    """Keep the processor out of deep sleep until this process ends.
+    """Keep the processor out of deep sleep until this process ends. Return False if refused.
 
-    From deep sleep, a processor wakes late and with cold caches. Return False if the kernel
-    refuses.
+    From deep sleep, a processor wakes late and with cold caches.
     """
     try:
         wish = os.open(DOZE, os.O_WRONLY | os.O_CLOEXEC)

@@ -12,11 +12,11 @@ from collections.abc import Mapping
 from acsard.core.values import NS_PER_S, Outputs
 
 FEEDS_PER_WATCHDOG = 4
-"""The control loop feeds systemd's watchdog this number of times in each timeout of the
+"""Number of times that the control loop feeds systemd's watchdog in each timeout of the
 watchdog."""
 
 PATIENCE_S = 30
-"""Each call of `waiting` gives the start this much time before systemd ends the process, s."""
+"""Time that each call of `waiting` adds before systemd ends a process that is still starting, s."""
 
 
 class Systemd:
@@ -52,9 +52,10 @@ class Systemd:
         self._send("STOPPING=1\nSTATUS=ramping to zero")
 
     def waiting(self, why: str) -> None:
-        """Tell systemd why the start takes longer, so that it goes on waiting.
+        """Report why the start takes longer, so that systemd goes on waiting.
 
-        Call this again within `PATIENCE_S`. Otherwise systemd ends this process.
+        Call this again within `PATIENCE_S`. Otherwise systemd ends this process. `why` is the
+        reason, in words.
         """
         self._send(f"EXTEND_TIMEOUT_USEC={PATIENCE_S * 1_000_000}\nSTATUS={why}")
 

@@ -15,7 +15,7 @@ T = TypeVar("T")
 
 
 class NoThreadError(TimeoutError):
-    """No thread could be started. The function that should run in it was not called."""
+    """The operating system could not start a thread, so the function was not called."""
 
 
 async def in_thread(
@@ -23,10 +23,12 @@ async def in_thread(
 ) -> T:
     """Call `call` in a new thread, and return its result.
 
+    If `call` returns after the caller has stopped waiting, a thread calls `late` with the result,
+    for example to close a file that `call` has opened. An error that `call` raises is raised here
+    too.
+
     Raises `TimeoutError` if `call` has not returned after `timeout` s; None means no time limit.
-    Raises `NoThreadError` if no thread can be started. If `call` returns after the caller has
-    stopped waiting, a thread calls `late` with the result, for example to close a file that `call`
-    has opened.
+    Raises `NoThreadError` if no thread can be started.
     """
     loop = asyncio.get_running_loop()
     future: asyncio.Future[T] = loop.create_future()
@@ -43,8 +45,8 @@ async def in_thread(
             future.set_result(result)
 
     def release(result: T) -> None:
-        """Call `late` with the result in a new thread, because `late` may block."""
         if late is not None:
+            # A new thread calls `late`, because `late` may block.
             threading.Thread(target=late, args=(result,), daemon=True).start()
 
     def work() -> None:

@@ -29,8 +29,8 @@ class _Itimerspec(ctypes.Structure):
 class TimerFd:
     """A timer whose file descriptor becomes readable when the timer expires.
 
-    The daemon's clock is CLOCK_MONOTONIC_RAW, and the kernel has no timerfd for this clock. So
-    `set` passes the remaining time to the kernel, and not the time at which the timer expires.
+    The daemon's clock is CLOCK_MONOTONIC_RAW, and the kernel has no timerfd for this clock.
+    Therefore `set` passes the remaining time to the kernel, not the time of the expiration.
     """
 
     def __init__(self) -> None:
@@ -46,7 +46,7 @@ class TimerFd:
         return int(self._fd)
 
     def set(self, at_ns: int) -> None:
-        """Let the timer expire once, at the monotonic time `at_ns` of `clock.mono_ns`, ns."""
+        """Let the timer expire once, at the time `at_ns` of the clock `clock.mono_ns`, ns."""
         wait_ns = max(1, at_ns - clock.mono_ns())
         value = self._spec.it_value
         value.tv_sec, value.tv_nsec = divmod(wait_ns, NS_PER_S)

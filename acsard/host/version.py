@@ -21,9 +21,9 @@ DIGITS = 9
 
 @lru_cache(1)
 def version() -> str:
-    """Return the version of acsard.
+    """Return the version of acsard, such as `0.1.0+g1a2b3c4d5`.
 
-    It is like `0.1.0+g1a2b3c4d5` if the commit of the source is known, else like `0.1.0`.
+    If the commit of the source is not known, the version is like `0.1.0`.
     """
     commit = _text(_PACKAGE / COMMIT_FILE) or commit_of(_PACKAGE.parent)
     return f"{__version__}+g{commit[:DIGITS]}" if commit else __version__

@@ -1,9 +1,9 @@
-"""Creates the certificate authority of a robot and the certificates that it signs, all as files.
+"""Creates the certificate authority of a robot, and the certificates that the authority signs.
 
-The keys are P-256 keys, in files that only their owner can read. People make their phones trust the
-authority, so the authority's certificate limits the hosts for which it may sign. A thief of the
-authority's key can pose as a robot or as a host of a private network, but not as a web site on the
-Internet.
+All certificates and keys are files. The keys are P-256 keys, in files that only their owner can
+read. Users make their phones trust the authority, so the authority's certificate limits the hosts
+for which it may sign. Somebody who has stolen the authority's key can pose as a robot or as a host
+of a private network, but not as a web site on the Internet.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from acsard.host.atomic_file import replace
 from acsard.machine.certificates import CA_KEY
 
 LOCAL = ("local", "localhost")
-"""Host names for which every authority may sign certificates. All names below them, such as
-`robot.local`, are permitted too."""
+"""Host names for which every authority may sign certificates. An authority may also sign for all
+names below these names, such as `robot.local`."""
 
 PRIVATE = (
     "10.0.0.0/8", "100.64.0.0/10", "127.0.0.0/8", "169.254.0.0/16", "172.16.0.0/12",
@@ -49,16 +49,17 @@ class Authority:
     ) -> Authority:
         """Create an authority, and write its certificate and its key into `directory`.
 
+        The authority may sign certificates with any common name. The common names identify clients
+        on the bus.
+
         Args:
             directory: existing or new directory for the files.
             name: common name of the authority.
-            days: usual validity of the certificates that it signs, days. The authority's own
-                certificate is valid for five times as long.
+            days: usual validity of the certificates that the authority signs, days. The authority's
+                own certificate is valid for five times as long.
             addresses: host names and IP addresses for which the authority may sign, in addition to
-                `LOCAL` and `PRIVATE`. For a host name it may also sign for all names below it, and
-                for an IPv6 address for the whole /64 network.
-
-        The common names of the certificates, which identify clients on the bus, are not limited.
+                `LOCAL` and `PRIVATE`. A host name also permits all names below it, and an IPv6
+                address also permits its /64 network.
         """
         directory.mkdir(mode=0o755, parents=True, exist_ok=True)
         key = ec.generate_private_key(ec.SECP256R1())
@@ -78,13 +79,13 @@ class Authority:
     def load(cls, directory: Path, password: Callable[[], str]) -> Authority:
         """Load the authority from its files in `directory`.
 
-        `password` is a function that returns the password of the key. It is called only if the key
-        is encrypted. Raises `OSError` or `ValueError` if the authority cannot be loaded.
+        `password` is a function that returns the password of the private key. It is called only if
+        the key is encrypted. Raises `OSError` or `ValueError` if the authority cannot be loaded.
         """
         data = (directory / CA_KEY).read_bytes()
         try:
             key = serialization.load_pem_private_key(data, None)
-        # The key is encrypted.
+        # An encrypted key without a password raises this error.
         except TypeError:
             key = serialization.load_pem_private_key(data, password().encode())
         if not isinstance(key, ec.EllipticCurvePrivateKey):
@@ -94,8 +95,8 @@ class Authority:
     def permits(self, address: str) -> bool:
         """Return whether this authority may sign a certificate for a host name or IP address.
 
-        If the authority's certificate has no list of permitted names, all names are permitted. An
-        authority that acsard has made always has a list.
+        If the authority's own certificate has no list of permitted names, return True. An authority
+        that acsard has made always has such a list.
         """
         try:
             constraints = self._certificate.extensions.get_extension_for_class(x509.NameConstraints)
@@ -117,9 +118,9 @@ class Authority:
         )
 
     def names_in(self, directory: Path) -> list[str]:
-        """Return the host names and IP addresses that the certificate in `directory` is valid for.
+        """Return the host names and IP addresses in the certificate in `directory`.
 
-        Returns [] if the certificate cannot be read.
+        Return [] if the certificate cannot be read or contains none.
         """
         try:
             found = x509.load_pem_x509_certificate((directory / CERTIFICATE).read_bytes())
@@ -130,9 +131,9 @@ class Authority:
         return [*names.get_values_for_type(x509.DNSName), *map(str, addresses)]
 
     def issue(self, directory: Path, name: str, addresses: list[str], days: float) -> None:
-        """Create a key, and sign a certificate that is for use as server and client.
+        """Create a key, and sign a certificate with which a program can be server and client.
 
-        The key, the certificate and the authority's own certificate are written into `directory`.
+        Write the key, the certificate and the authority's own certificate into `directory`.
 
         Args:
             directory: existing or new directory for the files.
@@ -236,6 +237,6 @@ def _key_pem(key: ec.EllipticCurvePrivateKey) -> bytes:
 def _write(path: Path, data: bytes, mode: int) -> None:
     """Write a file that this user owns, with the permission bits `mode`.
 
-    Not even for a moment does the file have more permissions than that.
+    The file never has more permissions than these, not even while it is being written.
     """
     replace(path, data, mode=mode, owner=(os.geteuid(), os.getegid()))

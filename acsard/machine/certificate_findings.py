@@ -1,4 +1,4 @@
-"""Examines the certificates of this machine and of the routers that it connects to."""
+"""Examines the certificates of this machine, and those of the routers to which it connects."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ from acsard.machine.finding import LEVELS, Finding
 
 
 def certificates(tls: str) -> Iterator[Finding]:
-    """Yield findings about the certificates in the directory `tls`.
+    """Yield findings about this machine's certificates, which are in the directory `tls`.
 
-    Yield nothing if `tls` is "", because this machine then has no certificates.
+    Yield nothing if `tls` is "".
     """
     if not tls:
         return
@@ -64,11 +64,11 @@ def certificates(tls: str) -> Iterator[Finding]:
 
 
 def renewal(tls: str, whose: str) -> str:
-    """Return the advice, with commands, how to replace a certificate that expires soon.
+    """Return advice on how to replace a certificate that expires soon, with the commands to run.
 
-    `tls` is the directory with this machine's certificate. `whose` says which certificate must be
-    replaced: "" for that of this machine, `AUTHORITY` for that of the authority, or a text such as
-    "the router tls/HOST:PORT".
+    `tls` is the directory of this machine's certificate. `whose` says which certificate expires: ""
+    for this machine's certificate, `AUTHORITY` for the certificate of the authority, or a text such
+    as "the router tls/HOST:PORT".
     """
     directory, name = Path(tls), common_name(tls)
     if whose == AUTHORITY:
@@ -95,7 +95,7 @@ def renewal(tls: str, whose: str) -> str:
 
 
 def _mend_of_absent(directory: Path) -> str:
-    """Return the advice for a directory in which a certificate file is missing or not readable."""
+    """Return advice for a directory in which a certificate file is missing or not readable."""
     if (directory / CA_KEY).exists():
         return f"run `{_command('renew', directory)}`, or run this check again with sudo"
     if not directory.is_dir() or not any(directory.iterdir()):
@@ -112,19 +112,19 @@ def _mend_of_absent(directory: Path) -> str:
 def _command(action: str, directory: Path) -> str:
     """Return the shell command that runs `acsard tls ACTION` for this directory.
 
-    If this user may not write there, the command begins with sudo. It then contains the full path
-    of acsard, because sudo does not search this user's PATH.
+    The command begins with sudo if this user may not write into the directory.
     """
     there = next(one for one in (directory, *directory.absolute().parents) if one.exists())
     program = "acsard"
     if not os.access(there, os.W_OK):
+        # sudo does not search this user's PATH, so the command contains the full path of acsard.
         found = shutil.which("acsard")
         program = f"sudo {found or f'{sys.executable} -m acsard'}"
     return f"{program} tls {action} --directory {shlex.quote(str(directory))}"
 
 
 def router_certificates(config: Config) -> Iterator[Finding]:
-    """Yield a finding about the certificate of each router that answers over TLS."""
+    """Yield a finding about the certificate of each configured router that answers over TLS."""
     tls = config.bus.tls
     routers = [endpoint for endpoint in config.bus.connect if endpoint.startswith(TLS)]
     for whose, ends_ns in ends_of(routers, tls).items():

@@ -1,4 +1,4 @@
-"""Makes and renews certificates: those of the authority, of the robot and of its clients.
+"""Creates the certificates of the authority, of the robot and of its clients, and renews them.
 
 The robot admits a client if the robot's authority has signed the client's certificate. The common
 name in that certificate determines the client's permissions (`[access]` in acsard.toml).
@@ -38,8 +38,8 @@ ADDRESS = re.compile(r"[A-Za-z0-9:]([A-Za-z0-9.:-]{0,251}[A-Za-z0-9:])?\Z")
 
 LABEL = r"[A-Za-z0-9_]([A-Za-z0-9_-]*[A-Za-z0-9_])?"
 HOST_LIKE = re.compile(rf"{LABEL}(\.{LABEL})*\Z")
-"""Regular expression of a common name that looks like a host name. Addresses like `10.0.0.5` match
-too."""
+"""Regular expression of a common name that looks like a host name. It also matches addresses such
+as `10.0.0.5`."""
 
 
 def init(directory: Path, addresses: Sequence[str], days: int, *, force: bool) -> list[str]:
@@ -51,7 +51,8 @@ def init(directory: Path, addresses: Sequence[str], days: int, *, force: bool) -
         directory: directory for all files.
         addresses: host names and addresses for the robot's certificate, in addition to those of
             this machine.
-        days: validity of the certificates, days.
+        days: validity of the robot's and the clients' certificates, days. The authority's
+            certificate is valid for five times as long.
         force: whether to replace an authority that `directory` already contains. If it is false,
             raise `MendableError` for such a directory.
     """
@@ -72,11 +73,17 @@ def init(directory: Path, addresses: Sequence[str], days: int, *, force: bool) -
 
 
 def add(directory: Path, name: str, addresses: Sequence[str], days: int) -> Path:
-    """Create a client certificate with the common name `name`, and return its directory.
+    """Create a client certificate, and return the directory of its files.
 
-    `directory` contains the authority. `addresses` are host names and addresses of the client for
-    its certificate, which is valid for `days` days. Raises `MendableError` if the client already
-    has a certificate.
+    Args:
+        directory: directory that contains the authority.
+        name: common name of the certificate.
+        addresses: host names and addresses of the client for the certificate.
+        days: validity of the certificate, days.
+
+    Raises:
+        MendableError: a directory for this client exists already, the authority may not sign for
+            one of the addresses, or the authority cannot be used.
     """
     authority = _load(directory)
     place = directory / "clients" / name
@@ -91,9 +98,10 @@ def add(directory: Path, name: str, addresses: Sequence[str], days: int) -> Path
 def renew_client(directory: Path, name: str, addresses: Sequence[str], days: int) -> Path:
     """Replace the client certificate with the common name `name`, and return its directory.
 
-    `directory` contains the authority. The new certificate contains `addresses`, and those host
-    names and addresses of the old certificate that the authority permits. It is valid for `days`
-    days.
+    The new certificate contains `addresses`, and those host names and addresses in the old
+    certificate that the authority permits. The new certificate is valid for `days` days.
+    `directory` contains the authority. Raises `MendableError` if the client has no certificate, if
+    the authority may not sign for one of the addresses, or if the authority cannot be used.
     """
     authority = _load(directory)
     clients = directory / "clients"
@@ -112,27 +120,29 @@ def renew_client(directory: Path, name: str, addresses: Sequence[str], days: int
 
 
 def renew(directory: Path, addresses: Sequence[str], days: int) -> list[str]:
-    """Replace the robot's own certificate, and return the names and addresses in the new one.
+    """Replace the robot's certificate; return the names and addresses in the new certificate.
 
-    `directory` contains the authority and the old certificate. The new certificate contains
-    `addresses`. It also contains the names and addresses of this machine and of the old
-    certificate, as far as the authority permits them. It is valid for `days` days.
+    The new certificate contains `addresses`. It also contains the names and addresses of this
+    machine and those in the old certificate, as far as the authority permits them. The new
+    certificate is valid for `days` days. `directory` contains the authority and the robot's
+    certificate. Raises `MendableError` if the authority may not sign for one of the addresses, or
+    cannot be used.
     """
     authority = _load(directory)
     _require_permitted(authority, addresses)
     known = _robot_names(authority.names_in(directory))
-    # The name or address of the machine may have changed since the authority was made.
+    # The name or address of this machine may have changed since the authority was made. The
+    # authority may not sign for the new one then.
     names = [*filter(authority.permits, known), *addresses]
     authority.issue(directory, OWN, names, days)
     return list(dict.fromkeys(names))
 
 
 def _names_of(name: str) -> list[str]:
-    """Return the host names that a certificate with the common name `name` should contain.
-
-    If a certificate contains no host name, OpenSSL treats its common name, such as `anna.meyer`, as
-    one. It then refuses the certificate if the authority may not sign for this host name.
-    """
+    """Return the host names and addresses for a certificate with the common name `name`."""
+    # If a certificate contains no host name, OpenSSL treats its common name, such as `anna.meyer`,
+    # as a host name. If the authority may not sign for this host name, OpenSSL refuses the
+    # certificate.
     named = [name] if ADDRESS.match(name) else []
     if not HOST_LIKE.match(name) or name.endswith(".local"):
         return named
@@ -140,7 +150,6 @@ def _names_of(name: str) -> list[str]:
 
 
 def _require_permitted(authority: Authority, addresses: Sequence[str]) -> None:
-    """Raise `MendableError` if the authority may not sign for one of the addresses."""
     barred = [one for one in addresses if not authority.permits(one)]
     if barred:
         named = " ".join(f"--address {one}" for one in barred)
@@ -160,11 +169,11 @@ def _robot_names(more: Sequence[str]) -> list[str]:
 
 
 def keys(config: Config, directory: Path) -> dict[str, object]:
-    """Return the values of `bus.listen` and `bus.tls` with which other machines can connect.
+    """Return values of `bus.listen` and `bus.tls` with which other machines can connect over TLS.
 
-    `config` is the present configuration. The new `bus.listen` contains its endpoints, and one TLS
-    endpoint more if none of them uses TLS. `directory` contains the robot's certificate, and is the
-    new `bus.tls`.
+    The new `bus.listen` contains the endpoints of `config`, the present configuration. If no
+    endpoint uses TLS, it also contains a TLS endpoint at port `PORT`. The new `bus.tls` is
+    `directory`, which contains the robot's certificate.
     """
     listen = list(config.bus.listen)
     if not any(endpoint.startswith("tls/") for endpoint in listen):
@@ -173,7 +182,10 @@ def keys(config: Config, directory: Path) -> dict[str, object]:
 
 
 def port(config: Config) -> str:
-    """Return the TCP port on which the robot listens with TLS once it uses the result of `keys`."""
+    """Return the TCP port of the first TLS endpoint in `config`, or `PORT` if it has none.
+
+    If the robot uses the values that `keys` returns, it listens on this port.
+    """
     ports = [at.rpartition(":")[2] for at in config.bus.listen if at.startswith("tls/")]
     return ports[0] if ports else str(PORT)
 
@@ -189,13 +201,14 @@ def _maker() -> type[Authority]:
 def _load(directory: Path) -> Authority:
     """Load the authority from `directory`.
 
-    Raises `MendableError` if that fails, or if this user may not write files into `directory`.
+    Raises `MendableError` if the authority cannot be loaded, or if this user may not write files
+    into `directory`.
     """
     maker = _maker()
     _writable(directory)
     try:
         return maker.load(directory, _password)
-    except UsageError:  # `UsageError` is a `ValueError`, too
+    except UsageError:  # `UsageError` is a `ValueError` too, and its text is complete already
         raise
     except FileNotFoundError:
         if (directory / CA).exists():

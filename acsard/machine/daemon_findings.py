@@ -1,7 +1,7 @@
-"""Examines whether the daemon can be reached, and evaluates what it reports about itself.
+"""Examines whether the daemon can be reached, and evaluates the daemon's reports.
 
 `acsard doctor` queries the daemon's configuration once, and its state twice, a second apart. The
-difference between the counters of the two states shows how well the serial link works.
+differences between the counters of the two states show how well the serial link works.
 """
 
 from __future__ import annotations
@@ -47,8 +47,7 @@ from acsard.host.processes import name_of
 from acsard.machine.finding import LEVELS, Finding, Level
 
 SHOWN = 6
-"""Largest number of keys that a finding names if their values in the daemon and in the file
-differ."""
+"""Maximum number of configuration keys that one finding of `compared` names."""
 
 
 OPTIONS = (
@@ -56,7 +55,7 @@ OPTIONS = (
     "ros.namespace",
 )  # fmt: skip
 """Configuration keys that options of `acsard run` can set. If the daemon's value of such a key
-differs from the value in the file, that is probably intended."""
+differs from the value in the file, the user has probably intended this."""
 
 WAYS: tuple[tuple[Callable[[str], bool], Level, str, str], ...] = (
     (
@@ -84,35 +83,42 @@ WAYS: tuple[tuple[Callable[[str], bool], Level, str, str], ...] = (
         "writes a value into the file",
     ),
 )
-"""Reasons why the daemon's value of a configuration key may differ from the value in the file. Each
-row has four items: a function that returns whether the reason can apply to a key, the level of the
-finding, the reason, and the advice."""
+"""Reasons why the daemon's value of a configuration key may differ from the value in the file.
+
+Each row has four items: a function that returns whether the reason can apply to a key, the level of
+the finding, the reason in words, and the advice to the user. `{which}` and `{lines}` in the advice
+are replaced.
+"""
 
 
 class Running(Struct, frozen=True):
-    """The answers of a running daemon to the doctor's queries."""
+    """The answers of a running daemon to the queries of `acsard doctor`.
+
+    `before` is the answer to the first query of the state, and `state` to the second query.
+    """
 
     info: Info
     config: Config
     before: RobotState
     state: RobotState
     looked_ns: int
-    """Wall-clock time of this machine, ns, in the middle between the query of `state` and its
-    answer."""
+    """Time in the middle between sending the query of `state` and receiving its answer: this
+    machine's wall clock, ns."""
     trip_ns: int = 0
-    """Duration from sending the query of `state` to receiving its answer, ns."""
+    """Time from sending the query of `state` to receiving its answer, ns."""
     rows: tuple[DiagnosticStatus, ...] = ()
+    """Rows of the daemon's diagnostics."""
     here: bool = True
-    """Whether the daemon runs on this machine. If not, its address leads to another machine."""
+    """Whether the daemon runs on this machine."""
     events: tuple[LogEvent, ...] = ()
 
 
 def asked(config: Config, address: Address) -> Running:
-    """Query the daemon at this address, and return its answers. This takes a second.
+    """Query the daemon at `address`, and return its answers. This takes about a second.
 
     `config` is the configuration in the local file. If the daemon does not return its own
-    configuration, `config` replaces it, with the values that the daemon's `info` contains. Raises
-    an `AcsardError` if the daemon does not answer.
+    configuration, use `config` instead, with the values from the daemon's `info`. Raises an
+    `AcsardError` if the daemon does not answer.
     """
     endpoint, robot_id, tls = address
     with connect(endpoint, robot_id=robot_id, tls=tls) as robot:
@@ -128,10 +134,10 @@ def asked(config: Config, address: Address) -> Running:
 
 
 def _configuration(robot: Client, info: Info, file: Config) -> Config:
-    """Return the daemon's configuration.
+    """Query the daemon's configuration and return it.
 
-    If the daemon does not return it, return `file`, the configuration in the local file, with the
-    values that `info` contains.
+    If the daemon does not send it, return the configuration `file` of the local file, with the
+    values from the daemon's `info`.
     """
     try:
         return from_builtins(robot.get("config"))
@@ -142,10 +148,10 @@ def _configuration(robot: Client, info: Info, file: Config) -> Config:
 
 
 def compared(running: Running, file: Config) -> Iterator[Finding]:
-    """Yield findings about the keys whose values in the running daemon and in the file differ.
+    """Yield findings about configuration keys with different values in the daemon and in the file.
 
     `file` is the configuration in the file. There is one finding for each row of `WAYS` that
-    applies to such a key. If no value differs, there is one finding with the level "ok".
+    applies to any of these keys. If no value differs, there is one finding with the level "ok".
     """
     info, others = running.info, differences(running.config, file)
     who = f"acsard {info.version}, pid {info.pid}"
@@ -170,10 +176,7 @@ def compared(running: Running, file: Config) -> Iterator[Finding]:
 
 
 def _tables(its: Mapping[str, Difference]) -> str:
-    """Return lines for the configuration file with the daemon's values.
-
-    `its` maps each key to the difference between the daemon's value and the file's value.
-    """
+    """Return text for the configuration file that sets the daemon's values of the keys `its`."""
     parts = [(key.rpartition("."), write(one.its)) for key, one in its.items()]
     return "; ".join(f"[{table}] {name} = {value}" for (table, _, name), value in parts)
 
@@ -212,11 +215,11 @@ def link(running: Running) -> Iterator[Finding]:
     passed = {
         key: count - running.before.counters.get(key, 0) for key, count in state.counters.items()
     }
-    # A loss of the link is a warning only if it occurs more than once a day on average. The limit
-    # `often` is therefore the number of days that the daemon has run.
+    # Warn of lost links only if the link was lost more than once a day on average. So `often`, the
+    # limit on the number of losses, is the number of days for which the daemon has run.
     often = state.counters.get("lines_sent", 0) / config.rate_hz / 86400
-    # The built-in simulator runs in the daemon and is never unplugged. So this computer has caused
-    # every loss of the link to the simulator.
+    # The built-in simulator runs in the daemon and is never unplugged. So if the link to the
+    # simulator was lost, the daemon's computer did not run the daemon in time.
     if late := state.counters.get(f"link_lost{'' if config.mcu.simulated else '_host_stall'}", 0):
         late_times = many(late, "time")
         text = (
@@ -287,12 +290,13 @@ def _battery(config: BatteryConfig, battery: BatterySummary | None, mend: str) -
 
 
 def lost(passed: Mapping[str, int], config: Config) -> Iterator[str]:
-    """Yield a warning if the board answered too few lines of the daemon.
+    """Yield a warning text if the board answered too few of the daemon's lines.
 
-    `passed` maps each of the daemon's counters to its rise within a second.
+    Yield nothing for a board with a configured `mcu.reply_period`. `passed` maps the name of each
+    of the daemon's counters to its increase within about a second.
     """
     sent, came = passed.get("lines_sent", 0), passed.get("lines", 0)
-    # Fewer than 40 lines are too few to judge the share of lost lines.
+    # With fewer than 40 lines, the share of lost lines is not significant.
     if config.mcu.reply_period or sent < 40 or came >= (1 - LOST) * sent - 1:
         return
     yield (
@@ -302,9 +306,10 @@ def lost(passed: Mapping[str, int], config: Config) -> Iterator[str]:
 
 
 def refused(counters: Mapping[str, int]) -> list[str]:
-    """Return a list with one warning text if the daemon rejected too many lines of the board.
+    """Return a list with a warning text if the daemon rejected too many lines of the board.
 
-    Otherwise return []. `counters` are the daemon's counters, or their rise within a second.
+    Otherwise return []. `counters` maps the name of each of the daemon's counters to its value, or
+    to its increase within about a second.
     """
     kinds = {
         name.removeprefix("line_"): count
@@ -318,10 +323,10 @@ def refused(counters: Mapping[str, int]) -> list[str]:
 
 
 def gone(counters: Mapping[str, int]) -> list[tuple[int, str]]:
-    """Return a list with one pair: how often the link was lost, and a sentence about it.
+    """Return a list with the pair (number of times that the link was lost, sentence about this).
 
-    Return [] if the link was never lost. If the daemon's computer did not run the daemon in time,
-    the resulting losses do not count.
+    Losses do not count if they occurred because the computer did not run the daemon in time. Return
+    [] if no loss counts. `counters` are the daemon's counters.
     """
     times = counters.get("link_lost", 0) - counters.get("link_lost_host_stall", 0)
     text = (
@@ -332,7 +337,7 @@ def gone(counters: Mapping[str, int]) -> list[tuple[int, str]]:
 
 
 def check(running: Running) -> str:
-    """Return the advice to run `acsard mcu check`, and how to prepare the robot for it."""
+    """Return the advice to run `acsard mcu check`, with the steps that must come first."""
     port = running.config.mcu.port
     return (
         f"`acsard mcu check --port {port}` finds the cause. Before you run it, lift the wheels off "
@@ -355,11 +360,10 @@ GYRO_MENDS: dict[GyroDoes, str] = {
     "not believed": "check that the gyro's z axis points up and that its driver sends rad/s; then "
     "measure the track width with `acsard calibrate`",
 }
-"""Maps each status of the gyro in the message `state` to advice for the user; "" if no advice is
-needed."""
+"""Advice to the user for each status of the gyro in the message `state`; "" if none is needed."""
 
 CAUSES_SHOWN = 3
-"""The doctor shows the causes of at most this number of late control periods, the latest ones."""
+"""Maximum number of causes of late control periods that the doctor shows: the latest causes."""
 
 CAUSES_PAGE = "deploy/systemd/README.md explains each cause of lateness"
 
@@ -377,7 +381,7 @@ ANOTHER = (
 OTHER_VERSION = "if the daemon has another version of acsard, run this tool from the same version"
 
 GUARD = "the daemon's guard"
-"""Words in the reason of a fault that the guard has found, which is a defect of acsard."""
+"""Words in the reason of a fault that the guard has found. Such a fault is a defect of acsard."""
 
 SIGN = (
     "or let the clients sign their commands (deploy/clients/README.md): signed commands do not "
@@ -399,9 +403,10 @@ PUT_ROUTER = (
 
 
 def routers(config: Config) -> Iterator[Finding]:
-    """Yield a warning for each endpoint of `bus.connect` at which no program listens.
+    """Yield findings about the endpoints in `bus.connect`, to which the daemon connects.
 
-    Also yield a warning for each endpoint to which the daemon connects without TLS.
+    There is a warning for each endpoint at which no program listens, and a warning for each
+    endpoint without TLS.
     """
     for endpoint in config.bus.connect:
         if not answers(endpoint):
@@ -421,10 +426,10 @@ def routers(config: Config) -> Iterator[Finding]:
 
 
 def found(config: Config, address: Address) -> Running | Finding:
-    """Return the answers of the daemon at `address`, or a finding that says why there are none.
+    """Return the answers of the daemon at `address`.
 
-    `config` is the configuration in the local file. Raises `UsageError` if the endpoint in
-    `address` is invalid.
+    If the daemon does not answer, return a finding with the reason instead. `config` is the
+    configuration in the local file. Raises `UsageError` if the endpoint in `address` is not valid.
     """
     endpoint = address.endpoint
     if not answers(endpoint):
@@ -451,7 +456,7 @@ def found(config: Config, address: Address) -> Running | Finding:
 
 
 def daemon(running: Running) -> Iterator[Finding]:
-    """Yield the findings that follow from the daemon's answers."""
+    """Yield findings about the robot and its daemon, from the daemon's answers `running`."""
     state = running.state
     level: Level = "failure" if state.mode == "fault" else "ok"
     mend = (
@@ -481,7 +486,7 @@ def daemon(running: Running) -> Iterator[Finding]:
     if state.latch_file_error:
         mend = "free disk space, or set control.state_directory to a writable directory"
         yield Finding("latch file", "warning", state.latch_file_error, mend)
-    # If the daemon runs on this machine, `compared` has read its file.
+    # If the daemon runs on this machine, `compared` reports these differences.
     if state.settings_differ and not running.here:
         mend = (
             "when the daemon restarts, it uses the values of the file; `acsard set KEY VALUE "
@@ -498,8 +503,8 @@ def daemon(running: Running) -> Iterator[Finding]:
 def certificate(row: DiagnosticStatus | None, here: bool) -> Iterator[Finding]:
     """Yield a finding if a certificate of the daemon or its TLS gateway expires soon.
 
-    `row` is the daemon's diagnostics about certificates, or None if it reports none. `here` says
-    whether the daemon runs on this machine.
+    `row` is the row about certificates in the daemon's diagnostics, or None if this row is missing.
+    `here` says whether the daemon runs on this machine.
     """
     if row is None or not row.level:
         return
@@ -517,11 +522,11 @@ def certificate(row: DiagnosticStatus | None, here: bool) -> Iterator[Finding]:
 
 
 def late(running: Running) -> Iterator[Finding]:
-    """Yield findings about late control periods.
+    """Yield findings about late control periods of the daemon.
 
     There is a warning if the daemon has missed more than 1 % of the periods since its start, or if
-    its diagnostics report recently missed periods. Each of the latest known causes is one more
-    finding.
+    its diagnostics report recently missed periods. There is also a finding for each of the latest
+    `CAUSES_SHOWN` known causes.
     """
     counters = running.state.counters
     missed, lines = counters.get("missed_periods", 0), counters.get("lines_sent", 0)
@@ -546,16 +551,17 @@ def late(running: Running) -> Iterator[Finding]:
 
 
 def clocks(running: Running) -> Iterator[Finding]:
-    """Yield a warning if the daemon's clock is wrong, and one if Zenoh has replaced time stamps.
+    """Yield findings about the clocks of the daemon and its clients.
 
-    If the daemon runs on another machine, its clock is compared with the clock of this machine. The
-    daemon read its clock at an unknown moment between the query and the answer. So the function
-    tolerates a difference of 0.4 s plus half of the time between query and answer. Zenoh replaces
-    the time stamps of commands from a computer whose clock is more than 0.5 s ahead.
+    There is a warning if the daemon runs on another machine, and its clock differs from this
+    machine's clock by more than 0.4 s plus half of the duration of the query. There is also a
+    warning if Zenoh has replaced time stamps of commands, because a client's clock was more than
+    0.5 s ahead.
     """
     its_ns, counters = running.state.stamp.to_ns(), running.state.counters
     apart = (its_ns - running.looked_ns) / NS_PER_S
-    # Zenoh replaces the stamps of a clock that is more than 0.5 s ahead.
+    # The limit of 0.4 s is a little below the 0.5 s from which on Zenoh replaces time stamps. The
+    # daemon has read its clock at an unknown moment between the query and the answer.
     if not running.here and abs(apart) > 0.4 + running.trip_ns / 2 / NS_PER_S:
         way = "ahead of" if apart > 0 else "behind"
         text = f"the daemon's clock is {abs(apart):.1f} s {way} this machine's"
@@ -577,10 +583,11 @@ def clocks(running: Running) -> Iterator[Finding]:
 
 
 def gyro(does: str, counters: Mapping[str, int]) -> Iterator[Finding]:
-    """Yield a finding about the gyro's status, and one if the daemon has rejected gyro samples.
+    """Yield findings about the gyro.
 
-    `does` is the gyro's status in the message `state`. If it is "off", the first finding is left
-    out. `counters` are the daemon's counters.
+    There is a finding about the gyro's status, unless the status is "off". There is also a warning
+    if the daemon has rejected gyro samples. `does` is the gyro's status in the message `state`, and
+    `counters` are the daemon's counters.
     """
     words = next((text for name, text in WORDS.items() if name == does), does)
     if does != "off":
@@ -608,8 +615,8 @@ def gyro(does: str, counters: Mapping[str, int]) -> Iterator[Finding]:
 def linked(rows: Mapping[str, DiagnosticStatus]) -> Iterator[Finding]:
     """Yield a finding about the daemon's connection to routers.
 
-    Yield nothing if the daemon's diagnostics say nothing about routers. `rows` maps the names of
-    the rows in the diagnostics to the rows.
+    `rows` contains the rows of the daemon's diagnostics, by name. Yield nothing if there is no row
+    about routers.
     """
     row = rows.get("acsard: router")
     if row is not None:
@@ -620,7 +627,10 @@ def linked(rows: Mapping[str, DiagnosticStatus]) -> Iterator[Finding]:
 
 
 def gateway(config: Config) -> Iterator[Finding]:
-    """Yield a finding for each endpoint of the TLS gateway: whether a program listens there."""
+    """Yield a finding for each endpoint of the TLS gateway, about whether a program listens there.
+
+    `config` contains the endpoints.
+    """
     for endpoint in config.bus.outside:
         if answers(endpoint):
             yield Finding("gateway", "ok", f"open at {endpoint}")

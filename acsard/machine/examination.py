@@ -1,12 +1,12 @@
 """Runs all examinations of `acsard doctor` in order.
 
-`certificate_findings.py` examines the certificates, and `daemon_findings.py` the daemon and its
-serial link. The doctor opens no serial port, and sends only queries to a robot.
+`certificate_findings.py` examines the certificates, and `daemon_findings.py` examines the daemon
+and its serial link. The doctor opens no serial port, and sends only queries to a robot.
 
-If a daemon runs, the doctor examines the configuration of the daemon instead of that in the file.
-The two differ if the file was edited since the daemon's start, or if the daemon was started with
-options. If the daemon runs on another machine, the doctor examines only the daemon's reports,
-because the daemon's port, files and gateway are on that machine.
+If a daemon runs, the doctor examines the daemon's configuration and not the configuration file. The
+file may have been edited since the daemon's start, or the daemon may have been started with
+options. If the daemon runs on another machine, the doctor examines the daemon's reports and this
+machine's certificates, because the daemon's port, files and gateway are on the other machine.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ REAL = (
 
 
 def meddlers() -> Iterator[Finding]:
-    """Yield findings about running programs that seize serial ports or send data to them."""
+    """Yield findings about running programs that take over serial ports or send data to them."""
     if running("brltty"):
         mend = (
             "run `sudo apt remove brltty`, unless you use a Braille display: brltty takes the "
@@ -56,7 +56,7 @@ def meddlers() -> Iterator[Finding]:
 
 
 def clock_set() -> Iterator[Finding]:
-    """Yield a finding that says whether this computer's wall clock is set to a plausible year.
+    """Yield a finding about whether this computer's wall clock shows a plausible year.
 
     The time stamps of all messages come from this clock.
     """
@@ -72,11 +72,11 @@ def clock_set() -> Iterator[Finding]:
 
 
 def scheduling(wanted: bool, pid: int | None) -> Iterator[Finding]:
-    """Yield a finding about real-time scheduling.
+    """Yield a finding about whether the daemon has real-time scheduling.
 
-    `wanted` is the setting `control.real_time`. `pid` is the process id of the running daemon, and
-    the finding says whether this process has real-time scheduling. If no daemon runs, `pid` is
-    None, and the finding says whether a daemon of this user would get it.
+    If no daemon runs, the finding says whether a daemon of this user would get real-time
+    scheduling. `wanted` is the setting `control.real_time`, and `pid` is the process id of the
+    running daemon, or None if no daemon runs.
     """
     has = None if pid is None else real_time.has(pid)
     if not wanted:
@@ -103,14 +103,15 @@ def scheduling(wanted: bool, pid: int | None) -> Iterator[Finding]:
 
 
 LOOK_S = 0.3
-"""Time between the two readings of the kernel's counters, s. The counters change with each tick of
-the kernel's clock, and this time contains 30 ticks."""
+"""Time between the two readings of the kernel's counters, s. The kernel updates its counters at
+each clock tick, and there are 30 ticks in this time."""
 
 
 def slowness(kernel: Kernel | None = None) -> Iterator[Finding]:
-    """Yield findings about conditions that make programs on this computer late now, such as heat.
+    """Yield findings about present conditions of this computer that slow down programs.
 
-    `kernel` reads the kernel's files. If it is None, a new reader is used.
+    An example is an overheated processor. `kernel` reads the kernel's counters; None means a new
+    reader.
     """
     kernel = kernel or Kernel()
     before, began_ns = kernel.read(), clock.mono_ns()
@@ -128,7 +129,11 @@ def slowness(kernel: Kernel | None = None) -> Iterator[Finding]:
 
 
 def serial_port(config: Config) -> Iterator[Finding]:
-    """Yield findings that say whether the serial port exists, may be opened, and is in use."""
+    """Yield findings about the serial port `mcu.port` of the configuration.
+
+    They say whether the port exists, whether this user may open it, and which programs use it.
+    There is also a finding about unknown or slow USB hardware of the port.
+    """
     path = config.mcu.port
     if path == "sim":
         mend = (
@@ -165,8 +170,9 @@ def serial_port(config: Config) -> Iterator[Finding]:
 
 
 def _hardware(name: str) -> Iterator[Finding]:
-    """Yield a warning if the USB id is not in `BOARDS`, and one if the USB chip delays bytes.
+    """Yield warnings about the USB hardware of a serial port.
 
+    There is a warning if the USB id is not in `BOARDS`, and a warning if the USB chip delays bytes.
     `name` is the name of the serial device in /dev.
     """
     usb = [port for port in serial_devices() if port.device == f"/dev/{name}"]
@@ -214,13 +220,14 @@ def examine(
 ) -> Iterator[Finding]:
     """Yield all findings of the doctor.
 
-    Raises `UsageError` if the daemon's address has an invalid endpoint.
-
     Args:
         where: the path of the configuration file, for messages.
         text: the content of the configuration file.
-        given: values that replace those in the file, by table and key.
+        given: the values that replace values in the file, by table and key.
         told: function that returns the daemon's address for a configuration.
+
+    Raises:
+        UsageError: the daemon's address contains an invalid endpoint.
     """
     try:
         config = parse(text, given)
@@ -254,8 +261,8 @@ def examine(
         config.control.real_time, running.info.pid if isinstance(running, Running) else None
     )
     yield from slowness()
-    # The running daemon may use copies of the certificates, which systemd made when the daemon
-    # started. So also examine the directories with the original files.
+    # systemd gives the daemon copies of the certificates at its start. Examine the directories with
+    # the copies and with the original files.
     for directory in dict.fromkeys((config.bus.tls, address.tls, written)):
         yield from certificates(directory)
     yield from routers(config)

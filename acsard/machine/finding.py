@@ -8,15 +8,15 @@ from msgspec import Struct
 
 Level = Literal["ok", "warning", "failure"]
 LEVELS: tuple[Level, ...] = ("ok", "warning", "failure")
-"""The levels of findings, from the mildest to the most severe. The index of a level is its number
-in ROS diagnostics."""
+"""The levels of findings, the mildest level first. The index of a level is also its number in ROS
+diagnostics."""
 
 
 class Finding(Struct, frozen=True):
     """One result of `acsard doctor`.
 
-    `subject` is the examined part, and `text` is the result in words. `mend` is the advice to the
-    user, or "".
+    `subject` is the name of the examined part, `text` is the result in words, and `mend` is the
+    advice to the user, or "" if no advice is needed.
     """
 
     subject: str

@@ -32,18 +32,20 @@ BY_ID = Path("/dev/serial/by-id")
 class SerialDevice(Struct, frozen=True):
     device: str
     names: list[str]
-    """Symbolic links to the port. Their names stay the same when the device is plugged in again."""
+    """Paths of the symbolic links to the port. They stay the same when the device is plugged in
+    again."""
     driver: str
     usb_id: str
-    """USB id in the form `vid:pid`, in hex; "" if the port is not on USB."""
+    """USB id in the form `vid:pid`, hexadecimal; "" if the port is not on USB."""
     description: str
     board: str
     """Name of the board or chip with this USB id; "" if `BOARDS` does not contain the id."""
     holders: list[Holder]
+    """Processes that use the port."""
 
 
 def serial_devices() -> list[SerialDevice]:
-    """Return the serial ports behind which there is hardware, such as a plugged-in USB device."""
+    """Return the serial ports of this machine that have hardware, sorted by device name."""
     links = _links()
     found = []
     for port in sorted(list_ports.comports(), key=lambda p: str(p.device)):

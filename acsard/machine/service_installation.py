@@ -1,8 +1,8 @@
-"""Installs acsard as a system service, or removes it.
+"""Installs acsard as a systemd service, or removes the service.
 
-The files come from `deploy/`, with the path of this installation in the units. Without `force` or
-`purge`, the module neither replaces nor removes a file that another person or program has changed.
-The user can read the text of every step before the steps are carried out.
+The files of the service come from `deploy/`, with the path of this installation in the units. A
+file that somebody has changed is replaced or removed only with `force` or `purge`. The installation
+and the removal are lists of steps, so that the user can read all steps before they are carried out.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from acsard.host.errors import MendableError, NotPermittedError
 from acsard.host.processes import called
 
 HOME = "/opt/acsard/venv"
-"""Path of the venv in the unit files of `deploy/`. The installation replaces it by the path of the
-venv that runs the installation."""
+"""Path of the venv in the unit files of `deploy/`. The installation replaces this path by the path
+of the venv that runs the installation."""
 
 GROUP, SETPRIV = "dialout", "/usr/bin/setpriv"
 """`GROUP` is the group of the service in the unit files. `SETPRIV` is the program with which the
@@ -42,7 +42,7 @@ def misplaced(
     executable: str = sys.executable,
     hidden: Sequence[str] = OUT_OF_SIGHT,
 ) -> str:
-    """Return why a service cannot run this installation of acsard, or "" if it can.
+    """Return the reason why a service cannot run this installation of acsard, or "" if it can.
 
     Args:
         prefix: directory of the venv that runs acsard.
@@ -55,7 +55,7 @@ def misplaced(
             f"a service cannot run from {prefix}, because services have no access to home "
             f"directories and /tmp; install acsard in a venv at {HOME} (deploy/systemd/README.md)"
         )
-    # A venv has no Python of its own: its bin/python is a link to the Python that made it.
+    # In a venv, bin/python is a link to the Python from which the venv was made.
     interpreter = Path(os.path.realpath(executable))
     for path in (Path(base), interpreter):
         if _hidden(path, hidden):
@@ -74,9 +74,9 @@ def misplaced(
 
 
 def lacking(group: str = GROUP, program: str = SETPRIV) -> str:
-    """Return a message if the service needs a group or a program that this system does not have.
+    """Return an error text if this system does not have the service's group or a needed program.
 
-    Return "" if the system has both.
+    Return "" if the system has the group `group` and the program `program`.
     """
     if not os.access(program, os.X_OK):
         return (
@@ -105,9 +105,9 @@ def _hidden(path: Path, hidden: Sequence[str]) -> bool:
 
 
 def _closed(path: Path) -> Path | None:
-    """Return the outermost directory in `path` that other users have no permission to enter.
+    """Return the outermost part of `path` that the service's user has no permission to enter.
 
-    Return None if they may enter all of them.
+    Return None if the user may enter all directories of the path.
     """
     for place in (*reversed(path.parents), path):
         try:
@@ -115,7 +115,7 @@ def _closed(path: Path) -> Path | None:
         except PermissionError:
             return place
         except OSError:
-            # The path does not exist, so no permission keeps the service out.
+            # The path does not exist, so no permission is missing.
             return None
         if not mode & stat.S_IXOTH:
             return place
@@ -123,8 +123,8 @@ def _closed(path: Path) -> Path | None:
 
 
 OURS = ("bin", "acsard", "acsard.service.d", "acsard-gateway.service.d", "acsard-web.service.d")
-"""Names of acsard's own directories. If one of them is empty after the removal of the service, the
-removal deletes it too."""
+"""Names of acsard's own directories. The removal of the service also deletes such a directory if
+the directory has become empty."""
 
 
 class File(Struct, frozen=True):
@@ -135,7 +135,7 @@ class File(Struct, frozen=True):
     mode: int = 0o644
     kept: bool = False
     """True for a file that users are expected to change, such as the configuration. An installation
-    never replaces it. If a user has changed it, only a purge removes it."""
+    never replaces such a file. If a user has changed the file, only a purge removes it."""
 
     def found(self) -> bytes | None:
         """Return the present content of the file, or None if it does not exist.
@@ -150,10 +150,10 @@ class File(Struct, frozen=True):
             raise _unreadable(self.path, error) from None
 
     def is_as_written(self) -> bool:
-        """Return whether the existing file has the permission bits `mode`, and root owns it.
+        """Return whether the existing file has the permission bits `mode` and the owner root.
 
-        Always return True for a `kept` file and for a symbolic link, because the user decides about
-        their mode and owner.
+        Return True for each file with `kept` and for each symbolic link, because the user decides
+        about their mode and owner. Raises `OSError` if the file does not exist.
         """
         status = self.path.lstat()
         if self.kept or stat.S_ISLNK(status.st_mode):
@@ -161,9 +161,9 @@ class File(Struct, frozen=True):
         return (stat.S_IMODE(status.st_mode), status.st_uid) == (self.mode, 0)
 
     def condition(self) -> str:
-        """Return the condition of the file on this system.
+        """Return the condition of the file on this system, in words.
 
-        It is "missing", "as installed", "changed", "wrong mode or owner" or "unreadable".
+        The result is "missing", "as installed", "changed", "wrong mode or owner" or "unreadable".
         """
         try:
             found = self.found()
@@ -180,7 +180,7 @@ WRONG_MODE = "wrong mode or owner"
 
 
 class Write(Struct, frozen=True):
-    """Step that writes a file. `why` is the reason, which the user sees, or ""."""
+    """Step that writes a file. `why` is the reason in words for the user, or ""."""
 
     file: File
     why: str = ""
@@ -191,7 +191,7 @@ class Write(Struct, frozen=True):
         return f"write   {self.file.path}  ({size} bytes, mode {mode:o}{why})"
 
     def do(self) -> None:
-        """Write the file, and create missing directories, which all users may enter."""
+        """Write the file. Create missing directories with permission for all users to enter."""
         path = self.file.path
         made = [place for place in path.parents if not place.exists()]
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -202,7 +202,7 @@ class Write(Struct, frozen=True):
 
 
 class Remove(Struct, frozen=True):
-    """Step of a removal that deletes a file, or a directory with everything in it."""
+    """Step that deletes a file, or a directory with everything in it."""
 
     path: Path
 
@@ -230,7 +230,7 @@ class Remove(Struct, frozen=True):
 
 
 class Keep(Struct, frozen=True):
-    """Step that leaves a file or directory as it is. `why` is the reason, or ""."""
+    """Step that leaves a file or directory as it is. `why` is the reason in words, or ""."""
 
     path: Path
     why: str = ""
@@ -245,15 +245,16 @@ class Keep(Struct, frozen=True):
 class Run(Struct, frozen=True):
     words: tuple[str, ...]
     may_fail: bool = False
-    """True if the other steps follow even if this command fails, for example without udev."""
+    """True if a failure of this command does not matter, for example on a system without udev."""
 
     def __str__(self) -> str:
         return f"run     {' '.join(self.words)}"
 
     def do(self) -> None:
-        """Run the command. If it fails and `may_fail` is False, raise `MendableError`.
+        """Run the command.
 
-        The error contains the error output of the command.
+        Raises `MendableError` with the command's error output if the command fails, unless
+        `may_fail` is true.
         """
         try:
             done = called(self.words, 60.0)
@@ -280,7 +281,7 @@ UNITS = Path("/etc/systemd/system")
 ETC = Path("/etc/acsard")
 LAN = "lan.conf"
 TLS = "/etc/acsard/tls"
-"""Directory in which `lan.conf` expects the certificates."""
+"""Directory of the certificates in the drop-in file `lan.conf`."""
 STATES = {
     UNIT: (
         Path("/var/lib/acsard"),
@@ -288,7 +289,7 @@ STATES = {
     ),
     PAGE: (Path("/var/lib/acsard-web"), "invitations to the page"),
 }
-"""Maps a unit to its state directory and a description of what this directory contains."""
+"""Maps each unit that has a state directory to this directory and a description of its content."""
 
 Found = Mapping[Path, bytes | None]
 """Maps the path of a file to its present content, or to None if the file does not exist."""
@@ -303,8 +304,8 @@ AGAIN = ("tty", "usb-serial", "misc")
 INSTALLED = (
     *RELOAD,
     Run(("udevadm", "trigger", *(f"--subsystem-match={one}" for one in AGAIN)), may_fail=True),
-    # Start the daemon first, and ignore a failure: the page's unit mounts the directory that
-    # systemd creates for the daemon.
+    # Start the daemon first, because the page's unit mounts a directory that systemd creates when
+    # the daemon starts. A failure is ignored, because the next command starts the daemon again.
     Run(("systemctl", "start", UNIT), may_fail=True),
     Run(("systemctl", "enable", "--now", *ALL)),
 )
@@ -335,7 +336,10 @@ def _unit(name: str) -> File:
 
 
 def lan_drop_in(unit: str) -> File:
-    """Return the drop-in file that lets a unit use the local network and the certificates."""
+    """Return the drop-in file `lan.conf` of a unit.
+
+    It lets the unit use the local network and the certificates. `unit` is the unit's file name.
+    """
     return File(UNITS / f"{unit}.d" / LAN, (source() / "systemd" / LAN).read_bytes())
 
 
@@ -343,9 +347,9 @@ def admitting(directory: Path) -> Write | Keep | None:
     """Return the step that lets the service's TLS gateway use the certificates in `directory`.
 
     The step writes a drop-in file for the gateway's unit. Without this file, the gateway may use
-    only loopback and cannot read root's files. If the drop-in exists, only its paths change, and
-    the networks in it stay, because a person may have narrowed them. Return None if the service is
-    not installed, or if this program does not run as root.
+    only loopback, and cannot read root's files. If the drop-in file exists, the step changes only
+    the paths in it. The networks in it stay, because the user may have restricted them. Return None
+    if the service is not installed, or if this program does not run as root.
     """
     if os.geteuid() != 0 or not (UNITS / GATEWAY).exists():
         return None
@@ -354,10 +358,15 @@ def admitting(directory: Path) -> Write | Keep | None:
 
 
 def admitted(file: File, found: bytes | None, directory: Path) -> Write | Keep:
-    """Return the step that writes the path `directory` of the certificates into a drop-in file.
+    """Return the step that writes the certificates' directory into a drop-in file.
 
-    `file` is the drop-in as the installation writes it. `found` is its present content, which the
-    step changes, or None if the drop-in does not exist.
+    If the drop-in file already names the directory, return a `Keep` step.
+
+    Args:
+        file: the drop-in file as the installation writes it.
+        found: the present content of the drop-in file, which the step changes; None if the drop-in
+            file does not exist.
+        directory: the directory of the certificates.
     """
     place = str(directory).encode()
     text = re.sub(
@@ -371,12 +380,15 @@ def admitted(file: File, found: bytes | None, directory: Path) -> Write | Keep:
 
 
 def present(wanted: Iterable[File]) -> dict[Path, bytes | None]:
-    """Map the path of each file to the file's present content, or to None if it does not exist."""
+    """Return the present content of each file, by path.
+
+    The content is None if the file does not exist. Raises `MendableError` if a file cannot be read.
+    """
     return {file.path: file.found() for file in wanted}
 
 
 def wrong_modes(wanted: Iterable[File]) -> set[Path]:
-    """Return the paths of those existing files whose mode or owner an installation would change."""
+    """Return the paths of the existing files in `wanted` whose mode or owner is wrong."""
     return {file.path for file in wanted if file.path.exists() and not file.is_as_written()}
 
 
@@ -416,7 +428,7 @@ def installing(
 
 
 def own_places() -> list[Path]:
-    """Return the service's directories in /etc. They may also contain files of the user."""
+    """Return the directories of the service in /etc, which may also contain the user's files."""
     return [*(UNITS / f"{unit}.d" for unit in reversed(ALL)), ETC]
 
 
@@ -438,7 +450,7 @@ def uninstalling(
 ) -> list[Step]:
     """Return the steps that remove the service.
 
-    For each file that stays, the result contains a `Keep` step with the reason.
+    For each file or directory that stays, the result contains a `Keep` step with the reason.
 
     Args:
         wanted: the files of the installation.
@@ -454,7 +466,7 @@ def uninstalling(
     """
     wanted, stateful = list(wanted), list(stateful)
     # Only systemd knows the real path of a state directory, and only while the unit is installed.
-    # An earlier uninstallation may have removed the unit and kept the directory.
+    # So if an earlier removal has kept the directory without its unit, install the unit again.
     again = [
         file for file in wanted if purge and file.path.name in stateful and found[file.path] is None
     ]
@@ -468,8 +480,8 @@ def uninstalling(
         elif not force:
             why[file.path] = "the file differs from what this version installs; --force removes it"
     if any(path.name == UNIT for path in why):
-        # The daemon's unit stays and may start again. Then it needs `acsard-stop`, which sends
-        # zeros after the daemon's end.
+        # The daemon's unit stays, so the daemon may start again. The unit then needs `acsard-stop`,
+        # which sends zeros after the daemon's end.
         why |= {f.path: f"{UNIT} stays and needs this file" for f in there if f.path.name == STOP}
     steps: list[Step] = [
         Keep(file.path, why[file.path]) if file.path in why else Remove(file.path) for file in there
@@ -488,9 +500,9 @@ def uninstalling(
 
 
 def state(unit: str) -> str:
-    """Return the state of a unit as lines `NAME=value`.
+    """Return the state of a systemd unit as lines `NAME=value`.
 
-    If systemctl fails, return its error text. If it cannot run or hangs, return "".
+    If systemctl fails, return its error text. If systemctl cannot be run or hangs, return "".
     """
     about = "--property=ActiveState,SubState,StatusText,NRestarts"
     try:
@@ -503,8 +515,8 @@ def state(unit: str) -> str:
 def source() -> Path:
     """Return the path of the directory `deploy/`.
 
-    In an installed package it is inside the package, and in a git clone it is beside the package.
-    Raises `MendableError` if it is missing.
+    In an installed package, this directory is inside the package. In a git clone, it is beside the
+    package. Raises `MendableError` if the directory is missing.
     """
     package = Path(acsard.__file__).parent
     inside = package / "deploy"
@@ -522,7 +534,7 @@ def source() -> Path:
 def _reference() -> Path:
     """Return the path of the reference configuration `acsard.toml`.
 
-    In an installed package it is inside `deploy/`, and in a git clone it is beside `deploy/`.
+    In an installed package, this file is inside `deploy/`. In a git clone, it is beside `deploy/`.
     """
     inside = source() / "acsard.toml"
     return inside if inside.is_file() else source().parent / "acsard.toml"

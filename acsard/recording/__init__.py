@@ -14,11 +14,11 @@ These modules are pure, so they do no I/O:
 These modules do I/O:
 - `recorder`: queues the steps of the control loop. `step_writer` writes them in a thread.
 - `directory`: manages the directory of recordings, and limits its size and the age of its files.
-- `file`: writes and reads one MCAP file; `mcap_records` and `end_record` are its parts.
+- `file`: writes and reads one MCAP file. `mcap_records` and `end_record` are parts of this code.
 - `series`: finds the recordings of a range of time, and joins the files of one run of the daemon.
 - `time_span`: parses the times that a person types, and finds them in a recording.
 - `recovery`: finishes a file that was cut off.
 - `file_replay`: replays a file, and compares the two copies of each event in the file.
-- `export`: writes files for other programs. `atomic_output` gives each file its name when the file
-  is complete.
+- `export`: writes files for other programs. `atomic_output` gives a file its final name when the
+  file is complete.
 """

@@ -1,8 +1,9 @@
 """Writes a file or a directory atomically, and protects recordings from being overwritten.
 
-The target never holds partial data, because its content is written to a temporary path that is
-renamed at the end. With `force` an existing target is replaced, but only if it is a regular file or
-a ROS bag. A recording is replaced only by another recording that contains all of its data.
+The data is written to a temporary path. When the data is complete, this path gets the final name.
+So another program never finds partial data under the final name. An existing file or ROS bag is
+replaced only if the caller permits it with `force`. A recording is replaced only if the function
+`may_replace` permits it too.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ BAG_SUFFIXES = (".mcap", ".db3")
 
 
 def never(recording: Recording) -> bool:
-    """Return False. As the default of `may_replace`, this function protects every recording."""
+    """Return False, so that no recording may be replaced. This is the default of `may_replace`."""
     return False
 
 
@@ -33,18 +34,20 @@ def never(recording: Recording) -> bool:
 def replacing(
     new: Path, force: bool, may_replace: Callable[[Recording], bool] = never
 ) -> Iterator[Path]:
-    """Yield a temporary path to write to, and rename it to `new` after the `with` block.
+    """Yield a temporary path for the new data, and rename it to `new` after the `with` block.
 
-    If the block fails, `new` is unchanged and the temporary file is removed.
+    The caller creates a file or a directory at the temporary path. If the block fails, `new` is
+    unchanged, and the temporary file or directory is removed.
 
     Args:
-        new: path of the finished file or directory.
-        force: true if an existing `new` may be replaced.
-        may_replace: takes the recording that exists at `new`, and returns whether it may be
-            replaced. `force` must be true as well.
+        new: final path of the file or directory.
+        force: true if an existing file or ROS bag at `new` may be replaced.
+        may_replace: function that takes the recording at `new`, and returns whether this recording
+            may be replaced. It is called only if `new` is a recording. The recording is replaced
+            only if `force` is true as well.
 
     Raises:
-        FileExistsError: `new` exists and must not be replaced.
+        FileExistsError: `new` exists, and must not be replaced.
     """
     _require_free(new, force, may_replace)
     part = _near(new, "part")
@@ -64,11 +67,9 @@ def synced(stream: BinaryIO) -> None:
 
 
 def _put(part: Path, new: Path) -> None:
-    """Rename `part` to `new`.
-
-    No system call replaces a directory that contains files. Therefore an existing directory `new`
-    first gets another name. It is removed after `part` has been renamed.
-    """
+    """Rename `part` to `new`, and remove the file or directory that was at `new`."""
+    # No system call replaces a directory that contains files. Therefore an existing directory `new`
+    # first gets another name. It is removed after `part` has been renamed.
     if not new.is_dir():
         os.replace(part, new)
         return

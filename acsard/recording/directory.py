@@ -1,9 +1,11 @@
-"""Manages the directory of recordings: its total size, the age of its files, free disk space.
+"""Manages the directory of recordings: begins, finishes and deletes files.
+
+The name of a file shows its state:
 
     000012-20261121T070027Z.mcap.part   being written, or cut off
     000012-20261121T070027Z.mcap        finished
-    000012-20261121T070027Z.near.mcap   finished, less than a minute from an incident
-    000012-20261121T070027Z.kept.mcap   finished, and an incident happened in it
+    000012-20261121T070027Z.near.mcap   finished, less than a minute before or after an incident
+    000012-20261121T070027Z.kept.mcap   finished, and an incident happened in the file
 
 An incident is a crash of the daemon, or one of the `INCIDENTS` in step_writer.py, such as a fault.
 The number gives the order of the files, even if the wall clock was adjusted between two files.
@@ -43,15 +45,13 @@ from acsard.recording.retention import (
 
 DIRECTORY_MODE = 0o750
 
+# Every user may read the files, but only root can enter the parent directory `PRIVATE`. The service
+# of the robot's web page reads the files through a read-only mount. Group permissions cannot give
+# this service access: a dynamic group has no name, and systemd 257 makes the user `nobody` the
+# owner of state directories.
 OPEN_DIRECTORY_MODE, OPEN_MODE = 0o755, 0o644
-"""File modes of the directory (0o755) and of its files (0o644) if the daemon records as a systemd
-service with a dynamic user.
-
-Every user may read the files, but only root can enter the parent directory `PRIVATE`. The service
-of the robot's web page reads the files through a read-only mount. Group permissions cannot give
-this service access: a dynamic group has no name, and systemd 257 makes the user `nobody` the owner
-of state directories.
-"""
+"""File modes of the directory (0o755) and of its files (0o644) if the daemon is a systemd service
+with a dynamic user. Every user who can enter the parent directory may then read the files."""
 
 PRIVATE = Path("/var/lib/private")
 """Parent of the state directories of services with a dynamic user. Only root can enter it."""
@@ -62,19 +62,20 @@ WHOLE = ".mcap"
 PART = ".mcap.part"
 
 MARKER = ".left"
-"""Suffix of a marker file, which says that the disk, and not a crash, cut off a `.part` file."""
+"""Suffix of a marker file. It shows that a `.part` file was cut off by the disk, not by a crash."""
 
 ENDINGS: dict[Kind, str] = {"plain": WHOLE, "near": NEAR, "kept": KEPT}
+"""Maps each retention class to the end of the name of a finished file."""
 
+# `Ring.tend` is called once a second, so there is a search every ten minutes. More searches are not
+# needed, because a single file may cover an hour.
 TRIM_ROUNDS = 600
-"""Once in this number of calls, `Ring.tend` searches for files that are too old. It is called once
-a second, so there is a search every ten minutes. More searches are not needed, because a single
-file may cover an hour."""
+"""Number of calls of `Ring.tend` between two searches for files that are too old."""
 
 S_PER_DAY = 86400
 
 FRESH_S = 10.0
-"""Time without a write after which a `.part` file no longer counts as being recorded, s. A daemon
+"""If a `.part` file was not written for this time, s, it does not count as being recorded. A daemon
 writes once a second."""
 
 STAMP = "%Y%m%dT%H%M%SZ"
@@ -82,7 +83,10 @@ STAMP = "%Y%m%dT%H%M%SZ"
 
 
 def listed(directory: Path) -> list[Path]:
-    """Return the recordings in a directory, the oldest first."""
+    """Return the paths of the recordings in a directory, the oldest first.
+
+    The result includes the file that is being written, and files that were cut off.
+    """
     found = [
         path
         for path in directory.iterdir()
@@ -93,9 +97,10 @@ def listed(directory: Path) -> list[Path]:
 
 
 def is_being_recorded(path: Path, now_s: float) -> bool:
-    """Return whether a daemon is still writing to the file.
+    """Return whether a daemon is still writing to a recording file.
 
-    `now_s` is the present time, s since 1970. Raises `OSError` if the file cannot be examined.
+    `now_s` is the present time, s since 1970. Raises `OSError` if the file does not exist or cannot
+    be examined.
     """
     return path.name.endswith(PART) and abs(now_s - path.stat().st_mtime) < FRESH_S
 
@@ -116,22 +121,23 @@ def _stem(path: Path) -> str:
 def mark_cut(part: Path, kind: Kind, cut: Literal["late", "disk"]) -> None:
     """Create a marker file, which says why the end of a `.part` file could not be written.
 
-    Without the marker, the next start of the daemon would assume that a crash cut off the file. The
-    marker is an empty file with `kind` and `cut` in its name, because even a full disk usually
-    accepts a new name. Raises `OSError` if the disk does not accept the marker.
+    Without the marker, the next start of the daemon would assume that a crash cut off the file.
+    Raises `OSError` if the disk does not accept the marker.
 
     Args:
         part: the `.part` file.
-        kind: the retention class of the file.
-        cut: "late" if the disk was too slow, or "disk" if it accepted no more data.
+        kind: the retention class that the file gets when it is finished.
+        cut: "late" if the disk was too slow, or "disk" if the disk accepted no more data.
     """
+    # The marker is empty and has `kind` and `cut` in its name, because even a full disk usually
+    # accepts a new name.
     part.with_name(f".{part.name}.{kind}.{cut}{MARKER}").touch()
 
 
 def _marked(part: Path) -> tuple[Kind, str] | None:
-    """Return the pair (retention class, cause) that the marker of a `.part` file names.
+    """Return the pair (retention class, cause) from the name of the marker of a `.part` file.
 
-    Returns None if the file has no marker.
+    The cause is a key of `CUTS`. Return None if the file has no marker.
     """
     for marker in part.parent.glob(f".{part.name}.*{MARKER}"):
         words = marker.name.removeprefix(f".{part.name}.").removesuffix(MARKER)
@@ -143,23 +149,27 @@ def _marked(part: Path) -> tuple[Kind, str] | None:
 
 
 class Run(Struct):
-    """State of one run of the daemon. After a disk error, a new `Ring` continues with it."""
+    """State of the directory of recordings in one run of the daemon.
+
+    After a disk error, the next `Ring` of the run continues with this object.
+    """
 
     numbers: set[int] = field(default_factory=set)
-    """Numbers, from the file names, of the files that ended in this run of the daemon."""
+    """Numbers of the files that ended in this run. The number of a file is in its name."""
     cut: dict[str, Kind] = field(default_factory=dict)
-    """Maps the name of each file that a disk error cut off in this run to its retention class. Any
-    other `.part` file without a marker was cut off by a crash before this run."""
+    """Files that a disk error cut off in this run. Maps the name of each file to its retention
+    class. Any other `.part` file without a marker was cut off by a crash before this run."""
     freed: int = 0
-    """Total size of the recordings that were deleted because the disk refused to write, bytes. It
-    restarts from 0 after each successful write."""
+    """Total size of the recordings that were deleted since the disk first refused to write, bytes.
+    It restarts from 0 after each successful write."""
     clock: ClockWatch = field(default_factory=ClockWatch)
 
 
 class Ring:
-    """The directory of recordings: begins and ends files, and deletes old ones to make room.
+    """The directory of recordings: begins and ends files, and deletes old files to make room.
 
-    Only one process at a time can have a `Ring` of a directory. Every method may raise `OSError`.
+    A `Ring` locks the directory until `close`, so that only one daemon records to it. Every method
+    may raise `OSError`.
     """
 
     def __init__(
@@ -167,20 +177,28 @@ class Ring:
     ) -> None:
         """Lock the directory, make room in it, and finish the files that were cut off.
 
+        If the directory does not exist, create it. Raises `OSError` if another daemon records to
+        the directory, or if the disk refuses to write.
+
         Args:
             settings: the configuration of the recordings.
-            run: the state that an earlier `Ring` of this run of the daemon left after a disk error;
-                None if there is no earlier `Ring`.
+            run: the `Run` of an earlier `Ring` in this run of the daemon, which a disk error ended;
+                None for the first `Ring`.
             refused: true if the last write failed because the disk was full.
         """
         self._directory = Path(settings.directory)
         self._bytes, self._days = int(settings.megabytes * 1e6), settings.days
         self._run = run or Run()
         self._rounds = self.file_bytes = 0
+        """`_rounds` is the number of calls of `tend`. `file_bytes` is the size above which the
+        file that is being written should end, bytes."""
         self.messages: list[str] = []
-        """Messages for the log about files that could not be finished."""
+        """Messages for the log about damaged files, and files that could not be finished."""
         self.cut_ns: int | None = None
-        """Time at which a crash cut off the newest unfinished file, ns since 1970, or None."""
+        """Wall-clock time at which a crash cut off a file of an earlier run, ns since 1970.
+
+        None if there was no crash. If several files were cut off, the newest file counts.
+        """
         here = self._directory.resolve()
         as_service = os.environ.get(RECORD) == settings.directory
         self._open_to_all = as_service and here.is_relative_to(PRIVATE)
@@ -188,8 +206,8 @@ class Ring:
             self._directory.mkdir(parents=True)
             # The umask may have removed bits of the mode.
             self._directory.chmod(DIRECTORY_MODE)
-        # Only this user and the group may open this file, because every process that can open it
-        # can also lock it.
+        # Other users may not open the lock file, because every process that can open the file can
+        # also lock it.
         self._lock = os.open(self._directory / ".lock", os.O_RDWR | os.O_CREAT, MODE)
         try:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -246,13 +264,13 @@ class Ring:
             with suppress(FileNotFoundError):
                 before_ns = cut_ns - path.stat().st_mtime_ns
                 earlier = (_number(path) or 0) < (_number(part) or 0)
-                # The clock of a computer without a battery-backed clock starts in the past. Then
-                # all older files seem to have ended long after the crash, and must not match.
+                # A computer without a battery-backed clock starts with a time in the past. Then all
+                # older files seem to have ended long after the crash. They must not match.
                 if earlier and abs(before_ns) < AROUND_NS:
                     self.retain(path)
 
     def _open_files(self) -> None:
-        """Let every user read the directory and its files, also files of older versions."""
+        """Let every user read the directory and its files, including files of older versions."""
         for path in (self._directory, *listed(self._directory)):
             mode = OPEN_DIRECTORY_MODE if path == self._directory else OPEN_MODE
             # The file may belong to another user. Recording goes on in any case.
@@ -265,9 +283,9 @@ class Ring:
         os.close(self._lock)
 
     def begin(self, about: About) -> Writing:
-        """Create a new file with the metadata `about`.
+        """Create a new file with the metadata `about`, and return the open file.
 
-        The number of the file is one above the largest number in the directory.
+        The number in the name of the file is one above the largest number in the directory.
         """
         files = listed(self._directory)
         number = 1 + max([_number(path) or 0 for path in files], default=0)
@@ -282,9 +300,9 @@ class Ring:
         """Finish a file, rename it, and return its new path.
 
         Args:
-            writing: the file.
-            kind: its retention class, which the new name shows.
-            cut: the cause that cut off the recording, a key of `CUTS`; "" if it ended normally.
+            writing: the file that is being written.
+            kind: the retention class of the file, which becomes a part of the new name.
+            cut: the cause that cut off the recording, a key of `CUTS`; "" for an ordinary end.
             why: an explanation of this cause in words, or "".
         """
         writing.finish(cut, why)
@@ -295,10 +313,10 @@ class Ring:
         return path
 
     def just_ended(self, now: Instant) -> Iterator[tuple[Path, Kind, int]]:
-        """Yield a tuple for each file that ended less than a minute ago.
+        """Yield the triple (path, retention class, time) of each file that ended recently.
 
-        The tuple contains the file's path, its retention class and the monotonic time of its end,
-        ns.
+        These are the finished files that ended less than a minute before `now`. The time is that of
+        the file's end, as monotonic time, ns.
         """
         for file in self._ended():
             ago_ns = now.wall_ns - int(file.at_s * NS_PER_S)
@@ -306,9 +324,10 @@ class Ring:
                 yield self._directory / file.name, file.kind, now.mono_ns - ago_ns
 
     def retain(self, path: Path) -> None:
-        """Give a finished `plain` file the retention class `near`.
+        """Rename a finished `plain` file so that it has the retention class `near`.
 
-        The caller has seen an incident within a minute after the end of the file.
+        Call this method for a file that ended less than a minute before an incident. A file of
+        another class keeps its name.
         """
         if path.name.endswith(WHOLE) and _kind(path) == "plain":
             # Another process may have removed the file.
@@ -317,10 +336,10 @@ class Ring:
             sync(self._directory)
 
     def tend(self, now: Instant) -> None:
-        """Call `trim` every ten minutes, and whenever the disk is nearly full.
+        """Call `trim` if it is due: every ten minutes, and whenever the disk is nearly full.
 
-        Call this method once a second. After a jump of the wall clock, it also corrects the
-        modification times of the files that ended in this run of the daemon.
+        After a jump of the wall clock, also correct the modification times of the files that ended
+        in this run of the daemon. The caller must call this method about once a second.
         """
         jumped_ns = self._run.clock.jump_ns(now)
         if jumped_ns:
@@ -340,13 +359,12 @@ class Ring:
                     os.utime(path, ns=(found.st_atime_ns, at_ns))
 
     def trim(self, now: Instant | None, refused: bool = False) -> None:
-        """Delete recordings until the limits on total size, age and free disk space are kept.
+        """Delete recordings to comply with the limits on total size, age and free disk space.
 
-        The file that is being written is never deleted. This method also sets `file_bytes`, the
-        size above which the file that is being written should end.
+        `.part` files are never deleted. This method also updates `file_bytes`.
 
         Args:
-            now: the present time; None if it is not known. Then no file counts as too old.
+            now: the present time; None if the time is not known, so that no file counts as too old.
             refused: true if the last write failed because the disk was full.
         """
         ended, disk = self._ended(), self._disk()

@@ -1,4 +1,8 @@
-"""The metadata record at the end of a finished recording."""
+"""Reads the end record: the metadata record at the end of a finished recording.
+
+The end record holds the times, a summary, and the cause if the recording was cut off. A program
+that lists many recordings reads only this record of each file.
+"""
 
 from __future__ import annotations
 
@@ -21,18 +25,18 @@ END = "acsard end"
 """Name of the MCAP metadata record that holds the `EndRecord`."""
 
 TAIL_BYTES = 1 << 16
-"""Number of bytes at the end of a file in which `read_end` searches for the end record. This record
-typically begins 1960 bytes before the end of the file."""
+"""Number of bytes at the end of a file in which `read_end` searches for the end record. The end
+record typically begins 1960 bytes before the end of the file."""
 
 _NAMED = struct.pack("<I", len(END)) + END.encode()
-"""The length of the end record's name, and the name. In the file these bytes follow the header of
-the MCAP record."""
+"""Bytes that follow the header of the end record in a file: the length of the record's name, and
+this name."""
 
 _FOOTER = HEAD.pack(Opcode.FOOTER, 20)
 """Header of the MCAP footer record, whose content has 20 bytes."""
 
 _DATA_END = HEAD.pack(Opcode.DATA_END, 4)
-"""Header of the MCAP record that follows the end record."""
+"""Header of the MCAP record `DataEnd`, which directly follows the end record."""
 
 Ns = Annotated[int, Meta(ge=-(1 << 63), le=(1 << 63) - 1)]
 """Time in ns that fits in a signed 64-bit integer."""
@@ -44,28 +48,28 @@ CUTS = {
     "late": "cut: the daemon was asked to end, and the disk was too slow to write the last steps",
     "open": "cut off, or still being recorded, when `acsard recording recover` read it",
 }
-"""Maps each cause that cuts off a recording to its description. A daemon that fails with the cause
-`bug` still finishes its file. After any other cause, the file stays unfinished until it is
+"""Maps each cause that cuts off a recording to its description. After the cause `bug`, the failing
+daemon still finishes its file. After any other cause, the file has no end record until it is
 recovered."""
 
 
 class EndRecord(Struct, frozen=True):
-    """The end record of a recording. A program that lists recordings reads only this record."""
+    """Content of the end record of a recording: times, summary, and the cause if it was cut off."""
 
     wall_ns: Ns
     """Wall-clock time at which the recording began, ns since 1970."""
     last_ns: Ns
-    """Latest wall-clock time of a message, ns since 1970. A message with several steps has the time
-    of its first step."""
+    """Latest wall-clock time of any message, ns since 1970. The time of a message with several
+    steps is the time of the first of these steps."""
     said: str
     """Summary of the events in a few words, from `timeline.summary`."""
     cut: str = ""
-    """Why the recording was cut off: a key of `CUTS`, or "" if the daemon ended normally."""
+    """Cause that cut off the recording, a key of `CUTS`; "" if the daemon ended normally."""
     why: str = ""
     """If `cut` is "bug", text that names the failed step and the exception; otherwise ""."""
     earliest_ns: Ns | None = None
-    """Earliest wall-clock time of a message, ns since 1970; None if it is not known. It is earlier
-    than `wall_ns` if the clock was set back during the recording."""
+    """Earliest wall-clock time of any message, ns since 1970; None if the file does not contain
+    this time. It is earlier than `wall_ns` if the clock was set back during the recording."""
 
 
 CRASHES = frozenset({"bug", "crash"})
@@ -73,11 +77,14 @@ CRASHES = frozenset({"bug", "crash"})
 
 
 def how_it_ends(cut: str, why: str = "") -> str:
-    """Describe in words how a recording was cut off.
+    """Return a text that says how a recording was cut off; "" if the daemon ended normally.
 
-    `cut` and `why` are fields of its end record. The result is "" if `cut` is "", which means that
-    the daemon ended normally. If this version of acsard does not know the cause `cut`, the result
-    contains only the word "cut" and the text `why`.
+    If another version of acsard recorded a cause that is not in `CUTS`, the text contains only the
+    word "cut" and `why`.
+
+    Args:
+        cut: the field `EndRecord.cut`; "" if the daemon ended normally.
+        why: the field `EndRecord.why`.
     """
     if not cut:
         return ""
@@ -86,17 +93,19 @@ def how_it_ends(cut: str, why: str = "") -> str:
 
 
 def as_metadata(last: EndRecord) -> dict[str, str]:
-    """Return the end record `last` as MCAP metadata, a mapping of strings to strings."""
+    """Return the end record `last` as MCAP metadata, which maps strings to strings."""
     fields = msgspec.to_builtins(last).items()
     return {key: str(value) for key, value in fields if value is not None}
 
 
 def read_end(path: Path) -> EndRecord | None:
-    """Read the end record of a file. Return None if it has no end record or cannot be read.
+    """Read the end record of a recording file.
 
-    This function reads only the first bytes and the last `TAIL_BYTES`. It does not follow the MCAP
-    index or unpack chunks, because a forged file may claim lengths of gigabytes.
+    Return None if the file cannot be read, or if no undamaged end record is found. The function is
+    quick: it reads only the first bytes and the last `TAIL_BYTES` of the file.
     """
+    # Do not follow the MCAP index or unpack chunks, because a forged file may claim lengths of
+    # gigabytes.
     try:
         with path.open("rb") as stream:
             if stream.read(len(MAGIC)) != MAGIC:
@@ -110,7 +119,10 @@ def read_end(path: Path) -> EndRecord | None:
 
 
 def end_in(data: bytes) -> EndRecord | None:
-    """Return the end record in `data`, the last bytes of a file, or None if there is none."""
+    """Return the end record that is in `data`, the last bytes of a file.
+
+    Return None if these bytes contain no valid end record.
+    """
     try:
         metadata = _last(data[-TAIL_BYTES:])
         return msgspec.convert(metadata, EndRecord, strict=False) if metadata else None
@@ -122,7 +134,7 @@ def end_in(data: bytes) -> EndRecord | None:
 def _last(tail: bytes) -> dict[str, str] | None:
     """Return the metadata of the end record in `tail`, the last bytes of a file.
 
-    Returns None if the file is not finished.
+    Return None if the file is not finished.
     """
     footer_at = len(tail) - len(MAGIC) - 20 - HEAD.size
     if footer_at < 0 or not (tail.startswith(_FOOTER, footer_at) and tail.endswith(MAGIC)):

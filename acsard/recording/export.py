@@ -1,8 +1,9 @@
 """Exports a recording for other programs: as ROS messages in MCAP or a ROS bag, or as CSV.
 
-In the CSV table each feedback line and each gyro sample has its own row. The first columns are
-those that `acsard calibrate` reads. A calibration must not use the columns `odom_...` as measured
-positions, because odometry is computed with the dimensions that the calibration has to find.
+In the CSV table, each feedback line of the board and each gyro sample has its own row. The first
+columns are those that `acsard calibrate` reads. A calibration must not use the columns `odom_...`
+as measured positions, because odometry is computed with the dimensions that the calibration has to
+find.
 """
 
 from __future__ import annotations
@@ -46,13 +47,14 @@ _ENDLESS = "{sec: 9223372036, nsec: 854775807}"
 class BagTopic(Struct, frozen=True):
     name: str
     type: str
+    """ROS type of the messages, such as `nav_msgs/msg/Odometry`."""
     qos: Qos
     count: int
-    """Number of messages."""
+    """Number of messages on the topic."""
 
 
 def offered_qos(qos: Qos) -> str:
-    """Return the QoS profile as a YAML list with one entry."""
+    """Return a QoS profile in the form that rosbag2 expects: a YAML list with one entry."""
     return "\n".join(
         [
             "- history: 1",
@@ -70,17 +72,16 @@ def offered_qos(qos: Qos) -> str:
 
 
 def bag_metadata(file: str, topics: Sequence[BagTopic], first_ns: int, last_ns: int) -> str:
-    """Return the text of the file `metadata.yaml` of a ROS bag with one MCAP file.
+    """Return the text of the file `metadata.yaml` for a ROS bag with one MCAP file.
 
     The text has format version 5 with numeric QoS policies, which every ROS 2 release since Humble
-    reads. Each channel of the MCAP file also contains its QoS text, because `ros2 bag play FILE`
-    reads it there.
+    reads.
 
     Args:
         file: name of the MCAP file.
         topics: the topics in the MCAP file.
-        first_ns: earliest wall-clock time of a message, ns since 1970.
-        last_ns: latest wall-clock time of a message, ns since 1970.
+        first_ns: earliest wall-clock time of any message, ns since 1970.
+        last_ns: latest wall-clock time of any message, ns since 1970.
     """
     count = sum(topic.count for topic in topics)
     begins = f"nanoseconds_since_epoch: {first_ns}"
@@ -117,19 +118,19 @@ def bag_metadata(file: str, topics: Sequence[BagTopic], first_ns: int, last_ns: 
 
 
 def _quoted(text: str) -> str:
-    """Quote a YAML string, because a name or a path may contain YAML syntax."""
+    # A name or a path may contain YAML syntax. A JSON string is also a YAML string.
     return msgspec.json.encode(text).decode()
 
 
 MEASURED = ("t [s]", "fr [rad/s]", "fl [rad/s]", "rl [rad/s]", "rr [rad/s]", "yaw_rate [rad/s]")
-"""Columns that calibration reads: the wall-clock time (s since 1970), the speeds of the wheels
-(front right, front left, rear left and rear right), and the yaw rate from a gyro."""
+"""Columns that a calibration reads: the wall-clock time (s since 1970), the speeds of the front
+right, front left, rear left and rear right wheel, and the yaw rate from a gyro."""
 
 OUTPUT_COLUMNS = (
     "odom_x [m]", "odom_y [m]", "odom_yaw [rad]", "linear [m/s]", "angular [rad/s]",
     "applied_linear [m/s]", "applied_angular [rad/s]", "mode", "link", "source",
 )  # fmt: skip
-"""Columns with outputs of the robot. They are empty in the row of a gyro sample."""
+"""Columns with outputs of the robot. The row of a gyro sample has no values in these columns."""
 
 CSV_HEADER = ",".join([*MEASURED, *OUTPUT_COLUMNS])
 MEASURED_CSV_HEADER = ",".join([*MEASURED, "applied_linear [m/s]", "applied_angular [rad/s]"])
@@ -139,7 +140,10 @@ _NO_OUTPUTS = "," * len(OUTPUT_COLUMNS)
 
 
 def csv_rows(step: Step, outputs: Outputs) -> Iterator[str]:
-    """Yield the CSV rows of a step, without line breaks."""
+    """Yield the rows of a step for the CSV table of an export, without line breaks.
+
+    `outputs` are the replayed outputs of the step.
+    """
     now = step.inputs.now
     for sample in step.inputs.gyro:
         yield gyro_columns(sample, now) + _NO_OUTPUTS
@@ -153,7 +157,11 @@ def csv_rows(step: Step, outputs: Outputs) -> Iterator[str]:
 
 
 def measured_csv_rows(step: Step, outputs: Outputs) -> Iterator[str]:
-    """Yield the CSV rows of a step with only the columns that calibration reads."""
+    """Yield the rows of a step for the CSV table that `acsard calibrate` reads.
+
+    The columns are those of `MEASURED_CSV_HEADER`. A row has no line break. `outputs` are the
+    replayed outputs of the step.
+    """
     for sample in step.inputs.gyro:
         yield gyro_columns(sample, step.inputs.now) + ",,"
     for estimate in outputs.estimates:
@@ -162,9 +170,9 @@ def measured_csv_rows(step: Step, outputs: Outputs) -> Iterator[str]:
 
 
 def wheel_columns(estimate: Estimate) -> str:
-    """Return the CSV fields of a feedback line for the columns `MEASURED`.
+    """Return the CSV fields of a feedback line of the board for the columns `MEASURED`.
 
-    The field of the yaw rate is empty.
+    The field for the yaw rate is empty.
     """
     wheels = ",".join(f"{speed:.6g}" for speed in estimate.speeds.as_tuple())
     return f"{_csv_seconds(estimate.at.wall_ns)},{wheels},"
@@ -173,9 +181,8 @@ def wheel_columns(estimate: Estimate) -> str:
 def gyro_columns(sample: GyroSample, now: Instant) -> str:
     """Return the CSV fields of a gyro sample for the columns `MEASURED`.
 
-    The fields of the wheel speeds are empty. The time is the stamp of the sample. If the sample has
-    no stamp, the time is its time of arrival, converted to wall-clock time with the clocks in
-    `now`.
+    The fields for the wheel speeds are empty. The time is the stamp of the sample. A sample without
+    a stamp gets the wall-clock time at which it arrived. `now` is the time of the step.
     """
     arrived_ns = sample.at_ns + now.wall_ns - now.mono_ns
     at_ns = arrived_ns if sample.stamp_ns is None else sample.stamp_ns
@@ -189,36 +196,39 @@ def _csv_seconds(wall_ns: int) -> str:
 Kind = Literal["mcap", "csv", "rosbag2"]
 
 SUFFIX: dict[Kind, str] = {"mcap": ".ros2.mcap", "csv": ".csv", "rosbag2": ".rosbag2"}
-"""Maps each kind of export to the suffix of its file or directory if the user gives no name."""
+"""Maps each kind of export to the suffix of the default name of its file or directory."""
 
 
 class ExportResult(Struct, frozen=True):
     count: int
-    """Number of exported messages, or of exported rows of a CSV table."""
+    """Number of exported messages, or number of exported rows of a CSV table."""
     gaps: list[Gap]
-    """Gaps of the recording that overlap the exported time span. The export lacks their outputs."""
+    """Gaps of the recording that overlap the exported part. The export contains no outputs of the
+    steps in these gaps."""
 
 
 class _Writer:
-    """Base class of the writers: writes steps to a stream in one file format."""
+    """Base class of the writers. A writer writes steps to a stream in one file format."""
 
     count = 0
-    """Number of messages or rows so far."""
+    """Number of messages or rows that were written so far."""
 
     def step(self, step: Step, outputs: Outputs) -> None:
+        """Write a step of the exported part, with its replayed outputs."""
         raise NotImplementedError
 
     def skip(self, step: Step, inside: bool) -> None:
         """Process a step whose outputs are not exported.
 
-        `inside` is true if the step is in the exported time span, but could not be replayed. Its
-        log lines are then exported nevertheless.
+        If `inside` is false, the step is before the exported part. If it is true, the step is in
+        the exported part, but could not be replayed. Its log lines are then written nevertheless.
         """
 
     def end(self, ending: str = "") -> None:
-        """Write the log lines that follow the last step.
+        """Write the log lines that follow the last exported step.
 
-        `ending` says how the recording was cut off, or is "" if the daemon ended normally.
+        `ending` says how the recording was cut off. It is "" if the daemon ended normally, or if
+        the exported part ends before the recording.
         """
 
     def finish(self) -> None:
@@ -274,6 +284,7 @@ class _MessageWriter(_Writer):
             text = channel.schema.encode()
             self._schemas[kind] = self._writer.register_schema(kind, SCHEMA_ENCODING, text)
         topic = channel.topic(self._namespace, source)
+        # `ros2 bag play FILE` reads the QoS profile from the channel of the MCAP file.
         about = {"offered_qos_profiles": offered_qos(channel.qos)}
         if kind in TYPE_HASHES:
             about["topic_type_hash"] = TYPE_HASHES[kind]
@@ -315,19 +326,23 @@ def export(
 ) -> ExportResult:
     """Replay a recording, and write its messages or its CSV table to `new`.
 
+    If an error occurs, no partial data is left at `new`.
+
     Args:
         recording: the recording to replay.
-        new: the file to write, or the directory if `kind` is `rosbag2`.
+        new: path of the file to write, or of the directory if `kind` is "rosbag2".
         kind: the format of the exported data.
-        other: the configuration to replay with; None means the recorded configuration.
+        other: the configuration of the replay; None for the recorded configuration.
         span: the part of the recording that is exported.
-        progress: called every `PROGRESS_STEPS` steps.
-        force: true if an existing `new` may be overwritten. A recording is never overwritten.
+        progress: function that is called every `PROGRESS_STEPS` steps with the wall-clock time of
+            the step, ns since 1970.
+        force: true if an existing file or ROS bag at `new` may be overwritten. A recording is never
+            overwritten.
 
     Raises:
         RecordingError: nothing was recorded in `span`, or the recording cannot be replayed.
-        FileExistsError: `new` must not be overwritten.
-        OSError: the disk refuses to write. After any error no partial file is left.
+        FileExistsError: `new` exists, and must not be overwritten.
+        OSError: the disk refuses to write.
     """
     run = RecordedRun(recording, other)
 
@@ -364,11 +379,12 @@ def export(
 def _write_steps(
     run: RecordedRun, writer: _Writer, recording: Recording, span: Span, progress: Progress
 ) -> None:
-    """Replay all steps, because each step changes the robot, but write only steps in `span`."""
+    """Replay all steps of a recording, and write the steps in `span`."""
+    # The steps before `span` are replayed too, because each step changes the robot.
     began_ns, over = recording.about.mono_ns, False
 
     def is_inside(step: Step) -> bool:
-        """Return whether a step is in `span`. The first step after `span` ends the output."""
+        """Return whether a step is in `span`. At the first step after `span`, end the output."""
         nonlocal over
         seconds = (step.inputs.now.mono_ns - began_ns) / NS_PER_S
         if seconds > span.end and not over:
@@ -401,10 +417,10 @@ def _gaps(run: RecordedRun, span: Span, about: About) -> list[Gap]:
 
 
 def measured(recording: Recording) -> bytes:
-    """Return the CSV table that `acsard calibrate` reads.
+    """Return the measured data of a recording as the CSV table that `acsard calibrate` reads.
 
     The table ends at the first gap of the recording. Raises `RecordingError` if the table has no
-    gyro samples.
+    gyro samples, or if the recording cannot be replayed.
     """
     run = RecordedRun(recording)
     lines, has_gyro = [MEASURED_CSV_HEADER], False

@@ -1,6 +1,7 @@
 """Writes and reads one recording as an MCAP file.
 
-The writer adds data every second. If a file is cut off or damaged, its other data stays readable.
+The writer adds data every second. If a file is cut off or damaged, the undamaged data stays
+readable.
 
 A file has four channels:
 - `steps`: batches of steps, as `rows.py` encodes them.
@@ -10,12 +11,12 @@ A file has four channels:
   after the daemon's first step has a `state` message first.
 - `unfinished`: the inputs of the step in which the daemon failed.
 
-A metadata record names the robot and the version of acsard, and an attachment holds the
-`acsard.toml`. A finished file has both at its beginning and before its end, because nothing can be
-replayed without them.
+A metadata record names the robot and the version of acsard, and an attachment contains the
+`acsard.toml`. No step can be replayed without this record and this attachment, so a finished file
+has a copy of each at its beginning and another copy before its end.
 
 A file that was cut off has no end record, but all data that was synced to the disk can still be
-read. `rewrite` copies its messages to a new, finished file.
+read. `rewrite` copies the messages of such a file to a new, finished file.
 """
 
 from __future__ import annotations
@@ -56,8 +57,8 @@ from acsard.recording.state import Checkpoint
 from acsard.recording.timeline import INCIDENT_WORDS, TimelineEntry, summary
 
 CHUNK_NS = 10 * NS_PER_S
-"""Longest time that an MCAP chunk covers, ns. Longer chunks would save little space, and damage to
-a single chunk would destroy more data."""
+"""Longest time between the first and the last message of an MCAP chunk, ns. Longer chunks would
+save little space, and damage to a single chunk would destroy more data."""
 
 CHUNK_BYTES = 1 << 20
 """Uncompressed size at which a chunk ends, bytes. Ten seconds of driving take 160 000 bytes."""
@@ -97,10 +98,10 @@ CONTENTS: dict[Topic, str] = {
     "unfinished": "the inputs of the step in which the daemon failed, in MessagePack: a map of "
     f"{', '.join(Unfinished.__struct_fields__)}",
 }
-"""For each channel, the text in its metadata that describes its messages."""
+"""Maps each channel to the text in the file that describes the messages of this channel."""
 
 UNFINISHED = "the file has no end: it was cut off, or is still being recorded"
-"""Text that describes the ending of an unfinished file."""
+"""Text of `Recording.ending` for a file without an end record."""
 
 EVENTS_SCHEMA = 1
 """MCAP schema number of the channel `events`. The other channels have no schema."""
@@ -120,9 +121,10 @@ class About(Struct, frozen=True):
     config: str = ""
     """Configuration at the beginning of the recording, as an `acsard.toml` with every key."""
     format: str = FORMAT
+    """Version of the encoding of the messages, as in `rows.FORMAT`."""
     started_ns: Ns = 0
-    """Wall-clock time of the daemon's start, ns since 1970; 0 if it is not known. The daemon may
-    have started hours before this recording began."""
+    """Wall-clock time at which the daemon started, ns since 1970; 0 if this time is not known. The
+    daemon may have started hours before this recording began."""
 
 
 class EndRecordBuilder:
@@ -135,9 +137,9 @@ class EndRecordBuilder:
         """True if the messages so far include the daemon's first step."""
 
     def message(self, topic: Topic, wall_ns: int, data: bytes) -> None:
-        """Add a message of any channel; `wall_ns` is its wall-clock time, ns since 1970.
+        """Add a message of any channel. `wall_ns` is the message's wall-clock time, ns since 1970.
 
-        The caller must also pass each message of the channel `events` to `event`.
+        The caller must also decode each message of the channel `events`, and pass it to `event`.
         """
         self._last_ns = max(self._last_ns, wall_ns)
         self._earliest_ns = min(self._earliest_ns, wall_ns)
@@ -148,14 +150,16 @@ class EndRecordBuilder:
                 self._starts = self._starts or unfinished(data).number == 0
 
     def event(self, event: TimelineEntry) -> None:
-        """Add an event to the summary if its name is a key of `INCIDENT_WORDS`."""
+        """Add an event to the summary. Events whose name is not in `INCIDENT_WORDS` are ignored."""
         if event.name in INCIDENT_WORDS:
             self._incidents.append(event)
 
     def end_record(self, cut: str = "", why: str = "") -> EndRecord:
-        """Return the end record of the messages that were added so far.
+        """Return the end record of a recording with the messages that were added so far.
 
-        `cut` and `why` become the fields of these names in the end record.
+        Args:
+            cut: the cause that cut off the recording, a key of `CUTS`; "" for an ordinary end.
+            why: an explanation of this cause in words, or "".
         """
         text = summary(self._incidents, self._starts)
         return EndRecord(self._wall_ns, self._last_ns, text, cut, why, self._earliest_ns)
@@ -179,7 +183,10 @@ class Index:
         )
 
     def message(self, channel: int, wall_ns: int) -> None:
-        """Count a message; `wall_ns` is its wall-clock time in ns since 1970, at least 0."""
+        """Count a message of the MCAP channel with the number `channel`.
+
+        `wall_ns` is the message's wall-clock time in ns since 1970, at least 0.
+        """
         totals = self._totals
         first_ns = totals.message_start_time if totals.message_count else wall_ns
         totals.message_start_time = min(first_ns, wall_ns)
@@ -192,9 +199,10 @@ class Index:
         self._totals.chunk_count += 1
 
     def record(self, record: McapRecord, at: int, length: int) -> None:
-        """Add a metadata record or an attachment to the index, and ignore other records.
+        """Add a metadata record or an attachment to the index. Ignore a record of another kind.
 
-        `at` is the offset of the record in the file, and `length` its length, both in bytes.
+        `at` is the offset in the file at which the record begins, bytes. `length` is the length of
+        the record, bytes.
         """
         if isinstance(record, Metadata):
             self._totals.metadata_count += 1
@@ -206,12 +214,15 @@ class Index:
             self._places.append(AttachmentIndex(at, length, *times, size, record.name, kind))
 
     def records(self) -> list[McapRecord]:
-        """Return the records of the summary section."""
+        """Return the MCAP records of the summary section: the statistics and the index."""
         return [self._totals, *self._places]
 
 
 class Writing:
-    """A recording that is being written. After a method has raised `OSError`, call only `close`."""
+    """A recording file that is being written.
+
+    If the disk refuses to write, a method raises `OSError`. After that, call only `close`.
+    """
 
     def __init__(self, path: Path, about: About, mode: int = MODE) -> None:
         self.path, self._mode = path, mode
@@ -220,7 +231,8 @@ class Writing:
         self._index = Index()
         self._chunk: GrowingChunk | None = None
         self._chunk_at: int | None = None
-        """Offset of the present chunk's header in the file; None if it is not written yet."""
+        """Offset in the file at which the header of the growing chunk begins, bytes. None if this
+        header is not written yet."""
         self._file = os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb")
         try:
             self._open(about)
@@ -243,13 +255,14 @@ class Writing:
 
     @property
     def size(self) -> int:
-        """Number of bytes written so far."""
+        """Number of bytes that the file has so far. Messages that are not written do not count."""
         return self._file.tell()
 
     def add(self, topic: Topic, wall_ns: int, data: bytes) -> None:
-        """Add a message to the current chunk; `wall_ns` is its wall-clock time, ns since 1970.
+        """Add a message. `wall_ns` is the message's wall-clock time, ns since 1970.
 
-        The message is written to the file at the next `flush`, or when its chunk ends.
+        The message is written to the file at the next `flush`, or when the message's chunk ends.
+        Use `event` for the channel `events`, so that the end record counts the event.
         """
         self._end_builder.message(topic, wall_ns, data)
         wall_ns = max(0, wall_ns)
@@ -267,22 +280,25 @@ class Writing:
             self.end_chunk()
 
     def event(self, event: TimelineEntry) -> None:
-        """Add a message to the channel `events`, and the event to the end record's summary."""
+        """Add an event to the channel `events`, and to the summary in the end record."""
         wall_ns = int(event.seconds * NS_PER_S)
         self.add("events", wall_ns, msgspec.json.encode(event))
         self._end_builder.event(event)
 
     def flush(self) -> None:
-        """Write all added messages to the file, and sync it, so that they can be read."""
+        """Write all added messages to the file, and sync the file to the disk.
+
+        Raises `FileNotFoundError` if the file was deleted.
+        """
         if self._chunk is not None and self._chunk.has_unwritten:
             self._put(self._chunk.take())
         self._sync()
-        # If the file was deleted, the disk still accepts data, but the data is lost.
+        # The disk also accepts data for a deleted file, but this data is lost.
         if not os.fstat(self._file.fileno()).st_nlink:
             raise FileNotFoundError(errno.ENOENT, f"{self.path.name} has been removed")
 
     def _put(self, data: bytes) -> None:
-        """Write compressed bytes of the chunk. Write the chunk's header first if it is missing."""
+        """Write compressed bytes of the growing chunk, after the chunk's header."""
         if self._chunk_at is None:
             self._chunk_at = self._file.tell()
             self._file.write(GROWING_HEAD)
@@ -307,9 +323,11 @@ class Writing:
         self._index.chunk()
 
     def finish(self, cut: str = "", why: str = "") -> None:
-        """Write the end of the file and close it.
+        """Write the end record and the MCAP summary section, and close the file.
 
-        `cut` and `why` become the fields of these names in the end record.
+        Args:
+            cut: the cause that cut off the recording, a key of `CUTS`; "" for an ordinary end.
+            why: an explanation of this cause in words, or "".
         """
         self.end_chunk()
         for record in self._about:
@@ -326,7 +344,7 @@ class Writing:
         self._file.close()
 
     def close(self) -> None:
-        """Close the file without writing an end."""
+        """Close the file without an end record. This method does not raise `OSError`."""
         try:
             self._file.close()
         except OSError:
@@ -335,7 +353,7 @@ class Writing:
 
 
 def _about_records(about: About) -> list[McapRecord]:
-    """Return the metadata and the attachment `acsard.toml` that hold the fields of `about`."""
+    """Return the metadata record and the attachment `acsard.toml` with the fields of `about`."""
     meta = {key: str(value) for key, value in msgspec.to_builtins(about).items()}
     text, at_ns = meta.pop("config").encode(), about.wall_ns
     return [
@@ -345,7 +363,7 @@ def _about_records(about: About) -> list[McapRecord]:
 
 
 def _checksum(metadata: Mapping[str, str]) -> int:
-    """Return a checksum of the metadata. An MCAP metadata record itself has no checksum."""
+    """Return a CRC-32 of the metadata. MCAP has no checksum for metadata records."""
     return zlib.crc32(msgspec.json.encode(metadata, order="sorted"))
 
 
@@ -368,10 +386,10 @@ class Recording:
     """A recording read from a file. Damaged parts of the file are skipped."""
 
     def __init__(self, path: Path) -> None:
-        """Read the file; raise `RecordingError` if it is not a recording that can be read."""
+        """Read the file. Raises `RecordingError` if it is not a readable recording of acsard."""
         self.path = path
         self.paths = [path]
-        """Paths of the files that are read, in order. Only a `Series` has more than one."""
+        """Paths of the files of the recording, in order. Only a `Series` has more than one file."""
         try:
             self._data = path.read_bytes()
         except OSError as error:
@@ -379,31 +397,33 @@ class Recording:
                 f"cannot read {path}: {error.strerror}; `acsard recording` lists the recordings"
             ) from None
         self.ended = False
-        """True if the file is finished; valid only after the last message of `messages()`. A
-        finished file may be damaged just before its end. `damaged` counts this place too."""
+        """True if the file is finished, so that it has an end record. A finished file may still be
+        damaged. Use this attribute only after `messages()` has yielded the last message."""
         self.damaged = 0
-        """Number of damaged places, mostly MCAP chunks, that are followed by readable data."""
+        """Number of damaged places that were skipped, mostly MCAP chunks. The incomplete end of a
+        file that was cut off does not count."""
         self.cut = ""
-        """Cause that cut off the recording, a key of `CUTS`; "" if the daemon ended normally."""
+        """Cause that cut off the recording, a key of `CUTS`; "" if the daemon ended normally or if
+        the file is not finished."""
         self.why = ""
         """If `cut` is "bug", text that names the failed step and the exception; otherwise ""."""
         self.unfinished: bytes | None = None
-        """Encoded inputs of the step in which the daemon failed; None if it did not fail."""
+        """Encoded inputs of the step in which the daemon failed; None if no step failed."""
         self.about = self._about()
 
     @property
     def whole(self) -> bool:
         """True if the file is finished and undamaged.
 
-        This property is valid only after the last message of `messages()`.
+        Use this property only after `messages()` has yielded the last message.
         """
         return self.ended and not self.damaged
 
     @property
     def ending(self) -> str:
-        """Text that says how the recording ended; "" if the daemon ended normally.
+        """Text that says how the recording was cut off; "" if the daemon ended normally.
 
-        This property is valid only after the last message of `messages()`.
+        Use this property only after `messages()` has yielded the last message.
         """
         if not self.ended:
             return UNFINISHED
@@ -411,16 +431,20 @@ class Recording:
 
     @property
     def missing(self) -> str:
-        """Text that describes the damage and an abnormal ending; "" if there is neither.
+        """Text with the number of damaged places, and with the text of `ending`.
 
-        This property is valid only after the last message of `messages()`.
+        The text is "" if the file is undamaged and the daemon ended normally. Use this property
+        only after `messages()` has yielded the last message.
         """
         places = many(self.damaged, "damaged place is", "damaged places are")
         damaged = f"{places} left out" if self.damaged else ""
         return "; ".join(filter(None, [damaged, self.ending]))
 
     def compute_end_record(self) -> EndRecord:
-        """Build an end record from all messages of the recording. Its field `cut` is ""."""
+        """Read all messages of the recording, and return an end record that is built from them.
+
+        The field `cut` of the end record is "", because the messages do not show the cause.
+        """
         builder = EndRecordBuilder(self.about)
         for topic, wall_ns, data in self.messages():
             builder.message(topic, wall_ns, data)
@@ -432,7 +456,8 @@ class Recording:
     def messages(self) -> Iterator[tuple[Topic, int, bytes]]:
         """Yield the triple (topic, wall-clock time in ns since 1970, data) of each message.
 
-        After the last message, `ended`, `damaged`, `cut`, `why` and `unfinished` are valid.
+        Messages in damaged parts of the file are skipped. After the last message, the attributes
+        `ended`, `damaged`, `cut`, `why` and `unfinished` have their final values.
         """
         self.ended, self.damaged, self.cut, self.why = False, 0, "", ""
         self.unfinished = None
@@ -452,8 +477,8 @@ class Recording:
             # In a damaged chunk, all readable messages precede the damage.
             self.damaged += place.damaged
         if not self.ended and (end := end_in(self._data)) is not None:
-            # `walk` mistook the damage for the end of a cut-off file, because no complete chunk
-            # follows the damage.
+            # The file is finished, but damaged before its end. No complete chunk follows the
+            # damage, so `walk` took the damage for the end of a file that was cut off.
             self.ended, self.cut, self.why = True, end.cut, end.why
             self.damaged += 1
 
@@ -490,11 +515,16 @@ class Recording:
 
 
 def rewrite(recording: Recording, path: Path, cut: str = "open") -> int:
-    """Write all readable messages to a new, finished file at `path`, and return their number.
+    """Copy all readable messages to a new, finished file at `path`, and return their number.
 
     If the recording is not finished, the end record of the new file names the cause `cut`, a key of
-    `CUTS`. Raises `OSError`, or `RecordingError` if an event cannot be decoded. After such an error
-    there is no file at `path`.
+    `CUTS`. Otherwise the new end record has the cause of the recording's own end record.
+
+    Raises:
+        OSError: a file exists at `path`, or the disk refuses to write.
+        RecordingError: an event cannot be decoded.
+
+    If an error occurs while the messages are copied, the new file is deleted.
     """
     writing = Writing(path, recording.about)
     try:
@@ -521,7 +551,7 @@ def is_part(part: Recording, recording: Recording) -> bool:
 
 
 def event_of(recording: Recording, data: bytes) -> TimelineEntry:
-    """Decode a message of the channel `events`; raise `RecordingError` if it is damaged."""
+    """Decode a message of the channel `events`. Raises `RecordingError` if it is damaged."""
     try:
         return msgspec.json.decode(data, type=TimelineEntry)
     except msgspec.MsgspecError as error:

@@ -1,4 +1,8 @@
-"""Replays a recording file, and resumes after a damaged place at the next recorded robot state."""
+"""Replays a recording, and compares the two copies of each event in the recording.
+
+After a damaged place, the replay resumes at the next robot state in the file. The steps between the
+damage and this state cannot be replayed.
+"""
 
 from __future__ import annotations
 
@@ -29,20 +33,21 @@ from acsard.recording.timeline import TimelineEntry, entry_of
 from acsard.recording.unpickling import MAX_BYTES
 
 Progress = Callable[[int], None]
-"""Callback that shows progress. Its argument is the wall-clock time of a step, ns since 1970."""
+"""Function that shows the progress of a replay. Its argument is the wall-clock time of the present
+step, ns since 1970."""
 
 PROGRESS_STEPS = 1024
-"""Number of replayed steps between two calls of the progress callback."""
+"""Number of replayed steps between two calls of the function that shows the progress."""
 
 
 def no_progress(wall_ns: int) -> None:
-    """Do nothing. A caller that displays no progress passes this function as its callback."""
+    """Do nothing. This is the default `Progress` function, which shows no progress."""
 
 
 INCOMPLETE_STATE_ERRORS = (
     AttributeError, TypeError, ValueError, LookupError, ArithmeticError, RecursionError
 )  # fmt: skip
-"""Exceptions that a `Robot` may raise if it was rebuilt from a recorded state that lacks parts."""
+"""Exceptions that a `Robot` may raise if it was rebuilt from an incomplete recorded state."""
 
 
 class Gap(Struct):
@@ -57,12 +62,13 @@ class Gap(Struct):
     end_ns: int
     """Monotonic time of the first replayed step after the gap, or of the recording's end, ns."""
     unreadable: int = 0
-    """Number of steps that cannot be read, computed from the numbers of the steps around them."""
+    """Number of steps that cannot be read. It follows from the numbers of the readable steps before
+    and after them."""
     skipped: int = 0
-    """Number of readable steps that are not replayed, because the next recorded robot state comes
-    later."""
+    """Number of steps that can be read, but not replayed. They are between the unreadable steps and
+    the next recorded state of the robot."""
     lines: int = 0
-    """How many of the `skipped` steps contain a line that the robot decided to send."""
+    """Number of `skipped` steps with a line that the robot decided to send to the board."""
     end_lost: bool = False
     """True if the last steps of the recording cannot be read."""
 
@@ -70,22 +76,26 @@ class Gap(Struct):
 class ReplayResult(NamedTuple):
     comparison: Comparison
     gaps: list[Gap]
-    """The parts of the recording that were not replayed, so their outputs were not compared."""
+    """The parts of the recording that were not replayed. Their outputs were not compared."""
     failed_step: str = ""
-    """Sentence that says whether the step in which the recorded daemon failed also fails in this
-    version. It is "" if the daemon did not fail."""
+    """Text about the step in which the recorded daemon failed: whether this step also fails in this
+    version of acsard. "" if the daemon did not fail."""
     event_copies: str = ""
-    """Sentence about the first event that differs from its copy in the channel `events`. It is ""
-    if every event equals its copy."""
+    """Text about the first event that differs from its copy in the channel `events`. "" if all
+    events equal their copies."""
 
     @property
     def same(self) -> bool:
-        """True if the replayed outputs equal the recorded ones, and every event equals its copy."""
+        """True if all replayed outputs equal the recorded outputs, and all events equal their
+        copies."""
         return self.comparison.same and not self.event_copies
 
 
 def config_of(recording: Recording) -> Config:
-    """Return a recording's configuration; raise `RecordingError` if this version cannot read it."""
+    """Return the configuration at the beginning of a recording.
+
+    Raises `RecordingError` if this version of acsard cannot use the configuration.
+    """
     try:
         return parse(recording.about.config.encode())
     except ConfigError as error:
@@ -108,8 +118,8 @@ def _items(
 ) -> Iterator[list[Step] | Checkpoint]:
     """Yield the readable batches of steps and the checkpoints, in the order of the file.
 
-    If `copies` is not None, each batch and each message of the channel `events` is passed to it
-    first.
+    If `copies` is not None, each batch of steps and each message of the channel `events` is first
+    passed to `copies`. Each damaged message is added to `Recording.damaged`.
     """
     for topic, _, data in recording.messages():
         if topic == "events" and copies is not None:
@@ -126,24 +136,25 @@ def _items(
             recording.damaged += 1
 
 
+# A genuine file stays below this limit. Without the limit, the replay of a forged file of 5 kB took
+# 4 s.
 MAX_STATE_BYTES = 8
-"""Limit on the robot states that are decoded after gaps. Their total size may be `MAX_BYTES` plus
-this many bytes for each byte of the file. A genuine file stays below this limit. Without the limit,
-the replay of a forged file of 5 kB took 4 s."""
+"""Factor in the limit on the total size of the robot states that are decoded after gaps. The limit
+is this factor times the size of the file, plus `MAX_BYTES`."""
 
 
 class _Source:
-    """Base class of the replays. It decodes the robot states in the recording."""
+    """Base class of the replays of a recording. It decodes the robot states in the recording."""
 
     def __init__(self, recording: Recording) -> None:
         self._recording = recording
         self._state: State | None = None
-        """Robot state that was last decoded from the file; None while the replay uses a new
-        robot."""
+        """The robot state from the file with which the replay goes on; None while the replay uses a
+        new robot."""
         self._place = "at the start of"
-        """Place of the robot state `_state` in the recording, in words."""
+        """Words for the position of `_state` in the recording, for error messages."""
         self._left = MAX_BYTES
-        """Number of bytes of robot states that may still be decoded after gaps."""
+        """Total size of the robot states that may still be decoded after gaps, bytes."""
         for path in recording.paths:
             # The reader of the steps reports a missing file later.
             with suppress(OSError):
@@ -151,11 +162,11 @@ class _Source:
 
     @contextmanager
     def state_errors(self) -> Iterator[None]:
-        """Raise `RecordingError` if the robot fails in the `with` block due to its recorded state.
+        """Convert the errors of a robot with an incomplete recorded state to `RecordingError`.
 
-        A forged state may lack any part, so every use of the robot must be in such a block. If the
-        robot was not rebuilt from a recorded state, an error in the block is a defect in the code,
-        and is raised unchanged.
+        A forged state may lack any part, so every use of the robot must be in a `with` block of
+        this context manager. Errors of a robot that was not rebuilt from a recorded state are not
+        converted, because they are defects in the code.
         """
         try:
             yield
@@ -176,12 +187,17 @@ class _Source:
         number: int,
         tried: Callable[[Config], Config] | None = None,
     ) -> State | None:
-        """Decode the robot in `saved` if it was saved just before the step `number`.
+        """Decode the robot state with which the replay can go on at the step `number`.
 
-        Returns None if `saved` is None or belongs to another step, if this version cannot read the
-        robot, or if the total size of the decoded states exceeds the limit (`MAX_STATE_BYTES`).
-        `tried` takes the configuration of the decoded robot, and returns the configuration that
-        replaces it. If `tried` is None, the robot keeps its configuration.
+        Return None if this is not possible. Either `saved` is None or was not saved just before
+        this step, or this version of acsard cannot use the state, or the limit on the total size of
+        the decoded states is exceeded.
+
+        Args:
+            saved: the last checkpoint before the step `number`.
+            number: the number of the next step.
+            tried: function that takes the configuration of the decoded robot, and returns the
+                configuration that replaces it. If it is None, the robot keeps its configuration.
         """
         if saved is None or saved.number != number:
             return None
@@ -200,39 +216,45 @@ class _Source:
 
 
 class RecordedRun(_Source):
-    """The steps of a recording that can be replayed, and the robot as it was before each step.
+    """The steps of a recording that can be replayed, and a robot that can replay them.
 
-    After missing steps, the run resumes at the next robot state in the file.
+    The caller must pass each step from `steps()` to `robot`, before it takes the next step. After
+    missing steps, the run resumes with another robot, from the next robot state in the file.
     """
 
     def __init__(self, recording: Recording, other: Config | None = None) -> None:
-        """Use the configuration `other`, or the recorded configuration if `other` is None.
+        """Read the configuration and the first robot state of a recording.
 
-        Raises `RecordingError` if this version cannot read the recorded configuration or state.
+        `other` is the configuration of the replay. If it is None, the replay uses the recorded
+        configuration. Raises `RecordingError` if this version of acsard cannot use the recorded
+        configuration or state.
         """
         super().__init__(recording)
         self._other, self._recorded = other, config_of(recording)
         self.config = other or self._recorded
         """Configuration with which the replay begins."""
         self.gaps: list[Gap] = []
-        """The gaps that were found so far."""
+        """The gaps that `steps()` has found so far."""
         self.number: int | None = None
         """Number of the last step that `steps()` yielded; None before the first step."""
         self.skipped: Callable[[Step], None] = lambda step: None
-        """Callback that is called with each step that can be read but not replayed."""
+        """Function that is called with each step that can be read, but not replayed."""
         self.copies = EventCopies(recording)
         self._next, self._state = _first_state(recording)
         """`_next` is the number of the step that `robot` can replay next. `_state` is the recorded
-        state with which `robot` was made, or None for a new robot."""
+        state from which `robot` was rebuilt, or None for a new robot."""
         self.robot, self.memory = self._state or (Robot(self.config), Memory())
-        """`robot` replays the steps, and `memory` is the memory of its guard. After a gap, both
-        come from the next robot state in the file."""
+        """`robot` is the robot that replays the steps, and `memory` is the memory of its guard.
+        After a gap, `steps()` replaces them with those of the next robot state in the file."""
         if self._state is not None:
             with self.state_errors():
                 adopt(self.robot, Robot(self._recorded), Robot(self.config))
 
     def steps(self) -> Iterator[Step]:
-        """Yield the steps that can be replayed. Raises `RecordingError` if there are none."""
+        """Yield the steps that can be replayed, in order. Collect the gaps in `gaps`.
+
+        Raises `RecordingError` if no step can be replayed.
+        """
         recording = self._recording
         replayed_ns = recording.about.mono_ns
         read, damaged = self._next, 0
@@ -287,7 +309,10 @@ class RecordedRun(_Source):
         return gap
 
     def _resume(self, saved: Checkpoint | None, number: int) -> bool:
-        """Continue at the step `number` with the robot in `saved`. Return False if that fails."""
+        """Go on at the step `number` with the robot in the checkpoint `saved`.
+
+        Return False if this is not possible, else True.
+        """
         other = self._other
         tried = None if other is None else partial(_with_changes, other, self._recorded)
         state = self._resumed(saved, number, tried)
@@ -301,11 +326,14 @@ class RecordedRun(_Source):
 def _with_changes(other: Config, recorded: Config, present: Config) -> Config:
     """Return `other` with the settings that clients changed while the recorded robot ran.
 
-    `recorded` is the configuration at the beginning of the recording, and `present` is the later
-    configuration that includes the changes. If the changed values are not permitted together with
-    `other`, the result is `other` itself, because a robot with the configuration `other` would have
-    refused the changes.
+    If the changed values are not permitted together with `other`, return `other` itself.
+
+    Args:
+        other: the configuration of the replay.
+        recorded: the configuration at the beginning of the recording.
+        present: the configuration of the recorded robot after the changes.
     """
+    # A robot with the configuration `other` would have refused changes that are not permitted.
     before = dict(flat(effective(recorded)))
     changes = {k: v for k, v in flat(effective(present)) if before.get(k) != v}
     try:
@@ -317,10 +345,15 @@ def _with_changes(other: Config, recorded: Config, present: Config) -> Config:
 def replay_file(
     recording: Recording, other: Config | None = None, progress: Progress = no_progress
 ) -> ReplayResult:
-    """Replay a recording with the configuration `other`, or the recorded one if `other` is None.
+    """Replay a recording, and compare the replayed outputs with the recorded outputs.
 
-    Calls `progress` every `PROGRESS_STEPS` steps. Raises `RecordingError` if the recording cannot
-    be replayed.
+    Args:
+        recording: the recording to replay.
+        other: the configuration of the replay; None for the recorded configuration.
+        progress: function that is called every `PROGRESS_STEPS` steps.
+
+    Raises:
+        RecordingError: the recording cannot be replayed.
     """
     run = RecordedRun(recording, other)
     with run.state_errors():
@@ -336,10 +369,15 @@ def replay_file(
 
 
 def _failed_step(recording: Recording, robot: Robot, last: int | None) -> str:
-    """Replay the step in which the daemon failed, and return the text for `failed_step`.
+    """Replay the step in which the recorded daemon failed.
 
-    `last` is the number of the last replayed step, or None if there was none, and `robot` is the
-    robot after that step. The failed step is replayed only if it has the number `last` + 1.
+    Return the text for `ReplayResult.failed_step`. The step is replayed only if its number is
+    `last` + 1.
+
+    Args:
+        recording: the recording, after `messages()` has yielded the last message.
+        robot: the robot after the last replayed step.
+        last: the number of the last replayed step; None if no step was replayed.
     """
     if recording.unfinished is None:
         return ""
@@ -363,17 +401,24 @@ def _failed_step(recording: Recording, robot: Robot, last: int | None) -> str:
 class DisplayReplay(_Source):
     """Replays every readable step of a recording, to display the recorded drive.
 
-    If steps are missing, the replayed robot may be wrong until the next robot state in the file.
+    In contrast to `RecordedRun`, the replay does not skip steps after a gap. After missing steps,
+    the state of the replayed robot may be wrong until the next robot state in the file.
     """
 
     def __init__(self, recording: Recording) -> None:
-        """Read the recording; raise `RecordingError` if its configuration cannot be read."""
+        """Read the configuration and the first robot state of the recording.
+
+        If the state cannot be used, the replay begins with a new robot, and `notes` says so. Raises
+        `RecordingError` if this version of acsard cannot use the configuration.
+        """
         super().__init__(recording)
         self.notes: list[str] = []
-        """Notes for the user about how this replay may differ from the recorded drive."""
+        """Notes for the user about possible differences between this replay and the recorded
+        drive."""
         self.config = config_of(recording)
+        """Configuration at the beginning of the recording."""
         self._in_gap = False
-        """True after a missing step, until the replay resumes with a robot state from the file."""
+        """True after missing steps, until the replay goes on with a robot state from the file."""
         try:
             _, self._state = _first_state(recording)
             with self.state_errors():
@@ -388,11 +433,10 @@ class DisplayReplay(_Source):
             )
 
     def steps(self) -> Iterator[tuple[Step, Outputs, Robot]]:
-        """Yield a triple for each step: the recorded step, its replayed outputs, and the robot.
+        """Yield a triple for each readable step: the step, its replayed outputs, and the robot.
 
-        The robot is in its state after the step.
-
-        Raises `RecordingError` if the recorded state lacks a part that a step uses.
+        The robot has just replayed the step. Raises `RecordingError` if the robot fails because its
+        recorded state lacks a part.
         """
         saved: Checkpoint | None = None
         number: int | None = None
@@ -419,10 +463,11 @@ class DisplayReplay(_Source):
 
 
 def _first_state(recording: Recording) -> tuple[int, State | None]:
-    """Return a pair: the number of the first step, and the recorded state before that step.
+    """Return the robot state with which a recording begins.
 
-    The pair is (0, None) if the recording has no state before its first step. Raises
-    `RecordingError` if the state is damaged, or if this version cannot read it.
+    The result is a pair: the number of the step that follows the state, and the state. It is
+    (0, None) if the recording has no state before its first steps. Raises `RecordingError` if the
+    state is damaged, or if this version of acsard cannot use it.
     """
     for topic, _, data in recording.messages():
         if topic == "state":
@@ -446,24 +491,30 @@ def _foreign(recording: Recording, reason: str) -> RecordingError:
 class EventCopies:
     """Finds the first event in a recording that differs from its copy.
 
-    A file has each event twice: in its step, and as a message of the channel `events`. In the order
-    of the file, call `batch()` for each batch of steps, and `copy()` for each message of that
-    channel. Call `end()` after the last message.
+    A file contains each event twice: in the step of the event, and as a message of the channel
+    `events`. In the order of the file, call `batch()` for each batch of steps, and `copy()` for
+    each message of the channel `events`. Call `end()` after the last message.
     """
 
     def __init__(self, recording: Recording) -> None:
         self.difference = ""
-        """Sentence about the first copy that differs, or "" if all copies are equal."""
+        """Text about the first event that differs from its copy; "" if all events equal their
+        copies."""
         self._recording = recording
         self._events: list[TimelineEntry] = []
+        """The events in the steps of the most recent batch."""
         self._copies: list[TimelineEntry] = []
+        """The messages of the channel `events` since the most recent batch."""
         self._number: int | None = None
         """Number of the step that follows the most recent batch; None before the first batch."""
         self._damaged = 0
         """Value of `Recording.damaged` when the most recent batch was read."""
 
     def batch(self, steps: list[Step]) -> None:
-        """Compare the previous batch with its copies, and store the events of the new batch."""
+        """Process the next batch of steps.
+
+        The events of the previous batch are compared with their copies.
+        """
         self._compare(last=False, follows=self._number in (None, steps[0].number))
         self._number, self._damaged = steps[-1].number + 1, self._recording.damaged
         self._events = [
@@ -474,7 +525,10 @@ class EventCopies:
         self._copies = []
 
     def copy(self, data: bytes) -> None:
-        """Store the copy of an event of the most recent batch. `data` encodes the copy."""
+        """Process a message of the channel `events`: the copy of an event in the previous batch.
+
+        `data` is the content of the message.
+        """
         try:
             self._copies.append(event_of(self._recording, data))
         except RecordingError as error:
@@ -483,8 +537,8 @@ class EventCopies:
     def end(self) -> None:
         """Compare the events of the last batch with their copies, and check the end record.
 
-        The end record is checked only if the file is finished and undamaged: its summary must agree
-        with the events.
+        The summary in the end record must agree with the events. This is checked only if the file
+        is finished and undamaged.
         """
         recording = self._recording
         self._compare(last=True)
@@ -504,8 +558,9 @@ class EventCopies:
         Nothing is compared if steps or copies may be missing because of damage.
 
         Args:
-            last: true if no batch follows. Copies may then be missing because the file was cut off.
-            follows: true if no step is missing between this batch and the next one.
+            last: true if this is the last batch. If the file was cut off, copies may then be
+                missing.
+            follows: true if no step is missing between this batch and the next batch.
         """
         recording = self._recording
         if recording.damaged > self._damaged or not follows:

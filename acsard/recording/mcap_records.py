@@ -1,16 +1,16 @@
 """Writes MCAP chunks in small pieces, and reads the MCAP records of files that may be damaged.
 
-The header of an MCAP chunk holds the chunk's length and checksum. Most programs therefore write a
-chunk only when it is complete, so that a power cut destroys the whole chunk. The recorder writes
-each chunk while the chunk grows:
+The header of an MCAP chunk contains the chunk's length and checksum. Most programs therefore write
+a chunk only when it is complete, so that a power cut destroys the whole chunk. The recorder instead
+writes each chunk while the chunk grows:
 
 1. First the recorder writes a header whose length field is larger than any file.
 2. Once a second it appends a zstd block with the new messages.
 3. When the chunk is complete, the recorder replaces the header by the true header.
 
-The reader does not need the header. Each zstd block holds its own length, and the field for the
-sequence number of each message holds the message's checksum. After a damaged chunk or a record
-whose length is wrong, the reader searches for the next complete chunk.
+The reader does not need the length and the checksum in the header. Each zstd block contains its own
+length, and each message contains a checksum in the field for its sequence number. After a damaged
+chunk or a record whose length is wrong, the reader searches for the next complete chunk.
 """
 
 from __future__ import annotations
@@ -29,73 +29,86 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, DataEnd, Footer, Header, McapRecord, Metadata
 from zstandard import COMPRESSOBJ_FLUSH_BLOCK, ZstdCompressionParameters
 
+# At this level, ten seconds of steps are compressed in 2 to 8 ms. The result is 13 to 16 % smaller
+# than at level 3.
 LEVEL = 9
-"""Compression level of zstd. At this level, ten seconds of steps are compressed in 2 to 8 ms. The
-result is 13 to 16 % smaller than at level 3."""
+"""Compression level of zstd."""
 
 PARAMETERS = ZstdCompressionParameters.from_level(
     LEVEL, source_size=1 << 18, write_content_size=False
 )
-"""Parameters of zstd for chunks of 256 KiB. With them the compressor needs 3 MB of memory."""
+"""Parameters of the zstd compressor for chunks of 256 KiB. The compressor then needs 3 MB of
+memory."""
 
 LAST_BLOCK = b"\x01\0\0"
-"""An empty zstd block that is marked as the last one. It completes a chunk that was cut off."""
+"""Empty zstd block with the mark of a last block. It completes a chunk that was cut off."""
 
 MAX_CHUNK_BYTES = 1 << 23
-"""Largest uncompressed chunk that is read, bytes. Recorders write up to 1 MiB plus one message."""
+"""Largest uncompressed size of a chunk that is read, bytes. Recorders write at most 1 MiB plus one
+message."""
 
 MAX_MESSAGE_BYTES = 1 << 22
 """Largest message that is read, bytes. One second of steps and 20 commands take 16 000 bytes."""
 
 _HEAD = struct.Struct("<BQQQQII4sQ")
-"""Header of a chunk record. The fields are: opcode, length of the record, earliest and latest time
-of a message, size of the uncompressed data, its CRC-32, length of the compression's name, this
-name, and size of the compressed data."""
+"""Layout of the header of an MCAP chunk record.
+
+The fields are: opcode, length of the record, earliest time of a message, latest time of a message,
+size of the uncompressed data, CRC-32 of the uncompressed data, length of the compression's name,
+name of the compression, and size of the compressed data.
+"""
 
 _AFTER_LENGTH = _HEAD.size - 9
-"""Number of bytes in a chunk's header after the length field. The value of that field includes
-these bytes."""
+"""Number of bytes in a chunk's header after the field "length of the record". The value of that
+field includes these bytes."""
 
 _NAME_AT = 37
-"""Offset of `ZSTD` from the beginning of a chunk's header, bytes."""
+"""Offset of the bytes `ZSTD` from the beginning of a chunk's header, bytes."""
 
 ZSTD = struct.pack("<I4s", 4, b"zstd")
-"""The length of the compression's name, and the name. Every chunk's header contains these bytes."""
+"""Bytes that every chunk's header contains: the length of the compression's name, and the name."""
 
 _ENDLESS = (1 << 63) - 1
-"""Value of the length field in the header of a growing chunk. No file is that long."""
+"""Value of the length fields in the header of a growing chunk. No file is that long."""
 
 _MESSAGE = struct.Struct("<BQHIQQ")
-"""Header of a message record: opcode, length, channel, sequence number, time of the log entry, and
-time of publication. A recording uses the sequence number for a checksum, and has equal times."""
+"""Layout of the header of an MCAP message record.
+
+The fields are: opcode, length of the record, channel, sequence number, log time and publish time.
+In a recording, the sequence number is a checksum, and the two times are equal.
+"""
 
 MAX_DATA_BYTES = MAX_MESSAGE_BYTES - _MESSAGE.size
+"""Largest size of the data of a message that is read, bytes."""
 
 _CHECKED = struct.Struct("<HQ")
 """Layout of a message's channel and time, which the checksum covers together with the data."""
 
 _BESIDE_DATA = _MESSAGE.size - 9
-"""Number of bytes in a message's header after the length field. The value of that field includes
-these bytes."""
+"""Number of bytes in a message's header after the field "length of the record". The value of that
+field includes these bytes."""
 
 _LONGEST_FRAME_HEAD = 18
+"""Largest size of the header of a zstd frame, bytes."""
 
 _BLOCK_BYTES = 1 << 17
 """Largest size of a zstd block, compressed or uncompressed, bytes."""
 
 _BLOCK_EFFORT = 1 << 10
-"""Work for each zstd block in addition to the work for its data, in unpacked bytes. Even an empty
-block takes about as long as 1 KiB of data."""
+"""Work that each zstd block adds to the work for its data, in unpacked bytes. Even an empty block
+takes about as long as 1 KiB of data."""
 
 _REPEATED = 1
-"""Type of a zstd block that holds a single byte and says how often to repeat this byte."""
+"""Type of a zstd block that contains a single byte, and the number of repetitions of this byte."""
 
 
 class Message(NamedTuple):
-    """A message of a chunk. `wall_ns` is its wall-clock time in ns since 1970, at least 0."""
+    """A message of a recording, as an MCAP chunk contains it."""
 
     channel: int
+    """Number of the MCAP channel."""
     wall_ns: int
+    """Wall-clock time of the message, ns since 1970, at least 0."""
     data: bytes
 
 
@@ -112,7 +125,7 @@ GROWING_HEAD = _head(0, 0, 0, 0, _ENDLESS)
 
 
 class GrowingChunk:
-    """A chunk that is being written: takes messages and returns compressed bytes."""
+    """A chunk that is being written. It takes messages, and returns compressed bytes."""
 
     def __init__(self) -> None:
         self._compressor = zstandard.ZstdCompressor(compression_params=PARAMETERS).compressobj()
@@ -139,15 +152,15 @@ class GrowingChunk:
         self._out += [self._compressor.compress(head), self._compressor.compress(data)]
 
     def take(self) -> bytes:
-        """Return the compressed bytes of the messages since the last call of `take`."""
+        """Return compressed bytes: those of the messages since the last call of `take`."""
         self._out.append(self._compressor.flush(COMPRESSOBJ_FLUSH_BLOCK))
         return self._taken()
 
     def end(self) -> tuple[bytes, bytes]:
-        """End the chunk, and return a pair of byte strings.
+        """End the chunk, and return a pair: the last bytes of the chunk, and its true header.
 
-        The first one contains the last bytes of the chunk. The second one is the true header, which
-        replaces the header at the beginning of the chunk.
+        The caller appends the last bytes to the file, and replaces the header at the beginning of
+        the chunk by the true header.
         """
         self._out.append(self._compressor.flush())
         last = self._taken()
@@ -161,27 +174,24 @@ class GrowingChunk:
 
 
 class ReadChunk(NamedTuple):
-    """The readable part of a chunk.
-
-    `complete` is true if the readable part includes the last block of the chunk.
-    """
+    """The readable part of a chunk."""
 
     begin: int
-    """Offset of the chunk's header in the file."""
+    """Offset in the file at which the chunk's header begins, bytes."""
     end: int
-    """Offset in the file at which the readable part ends. The last block of the readable part ends
-    with a complete message."""
+    """Offset in the file at which the readable part ends, bytes. The last zstd block of the
+    readable part ends with a complete message."""
     messages: list[Message]
     complete: bool
+    """True if the readable part includes the last zstd block of the chunk."""
     effort: int = 0
-    """Work of reading the chunk: its number of unpacked bytes, plus `_BLOCK_EFFORT` per block."""
+    """Work of reading the chunk: number of unpacked bytes, plus `_BLOCK_EFFORT` for each block."""
 
     def head(self, data: bytes) -> bytes:
         """Return a new chunk header that describes only the readable part of the chunk.
 
-        If `complete` is false, the caller must also write `LAST_BLOCK` at the offset `self.end`.
-        Two fields of the header then include the bytes of this block: the length of the record, and
-        the size of the compressed data. `data` is the content of the whole file.
+        `data` is the content of the whole file. If `complete` is false, the caller must also write
+        `LAST_BLOCK` at the offset `self.end`. The sizes in the header then include this block.
         """
         times = [message.wall_ns for message in self.messages]
         blocks = _blocks(data[: self.end], self.begin + _HEAD.size)
@@ -193,7 +203,10 @@ class ReadChunk(NamedTuple):
 
 
 def chunk_places(data: bytes, begin: int) -> Iterator[int]:
-    """Yield each offset, `begin` or later, at which a chunk may begin. `data` is the whole file."""
+    """Yield each offset in a file at which a chunk's header may begin, in increasing order.
+
+    `data` is the content of the whole file. The offsets are at least `begin`.
+    """
     at = data.find(ZSTD, begin + _NAME_AT)
     while at >= 0:
         yield at - _NAME_AT
@@ -201,7 +214,10 @@ def chunk_places(data: bytes, begin: int) -> Iterator[int]:
 
 
 def read_chunk(data: bytes, begin: int) -> ReadChunk | None:
-    """Read the chunk whose header begins at the offset `begin`; return None if there is none."""
+    """Read the chunk whose header begins at the offset `begin`, as far as it is readable.
+
+    Return None if no chunk begins at this offset. `data` is the content of the whole file.
+    """
     at = begin + _HEAD.size
     named = data.startswith(ZSTD, begin + _NAME_AT)
     if at > len(data) or not (named or data[begin] == Opcode.CHUNK):
@@ -209,7 +225,7 @@ def read_chunk(data: bytes, begin: int) -> ReadChunk | None:
     messages: list[Message] = []
     whole = ReadChunk(begin, at, messages, False)
     rest, size, effort, wanted = bytearray(), 0, 0, _MESSAGE.size
-    # Complete messages of a block that ends in the middle of a message.
+    # Complete messages since the last block that ended with a complete message.
     waiting: list[Message] = []
     try:
         for end, out, last in _blocks(data, at):
@@ -230,15 +246,19 @@ def read_chunk(data: bytes, begin: int) -> ReadChunk | None:
                 waiting.clear()
                 whole = ReadChunk(begin, end, messages, last)
     except zstandard.ZstdError:
-        # A block is damaged. The blocks after it refer to it, so they cannot be read either.
+        # A block is damaged. The next blocks refer to this block, so they cannot be read either.
         effort += _BLOCK_BYTES
     return whole._replace(effort=effort)
 
 
 def _blocks(data: bytes, at: int) -> Iterator[tuple[int, bytes, bool]]:
-    """Yield the triple (end offset, unpacked data, is the last block) of each zstd block.
+    """Yield the triple (end offset, unpacked data, is last) for each zstd block of a frame.
 
-    `at` is the offset at which the zstd frame begins. Raises `ZstdError` for a damaged block.
+    The end offset counts from the beginning of the file, bytes. `is last` is true for the last
+    block of the frame.
+
+    `data` is the content of the file. `at` is the offset at which the zstd frame begins. Raises
+    `ZstdError` for a damaged block.
     """
     begin = at + zstandard.frame_header_size(data[at : at + _LONGEST_FRAME_HEAD])
     unpacker = zstandard.ZstdDecompressor(max_window_size=1 << PARAMETERS.window_log)
@@ -249,7 +269,8 @@ def _blocks(data: bytes, at: int) -> Iterator[tuple[int, bytes, bool]]:
         block = int.from_bytes(data[begin : begin + 3], "little")
         last, kind, size = bool(block & 1), block >> 1 & 3, block >> 3
         end = begin + 3 + (1 if kind == _REPEATED else size)
-        # A disk may leave zeros after a power cut. Zeros would be decoded as endless empty blocks.
+        # After a power cut, a file may end with zeros. They would be decoded as endless empty
+        # blocks.
         if not block or size > _BLOCK_BYTES or end > len(data):
             return
         yield end, stream.decompress(data[begin:end]), last
@@ -259,8 +280,9 @@ def _blocks(data: bytes, at: int) -> Iterator[tuple[int, bytes, bool]]:
 def _messages(data: bytearray) -> tuple[list[Message], int, int]:
     """Decode the complete messages at the beginning of `data`.
 
-    Returns a triple: the messages, their total size in bytes, and the size of the next message in
-    bytes as far as it is known. This size exceeds `MAX_MESSAGE_BYTES` if that message is damaged.
+    Returns a triple: the messages, the total size of these messages, and the number of bytes that
+    are needed to continue with the next message. This number exceeds `MAX_MESSAGE_BYTES` if the
+    next message is damaged.
     """
     messages: list[Message] = []
     at = 0
@@ -283,19 +305,17 @@ DAMAGE = (
     McapError, msgspec.MsgspecError, zstandard.ZstdError, struct.error,
     ValueError, OverflowError, EOFError, MemoryError,
 )  # fmt: skip
-"""Exceptions that may occur when the bytes of a damaged file are decoded."""
+"""Exceptions that the decoders raise if the bytes of a file are damaged."""
 
 MAGIC = b"\x89MCAP0\r\n"
 
+# In the test recordings, each byte of a chunk unpacks to 5 to 13 bytes. The limit is larger,
+# because a damaged chunk is read up to three times, and a damaged block counts as 128 KiB.
 MAX_EFFORT = 256
-"""Limit on the work for damaged chunks, in unpacked bytes for each byte of the file.
-
-In the test recordings, each byte of a chunk unpacks to 5 to 13 bytes. The limit is larger, because
-a damaged chunk is read up to three times, and a damaged block counts as 128 KiB.
-"""
+"""Limit on the work for damaged chunks, in unpacked bytes for each byte of the file."""
 
 HEAD = struct.Struct("<BQ")
-"""Header of a record: its opcode, and the number of bytes that follow this header."""
+"""Layout of the header of an MCAP record: opcode, and number of bytes that follow the header."""
 
 READ: dict[int, Callable[[ReadDataStream], McapRecord]] = {
     Opcode.ATTACHMENT: Attachment.read,
@@ -304,10 +324,11 @@ READ: dict[int, Callable[[ReadDataStream], McapRecord]] = {
     Opcode.HEADER: Header.read,
     Opcode.METADATA: Metadata.read,
 }
-"""Maps the opcode of each kind of record in a recording, except chunks, to its decoder. The reader
-skips all other records."""
+"""Maps the opcodes of the MCAP records that are read to their decoders. Chunks have a decoder of
+their own, `read_chunk`."""
 
 OTHERS = frozenset(Opcode) - READ.keys() - {Opcode.CHUNK}
+"""Opcodes of the MCAP records that the reader skips."""
 
 
 def encoded(*records: McapRecord) -> bytes:
@@ -321,13 +342,14 @@ class Found(NamedTuple):
     """A record, a chunk or a damaged place of a file."""
 
     record: McapRecord | None
-    """The record; None for a chunk and for damage."""
+    """The decoded record; None for a chunk and for a damaged place."""
     chunk: ReadChunk | None
-    """The readable part of a chunk, even if the chunk is damaged; None for other records."""
+    """The readable part of a chunk, which may be damaged; None for any other record."""
     end: int
-    """Offset in the file at which this item ends and the next one begins, bytes."""
+    """Offset in the file at which the record, chunk or damaged place ends, bytes. The next item
+    begins at this offset."""
     damaged: bool = False
-    """True for a damaged place. If a file was cut off, its incomplete end does not count as
+    """True for a damaged place. The incomplete end of a file that was cut off does not count as
     damaged."""
 
     @property
@@ -336,10 +358,10 @@ class Found(NamedTuple):
 
 
 def walk(data: bytes) -> Iterator[Found]:
-    """Yield the records, chunks and damaged places of a file, up to its footer or its end.
+    """Yield the records, chunks and damaged places of a file in order, up to the MCAP footer.
 
-    If the work for damaged chunks exceeds `MAX_EFFORT`, the rest of the file counts as one damaged
-    place.
+    A file without a footer is read to its end. If the work for damaged chunks exceeds `MAX_EFFORT`,
+    the rest of the file counts as one damaged place. `data` is the content of the file.
     """
     at, stream, chunks = len(MAGIC), io.BytesIO(data), _Chunks(data)
     # If the first bytes of a finished file are damaged, its last bytes still identify it.
@@ -359,7 +381,7 @@ def walk(data: bytes) -> Iterator[Found]:
             after = chunks.later(at + 1)
             if claimed < (after or len(data)):
                 following = chunks.read(claimed)
-                # The next chunk is damaged as well, but its first messages can be read.
+                # If the next chunk is damaged as well, its first messages can still be read.
                 if following is not None and following.messages:
                     after = claimed
             cut = after is None and not chunks.spent and (not opcode or claimed > len(data))
@@ -372,10 +394,11 @@ def walk(data: bytes) -> Iterator[Found]:
 
 
 def _read(stream: io.BytesIO, at: int, opcode: int, claimed: int, size: int) -> Found | None:
-    """Decode the record at the offset `at`, whose length field says that it ends at `claimed`.
+    """Decode the record at the offset `at`.
 
-    `size` is the size of the file, bytes. Returns None if the opcode is not a key of `READ`, or if
-    the record is damaged or cut off.
+    Return None if the opcode is not a key of `READ`, or if the record is damaged or cut off.
+    `claimed` is the offset at which the record ends according to its length field. `size` is the
+    size of the file, bytes.
     """
     read = READ.get(opcode)
     if read is None:
@@ -392,7 +415,10 @@ def _read(stream: io.BytesIO, at: int, opcode: int, claimed: int, size: int) -> 
 
 
 def _is_intact(stream: io.BytesIO, at: int, end: int) -> bool:
-    """Return whether the attachment from `at` to `end` has a correct checksum or no checksum."""
+    """Return whether an attachment has a correct checksum, or has no checksum (0).
+
+    `at` and `end` are the offsets in the file at which the attachment begins and ends.
+    """
     stream.seek(at)
     record = stream.read(end - at)
     crc = int.from_bytes(record[-4:], "little")
@@ -400,29 +426,31 @@ def _is_intact(stream: io.BytesIO, at: int, end: int) -> bool:
 
 
 class _Chunks:
-    """Reads chunks, and finds the next complete chunk. No part of the file is searched twice.
+    """Reads chunks, and finds the next complete chunk. Limits the work for incomplete chunks."""
 
-    In a hostile file thousands of incomplete chunks may share the same blocks, and each chunk
-    unpacks to megabytes. So the work for incomplete chunks is limited in proportion to the file's
-    size.
-    """
+    # In a hostile file thousands of incomplete chunks may share the same blocks, and each chunk
+    # unpacks to megabytes. So the limit on the work is proportional to the file's size, and no part
+    # of the file is searched twice.
 
     def __init__(self, data: bytes) -> None:
         self._data = data
         self._effort = MAX_CHUNK_BYTES + MAX_EFFORT * len(data)
         """Work that may still be spent on incomplete chunks, in unpacked bytes."""
         self._searched = 0
+        """Offset up to which the file was searched for complete chunks, bytes."""
         self._found: int | None = None
+        """Offset of the complete chunk that was found last, bytes, or None."""
 
     @property
     def spent(self) -> bool:
-        """True if the work for incomplete chunks exceeds its limit. `later()` then stops."""
+        """True if the work for incomplete chunks exceeds its limit, so that `later()` stops."""
         return self._effort < 0
 
     def read(self, begin: int) -> ReadChunk | None:
-        """Read the chunk that begins at the offset `begin`; return None if there is none.
+        """Read the chunk whose header begins at the offset `begin`, as far as it is readable.
 
-        The work for an incomplete or empty chunk counts towards the limit.
+        Return None if no chunk begins at this offset. If the chunk is incomplete or empty, the work
+        of reading it counts towards the limit.
         """
         chunk = read_chunk(self._data, begin)
         if chunk is not None and not (chunk.complete and chunk.messages):
@@ -430,10 +458,10 @@ class _Chunks:
         return chunk
 
     def later(self, begin: int) -> int | None:
-        """Return the offset of the first complete chunk that begins at `begin` or later.
+        """Return the offset of the first complete chunk that begins at the offset `begin` or later.
 
-        Returns None if there is no such chunk, or if the work exceeds its limit. `begin` must not
-        be smaller than in the previous call.
+        Return None if the rest of the file contains no complete chunk, or if the work exceeds its
+        limit. `begin` must not be smaller than in the previous call.
         """
         if self._found is not None and self._found >= begin:
             return self._found

@@ -1,9 +1,9 @@
 """Rebuilds the messages that a robot published, while its recording is replayed.
 
 The daemon's class `Report` builds the messages as if a client had subscribed to every topic for the
-whole time. A recording does not hold the daemon's measurements of itself, so the rows of
-`diagnostics` with such measurements are omitted. The messages of `log` are the entries of
-`timeline.py`. Some of these entries, such as `drive` and `reason`, were not published by the robot.
+whole time. A recording does not contain the daemon's measurements of itself, so these values are
+omitted from `state` and `diagnostics`. The messages on `log` are the entries of `timeline.py`. The
+robot did not publish some of these entries, such as `drive` and `reason`.
 """
 
 from __future__ import annotations
@@ -24,22 +24,23 @@ from acsard.recording.recorded_steps import Step
 from acsard.recording.timeline import TimelineEntry, TimelineWriter
 
 MEASURED = frozenset({"acsard: control loop", "acsard: certificate"})
-"""Names of the rows of `diagnostics` whose values a recording does not hold."""
+"""Names of the rows that are omitted from `diagnostics`, because a recording does not contain their
+values."""
 
 
 ROUNDED_NS = 1000
-"""Upper bound of the rounding error of `TimelineEntry.seconds`, ns. The times of two steps always
-differ by more."""
+"""Upper bound of the rounding error of `TimelineEntry.seconds`, ns. The time between two steps is
+always longer."""
 
 
 class Published(NamedTuple):
-    """A message that a robot published or received, with its time."""
+    """A message that a robot published, or a command that it received, with the time."""
 
     channel: Channel
     source: str
-    """Source of a received command; "" for a published message."""
+    """Command source of a received command; "" for a published message."""
     wall_ns: int
-    """Wall-clock time of publication or arrival, ns since 1970."""
+    """Wall-clock time at which the message was published or the command arrived, ns since 1970."""
     message: Any
 
 
@@ -47,14 +48,16 @@ class Publisher:
     """Rebuilds the messages of a replayed robot, step by step."""
 
     def __init__(self, robot: Robot, started_ns: int) -> None:
-        """Prepare to rebuild the messages of `robot`, before its first step is replayed.
+        """Prepare for the first step.
 
-        `started_ns` is the time of the daemon's start, ns since 1970. It becomes the stamp of the
-        messages that never change.
+        Args:
+            robot: the robot that replays the steps, before its first step.
+            started_ns: wall-clock time of the daemon's start, ns since 1970. This time becomes the
+                stamp of the messages that never change.
         """
         self.robot = robot
-        """The robot that replays the steps. If the replay resumes with another robot, the caller
-        must assign that robot to this attribute."""
+        """The robot that replays the steps. If the replay goes on with another robot, the caller
+        must assign the new robot to this attribute."""
         self._config = robot.config
         self._report = Report(robot.config, Instant(0, started_ns))
         self._wanted = self._wanted_keys()
@@ -62,16 +65,18 @@ class Publisher:
         self._now = Instant(0, started_ns)
         self._static: TFMessage | None = None
         self._static_due = True
-        """True if `tf_static` must be built: at the first step, and when a setting has changed."""
+        """True if the message `tf_static` must be built: at the first step, and after a change of a
+        setting."""
 
     def _wanted_keys(self) -> frozenset[str]:
         names = {channel.native for channel in published_channels(left_out(self._config))}
         return frozenset(names & BY_KEY.keys())
 
     def step(self, step: Step, outputs: Outputs) -> Iterator[Published]:
-        """Yield the messages of a step that was just replayed: commands first, log lines last.
+        """Yield the messages of a step that was just replayed.
 
-        The steps must come in order. If the messages of a step are not wanted, call `skip` instead.
+        The received commands come first, and the log lines come last. `outputs` are the replayed
+        outputs. Call this method or `skip` for each step, in order.
         """
         # A step that changes a setting gives the robot a new configuration.
         if self.robot.config is not self._config:
@@ -89,7 +94,7 @@ class Publisher:
         yield from self.skip(step)
 
     def skip(self, step: Step) -> Iterator[Published]:
-        """Yield only the log lines of a step, which may be a step that was not replayed."""
+        """Yield only the log lines of a step. The step need not be replayed."""
         self._now = step.inputs.now
         yield from map(self._line, self._timeline.step(step))
 
@@ -102,8 +107,8 @@ class Publisher:
 
     def _line(self, entry: TimelineEntry) -> Published:
         wall_ns = round(entry.seconds * NS_PER_S)
-        # An entry's time is rounded to a fraction of a us. Use the exact time of its step instead,
-        # so that the log agrees with the stamps of the other messages.
+        # The time of an entry is rounded to a fraction of a us. Use the exact time of the step
+        # instead, so that the log agrees with the stamps of the other messages.
         if abs(wall_ns - self._now.wall_ns) < ROUNDED_NS:
             wall_ns = self._now.wall_ns
         line = Log(Time.from_ns(wall_ns), LEVELS[entry.level], entry.name, entry.sentence)

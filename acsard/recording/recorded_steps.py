@@ -1,4 +1,4 @@
-"""One control step as a recording stores it: all of its inputs, and its outputs.
+"""One control step as a recording stores it: all inputs, and the outputs that are worth comparing.
 
 Poses from odometry are rounded to um and urad. A checksum of the exact values lets a replay detect
 differences that are smaller than this rounding. `rows.py` encodes batches of steps.
@@ -30,8 +30,8 @@ from acsard.core.values import (
 MICRO = 1e6
 
 Status = tuple[str, str, str, str]
-"""Tuple: mode of the robot, reason of the mode in words, state of the link, and source that
-commands the robot ("" if there is none)."""
+"""Tuple: the robot's mode, the reason of this mode in words, the state of the link to the board,
+and the name of the source that commands the robot ("" without a source)."""
 
 Micropose = tuple[int, int, int]
 """Pose as integers: x and y in um, yaw in urad."""
@@ -40,7 +40,7 @@ _DOUBLES = struct.Struct("<9d")
 
 
 class Taken(NamedTuple):
-    """A finished step that the control loop hands to the recorder."""
+    """A finished step, as the control loop passes it to the recorder."""
 
     inputs: Inputs
     outputs: Outputs
@@ -49,24 +49,25 @@ class Taken(NamedTuple):
 
 
 class Start(NamedTuple):
-    """State of the robot before the step `number`.
+    """The robot's state before the step `number`, as the control loop passes it to the recorder.
 
-    The recorder begins a new file with a `Start`, or writes it as a checkpoint into the present
-    file.
+    The recorder begins a new file with this state, or adds the state to the present file as a
+    checkpoint.
     """
 
     number: int
     state: bytes
-    """The robot and its guard, encoded by `state.freeze`; empty for a new robot."""
+    """The robot and the memory of its guard, encoded by `state.freeze`; empty for a new robot."""
     config: Config
-    """Configuration before step `number`. It includes all changes since the daemon's start."""
+    """Configuration before the step `number`, with all changes since the daemon's start."""
 
 
 def runs(items: list[Taken | Start]) -> Iterator[tuple[Start | None, list[Taken]]]:
-    """Split the recorder's queue at each `Start`, and yield a pair for each part.
+    """Split the items of the recorder's queue at each `Start`.
 
-    The pair is a `Start` and the steps that follow it. The first pair has None instead of a
-    `Start`: its steps continue those that were taken from the queue before.
+    Yields pairs of a `Start` and the list of the steps that follow this `Start`. The first pair
+    contains None, and the steps before the first `Start`. These steps continue the steps that were
+    taken from the queue earlier.
     """
     start: Start | None = None
     steps: list[Taken] = []
@@ -80,7 +81,7 @@ def runs(items: list[Taken | Start]) -> Iterator[tuple[Start | None, list[Taken]
 
 
 class BlackBox(Protocol):
-    """Interface of the recorder for the control loop. No method waits for the disk."""
+    """Interface through which the control loop uses the recorder. No method waits for the disk."""
 
     def begins(self, robot: Robot, guard: Guard) -> None:
         """Record the state of the robot and of its guard before the first step."""
@@ -95,7 +96,10 @@ class BlackBox(Protocol):
         """
 
     def died(self, inputs: Inputs) -> None:
-        """Record the inputs of the step in which the daemon failed, just before the daemon ends."""
+        """Record the inputs of the step in which the daemon failed.
+
+        Call this method once, after the failure and before the daemon ends.
+        """
 
     @property
     def status(self) -> Recording:
@@ -106,50 +110,55 @@ class RecordedOutputs(Struct, frozen=True):
     """The part of a step's outputs that a recording stores."""
 
     line: bytes | None
-    """Line that the robot decided to send, or None."""
+    """Line to the board that the robot decided to send, or None."""
     sent: bytes | None
-    """Line that was written to the serial port, or None."""
+    """Line that the daemon wrote to the serial port, or None."""
     status: Status
     poses: tuple[Micropose, ...]
-    """One pose for each feedback line that odometry accepted."""
+    """One pose for each feedback line of the board that odometry accepted in this step."""
     events: tuple[Event, ...] = ()
     checksum: int | None = None
-    """CRC-32 of the exact poses, twists and wheel rotations in the whole batch. Only the last
-    step of a batch has this checksum; it is None in the other steps."""
+    """CRC-32 of the exact poses, twists and wheel angles of all steps in a batch (see the function
+    `checksum`). Only the last step of a batch has this value. It is None in all other steps."""
     names: int | None = None
-    """CRC-32 of all `input_names()` of the batch; None in a file of an older version. Only the last
-    step of a batch has this checksum; it is None in the other steps."""
+    """CRC-32 of the names in the inputs of all steps in a batch (see the function `input_names`).
+    Only the last step of a batch has this value. It is None in all other steps, and in files of
+    older versions."""
 
 
 class Step(Struct, frozen=True):
-    """A decoded step. `number` counts the steps since the daemon's start."""
+    """A step that was read from a recording."""
 
     number: int
+    """Number of the step. It counts the steps since the daemon's start, from 0."""
     inputs: Inputs
     recorded: RecordedOutputs
     begins: bool = False
-    """True for the first step of a batch, at which both checksums restart from 0."""
+    """True for the first step of a batch. The checksums of the exact values and of the names
+    restart from 0 at this step."""
 
 
 class UnfinishedError(AcsardError):
-    """The record of the step in which the daemon failed cannot be decoded.
+    """The recorded inputs of the step in which the daemon failed cannot be decoded.
 
-    The daemon failed before it finished this control step. The record therefore contains the inputs
-    of the step, but no outputs (`Unfinished`).
+    A recording stores these inputs in a message of its own, on the channel `unfinished`, because
+    the daemon did not finish this control step.
     """
 
 
 class Unfinished(Struct, frozen=True):
     """Inputs of the control step in which the daemon failed.
 
-    The daemon did not finish this step, so the record contains only the inputs of the step.
+    There are no outputs, because the daemon did not finish this step.
     """
 
     number: int
+    """Number of the step. It counts the steps since the daemon's start, from 0."""
     inputs: Inputs
 
     def encode(self) -> bytes:
-        """Encode the inputs with field names, because a later version may add fields."""
+        """Return the content of a message on the channel `unfinished`, in MessagePack."""
+        # The encoding contains the field names, because a later version may add fields.
         return msgspec.msgpack.encode(self)
 
 
@@ -157,7 +166,7 @@ _unfinished = msgspec.msgpack.Decoder(Unfinished)
 
 
 def unfinished(data: bytes) -> Unfinished:
-    """Decode the record of the control step in which the daemon failed.
+    """Decode a message of the channel `unfinished`: the step in which the daemon failed.
 
     Raises `UnfinishedError` if the bytes are damaged.
     """
@@ -170,10 +179,13 @@ def unfinished(data: bytes) -> Unfinished:
 
 
 def checksum(estimates: Sequence[Estimate], before: int) -> int:
-    """Extend the CRC-32 `before` by the estimates of a step, and return the new CRC-32.
+    """Return the CRC-32 of the estimates in a batch of steps, up to and including this step.
 
-    The CRC-32 covers all bits of the poses, the twists and the angles by which the wheels turned.
-    `before` is 0 for the first step of a batch.
+    It covers all bits of the poses, of the twists and of the angles by which the wheels turned.
+
+    Args:
+        estimates: the estimates of this step.
+        before: the CRC-32 of the earlier steps of the batch; 0 for the first step.
     """
     for e in estimates:
         pose, twist = e.pose, e.twist
@@ -183,10 +195,13 @@ def checksum(estimates: Sequence[Estimate], before: int) -> int:
 
 
 def input_names(inputs: Inputs, before: int) -> int:
-    """Extend the CRC-32 `before` by the names in the inputs of a step, and return the new CRC-32.
+    """Return the CRC-32 of the names in a batch of steps, up to and including this step.
 
-    The names are those of sources, senders and clients. `before` is 0 for the first step of a
-    batch.
+    It covers the names of sources, senders and clients in the inputs.
+
+    Args:
+        inputs: the inputs of this step.
+        before: the CRC-32 of the earlier steps of the batch; 0 for the first step.
     """
     names = [
         *[name for command in inputs.commands for name in (command.source, command.sender)],
@@ -199,7 +214,10 @@ def input_names(inputs: Inputs, before: int) -> int:
 
 
 def count_superseded(commands: Sequence[Command]) -> int:
-    """Return how many commands of a step are followed by a newer command of the same sender."""
+    """Return the number of commands that are followed by a newer command of the same sender.
+
+    `commands` are the commands of one step, in order.
+    """
     return len(commands) - len({(command.source, command.sender) for command in commands})
 
 

@@ -1,9 +1,9 @@
 """The black box of a running daemon: records each step without delaying the control loop.
 
 The control loop puts each step into a bounded queue. Once a second a thread writes the queued steps
-as a block, and syncs the file to the disk. If the queue is full, further steps are lost and
-counted. The recording then goes on in a new file that begins with the robot's state, so that the
-new file can be replayed.
+to a file, and syncs the file to the disk. If the queue is full, further steps are lost and counted.
+The recording then goes on in a new file that begins with the robot's state, so that the new file
+can be replayed.
 """
 
 from __future__ import annotations
@@ -26,62 +26,74 @@ MAX_QUEUED_STEPS = 4096
 """Largest number of queued steps. At 400 steps a second, the queue is full after 10 s."""
 
 SLOW_NS = 3 * NS_PER_S
-"""Duration of a sync, ns, above which the log reports that the disk hangs."""
+"""If a sync of the file to the disk takes longer than this, ns, the log reports that the disk
+hangs."""
 
 SLOW = "the disk has accepted no data for 3 s"
 
 PAUSE_NS = NS_PER_S // 4
-"""Largest part of the time between two steps that counts as a wait for the disk, ns.
+"""Largest part of the time between two steps that counts as duration of a sync, ns.
 
-If two steps are further apart, the whole process was stopped for the rest of the time. The disk is
-not the cause of that.
+If the time between two steps is longer, the whole process was stopped, and the disk is not the
+cause.
 """
 
 FLUSH_S = 0.98
-"""Pause between two syncs of the file, s. The pause and one sync together take about a second."""
+"""Pause between two syncs of the file to the disk, s. The pause and one sync together take about a
+second."""
 
 MAX_TEXT = 200
 """Number of characters to which the text of an exception is cut."""
 
 CLOSE_S, MARK_S = 0.5, 0.1
-"""Time limits of `Recorder.close()`, s: `CLOSE_S` for the end of the file, and `MARK_S` for the
-marker that is written instead if the disk is too slow."""
+"""Time limits in `Recorder.close()`, s. `CLOSE_S` applies to writing the last steps and the end of
+the file. If the disk is too slow for that, `MARK_S` applies to writing a marker file."""
 
 
 class Recorder:
-    """The black box of a running daemon. `step` never waits; a thread writes to the disk."""
+    """The black box of a running daemon.
+
+    The control loop calls `step`, which never waits for the disk. A thread writes the steps to the
+    disk.
+    """
 
     def __init__(
         self, config: Config, report: Callable[[Event], None], started_ns: int = 0
     ) -> None:
         """Start the thread that writes to the disk.
 
-        `report` receives events about the recorder itself. Only `step()` calls it, so it runs in
-        the thread of the control loop. `started_ns` is the wall-clock time of the daemon's start,
-        ns since 1970. An export uses it as the stamp of the messages that never change.
+        Args:
+            config: the configuration at the daemon's start.
+            report: receives events about the recorder itself. Only `step()` calls this function, so
+                the function runs in the thread of the control loop.
+            started_ns: wall-clock time of the daemon's start, ns since 1970. An export uses this
+                time as the stamp of the messages that never change.
         """
         self._queue: deque[Taken | Start] = deque()
         self._report = report
         self._events: deque[Event] = deque()
-        """Events from the recorder's thread. `step` passes them to `report`."""
+        """Events from the recorder's thread. Each call of `step` passes one event to `report`."""
         self._number = 0
+        """Number of the next step. It counts the steps since the daemon's start."""
         self._lost = 0
-        """Number of steps lost because the queue was full."""
+        """Number of steps that were lost because the queue was full."""
         self._full = False
+        """True after the queue was full, until half of the queue is free again."""
         self._syncs = 0
         """Value of `StepWriter.syncs` at the last step."""
         self._waited_ns = self._now_ns = 0
         """Duration of the present sync so far, and monotonic time of the last step, both in ns."""
         self._slow = False
-        """True from the report that the disk hangs until the report that it accepts data again."""
+        """True while the disk hangs, as far as the log has reported it."""
         self._lost_before = 0
         """Number of steps that were already lost when the disk began to hang."""
         self._failed_inputs: Inputs | None = None
         """Inputs of the step in which the daemon failed, or None."""
         self._wants_state = False
-        """True if the thread needs the robot's state for a new file or a checkpoint.
+        """True if the control loop must queue the robot's state for a new file or a checkpoint.
 
-        The thread sets this flag. `step` queues the state and clears the flag.
+        The recorder's thread sets this flag, and also `step` after the queue was full. When `step`
+        queues the state, it clears the flag.
         """
         self._writer = StepWriter(config, self._events.append, self._request_state, started_ns)
         self._over = threading.Event()
@@ -91,9 +103,10 @@ class Recorder:
     # These methods run in the control loop's thread.
 
     def begins(self, robot: Robot, guard: Guard) -> None:
-        """Record the state of the robot and its guard before the first step.
+        """Record the state of the robot and of its guard before the first step.
 
-        Without this call, a replay of the first file begins with a new robot and a new guard.
+        This call may be omitted. A replay of the first file then begins with a new robot and a new
+        guard.
         """
         self._queue.append(Start(0, freeze(robot, guard.memory), robot.config))
 
@@ -137,7 +150,10 @@ class Recorder:
             queue.append(Start(self._number, freeze(robot, guard.memory), robot.config))
 
     def _watch_disk(self, now_ns: int) -> None:
-        """Report when the disk begins to hang, and when a sync ends in time again."""
+        """Report when the disk begins to hang, and when it is fast enough again.
+
+        `now_ns` is the monotonic time of the present step, ns.
+        """
         before, self._syncs = self._syncs, self._writer.syncs
         passed = self._syncs - before
         if passed:
@@ -164,7 +180,7 @@ class Recorder:
             self._slow, self._lost_before = True, self._lost
 
     def died(self, inputs: Inputs) -> None:
-        """Record the inputs of the step in which the daemon failed, just before the daemon ends."""
+        """Keep the inputs of the step in which the daemon failed. `close` records them."""
         self._failed_inputs = inputs
 
     @property
@@ -180,11 +196,15 @@ class Recorder:
         return Recording(self._writer.where, trouble, self._lost + self._writer.lost)
 
     def close(self, error: BaseException | None = None) -> None:
-        """Write the last steps and the end of the file within `CLOSE_S`.
+        """Write the last steps and the end of the file, and wait at most `CLOSE_S` for that.
 
-        `error` is the exception that ends the daemon. An `Exception` is a failure of the daemon.
-        None, or any other exception such as `KeyboardInterrupt`, is an ordinary end. If the disk is
-        too slow after an ordinary end, write a marker that says so.
+        If the disk is slower, and the daemon has not failed, also try to write a marker file with
+        this reason, for at most `MARK_S`.
+
+        Args:
+            error: the exception that ends the daemon. An `Exception` is a failure of the daemon.
+                None, or any other exception such as `KeyboardInterrupt`, is an ordinary end. In an
+                exception group, the first exception counts.
         """
         while isinstance(error, BaseExceptionGroup):
             error = error.exceptions[0]

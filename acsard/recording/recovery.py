@@ -1,7 +1,9 @@
-"""Finishes a recording that was cut off: as a copy, or in place if the disk has no room for a copy.
+"""Finishes a recording that was cut off, so that the file has an end record.
 
-Recovery deletes no readable data. If this version cannot read a file, or if the disk has no room
-even for its end record, the file is renamed and its content stays unchanged.
+The readable data is copied to a new file. If the disk has no room for a copy, the end record is
+written to the old file instead. Recovery deletes no readable data. If this version cannot read a
+file, or if the disk has no room even for the end record, the file is only renamed, and its content
+stays unchanged.
 """
 
 from __future__ import annotations
@@ -23,24 +25,33 @@ from acsard.recording.mcap_records import LAST_BLOCK, MAGIC, chunk_places, encod
 FULL = (errno.ENOSPC, errno.EDQUOT)
 
 NOTHING_BYTES = 64 << 10
-"""Largest size of a file that is deleted if it has no readable data, bytes.
+"""Size limit below which a file without readable data is deleted, bytes.
 
-A larger file has more than a header and one second of steps, so it is never deleted.
+A larger file contains more than a header and one second of steps. It is never deleted.
 """
 
 
 def recover(part: Path, whole: Path, cut: str, room: bool) -> str:
-    """Make the finished file `whole` from the recording `part`, which was cut off.
+    """Finish a recording that was cut off, and give it its final name.
 
-    A small file without any data is deleted. Any other file that this version cannot read is
-    renamed, and its content stays unchanged. Returns a message for the log, or "" if there is
-    nothing to report. Raises `OSError` if the disk refuses to read or write.
+    Usually this function writes a finished copy at `whole` and deletes `part`. If the disk has no
+    room for a copy, it finishes `part` in place and renames it to `whole`. There are two
+    exceptions:
+
+    - A small file without any data is deleted.
+    - Any other file that this version cannot read is renamed to `whole`, with unchanged content.
 
     Args:
-        part: the file that was cut off; it is removed or renamed.
+        part: path of the file that was cut off.
         whole: path of the finished file.
-        cut: why the file was cut off, a key of `CUTS`.
+        cut: the cause that cut off the file, a key of `CUTS`.
         room: true if the disk has room for a copy.
+
+    Returns:
+        A message for the log, or "" if there is nothing to report.
+
+    Raises:
+        OSError: the disk refuses to read or write.
     """
     before, message = part.stat(), ""
     try:
@@ -78,22 +89,21 @@ def recover(part: Path, whole: Path, cut: str, room: bool) -> str:
 
 
 def _has_configuration(part: Path) -> bool:
-    """Return whether the file has an attachment, which holds the configuration.
-
-    `Recording` refuses a file without a configuration.
-    """
+    # The attachment of a recording contains the configuration. `Recording` refuses a file without a
+    # configuration.
     return any(isinstance(place.record, Attachment) for place in walk(part.read_bytes()))
 
 
 def _has_chunks(part: Path) -> bool:
-    """Return whether the file has the header of a chunk, even if the chunk is unreadable."""
+    """Return whether the file has the header of a chunk. Its content may be unreadable."""
     return any(True for _ in chunk_places(part.read_bytes(), 0))
 
 
 def _copy(recording: Recording, part: Path, whole: Path, cut: str) -> bool:
-    """Write the readable data of `recording` to `whole`, and then delete `part`.
+    """Copy the readable data of `recording` to `whole`, and then delete its file `part`.
 
-    `cut` says why the recording was cut off, a key of `CUTS`. Returns False if the disk is full.
+    `cut` is the cause that cut off the recording, a key of `CUTS`. Return False without a copy if
+    the disk is full, else True.
     """
     written = part.with_name(f".{part.name}.new")
     written.unlink(missing_ok=True)
@@ -109,15 +119,15 @@ def _copy(recording: Recording, part: Path, whole: Path, cut: str) -> bool:
 
 
 def _finish_in_place(recording: Recording, part: Path, cut: str) -> bool:
-    """Write the missing end of the file `part` directly after its last readable data.
+    """Write the missing end of the file `part`, and the true headers of its unfinished chunks.
 
-    The end overwrites incomplete data. Each `GROWING_HEAD` is replaced by the true header of its
-    chunk. If an earlier recovery was interrupted after it had written the end, only the headers are
-    written. `cut` says why the recording was cut off, a key of `CUTS`.
+    The end is written directly after the last readable data, and overwrites incomplete data. `cut`
+    is the cause that cut off the recording, a key of `CUTS`.
 
-    Returns False if the disk has no room for the end. The file is then unchanged. Readable data is
-    not removed to make room, because on some disks this does not help.
+    Return True on success. Return False, and leave the file unchanged, if the disk has no room for
+    the end.
     """
+    # Readable data is not removed to make room, because on some disks this does not help.
     builder = EndRecordBuilder(recording.about)
     for topic, wall_ns, data in recording.messages():
         builder.message(topic, wall_ns, data)
@@ -147,14 +157,15 @@ def _finish_in_place(recording: Recording, part: Path, cut: str) -> bool:
 def _writes(before: bytes, last: EndRecord) -> tuple[list[tuple[int, bytes]], int]:
     """Return a pair: the writes that finish a file, and the size of the finished file in bytes.
 
-    Each write is a pair (offset, data). The first write is the end of the file, unless an earlier
-    recovery wrote it. It comes first because the disk may have no room for it. The other writes
-    replace headers of chunks.
+    Each write is a pair (offset, data). The first write is the end of the file. The other writes
+    are the true headers of chunks. If an interrupted recovery has already written the end of the
+    file, there are only headers.
 
     Args:
         before: the present content of the file.
         last: the end record of the finished file.
     """
+    # The end comes first, because the disk may have no room for it.
     heads: list[tuple[int, bytes]] = []
     chunk, index = None, Index()
     for place in walk(before):
@@ -184,7 +195,10 @@ def _writes(before: bytes, last: EndRecord) -> tuple[list[tuple[int, bytes]], in
 
 
 def _put(stream: FileIO, at: int, data: bytes) -> None:
-    """Write `data` at the offset `at` and sync it. An error may leave only a part of it written."""
+    """Write `data` at the offset `at` of the file, and sync the file to the disk.
+
+    If the disk refuses to write, a part of `data` may have been written.
+    """
     stream.seek(at)
     while data:
         data = data[stream.write(data) :]
@@ -192,12 +206,14 @@ def _put(stream: FileIO, at: int, data: bytes) -> None:
 
 
 def _end(last: EndRecord, index: Index, at: int) -> bytes:
-    """Return the bytes from the end record `last` to the end of an MCAP file.
+    """Return the last bytes of an MCAP file: the end record `last`, the summary and the footer.
 
-    The caller writes these bytes at the offset `at`. Their summary section comes from `index`. It
-    does not repeat the schema and the channels, because the disk may be nearly full. It has the
-    statistics, because some readers treat a file without statistics as empty.
+    The caller writes these bytes at the offset `at` of the file. `index` contains the data of the
+    summary.
     """
+    # The summary section does not repeat the schema and the channels, because the disk may be
+    # nearly full. It has the statistics, because some readers treat a file without statistics as
+    # empty.
     record = Metadata(END, as_metadata(last))
     data = encoded(record)
     index.record(record, at, len(data))

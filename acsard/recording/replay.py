@@ -1,8 +1,8 @@
-"""Replays steps: runs `Robot.step` over the recorded inputs and compares the outputs.
+"""Replays steps: runs `Robot.step` with the recorded inputs, and compares the outputs.
 
 A robot's behavior depends only on its inputs and its configuration. So the same code with the same
-configuration reproduces every line, mode and pose. With other code or another configuration, the
-differences show how the robot would have behaved.
+configuration reproduces every line to the board, every mode and every pose. If the code or the
+configuration has changed, the differences show how the changed robot would have behaved.
 """
 
 from __future__ import annotations
@@ -49,75 +49,91 @@ Output = Literal[
 ]
 """Name of an output whose recorded and replayed values are compared.
 
-`line` is the line that the robot decided to send, and `sent line` is the line after the check by
-the guard. `event` is any property of an event except its text and its client. `client` is the name
-of the client in an event. `input names` are compared by a checksum of the whole batch, so a
-difference is reported at the last step of the batch.
+- line: The line to the board that the robot decided to send.
+- sent line: The line that was sent after the guard had checked it.
+- event: All properties of an event except its text and its client.
+- client: The name of the client that caused an event.
+- input names: The names in the inputs of a step. One checksum covers all steps of a batch, so a
+  difference is reported at the last step of the batch.
 """
 
 WORDING: frozenset[Output] = frozenset({"reason", "event text"})
-"""Outputs that are text for people. Another version may word them differently."""
+"""Outputs that are text for people. Another version of acsard may use other words in such a
+text."""
 
 
 class Difference(Struct, frozen=True):
-    """A step whose replayed outputs differ from the recorded ones."""
+    """A step whose replayed outputs differ from the recorded outputs."""
 
     number: int
+    """Number of the step. It counts the steps since the daemon's start."""
     at: Instant
     what: tuple[Output, ...]
+    """Names of the outputs that differ."""
     recorded: RecordedOutputs
     replayed: RecordedOutputs
     trip: str
-    """Why the guard replaced the replayed line; "" if the guard did not replace it."""
+    """Why the guard replaced the replayed line by zeros; "" if the guard did not replace it."""
 
 
 class Comparison(Struct):
-    """Result of a replay so far: how many outputs were compared, how many are equal, and the first
-    differences."""
+    """Result of a replay so far.
+
+    It contains the number of outputs that were compared, the number of outputs that are equal, and
+    the first differences.
+    """
 
     steps: int = 0
     lines: int = 0
-    """Number of steps with a recorded line, a replayed line or both."""
+    """Number of steps in which the recorded robot, the replayed robot or both decided to send a
+    line."""
     lines_same: int = 0
     poses: int = 0
+    """Number of recorded poses."""
     poses_same: int = 0
     modes_same: int = 0
     reasons_same: int = 0
     links_same: int = 0
     sources_same: int = 0
     events: int = 0
-    """Number of compared events. Each step adds its number of recorded or of replayed events,
-    whichever is larger."""
+    """Number of compared events. If a step has more recorded events than replayed events, or the
+    other way round, the larger number counts."""
     events_same: int = 0
     exact: bool = True
-    """True if every checksum so far matches, so that all poses are equal to the last bit."""
+    """True if all poses, twists and wheel angles so far are equal to the last bit. They are
+    compared by checksums."""
     first: Difference | None = None
+    """First step in which any output differs, or None."""
     first_by_output: dict[Output, Difference] = {}
-    """Maps each output that differs to the first step in which it differs."""
+    """Maps the name of each output that differs to the first step in which the output differs."""
     fault: Difference | None = None
-    """First step in which the replayed robot, but not the recorded one, is in the mode `fault`."""
+    """First step in which the replayed robot is in the mode `fault` and the recorded robot is not,
+    or None."""
     apart: float = 0.0
-    """Largest distance between the recorded and the replayed pose, m."""
+    """Largest distance so far between the recorded and the replayed position, m."""
     fastest: tuple[int, int] = (0, 0)
-    """Pair: the highest wheel speed in the recorded lines and in the replayed lines, 0.01 rad/s."""
+    """Pair: the highest wheel speed in the recorded lines, and the highest wheel speed in the
+    replayed lines, both in 0.01 rad/s."""
     end: tuple[Micropose, Micropose] | None = None
-    """Pair: the last recorded pose, and the replayed pose at that step; None before any pose."""
+    """Pair: the last recorded pose, and the replayed pose after that step. None before the first
+    pose."""
 
     @property
     def same(self) -> bool:
-        """True if every compared output is equal. Poses are compared to the um."""
+        """True if every compared output is equal. Poses are first rounded to um and urad."""
         return self.first is None
 
     @property
     def only_words(self) -> bool:
-        """True if outputs differ, but only in the wording of reasons and event texts."""
+        """True if outputs differ, but all differences are in the texts of reasons and events."""
         return not self.same and self.first_by_output.keys() <= WORDING
 
 
 def replay_step(robot: Robot, step: Step) -> Outputs:
-    """Run `robot.step` with the inputs of a recorded step, and return the outputs.
+    """Run `robot.step` with the inputs of a recorded step, and return the new outputs.
 
-    Also update the robot's counters of lines and commands, as the daemon's control loop did.
+    Also update the robot's counters `lines_sent`, `lines_superseded` and `commands_superseded`,
+    which the daemon's control loop updates while it records.
     """
     recorded, inputs = step.recorded, step.inputs
     if superseded := count_superseded(inputs.commands):
@@ -136,9 +152,12 @@ class Replay:
     def __init__(
         self, config: Config, robot: Robot | None = None, memory: Memory | None = None
     ) -> None:
-        """Start with `robot` and the `memory` of its guard.
+        """Prepare for the first step.
 
-        If `robot` is None, start with a new robot that has the configuration `config`.
+        Args:
+            config: the configuration of a new robot. It is used only if `robot` is None.
+            robot: the robot that replays the steps, or None for a new robot.
+            memory: the memory of the robot's guard, or None for a new guard.
         """
         self.outputs: Outputs | None = None
         """Outputs of the last replayed step; None before the first step."""
@@ -148,15 +167,19 @@ class Replay:
         self._pose: Micropose = (0, 0, 0)
 
     def resume(self, robot: Robot, memory: Memory | None) -> None:
-        """Continue with another robot and the memory of its guard, for example after a gap."""
+        """Replay the next steps with another robot, for example after missing steps.
+
+        `memory` is the memory of this robot's guard, or None for a new guard.
+        """
         self.robot = robot
         self._config = robot.config
         self._guard = Guard(robot.session.codec.stop, robot.config, memory)
 
     def step(self, step: Step) -> Difference | None:
-        """Replay a step, and return how its outputs differ from the recorded outputs.
+        """Replay a step, and update `outputs` and `comparison`.
 
-        Returns None if they are equal.
+        Returns the difference between the recorded and the replayed outputs, or None if these
+        outputs are equal. The steps must come in order.
         """
         if step.begins:
             self._checksum = self._names = 0
@@ -169,7 +192,7 @@ class Replay:
         self._checksum = checksum(outputs.estimates, self._checksum)
         self._names = input_names(step.inputs, self._names)
         if step.recorded.sent is not None:
-            # The board obeyed the recorded line, even if the replay decides another one.
+            # The board obeyed the recorded line, even if the replayed robot decides another line.
             self._guard.left(step.recorded.sent)
         poses = tuple([micropose(estimate) for estimate in outputs.estimates])
         sent = line if step.recorded.sent is not None else None
@@ -257,7 +280,10 @@ def _different_parts(
 
 @lru_cache(64)
 def fastest(line: bytes | None) -> int:
-    """Return the highest wheel speed in a line, in hundredths of rad/s; 0 if `line` is None."""
+    """Return the highest absolute wheel speed in a line to the board, in 0.01 rad/s.
+
+    Returns 0 without a line.
+    """
     if line is None:
         return 0
     tokens = [line[start + 2 : start + 7].replace(b".", b"") for start in (0, 8, 16, 24)]

@@ -15,17 +15,17 @@ from acsard.recording.recorded_steps import MICRO, RecordedOutputs
 from acsard.recording.replay import Comparison, Difference, fastest
 
 HUNDREDTHS = 100.0
-"""Divisor that converts the wheel speeds in a line to rad/s."""
+"""Divisor that converts a wheel speed in 0.01 rad/s to rad/s."""
 
 LINE_SETTINGS = ("limits.", "drive.", "mcu.wheels.")
 """Prefixes of the names of the settings that affect the speeds in the lines to the board."""
 
 MAX_KEYS = 8
-"""Largest number of changed settings that a line of text names."""
+"""Largest number of changed settings that are named in one line of text."""
 
 
 def verdict(comparison: Comparison) -> str:
-    """Describe the result of a replay in one line."""
+    """Return one line of text: how many replayed outputs of each kind equal the recorded ones."""
     c = comparison
     shares = (
         ("poses", c.poses_same, c.poses),
@@ -46,9 +46,9 @@ def _share(same: int, total: int) -> str:
 
 
 def explain_verdict(other: bool) -> str:
-    """Return a sentence that explains the figures of `verdict()`.
+    """Return a paragraph that explains the numbers in the text of `verdict()`.
 
-    `other` is true if the replay used another configuration than the recorded one.
+    `other` is true if the replay used another configuration than the recorded configuration.
     """
     computed = "with the other configuration" if other else "with this version of acsard"
     return (
@@ -61,9 +61,9 @@ def explain_verdict(other: bool) -> str:
 
 
 def describe_gaps(gaps: Sequence[Gap], how: str) -> str:
-    """Return a sentence with the seconds and steps in the gaps, or "" if there are no gaps.
+    """Return a text with the duration of the gaps and the number of steps in them.
 
-    The sentence begins with `how`, for example "not compared".
+    The text begins with `how`, for example "not compared". It is "" if `gaps` is empty.
     """
     if not gaps:
         return ""
@@ -87,9 +87,9 @@ def describe_gaps(gaps: Sequence[Gap], how: str) -> str:
 def describe_difference(difference: Difference, began_ns: int) -> list[str]:
     """Return lines of text with the recorded and the replayed outputs of a step.
 
-    The step is the first step whose recorded and replayed outputs differ.
-
-    `began_ns` is the monotonic time at which the recording began, ns.
+    Args:
+        difference: the first step whose recorded and replayed outputs differ.
+        began_ns: the monotonic time at which the recording began, ns.
     """
     seconds = (difference.at.mono_ns - began_ns) / 1e9
     what = ", ".join(difference.what)
@@ -122,11 +122,15 @@ def _event(event: Event) -> str:
 def explain_settings(
     recorded: Config, other: Config, comparison: Comparison, began_ns: int
 ) -> list[str]:
-    """Return lines of text that relate the differences of a replay to the changed settings.
+    """Return lines of text about the effects of changed settings in a replay.
 
-    The replay used the configuration `other` instead of `recorded`.
+    They name the changed settings, the first line to the board that differs, and a new fault.
 
-    `began_ns` is the monotonic time at which the recording began, ns.
+    Args:
+        recorded: the recorded configuration.
+        other: the configuration that the replay used instead.
+        comparison: the result of the replay.
+        began_ns: the monotonic time at which the recording began, ns.
     """
     before, after = (dict(flat(effective(config))) for config in (recorded, other))
     keys = [key for key in before | after if before.get(key) != after.get(key)]
@@ -168,7 +172,11 @@ def _speeds(recorded: int, replayed: int) -> str:
 
 
 def describe_outcome(comparison: Comparison) -> list[str]:
-    """Return lines of text that compare the motion of the replayed and the recorded robot."""
+    """Return lines of text that compare the motion of the recorded and the replayed robot.
+
+    They contain the number of different lines to the board, the highest wheel speeds, the last
+    poses, and the largest distance between the two paths.
+    """
     rows = [
         f"{comparison.lines - comparison.lines_same} of {comparison.lines} lines to the board "
         f"differ from the recorded ones, and {comparison.steps - comparison.modes_same} of "

@@ -1,10 +1,13 @@
 """Decides which recordings are deleted, and which are retained because of an incident.
 
-A recording is protected if an incident, such as a fault, happened in it or within a minute of it.
-`Disk.spare` is the free space that recordings leave to other programs. If less than that is free,
-old unprotected recordings are deleted, but not the newest recording. Protected recordings and the
-newest recording are deleted only if less than a fifth of `Disk.spare` is free, or if the limit on
-the total size is exceeded.
+A recording is protected if an incident, such as a fault, happened in the recording or within a
+minute of it. Only the newest `KEPT_FILES` recordings with an incident are protected.
+
+- An unprotected recording is deleted when it is too old.
+- Recordings leave some free space to other programs (`Disk.spare`). If less space is free,
+  unprotected recordings are deleted, the oldest first, but not the newest recording.
+- If less than a fifth of that space is free, or if the recordings exceed the limit on their total
+  size, protected recordings and the newest recording are deleted too.
 """
 
 from __future__ import annotations
@@ -19,40 +22,47 @@ from acsard.core.values import NS_PER_S, Instant
 File = TypeVar("File")
 
 Kind = Literal["plain", "near", "kept"]
-"""Retention class of a recording: an incident happened in it (`kept`), within a minute of it
-(`near`), or neither (`plain`)."""
+"""Retention class of a recording.
+
+- kept: An incident happened in the recording.
+- near: An incident happened less than a minute before or after the recording.
+- plain: No incident happened in the recording or near it.
+"""
 
 AROUND_NS = 60 * NS_PER_S
-"""A recording is retained if it ended or began within this time of an incident, ns."""
+"""Time before and after an incident, ns. Recordings that ended or began in this time are
+protected."""
 
 KEPT_FILES = 50
-"""Largest number of `kept` recordings that are protected."""
+"""Largest number of `kept` recordings that are protected. If there are more, only the newest
+recordings are protected."""
 
 FILES = 100
-"""The size limit of one file is the limit on the total size divided by this number. So 50 protected
-files take about half of the total size."""
+"""Divisor that gives the size limit of one file from the limit on the total size. With this number,
+50 protected files take about half of the total size."""
 
 LEAST_BYTES = 100_000
 """Size to which a recording file may always grow, even if the disk is nearly full, bytes."""
 
 SPARE = 0.05
-"""Fraction of the disk's size that the recordings leave to other programs. On a large disk they
-leave only `SPARE_BYTES`."""
+"""Fraction of the disk's size that recordings leave free for other programs, but at most
+`SPARE_BYTES`."""
 
 SPARE_BYTES = 1_000_000_000
-"""Largest space that the recordings leave to other programs, bytes. They leave less space only on a
-disk of less than 20 GB."""
+"""Largest space that recordings leave free for other programs, bytes. On a disk of less than 20 GB,
+they leave the fraction `SPARE`, which is less."""
 
 NEEDED = 0.2
-"""If less than this fraction of `Disk.spare` is free, protected recordings are deleted too."""
+"""Fraction of `Disk.spare`. If less space than this is free, protected recordings are deleted
+too."""
 
 JUMP_NS = 60 * NS_PER_S
 """Largest change of the wall clock that counts as a correction and not as a jump, ns. The change is
 measured against the monotonic clock, between two calls of `ClockWatch.jump_ns()`."""
 
 STEADY_NS = 600 * NS_PER_S
-"""Time without a jump of the wall clock, ns, after which this clock may decide that a recording is
-too old."""
+"""Time without a jump of the wall clock, ns, after which the wall clock is trusted. Recordings are
+deleted because of their age only while the clock is trusted."""
 
 
 class Disk(NamedTuple):
@@ -63,40 +73,49 @@ class Disk(NamedTuple):
 
     @property
     def spare(self) -> int:
-        """Number of bytes that the recordings leave to other programs."""
+        """Number of bytes that recordings leave free for other programs."""
         return min(int(self.total * SPARE), SPARE_BYTES)
 
     @property
     def low(self) -> bool:
+        """True if less than `spare` bytes are free."""
         return self.free < self.spare
 
 
 class Ended(NamedTuple):
+    """A recording file that is finished."""
+
     name: str
+    """Name of the file."""
     number: int
+    """Number at the beginning of the file's name. Newer files have larger numbers."""
     kind: Kind
     size: int
     """Size in bytes."""
     at_s: float
     """Wall-clock time at which the recording ended, s since 1970."""
     this_run: bool = False
-    """True if the recording ended in this run of the daemon. It then never counts as too old."""
+    """True if the recording ended in this run of the daemon. Such a recording never counts as too
+    old."""
 
 
 class Bounds(NamedTuple):
-    """Limits of all recordings together."""
+    """Limits on the total size and on the age of the recordings."""
 
     size: int
-    """Largest total size in bytes."""
+    """Largest total size of all recordings, bytes."""
     oldest_s: float
-    """Recordings that ended before this time are too old, s since 1970. It is -inf if the wall
-    clock is not trusted."""
+    """Wall-clock time, s since 1970. Recordings that ended earlier are too old. The time is -inf if
+    the wall clock is not trusted."""
 
 
 def share(bound: int, own: int, disk: Disk) -> int:
-    """Return how large one recording file may become, bytes.
+    """Return the size limit of one recording file, bytes.
 
-    `bound` is the limit on the total size of all recordings. `own` is their present total size.
+    Args:
+        bound: the limit on the total size of all recordings, bytes.
+        own: the present total size of all recordings, bytes.
+        disk: the size and the free space of the disk.
     """
     return max(LEAST_BYTES, min(bound, own + disk.free - disk.spare) // FILES)
 
@@ -106,13 +125,19 @@ def to_delete(
 ) -> set[str]:
     """Return the names of the recordings that must be deleted so that one more file fits.
 
-    `ended` must be sorted by `Ended.number`. If the disk accepts data, `freed` is None. If it
-    refuses to write, even though it may report free space, `freed` is the number of bytes that were
-    deleted since its first refusal. The refusal has these consequences:
+    Args:
+        ended: all finished recordings, sorted by `Ended.number`.
+        bounds: the limits on the total size and on the age.
+        disk: the size and the free space of the disk.
+        freed: None if the disk accepts data. If the disk refused the last write, the number of
+            bytes that were deleted since the first refusal.
 
-    - `freed` is 0: at least one recording is deleted, even if all of them are protected.
-    - `freed` is less than `LEAST_BYTES`: at least one more unprotected recording is deleted.
-    - `freed` is `LEAST_BYTES` or more: no recording is deleted because of the refusal.
+    A disk may refuse to write although it reports free space. So a refusal alone has these effects:
+
+    - If `freed` is 0, at least one recording is deleted, even if all recordings are protected.
+    - If `freed` is less than `LEAST_BYTES`, at least one unprotected recording is deleted, if any
+      exists.
+    - If `freed` is `LEAST_BYTES` or more, the refusal has no effect.
     """
     protected = _protected(ended)
     plain = [file for file in ended if file.name not in protected]
@@ -138,8 +163,8 @@ def to_delete(
 def _protected(ended: Sequence[Ended]) -> set[str]:
     """Return the names of the protected recordings.
 
-    These are the `KEPT_FILES` newest `kept` recordings, and the `near` recordings in their groups
-    (see `_groups`).
+    These are the newest `KEPT_FILES` recordings of the class `kept`, and all `near` recordings that
+    are in a group with one of these (see `_groups`).
     """
     kept = {file.name for file in [file for file in ended if file.kind == "kept"][-KEPT_FILES:]}
     return {
@@ -152,7 +177,10 @@ def _protected(ended: Sequence[Ended]) -> set[str]:
 
 
 def _groups(ended: Sequence[Ended]) -> Iterator[list[Ended]]:
-    """Yield groups of recordings that are not `plain`. The numbers in a group are consecutive."""
+    """Yield the groups of successive recordings that are not `plain`.
+
+    The file numbers in a group are consecutive.
+    """
     group: list[Ended] = []
     for file in ended:
         if file.kind == "plain":
@@ -165,16 +193,23 @@ def _groups(ended: Sequence[Ended]) -> Iterator[list[Ended]]:
 
 
 class ClockWatch(Struct):
-    """Detects jumps of the wall clock, and trusts the clock again `STEADY_NS` after a jump."""
+    """Detects jumps of the wall clock.
+
+    The clock is trusted if it has not jumped for `STEADY_NS`.
+    """
 
     _since_ns: int | None = None
-    """Monotonic time of the last jump, or of the first call of `jump_ns()` if there was no jump,
-    ns. None before the first call."""
+    """Monotonic time of the last jump, ns. If there was no jump, the time of the first call of
+    `jump_ns()`. None before this call."""
     _ahead_ns: int = 0
-    """Offset of the wall clock from the monotonic clock at the last call of `jump_ns`, ns."""
+    """Wall-clock time minus monotonic time at the last call of `jump_ns()`, ns."""
 
     def jump_ns(self, now: Instant) -> int:
-        """Return by how much the wall clock jumped since the last call, ns; 0 without a jump."""
+        """Return the size of a jump of the wall clock since the last call, ns.
+
+        The result is positive if the clock was set forward, and negative if it was set back. It is
+        0 at the first call, and if the clock changed by at most `JUMP_NS`.
+        """
         ahead_ns = now.wall_ns - now.mono_ns
         jumped_ns = 0 if self._since_ns is None else ahead_ns - self._ahead_ns
         self._ahead_ns = ahead_ns
@@ -184,31 +219,37 @@ class ClockWatch(Struct):
         return 0
 
     def trusted(self, now: Instant) -> bool:
-        """Return whether the wall clock was watched for `STEADY_NS` without a jump."""
+        """Return True if the wall clock has been watched for `STEADY_NS` without a jump."""
         return self._since_ns is not None and now.mono_ns - self._since_ns >= STEADY_NS
 
 
 class IncidentWindow(Generic[File]):
-    """Finds the files that an incident protects. All times are monotonic, in ns.
+    """Finds the files that an incident protects.
 
-    An incident protects the file in which it happens, and all files within a minute of it.
+    An incident protects the file in which it happens, and the files that ended or began less than a
+    minute before or after the incident.
     """
 
     def __init__(self) -> None:
         self.kind: Kind = "plain"
         """Retention class of the file that is being written."""
         self._recent: list[tuple[File, int]] = []
-        """Plain files that ended less than a minute ago, each with the time of its end, ns."""
+        """Recent `plain` files, each with the monotonic time of its end, ns."""
         self._happened_ns = -AROUND_NS
+        """Monotonic time of the last incident, ns."""
 
     def begin(self, now_ns: int) -> None:
-        """Register the beginning of a new file."""
+        """Register the beginning of a new file, and set its class `kind`.
+
+        `now_ns` is the present monotonic time, ns.
+        """
         self.kind = "near" if now_ns - self._happened_ns < AROUND_NS else "plain"
 
     def happened(self, now_ns: int) -> list[File]:
-        """Register an incident in the current file, which becomes `kept`.
+        """Register an incident in the current file, at the monotonic time `now_ns`, ns.
 
-        Returns the earlier plain files that the caller must retain too.
+        The current file becomes `kept`. Returns the `plain` files that ended less than a minute
+        ago. The caller must give them the class `near`.
         """
         self.kind, self._happened_ns = "kept", now_ns
         close = [file for file, ended_ns in self._recent if now_ns - ended_ns < AROUND_NS]
@@ -216,18 +257,29 @@ class IncidentWindow(Generic[File]):
         return close
 
     def end(self, file: File, last_ns: int) -> None:
-        """Register the end of the current file; `last_ns` is the time of its last step."""
+        """Register the end of the current file.
+
+        `last_ns` is the monotonic time of the last step in the file, ns.
+        """
         self._recent = [(older, ns) for older, ns in self._recent if last_ns - ns < AROUND_NS]
         if self.kind == "plain":
             self._recent.append((file, last_ns))
 
     def earlier(self, file: File, kind: Kind, ended_ns: int) -> None:
-        """Register a file of the previous run of the daemon, with the time of its end."""
+        """Register a file of the previous run of the daemon.
+
+        The incident of a `kept` file counts as if it happened at the end of the file. `ended_ns` is
+        the time of this end on the present monotonic clock, ns. After a restart of the computer the
+        time may be negative.
+        """
         if kind == "plain":
             self._recent.append((file, ended_ns))
         elif kind == "kept":
             self.earlier_happened(ended_ns)
 
     def earlier_happened(self, at_ns: int) -> None:
-        """Register the time of an incident or a crash in the previous run of the daemon."""
+        """Register an incident or a crash in the previous run of the daemon.
+
+        `at_ns` is the time of the incident on the present monotonic clock, ns.
+        """
         self._happened_ns = max(self._happened_ns, at_ns)

@@ -44,35 +44,36 @@ FORMAT = "3"
 """Version of the encoding of the messages in a recording."""
 
 MAX_ROWS = 4096
-"""Largest number of rows in a batch. The recorder's queue never holds more steps."""
+"""Largest number of rows in a batch that `decode` accepts. The recorder's queue contains at most
+this number of steps."""
 
 MAX_TIME_NS = 1 << 61
-"""Largest accepted age of a serial read, and largest accepted `Rare.late_ns`, ns: 73 years.
+"""Limit on two durations in a recorded step, ns: the age of a serial read, and `Rare.late_ns`.
 
-The limit on a monotonic time is twice as large.
+It is 73 years. The limit on a monotonic time is twice as large.
 """
 
 MAX_OFFSET_NS = 1 << 62
 """Limit on the offset of the wall clock from the monotonic clock, ns.
 
-Below this limit, the sum of the offset and a monotonic time fits in 64 bits. A clock with the right
-time reaches the limit in the year 2116.
+The limit ensures that the sum of this offset and a monotonic time fits in 64 bits. A correct wall
+clock reaches the limit in the year 2116.
 """
 
 
 class BatchError(AcsardError):
-    """The bytes are not a valid batch of steps."""
+    """A recorded batch of steps is damaged, or contains values that no daemon records."""
 
 
 class Rare(Struct, frozen=True, omit_defaults=True):
-    """The inputs and outputs that are absent or unchanged in most steps.
-
-    None in `opened`, `trouble` or `status` means that the value of the previous row still applies.
-    """
+    """The part of a row with the inputs and outputs that are absent or unchanged in most steps."""
 
     opened: int | None = None
+    """`Inputs.opened`; None if it is the same as in the previous row of the batch."""
     trouble: str | None = None
+    """`Inputs.port_trouble`; None if it is the same as in the previous row of the batch."""
     status: Status | None = None
+    """Status of the robot; None if it is the same as in the previous row of the batch."""
     missed: int = 0
     late_ns: Annotated[int, Meta(ge=0, le=MAX_TIME_NS)] = 0
     guard_trip: str = ""
@@ -88,18 +89,18 @@ NOTHING = Rare()
 
 
 class Read(NamedTuple):
-    """One read from the serial port. Its times are in units of `Batch.unit`."""
+    """The bytes of one read from the serial port, and the time of this read."""
 
     age: int
     """Time from the read to the step that processes the bytes, in units of `Batch.unit`."""
     offset: int
-    """Offset of the wall clock from the monotonic clock at the read, minus `Batch.offset_ns`, in
-    units of `Batch.unit`."""
+    """Change of the wall clock against the monotonic clock, from the first step of the batch to the
+    read, in units of `Batch.unit`."""
     data: bytes
 
 
 class Row(Struct, frozen=True, array_like=True):
-    """One step. Its times are in units of `Batch.unit`."""
+    """One step as a recording stores it."""
 
     tick: bool
     port_open: bool
@@ -107,39 +108,42 @@ class Row(Struct, frozen=True, array_like=True):
     shutting_down: bool
     superseded: bool
     now: int
-    """Monotonic time of the step, in units of `Batch.unit`. It is counted from the most recent
-    earlier row whose `tick` is true, or from `Batch.mono_ns` if the batch has no such row."""
+    """Monotonic time of the step, as the time since the last earlier row with a true `tick`. If the
+    batch has no such row, it is the time since `Batch.mono_ns`. The unit is `Batch.unit`."""
     offset: int
-    """Offset of the wall clock from the monotonic clock at the step, minus `Batch.offset_ns`, in
-    units of `Batch.unit`."""
+    """Change of the wall clock against the monotonic clock, from the first step of the batch to
+    this step, in units of `Batch.unit`."""
     reads: tuple[Read, ...]
     line: bytes | None
+    """Line to the board that the robot decided to send, or None."""
     sent: bytes | bool
-    """True if `line` was sent, False if no line was sent, or the bytes that were sent instead."""
+    """True if the daemon sent `line`, and False if it sent no line. If the daemon sent another line
+    than `line`, these are the bytes that it sent."""
     poses: tuple[Micropose, ...]
     """Poses in um and urad. Each pose is stored as its difference from the previous pose of the
     batch. The first pose of the batch is stored unchanged."""
     rare: Rare | None
+    """Further inputs and outputs; None if all of them are absent or unchanged."""
 
 
 class Batch(Struct, frozen=True, array_like=True):
-    """A batch of steps as a recording stores it."""
+    """A batch of successive steps, as a recording stores it."""
 
     first: int
-    """Number of the first step."""
+    """Number of the first step of the batch. It counts the steps since the daemon's start."""
     mono_ns: int
     """Monotonic time of the first step, ns."""
     offset_ns: int
-    """Offset of the wall clock from the monotonic clock at the first step, ns."""
+    """Wall-clock time minus monotonic time at the first step, ns."""
     unit: Annotated[int, Meta(ge=1)]
     """Unit of the times in `rows`, ns: the greatest common divisor of these times. It is at least
     1000 if the clocks count in us."""
     rows: Annotated[tuple[Row, ...], Meta(min_length=1, max_length=MAX_ROWS)]
     checksum: int
-    """CRC-32 of all estimates of the batch: the poses, the twists and the angles by which the
-    wheels turned."""
+    """CRC-32 of the exact poses, twists and wheel angles of all steps in the batch."""
     names: int | None = None
-    """CRC-32 of all `input_names` of the batch; None if an older version recorded it."""
+    """CRC-32 of the names in the inputs of all steps in the batch; None in a file of an older
+    version."""
 
 
 class _First(Struct, frozen=True, array_like=True):
@@ -154,7 +158,12 @@ _decoder_of_first = msgspec.msgpack.Decoder(_First)
 
 
 def encode(first: int, taken: Sequence[Taken]) -> bytes:
-    """Encode 1 to `MAX_ROWS` successive steps, the first of which has the number `first`."""
+    """Encode successive steps as a batch.
+
+    Args:
+        first: the number of the first step. It counts the steps since the daemon's start.
+        taken: 1 to `MAX_ROWS` steps.
+    """
     start = taken[0].inputs.now
     offset_ns = start.wall_ns - start.mono_ns
     times = list(_times(taken, start.mono_ns, offset_ns))
@@ -192,10 +201,10 @@ def encode(first: int, taken: Sequence[Taken]) -> bytes:
 
 
 def _times(taken: Sequence[Taken], mono_ns: int, offset_ns: int) -> Iterator[list[int]]:
-    """Yield a list of times, ns, for each row.
+    """Yield the times of each row as a list, in ns.
 
-    The list begins with the `now` and `offset` of the row. The `age` and `offset` of each of its
-    reads follow.
+    The list contains `Row.now` and `Row.offset`, and then `Read.age` and `Read.offset` of each
+    read.
     """
     tick_ns = mono_ns
     for inputs, _, _ in taken:
@@ -236,9 +245,9 @@ def _rares(taken: Sequence[Taken]) -> Iterator[Rare]:
 
 
 def decode(data: bytes) -> list[Step]:
-    """Decode a batch of steps.
+    """Return the steps of an encoded batch.
 
-    Raises `BatchError` if the bytes are damaged, or if they hold values that no daemon records.
+    Raises `BatchError` if the bytes are damaged, or if they contain values that no daemon records.
     """
     try:
         return list(_steps(_decoder.decode(data)))
@@ -247,7 +256,7 @@ def decode(data: bytes) -> list[Step]:
 
 
 def first_of(data: bytes) -> int | None:
-    """Return the number of the first step of a batch, or None if the bytes are damaged."""
+    """Return the number of the first step of an encoded batch, or None if the bytes are damaged."""
     try:
         return _decoder_of_first.decode(data).number
     except msgspec.MsgspecError:
@@ -318,10 +327,10 @@ def _sent(row: Row) -> bytes | None:
 
 
 def _instant(batch: Batch, mono_ns: int, offset: int) -> Instant:
-    """Return the instant with the monotonic time `mono_ns`.
+    """Return an instant: the monotonic time `mono_ns`, and the wall-clock time at that time.
 
-    `offset` is the field of this name of a `Row` or a `Read` in `batch`. Raises `ValueError` if a
-    time is out of range.
+    `offset` is a `Row.offset` or a `Read.offset` of the batch. Raises `ValueError` if a time is out
+    of range.
     """
     ahead_ns = batch.offset_ns + offset * batch.unit
     if abs(mono_ns) >= 2 * MAX_TIME_NS or abs(ahead_ns) >= MAX_OFFSET_NS:
@@ -330,9 +339,9 @@ def _instant(batch: Batch, mono_ns: int, offset: int) -> Instant:
 
 
 def _require_finite(rare: Rare) -> None:
-    """Raise `ValueError` if a number in requests or gyro samples is NaN or infinite.
+    """Raise `ValueError` if a number in a request or in a gyro sample is NaN or infinite.
 
-    The robot itself checks the numbers in commands.
+    The numbers in commands are not checked here, because the robot checks them.
     """
     for request in rare.requests:
         pose = request.pose

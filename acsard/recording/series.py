@@ -1,8 +1,8 @@
 """Finds the recordings of a range of time, and reads successive files as one recording.
 
-The daemon splits the recording of one run into several files. The last step of one file and the
-first step of the next file have consecutive numbers. Such files are read as one `Series`, so that a
-drive or a replay can continue from one file to the next.
+The daemon splits the recording of one run into several files. The last step of a file and the first
+step of the next file have consecutive numbers. Such files are read as one `Series`, so that a drive
+or a replay can continue from one file to the next.
 """
 
 from __future__ import annotations
@@ -22,16 +22,17 @@ from acsard.recording.file import Recording, Topic
 from acsard.recording.time_span import Contents, Span, clock, part_between, read_contents
 
 MARGIN_S = 60.0
-"""Tolerance for the times in an end record, and for the time between two files of a series, s.
+"""Tolerance of a search, s.
 
-The end record contains the time at which the last message begins. If the disk is slow, this message
-may hold many seconds of steps. Therefore a file is read even if the times in its end record miss
-the searched range by up to `MARGIN_S`. In a series, the first step of a file comes less than
-`MARGIN_S` after the last step of the previous file.
+- A file is read if the times in its end record are at most this far from the searched range. The
+  end record contains the time of the first step in the last message. If the disk is slow, this
+  message may contain many seconds of steps.
+- In a series, the first step of a file comes less than this time after the last step of the
+  previous file.
 """
 
 GAP_S = 2.0
-"""Longest time without a recording, s, that the search does not report as a gap."""
+"""Longest time without a recording that does not count as a gap, s."""
 
 
 class Series(Recording):
@@ -41,9 +42,10 @@ class Series(Recording):
     """
 
     def __init__(self, paths: Sequence[Path]) -> None:
-        """Read the first of the files; `messages()` reads all of them.
+        """Read the first file. The other files are read by `messages()`.
 
-        Raises `RecordingError` if the first file is not a recording that can be read.
+        `paths` are the paths of the files in order. Raises `RecordingError` if the first file is
+        not a readable recording.
         """
         super().__init__(_present(paths[0]))
         self.paths = list(paths)
@@ -51,8 +53,9 @@ class Series(Recording):
     def messages(self) -> Iterator[tuple[Topic, int, bytes]]:
         """Yield the triple (topic, wall-clock time in ns since 1970, data) of each message.
 
-        The messages are those of all files. `damaged` counts the damaged places of all files.
-        `ended`, `cut`, `why` and `unfinished` describe the last file.
+        The messages of all files follow each other. After the last message, `damaged` counts the
+        damaged places of all files. `ended`, `cut`, `why` and `unfinished` describe the last file.
+        Raises `RecordingError` if a file is not a readable recording.
         """
         self.damaged, self.ended, self.cut, self.why = 0, False, "", ""
         self.unfinished = None
@@ -68,46 +71,57 @@ class Series(Recording):
 
 
 class Found(NamedTuple):
-    """A recording with steps in the searched range of time.
-
-    `part` is the part of the recording that lies in this range.
-    """
+    """A recording with steps in the searched range of time."""
 
     recording: Recording
     part: Span
+    """Part of the recording that is in the searched range."""
 
 
 class Search(Struct):
-    """The recordings that have steps in a range of time, and the times without a recording."""
+    """Result of a search: the recordings in a range of time, and the gaps between them."""
 
     found: list[Found] = field(default_factory=list)
+    """The recordings that have steps in the range, the oldest first."""
     unreadable: list[str] = field(default_factory=list)
     """A sentence for each file that cannot be read."""
     gaps: list[tuple[float, float]] = field(default_factory=list)
-    """Beginning and end of each gap (a part of the range without a recording), s since 1970."""
+    """Pairs: the beginning and the end of each part of the range without a recording, s since 1970.
+
+    Parts of at most `GAP_S` are left out.
+    """
 
 
 class NothingRecordedError(AcsardError):
-    """No file has a step in the searched range of time.
+    """No recording has a step in the searched range of time.
 
-    The message names the nearest recordings.
+    The text of this error names the nearest recordings before and after the range.
     """
 
 
 class _Piece(NamedTuple):
-    """A range of time, from `begin` to `end`, s since 1970, that the file `path` covers."""
+    """A range of time for which a file contains steps."""
 
     begin: float
+    """Wall-clock time, s since 1970."""
     end: float
+    """Wall-clock time, s since 1970."""
     path: Path
 
 
 def search(files: Sequence[Path], first: float, last: float) -> Search:
-    """Find the recordings that have steps between the times `first` and `last`, s since 1970.
+    """Find the recordings that have steps in a range of time.
 
-    `files` are sorted, oldest first. If a file that is found begins during a drive, the result also
-    includes the files with the earlier part of this drive. Raises `NothingRecordedError` if no
-    recording is found.
+    Files that continue each other are joined to a `Series`. If a file begins during a drive, its
+    series also includes the files with the earlier part of this drive.
+
+    Args:
+        files: paths of the files to search, the oldest first.
+        first: beginning of the range, s since 1970; -inf for no limit.
+        last: end of the range, s since 1970; inf for no limit.
+
+    Raises:
+        NothingRecordedError: no recording has a step in the range.
     """
     result, pieces = Search(), list[_Piece]()
     chosen: dict[int, Contents] = {}
@@ -140,9 +154,9 @@ def search(files: Sequence[Path], first: float, last: float) -> Search:
 
 
 def _gaps(pieces: Sequence[_Piece], first: float, last: float) -> list[tuple[float, float]]:
-    """Return the ranges of time from `first` to `last` that no piece covers, s since 1970.
+    """Return the gaps: the parts of the range from `first` to `last` that no piece covers.
 
-    Ranges that are not longer than `GAP_S` are left out.
+    A gap is a pair (beginning, end), s since 1970. Gaps of at most `GAP_S` are left out.
     """
     inside = sorted(piece for piece in pieces if piece.begin <= last and first <= piece.end)
     ends = [first]
@@ -156,8 +170,8 @@ def _gaps(pieces: Sequence[_Piece], first: float, last: float) -> list[tuple[flo
 def _groups(files: Sequence[Path], chosen: dict[int, Contents]) -> list[list[int]]:
     """Group the chosen files into series, and return the indices in `files` of each series.
 
-    `chosen` maps the index of each chosen file to its contents. Each series begins with the files
-    that `_earlier()` finds.
+    `chosen` maps the index of each chosen file to the contents of this file. A series also includes
+    the earlier files that `_earlier()` finds for its first chosen file.
     """
     groups: list[list[int]] = []
     for number, contents in sorted(chosen.items()):
@@ -169,10 +183,10 @@ def _groups(files: Sequence[Path], chosen: dict[int, Contents]) -> list[list[int
 
 
 def _earlier(files: Sequence[Path], number: int, contents: Contents) -> list[int]:
-    """Return the indices of the files that contain the earlier part of a drive, oldest first.
+    """Return the indices of the files with the earlier part of a drive, the oldest file first.
 
-    The robot is on this drive when the file with the index `number` begins. `contents` are the
-    contents of that file. The list is empty if the file does not begin during a drive.
+    It is the drive during which the file with the index `number` begins. The list is empty if this
+    file does not begin during a drive. `contents` are the contents of this file.
     """
     found: list[int] = []
     while number > 0 and contents.first.recorded.status[0] == "driving":
@@ -189,21 +203,30 @@ def _earlier(files: Sequence[Path], number: int, contents: Contents) -> list[int
 
 
 def _continues(before: Contents, contents: Contents) -> bool:
-    """Return whether `contents` continues `before` without a missing step, in the same run."""
+    """Return whether a file with `contents` continues a file with `before`.
+
+    It does if both are from the same run of the daemon, and no step is missing between them.
+    """
     follows = contents.first.number == before.last.number + 1
     mono_ns = contents.first.inputs.now.mono_ns - before.last.inputs.now.mono_ns
     return follows and 0 <= mono_ns < MARGIN_S * NS_PER_S
 
 
 def _covered(path: Path) -> _Piece:
-    """Return the range of time that a file covers. If it has no end record, read the whole file."""
+    """Return the range of time that a file covers, from its end record.
+
+    If the file has no end record, read the whole file. Raises `RecordingError` if that fails.
+    """
     end = read_end(path) or Recording(_present(path)).compute_end_record()
     earliest_ns = end.wall_ns if end.earliest_ns is None else end.earliest_ns
     return _Piece(min(earliest_ns, end.wall_ns) / NS_PER_S, end.last_ns / NS_PER_S, path)
 
 
 def _present(path: Path) -> Path:
-    """Return the present path of a recording. The daemon renames the file when it is finished."""
+    """Return the present path of a recording, which the daemon may have renamed since `path`.
+
+    If no file is found, return `path`.
+    """
     if path.exists() or not path.parent.is_dir():
         return path
     stem = path.name.partition(".")[0]
@@ -211,7 +234,7 @@ def _present(path: Path) -> Path:
 
 
 def _nearest(pieces: Sequence[_Piece], first: float, last: float) -> str:
-    """Return a sentence that says that nothing was recorded, and names the nearest recordings."""
+    """Return the text of `NothingRecordedError`, with the nearest recordings."""
     before = max([p for p in pieces if p.end < first], key=lambda p: p.end, default=None)
     after = min([p for p in pieces if p.begin > last], key=lambda p: p.begin, default=None)
     text = f"nothing was recorded {in_words(first, last)}"
@@ -225,9 +248,9 @@ def _described(piece: _Piece) -> str:
 
 
 def in_words(first: float, last: float) -> str:
-    """Return words for the range of time from `first` to `last`, s since 1970.
+    """Return a text for a range of time, for example "from 2026-11-21 14:05:00".
 
-    Both limits may be infinite.
+    `first` and `last` are times in s since 1970. An infinite limit does not appear in the text.
     """
     parts = [
         f"{word} {clock(at, day=True)}"

@@ -1,8 +1,8 @@
-"""Encodes a `Robot` between two steps, decodes it, and applies another configuration to it.
+"""Encodes a `Robot` between two steps as bytes, and decodes such bytes.
 
-When a run of the daemon begins a second or later file, the file begins with an encoded robot. Every
-file contains further encoded robots, about one every 20 s, so that a replay can go on after a
-damaged place.
+It also applies another configuration to a decoded robot. Each file of a run of the daemon, except
+possibly the first file, begins with an encoded robot. About every 20 s the file contains another
+encoded robot, so that a replay can go on after a damaged place.
 
 `freeze` uses pickle, which takes a fraction of a millisecond. `thaw` uses `unpickling.py` instead,
 because a forged file could run code through pickle.
@@ -31,14 +31,14 @@ PART_MODULES = (
     "acsard.core.values", "acsard.core.robot", "acsard.core.guard", "acsard.core.config.settings",
     "acsard.core.motion.", "acsard.core.link.",
 )  # fmt: skip
-"""Names of modules and packages whose classes may be parts of a robot. The name of a package ends
-with a dot. The constructors of these classes have no side effects."""
+"""Names of the modules and packages whose classes may be parts of a robot. The name of a package
+ends with a dot. A class in these modules must have a constructor without side effects."""
 
 OTHER_PARTS: dict[tuple[str, str], type] = {
     ("collections", "Counter"): Counter,
     ("collections", "deque"): deque,
 }
-"""Other classes that may be parts of a robot. Each key is the pair (module name, class name)."""
+"""Maps the pair (module name, class name) to each further class that may be a part of a robot."""
 
 PROTOCOL = 5
 """Version of the pickle format that `unpickling.py` reads."""
@@ -46,43 +46,42 @@ PROTOCOL = 5
 MAX_TEXT = 200
 """Number of characters to which the text of an error is cut."""
 
+# Without this table, Python 3.11 before 3.11.4, as in Debian 12, would encode a mode as a call of
+# `getattr`, which `unpickling.py` refuses.
 TABLE = copyreg.dispatch_table | {
     Mode: lambda mode: (Mode, (mode.value,)),
 }
-"""Dispatch table with which pickle encodes a mode as a call of `Mode` with the mode's value.
-
-Python 3.11 before 3.11.4, as in Debian 12, would encode a call of `getattr`, which `unpickling.py`
-refuses.
-"""
+"""Dispatch table with which pickle encodes a mode as a call of `Mode` with the mode's value."""
 
 
 class StateError(AcsardError):
-    """The saved state of a robot is damaged, or this version of acsard cannot use it."""
+    """The recorded state of a robot is damaged, or this version of acsard cannot use this state."""
 
 
 class State(NamedTuple):
-    """The state between two control steps: a robot, and the memory of the guard of its lines.
+    """The complete state of a robot between two control steps.
 
-    If two runs of the control steps begin with equal states and receive equal inputs, they produce
-    equal outputs.
+    The state and the inputs of the following steps determine all outputs of these steps.
     """
 
     robot: Robot
     memory: Memory
+    """Memory of the guard, which checks the robot's lines to the board."""
 
 
 class Checkpoint(Struct, frozen=True, array_like=True):
-    """The saved state of a robot between two control steps.
+    """The saved state of a robot between two control steps, and the number of the next step.
 
-    It is the content of one message on the channel `state` of a recording.
+    A recording contains checkpoints as messages on the channel `state`.
     """
 
     number: Annotated[int, Meta(ge=0)]
     """Number of the step that follows the saved state."""
     data: bytes
-    """The robot and its guard's memory, encoded by `freeze`."""
+    """The robot and the memory of its guard, encoded by `freeze`."""
 
     def encode(self) -> bytes:
+        """Return the content of a message on the channel `state`, in MessagePack."""
         return msgspec.msgpack.encode(self)
 
 
@@ -90,9 +89,10 @@ _checkpoint = msgspec.msgpack.Decoder(Checkpoint)
 
 
 def checkpoint(data: bytes) -> Checkpoint:
-    """Decode a message of the channel `state`, but not the robot in it.
+    """Decode a message of the channel `state` of a recording.
 
-    Raises `StateError` if the message is damaged.
+    The robot in the checkpoint stays encoded; `thaw` decodes it. Raises `StateError` if the message
+    is damaged.
     """
     try:
         return _checkpoint.decode(data)
@@ -104,7 +104,7 @@ def checkpoint(data: bytes) -> Checkpoint:
 
 
 def freeze(robot: Robot, memory: Memory) -> bytes:
-    """Encode the robot and the memory of its guard as they are now."""
+    """Encode the present state of a robot and of its guard's memory. `thaw` decodes the result."""
     written = io.BytesIO()
     pickler = pickle.Pickler(written, PROTOCOL)
     pickler.dispatch_table = TABLE
@@ -113,7 +113,11 @@ def freeze(robot: Robot, memory: Memory) -> bytes:
 
 
 def thaw(data: bytes) -> State:
-    """Decode a robot and its guard's memory; raise `StateError` if this is not possible."""
+    """Decode a robot and its guard's memory, encoded by `freeze`. The bytes may be forged.
+
+    Raises `StateError` if the bytes are damaged or forged, or if another version of acsard encoded
+    them and this version cannot use them.
+    """
     try:
         made = unpickle(data, part_class)
     except ValueError as error:
@@ -129,16 +133,17 @@ def thaw(data: bytes) -> State:
 
 
 def short(error: Exception) -> str:
-    """Return the text of an error, shortened and printable, because it may quote a forged file."""
+    """Return the text of an error, cut to `MAX_TEXT` characters and without control characters."""
+    # The text may quote a forged file.
     return printable(str(error))[:MAX_TEXT]
 
 
 def part_class(module: str, name: str) -> type:
-    """Return the class `name` of the module `module` if it may be a part of a robot.
+    """Return the class with the name `name` in the module `module`, for `unpickle`.
 
-    Raises `ValueError` if the module is not loaded, or if `name` is anything else: for example a
-    function, a class that the module imports, or an attribute of an attribute. This function
-    imports nothing.
+    Raises `ValueError` if objects of this class cannot be parts of a robot, or if `name` is not a
+    class that this module defines. A module that is not loaded is not imported, and causes the same
+    error.
     """
     if (module, name) in OTHER_PARTS:
         return OTHER_PARTS[module, name]
@@ -155,41 +160,40 @@ PLAIN = (bool, int, float, str, bytes, type(None))
 
 
 def adopt(robot: Robot, begun: Robot, other: Robot) -> None:
-    """Apply another configuration to the recorded robot `robot`, in place.
+    """Change the configuration of a recorded robot, in place.
 
-    The three robots are compared attribute by attribute. If an attribute of `robot` still equals
-    that of `begun`, it gets the value from `other`. If the recorded run has changed the attribute,
-    it keeps its value.
+    An attribute that the recorded run has changed keeps its value. Such an attribute differs
+    between `robot` and `begun`. Every other attribute gets its value from `other`.
 
     Args:
-        robot: the recorded robot.
+        robot: the recorded robot, which is changed.
         begun: a new robot with the recorded configuration.
-        other: a new robot with the other configuration. Afterwards `robot` may share parts with
-            `other`.
+        other: a new robot with the new configuration. Do not use it later, because `robot` may
+            share objects with it.
     """
     _Walk().into(robot, begun, other)
 
 
 class _Walk:
-    """Walks through the three robots of `adopt()`, and visits each of their objects once."""
+    """Walks through the three robots of `adopt()`, and visits each object of `robot` once."""
 
     def __init__(self) -> None:
         self._visited: dict[int, Any] = {}
-        """Maps the `id()` of each visited object to this object, which stays alive so that its
-        `id()` stays unique."""
+        """Maps the `id()` of each visited object to the object. A reference keeps the object alive,
+        so that no other object gets the same `id()`."""
 
     def into(self, now: Any, begun: Any, other: Any) -> None:
-        """Merge the attributes of three corresponding objects into `now`, in place.
+        """Change the attributes of the object `now` as `adopt()` describes.
 
-        `now` is a part of the recorded robot, and `begun` and `other` of the two new robots.
+        `now`, `begun` and `other` are corresponding objects in `robot`, `begun` and `other` of
+        `adopt()`.
         """
         if id(now) in self._visited:
             return
         self._visited[id(now)] = now
         for name in _names(other):
             new = getattr(other, name)
-            # Another version may have recorded the robot without this attribute. The new robot has
-            # it.
+            # Another version of acsard may have recorded the robot without this attribute.
             if not hasattr(now, name):
                 setattr(now, name, new)
                 continue
@@ -199,9 +203,10 @@ class _Walk:
                 setattr(now, name, merged)
 
     def merged(self, now: Any, begun: Any, other: Any) -> Any:
-        """Return the merged value of an attribute, given its value in each of the three robots.
+        """Return the new value of an attribute, given its values in the three robots of `adopt()`.
 
-        The result is `now`, perhaps with changed parts, or `other`.
+        The result is `other`, or `now`, or a copy of `now` with changed parts. Parts of `now` may
+        be changed in place.
         """
         if type(now) is not type(other):
             return other if _same(now, begun) else now
@@ -230,7 +235,7 @@ def _same(now: Any, begun: Any) -> bool:
 
 
 def _names(item: object) -> list[str]:
-    """Return the names of the attributes that the object stores, without class attributes."""
+    """Return the names of the object's own attributes, in `__dict__` and `__slots__`."""
     slots = [name for kind in type(item).__mro__ for name in getattr(kind, "__slots__", ())]
     names = [*getattr(item, "__dict__", ()), *slots]
     return [name for name in names if hasattr(item, name)]

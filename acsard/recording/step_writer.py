@@ -1,8 +1,8 @@
-"""The recorder's thread: writes steps to the current file, and reacts to errors of the disk.
+"""Writes recorded steps to the current file, and reacts to errors of the disk.
 
-One thread calls `StepWriter.write` about once a second. If the disk refuses to write, the steps of
-that call are lost and counted. The writer then pauses for `RETRY_ROUNDS` calls. After the pause it
-begins a new file with the robot's state.
+The recorder's thread calls `StepWriter.write` about once a second. If the disk refuses to write,
+the steps of that call are lost and counted. The writer then pauses for `RETRY_ROUNDS` calls. After
+the pause, the writer begins a new file with the robot's state.
 """
 
 from __future__ import annotations
@@ -30,44 +30,46 @@ from acsard.recording.state import Checkpoint
 from acsard.recording.timeline import entry_of
 
 RETRY_ROUNDS = 5
-"""Number of calls of `StepWriter.write()` for which the writer pauses after an error of the disk.
-There is about one call each second."""
+"""Number of calls of `StepWriter.write()` that write nothing after an error of the disk. There is
+about one call each second."""
 
 BATCH = 256
-"""Largest number of steps in one message. There are fewer steps in a second, unless many commands
-arrive."""
+"""Largest number of steps in one message of the channel `steps`. Usually all steps of a second fit
+in one message, unless many commands arrive."""
 
+# After damage to a chunk, a replay lacks at most 20 s. The control loop needs 0.6 ms for a
+# checkpoint, after it has written its line. A checkpoint has 6 kB while the robot stands still, and
+# 13 kB while it drives.
 CHECKPOINT_NS = 18 * NS_PER_S + NS_PER_S // 2
-"""Time from one checkpoint (the robot's state in a file) to the request for the next one, ns.
-
-After damage to a chunk, a replay lacks at most 20 s. The control loop needs 0.6 ms for a
-checkpoint, after it has written its line. A checkpoint has 6 kB while the robot stands and 13 kB
-while it drives.
-"""
+"""Time from one checkpoint to the request for the next checkpoint, ns. A checkpoint is the robot's
+state in a file, at which a replay can begin."""
 
 MAX_FILE_NS = 3600 * NS_PER_S
+"""Duration of a file, ns, after which the recording goes on in a new file."""
 
 INCIDENTS = frozenset({
     "fault", "stop", "emergency_stop", "bumper_pressed", "battery_stop", "link_down", "link_stale",
     "port_lost",
 })  # fmt: skip
-"""Names of the events that count as incidents. All files within a minute of an incident are
-retained."""
+"""Names of the events that count as incidents. The file with an incident, and every file that ended
+or began within a minute of the incident, is retained longer than other files."""
 
 
 class Bug(NamedTuple):
     """An internal error that ends the daemon."""
 
     why: str
-    """Text of the exception. If a step raised it, the text begins with the number of that step."""
+    """Type and text of the exception. If a control step raised the exception, the number of that
+    step comes first."""
     at: Instant | None
-    """Instant of the step that failed; None if the daemon failed outside a step."""
+    """Time of the control step that failed; None if the daemon failed outside a step."""
     unfinished: bytes
-    """Encoded inputs of the step that failed; empty if they do not exist or cannot be encoded."""
+    """Inputs of the control step that failed, as an encoded `Unfinished`. Empty if the daemon
+    failed outside a step, or if the inputs cannot be encoded."""
 
 
 class StepWriter:
-    """Writes steps to the directory of recordings, and starts again after an error of the disk."""
+    """Writes steps to the directory of recordings, and begins a new file after a disk error."""
 
     def __init__(
         self,
@@ -76,7 +78,7 @@ class StepWriter:
         request_state: Callable[[], None],
         started_ns: int,
     ) -> None:
-        """Start without an open file: the first call of `write` opens one.
+        """Prepare to write. The first call of `write` opens the directory and a file.
 
         Args:
             config: the configuration at the daemon's start.
@@ -86,14 +88,16 @@ class StepWriter:
         """
         self._started_ns = started_ns
         self.where = config.record.directory
+        """Directory of the recordings."""
         self.trouble = ""
         """The present error of the disk, in words for the user; "" if the disk accepts data."""
         self.lost = 0
         """Number of steps that were not written because of errors of the disk."""
         self.syncs = 0
-        """Number of syncs begun plus number of syncs ended. It is odd during a sync."""
+        """Number of syncs that have begun, plus number of syncs that have ended. So the number is
+        odd during a sync."""
         self._lost_before = 0
-        """Value of `lost` before the present trouble began."""
+        """Value of `lost` when the present error of the disk began."""
         self._safe_ns: int | None = None
         """Monotonic time of the last step that is synced to the disk, ns; None before the first
         sync."""
@@ -101,35 +105,40 @@ class StepWriter:
         self._ring: Ring | None = None
         self._writing: Writing | None = None
         self._start: Start | None = Start(0, b"", config)
-        """State of the robot for the beginning of the next file; None if it must be requested."""
+        """The robot's state with which the next file begins. None if a file is open, or if the
+        state must be requested from the control loop."""
         self._incidents = IncidentWindow[Path]()
         self._number = self._began_ns = self._state_ns = 0
         self._last = Instant(0, 0)
         self._reported = False
-        """True once the log has an event that says that the daemon records."""
+        """True once the log has an event with the text that the daemon records."""
         self._refused = False
         """True if the last write failed because the disk was full."""
         self._looked_back = False
+        """True once the files of the previous run are registered in `_incidents`."""
         self._run = Run()
         self._cut_ns: int | None = None
-        """Time at which a crash cut off the previous run's file, ns since 1970.
+        """Wall-clock time at which a crash cut off the file of the previous run, ns since 1970.
 
-        It is None if there was no crash, and it becomes None when this run begins a file.
+        The value is None without such a crash, and after this run has begun a file.
         """
         self.bug: Bug | None = None
-        """The failure that ends the daemon; only the last call of `write` reads it."""
+        """The internal error that ends the daemon, or None. The last call of `write` records it."""
         self._pause = 0
+        """Number of further calls of `write` that write nothing because of an error of the disk."""
         self._handed = self._safe = 0
-        """`_handed` is the number of steps that this call of `write` has written or lost so far.
+        """Numbers of steps in the present call of `write`.
 
-        `_safe` is the number of these steps that are already synced or lost. If the disk refuses to
-        write, all other steps of this call are lost.
+        `_handed` counts the steps that were written to the file or lost so far. `_safe` counts only
+        those that are synced to the disk or already in `lost`. If the disk refuses to write, all
+        steps of the call that `_safe` does not count are lost.
         """
 
     def write(self, items: list[Taken | Start], over: bool) -> None:
-        """Write the items, or count their steps as lost if the disk refuses to write.
+        """Write the items of the recorder's queue, and sync the file to the disk.
 
-        `over` is true for the last call, which also finishes the file.
+        If the disk refuses to write, and during the pause after such an error, the steps are lost
+        and counted. `over` is true for the last call, which also finishes the file.
         """
         self._handed = self._safe = 0
         try:
@@ -150,10 +159,11 @@ class StepWriter:
             self._request_state()
 
     def mark_cut(self, cut: Literal["late", "disk"]) -> None:
-        """Create a marker file, which says that no crash cut off the unfinished file.
+        """Create a marker file with the reason why the current file is not finished.
 
-        `cut` is "late" if the disk was too slow, or "disk" if it accepted no more data. Another
-        thread may call this method while `write` waits for the disk.
+        Without this marker, the next start of the daemon would assume a crash. `cut` is "late" if
+        the disk was too slow, or "disk" if the disk accepted no more data. Another thread may call
+        this method while `write` waits for the disk.
         """
         writing = self._writing
         if writing is not None:
@@ -161,7 +171,7 @@ class StepWriter:
                 mark_cut(writing.path, self._incidents.kind, cut)
 
     def _open_ring(self) -> Ring:
-        """Open the directory, and report the files that could not be finished."""
+        """Open the directory of recordings, and report the old files that could not be finished."""
         ring = Ring(self._config.record, self._run, self._refused)
         self._refused, self._cut_ns = False, ring.cut_ns or self._cut_ns
         for text in ring.messages:
@@ -169,7 +179,11 @@ class StepWriter:
         return ring
 
     def _write_group(self, ring: Ring, start: Start | None, steps: list[Taken]) -> None:
-        """Write steps to the current file, or to a new file that begins with `start`."""
+        """Write steps to the current file, or to a new file.
+
+        If `start` is not None, it is the robot's state before the first of the steps. A new file
+        begins with this state. In the current file, the state becomes a checkpoint.
+        """
         if start is not None and self._writing is not None and self._goes_on(ring, start):
             self._add_checkpoint(self._writing, start, self._last)
         elif start is not None:
@@ -189,8 +203,8 @@ class StepWriter:
     def _goes_on(self, ring: Ring, start: Start) -> bool:
         """Return whether the steps after `start` may follow in the current file.
 
-        They may not if steps are missing before `start`, or if the current file has reached its
-        largest duration or size.
+        If not, either steps are missing before `start`, or the current file has reached its largest
+        duration or size.
         """
         return start.number == self._number and not self._is_long_enough(ring)
 
@@ -204,7 +218,8 @@ class StepWriter:
         self._state_ns = now.mono_ns
 
     def _add(self, ring: Ring, writing: Writing, batch: list[Taken]) -> None:
-        """Write steps as one message, or as several if one message is too large for a reader."""
+        """Write steps as one message, or as several messages if one would exceed the limit of the
+        reader, `MAX_DATA_BYTES`."""
         data = encode(self._number, batch)
         if len(data) > MAX_DATA_BYTES and len(batch) > 1:
             half = len(batch) // 2
@@ -243,7 +258,11 @@ class StepWriter:
         self._add_checkpoint(self._writing, start, now)
 
     def _look_back(self, ring: Ring, now: Instant) -> None:
-        """Register the files of the previous run, so that incidents protect files of both runs."""
+        """Register the files of the previous run that ended less than a minute ago.
+
+        An incident at the beginning of this run then protects these files. An incident at the end
+        of the previous run protects the first file of this run.
+        """
         for path, kind, ended_ns in ring.just_ended(now):
             self._incidents.earlier(path, kind, ended_ns)
         self._looked_back = True
@@ -254,7 +273,7 @@ class StepWriter:
             ring.retain(path)
 
     def _write_bug(self, ring: Ring, bug: Bug) -> None:
-        """Write the inputs of the step that failed, and register an incident to retain the file."""
+        """Record the inputs of the step that failed. The failure counts as an incident."""
         if bug.at is not None and self._writing is None and self._start is not None:
             self._begin(ring, self._start, bug.at)
         if self._writing is None:

@@ -1,7 +1,8 @@
 """Parses times that a person types, and finds the part of a recording between two such times.
 
 A recording may cross midnight, and the wall clock may be adjusted during the recording. Therefore a
-time is searched in every `Stretch`, a part of the recording without an adjustment of the clock.
+recording is divided into stretches without an adjustment of the clock, and a time is searched in
+every `Stretch`.
 """
 
 from __future__ import annotations
@@ -20,13 +21,17 @@ from acsard.recording.timeline import SET_NS
 
 
 class Span(NamedTuple):
-    """A part of a recording. Its limits are monotonic times, s after the recording began."""
+    """A part of a recording, limited by two times in s after the recording began.
+
+    The times are counted by the monotonic clock.
+    """
 
     begin: float = -math.inf
     end: float = math.inf
 
 
 WHOLE = Span()
+"""The part that contains the whole recording."""
 
 
 class Offset(NamedTuple):
@@ -36,7 +41,7 @@ class Offset(NamedTuple):
 
 
 class TimeOfDay(NamedTuple):
-    """A time of day without a date, local time."""
+    """A time that a person typed as a time of day without a date. It is a local time."""
 
     hours: int
     minutes: int
@@ -47,17 +52,23 @@ MIDNIGHT = TimeOfDay(0, 0, 0.0)
 
 
 class Moment(NamedTuple):
-    """A moment or a whole day, in s since 1970. For a moment, `begin` equals `end`."""
+    """A time that a person typed with a date, as "2 h ago", or as a whole day such as "today".
+
+    A whole day has two different times `begin` and `end`. In the other cases both are equal.
+    """
 
     begin: float
+    """Wall-clock time, s since 1970."""
     end: float
+    """Wall-clock time, s since 1970."""
 
 
 When = Offset | TimeOfDay | Moment
-"""A time that a person typed."""
+"""A time that a person typed, after parsing."""
 
 TIMES = '14:05, 14:05:30, today, "yesterday 14:05", "2026-11-21 14:05", 2026-11-21 or "2 h ago"'
-"""Examples of times that do not refer to one particular recording."""
+"""Examples of times, for messages to the user. A number of seconds after the beginning of a
+recording is not included."""
 
 EXAMPLES = f"{TIMES}; for one recording also a number of seconds after its beginning"
 
@@ -68,13 +79,14 @@ _DAYS_AGO = {"today": 0, "yesterday": 1}
 
 
 class TimeError(AcsardError):
-    """A text is not a time."""
+    """A text that a person typed is not a valid time or range of time."""
 
 
 def parse_when(text: str, now_s: float) -> When:
-    """Parse a time that a person typed; `now_s` is the present time, s since 1970.
+    """Parse a time that a person typed. `EXAMPLES` shows the permitted forms.
 
-    Raises `TimeError` with advice on how to write a time.
+    `now_s` is the present time, s since 1970. Raises `TimeError` with advice if `text` is not a
+    time.
     """
     words = re.sub(r"(?<=\d)t(?=\d)", " ", " ".join(text.lower().split()))
     if re.fullmatch(r"\d+(\.\d+)?", words):
@@ -109,8 +121,8 @@ def _time_of_day(words: str, text: str) -> TimeOfDay:
 def _date(words: str, text: str, now_s: float) -> tuple[int, int, int]:
     """Return the triple (year, month, day) for a date that a person typed.
 
-    On the first day of a month, the result for "yesterday" has the present month and the day 0.
-    `_moment` takes the day 0 for the last day of the previous month.
+    On the first day of a month, the result for "yesterday" has the day 0. This means the last day
+    of the previous month.
 
     Args:
         words: the date: "today", "yesterday" or a date like "2026-11-21".
@@ -134,10 +146,10 @@ def _date(words: str, text: str, now_s: float) -> tuple[int, int, int]:
 
 
 def _moment(date: tuple[int, int, int], when: TimeOfDay = MIDNIGHT, days: int = 0) -> float:
-    """Return a local time in s since 1970: the time of day `when`, `days` days after `date`.
+    """Return a local time as s since 1970: the time of day `when`, `days` days after `date`.
 
-    The day of the month in `date` may be out of range. For example, the day 0 is the last day of
-    the previous month.
+    `date` is a triple (year, month, day). The day may be out of range. For example, the day 0 is
+    the last day of the previous month.
     """
     year, month, day = date
     whole = (year, month, day + days, when.hours, when.minutes, 0, 0, 0, -1)
@@ -149,15 +161,23 @@ def _unknown(text: str) -> TimeError:
 
 
 def resolve(begin: When | None, end: When | None, now_s: float) -> tuple[float, float]:
-    """Return the pair of limits, s since 1970, that `begin` and `end` mean.
+    """Return the range of time that a person typed, as the pair (first, last), s since 1970.
 
-    - If `begin` or `end` is None or an `Offset`, the range is unlimited (infinite) on that side.
-    - If `begin` is a time of day, it means the last occurrence of this time before `end` if `end`
-      is a `Moment`, and otherwise before the present time `now_s`, s since 1970.
-    - If `end` is a time of day, it means the first occurrence of this time after `begin` if `begin`
-      limits the range, and otherwise the last occurrence before `now_s`.
+    None and an `Offset` set no limit, so `first` is -inf or `last` is inf. The limits of a `Moment`
+    are used unchanged. A `TimeOfDay` gets a date:
 
-    Raises `TimeError` if the range ends before it begins.
+    - For `begin`, the result is the last such time before the present. If `end` is a `Moment`, it
+      is the last such time before `end`.
+    - For `end`, the result is the first such time after `begin`. If `begin` sets no limit, it is
+      the last such time before the present.
+
+    Args:
+        begin: the beginning of the range.
+        end: the end of the range.
+        now_s: the present time, s since 1970.
+
+    Raises:
+        TimeError: the range ends before it begins.
     """
     first, last = -math.inf, math.inf
     if isinstance(begin, TimeOfDay):
@@ -183,9 +203,10 @@ def _last_occurrence(when: TimeOfDay, before_s: float) -> float:
 
 
 def clock(seconds: float, day: bool = False) -> str:
-    """Format a time in s since 1970 as local time.
+    """Return a time as text in local time. `seconds` is the time in s since 1970.
 
-    The text contains the date if `day` is true. Otherwise it contains milliseconds.
+    If `day` is true, the text contains the date and whole seconds, such as "2026-11-21 14:05:30".
+    Otherwise it contains milliseconds and no date, such as "14:05:30.250".
     """
     local = time.localtime(seconds)
     if day:
@@ -194,7 +215,7 @@ def clock(seconds: float, day: bool = False) -> str:
 
 
 def date(seconds: float) -> str:
-    """Return the local date of a time in s since 1970."""
+    """Return the local date of a time in s since 1970 as text, such as "2026-11-21"."""
     return time.strftime("%Y-%m-%d", time.localtime(seconds))
 
 
@@ -210,7 +231,7 @@ class Stretch(NamedTuple):
 
 
 def span(recording: Recording, begin: When | None, end: When | None) -> Span:
-    """Return the part of a recording from `begin` to `end`.
+    """Return the part of a recording between two times that a person typed.
 
     If `begin` or `end` is None, the part is not limited on that side.
     """
@@ -240,16 +261,22 @@ def _seconds(when: When, found: list[Stretch], end: bool) -> float:
 
 
 def part_between(found: list[Stretch], first: float, last: float) -> Span | None:
-    """Return the part of a recording between the times `first` and `last`, s since 1970.
+    """Return the part of a recording between two wall-clock times.
 
-    `found` are the stretches of the recording. Returns None if none of them overlaps that range.
+    If the range overlaps several stretches, the part includes all of them. Return None if the range
+    overlaps no stretch.
+
+    Args:
+        found: the stretches of the recording, in order.
+        first: beginning of the range, s since 1970.
+        last: end of the range, s since 1970.
     """
     inside = [one for one in found if one.begin <= last and first <= one.end]
     if not inside:
         return None
     begin = min(one.at + max(first, one.begin) - one.begin for one in inside)
     end = max(one.at + min(last, one.end) - one.begin for one in inside)
-    # If the part includes the last step, it also includes the end of the file.
+    # A part that includes the last step must also include the end of the file.
     whole_begin = inside[0] is found[0] and first <= found[0].begin
     whole_end = inside[-1] is found[-1] and last >= found[-1].end
     return Span(-math.inf if whole_begin else begin, math.inf if whole_end else end)
@@ -268,18 +295,25 @@ class Contents(NamedTuple):
     """The stretches of a recording, and its first and last readable step."""
 
     stretches: list[Stretch]
+    """Parts of the recording without an adjustment of the wall clock, in order."""
     first: Step
     last: Step
 
 
 def stretches(recording: Recording) -> list[Stretch]:
-    """Return the stretches of a recording in order. The list is empty if no step is readable."""
+    """Return the parts of a recording without an adjustment of the wall clock, in order.
+
+    The list is empty if no step is readable.
+    """
     contents = read_contents(recording)
     return contents.stretches if contents else []
 
 
 def read_contents(recording: Recording) -> Contents | None:
-    """Read the contents of a recording. Returns None if no step can be read."""
+    """Return the stretches, the first step and the last step of a recording.
+
+    Return None if no step is readable.
+    """
     found: list[Stretch] = []
     first: Step | None = None
     last_ns, before = 0, b""

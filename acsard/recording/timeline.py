@@ -1,8 +1,8 @@
 """Describes a recording as a timeline of short texts.
 
-The timeline has an entry for each event of the log, and further entries. For example, each drive (a
-period in the mode `driving`) has an entry. `acsard recording show` and `acsard recording report`
-show the same entries, and an export writes them to the channel `log`.
+The timeline has an entry for each event in the daemon's log, and further entries. For example, each
+drive (a period in the mode `driving`) has an entry. `acsard recording show` and `acsard recording
+report` show the same entries, and an export writes them to the channel `log`.
 """
 
 from __future__ import annotations
@@ -26,19 +26,19 @@ from acsard.core.values import NS_PER_S, Command, Event, Instant
 from acsard.recording.recorded_steps import MICRO, Step
 
 FURTHEST_S = 2**63 / 1e9
-"""Largest distance between an entry's time and 1970, s. It is 292 years, because a time in ns must
-fit in 64 bits."""
+"""Largest time between 1970 and an entry of the timeline, s. It is 292 years, because a time in ns
+must fit in 64 bits."""
 
 
 REASON_NS = NS_PER_S
-"""Shortest time between two entries with the same name `reason`, `waits` or `board`, ns.
+"""Shortest time between two `reason` entries, two `waits` entries or two `board` entries, ns.
 
 Without this limit, two sources that alternate in every step would fill the timeline.
 """
 
 POSE_NS = NS_PER_S
-"""The entry `continues` is delayed until the first pose, but at most for this time, ns. Without a
-link to the board there is no pose."""
+"""Longest delay of the entry `continues`, ns. The entry is delayed until the first pose, because it
+contains this pose. Without a link to the board there is no pose."""
 
 SET_NS = 5 * NS_PER_S
 """Smallest change of the wall clock that gives an entry `clock`, ns. The change is measured against
@@ -47,22 +47,24 @@ the monotonic clock."""
 WAITS_NS = NS_PER_S
 """Time for which a sender must send speeds without effect before it gets an entry `waits`, ns.
 
-While an operator changes from one sender to another, both may send, but for less than this time.
+While an operator changes from one sender to another, both senders may send, but for less than this
+time.
 """
 
 SILENT_NS = NS_PER_S
 """If a waiting sender sends nothing for longer than this, ns, its waiting time restarts at 0."""
 
 MAX_IDENTITY_BYTES = 256
-"""Largest length, bytes, of the line with which a microcontroller names itself. The reference
-firmware's line has 150 bytes."""
+"""Largest length, bytes, of the line with which a microcontroller names itself. The line of the
+reference firmware has 150 bytes."""
 
 MAX_WAITING = 16
-"""Largest number of waiting senders that are watched. A hostile client may use many names."""
+"""Largest number of waiting senders that are watched at a time. A hostile client may use many
+names."""
 
 NUMBER = re.compile(r"\b\d+(\.\d+)?\b")
-"""Matches a number, but not a digit in a name. Reasons that differ only in numbers count as
-equal."""
+"""Pattern for a number in a reason, but not for a digit in a name. Reasons that differ only in
+numbers count as equal."""
 
 
 class TimelineEntry(Struct, frozen=True, omit_defaults=True):
@@ -77,7 +79,7 @@ class TimelineEntry(Struct, frozen=True, omit_defaults=True):
     - `continues`: the recording continues an earlier one.
     - `drive`: a drive has ended, or is under way as the recording ends.
     - `link_late`: an event `link_stale` that a delay of the daemon's computer caused.
-    - `link_heard`: a further event about a link that is already lost.
+    - `link_heard`: another event about a loss of the link that an earlier event has reported.
     - `reason`: the reason of the robot's mode has changed, but the mode has not.
     - `waits`: a sender must wait while another one drives.
     - `board`: a microcontroller has named itself and its last reset.
@@ -89,33 +91,39 @@ class TimelineEntry(Struct, frozen=True, omit_defaults=True):
     text: str
     level: str = "info"
     by: str = ""
-    """The client that caused the event, or the sources that commanded the drive."""
+    """The client that caused the event, or the sources that commanded the drive; "" if unknown."""
     count: int = 1
-    """Number of equal events that this entry stands for."""
+    """Number of equal events that the log combined to this entry."""
 
     @property
     def sentence(self) -> str:
-        """The text, the client and the number of events as one text, as in a line of the log."""
+        """The text, the client and the number of events, combined as in a line of the log."""
         by = f" (by {self.by})" if self.by else ""
         return f"{self.text}{by}{how_often(self.text, self.count)}"
 
 
 def entry_of(event: Event, wall_ns: int) -> TimelineEntry:
-    """Return the entry of an event. `wall_ns` is its wall-clock time, ns since 1970."""
+    """Return the timeline entry for an event of the log.
+
+    `wall_ns` is the wall-clock time of the event, ns since 1970.
+    """
     late = event.name == "link_stale" and is_ours(event.text)
     name = "link_late" if late else event.name
     return TimelineEntry(wall_ns / 1e9, name, event.text, event.level, event.by, event.count)
 
 
 class LinkLosses:
-    """Detects repeated events about a link that is already lost."""
+    """Detects repeated events about the same loss of the link to the board."""
 
     def __init__(self) -> None:
         self._names: set[str] = set()
         """Names of the events that have reported a lost link since the link was last up."""
 
     def repeated(self, name: str) -> bool:
-        """Register an event. Return whether it repeats an event about the same loss of the link."""
+        """Register the name of the next event.
+
+        Return whether this event repeats an earlier event about the same loss of the link.
+        """
         if name == "link_up":
             self._names.clear()
         if name not in ("link_down", "link_booting", "link_stale", "link_late"):
@@ -126,26 +134,24 @@ class LinkLosses:
 
 
 class ReasonChanges:
-    """Detects when the reason of the robot's mode changes, although the mode does not.
-
-    A reason that an event reports is ignored.
-    """
+    """Makes the entries `reason`: the reason of the robot's mode changes, but the mode does not."""
 
     def __init__(self) -> None:
         self._mode = self._reason = ""
-        """The last mode and reason that the timeline shows. The reason has `#` for each number."""
+        """The last mode and reason that the timeline shows. Each number in the reason is replaced
+        by `#`."""
         self._reported_ns = -REASON_NS
-        """Monotonic time of the last entry, or of the last event that reported the mode `waiting`,
-        whichever is later, ns."""
+        """Monotonic time of the last entry, ns. An event that reports the mode `waiting` counts
+        like an entry."""
         self._sender = ("", "")
-        """Pair: the source that the robot followed when its last command arrived, and the sender of
-        that command."""
+        """Pair: the source that the robot followed last, and the sender of that source's last
+        command."""
 
     def step(self, step: Step) -> Iterator[TimelineEntry]:
-        """Yield an entry if the reason has changed, but the mode has not.
+        """Yield an entry if the reason of the mode has changed in a step, but the mode has not.
 
-        There is no entry if an event reports the reason, and none while the robot drives. There is
-        at most one entry each second.
+        There is no entry if an event reports the reason, or while the robot drives. There is at
+        most one entry each second.
         """
         mode, text, _, source = step.recorded.status
         now, reason = step.inputs.now, NUMBER.sub("#", text)
@@ -171,21 +177,22 @@ _IDENTITY = re.compile(re.escape(IDENTITY) + rb"([^\r\n]*)[\r\n]")
 
 
 class BoardIdentity:
-    """Detects the line with which a microcontroller names itself.
+    """Makes the entries `board` from the lines with which a microcontroller names itself.
 
-    The board sends this line after its start, and when the daemon asks for it. The robot reports
-    the line as an event only if the link was up. If a restart takes so long that the link is lost,
-    only this line shows that a restart was the reason.
+    The board sends such a line after its start, and when the daemon asks for its name. The robot
+    reports the line as an event only if the link was up. If the link was lost before the line
+    arrived, only this entry shows that the board was restarted.
     """
 
     def __init__(self) -> None:
         self._data = b""
-        """The last received bytes if they may be the beginning of the line with the board's name,
+        """The last received bytes, if they may be the beginning of the line with the board's name;
         otherwise empty."""
         self._reported_ns = -REASON_NS
+        """Monotonic time of the last entry, ns."""
 
     def step(self, step: Step) -> Iterator[TimelineEntry]:
-        """Yield an entry if the board has named itself, but at most one entry each second."""
+        """Yield an entry if the board has named itself in a step, but at most one each second."""
         now = step.inputs.now
         for read in step.inputs.received:
             data = self._data + read.data
@@ -212,30 +219,35 @@ class BoardIdentity:
 
 
 class _Waiting(Struct):
-    """A sender that sends speeds while the robot follows another one."""
+    """A sender that sends speeds while the robot follows another sender."""
 
     since_ns: int
-    """Monotonic time of the first speed that the robot did not follow, ns."""
+    """Monotonic time of the sender's first speed that the robot did not follow, ns."""
     last_ns: int
-    """Monotonic time of the last speed that the robot did not follow, ns."""
+    """Monotonic time of the sender's last speed that the robot did not follow, ns."""
     reported: bool = False
+    """True if the sender already has an entry in the timeline."""
 
 
 class WaitingSenders:
-    """Detects senders whose speeds do not move the robot because it follows another sender."""
+    """Makes the entries `waits`: a sender sends speeds, but the robot follows another sender."""
 
     def __init__(self, priorities: Mapping[str, int]) -> None:
+        """Prepare for the first step. `priorities` maps each source's name to its priority."""
         self._priorities = priorities
         self._commander = ""
-        """The sender that the robot follows: text "source (sender)" from the event `commander`."""
+        """The sender that the robot follows, as the text "source (sender)" of the last event
+        `commander`."""
         self._waiting: dict[tuple[str, str], _Waiting] = {}
+        """Maps the pair (source, sender) to each waiting sender."""
         self._reported_ns = -REASON_NS
+        """Monotonic time of the last entry, ns."""
 
     def step(self, step: Step) -> Iterator[TimelineEntry]:
-        """Yield an entry for each sender that has just waited for `WAITS_NS`."""
+        """Yield an entry for each sender that has waited for `WAITS_NS` and has no entry yet."""
         for event in step.recorded.events:
             if event.name == "commander":
-                # If the log combined several changes, `by` contains several names.
+                # If the log combined several changes of the sender, `by` contains several names.
                 self._commander = event.by
         mode, _, _, source = step.recorded.status
         if mode != "driving":
@@ -267,7 +279,7 @@ class WaitingSenders:
         yield TimelineEntry(now.wall_ns / 1e9, "waits", text, by=_named(*key))
 
     def _has_room(self, now: Instant) -> bool:
-        """Return whether one more sender can be watched. If not, first forget silent senders."""
+        """Return whether another sender can be watched. If needed, first forget silent senders."""
         if len(self._waiting) >= MAX_WAITING:
             oldest_ns = now.mono_ns - SILENT_NS
             kept = {key: one for key, one in self._waiting.items() if one.last_ns >= oldest_ns}
@@ -275,14 +287,14 @@ class WaitingSenders:
         return len(self._waiting) < MAX_WAITING
 
     def _known(self, source: str) -> bool:
-        """Return whether it is known which sender of this source the robot follows."""
+        """Return whether `_commander` names exactly one sender, and it is a sender of `source`."""
         return self._commander.startswith(f"{source} (") and ", " not in self._commander
 
     def _why(self, waiting: str, followed: str) -> str:
-        """Return why the robot follows the source `followed` and not `waiting`; "" if unknown.
+        """Return why the robot follows the source `followed` and not the source `waiting`.
 
-        The result is also "" if `waiting` has the higher priority. Such a source does not wait: the
-        robot follows another one because it refuses the commands of `waiting`.
+        The result is "" if a priority is not known, or if `waiting` has the higher priority. In the
+        latter case `waiting` does not wait, but the robot refuses its commands.
         """
         one, other = self._priorities.get(waiting), self._priorities.get(followed)
         if one is None or other is None or one > other:
@@ -298,7 +310,11 @@ class TimelineWriter:
     """Makes the timeline of a recording from its steps."""
 
     def __init__(self, config: Config | None = None) -> None:
-        """Prepare for the first step. If `config` is None, there are no entries `waits`."""
+        """Prepare for the first step.
+
+        `config` is the configuration of the recorded robot. Without it, the timeline has no `waits`
+        entries.
+        """
         sources = config.commands.sources if config is not None else ()
         self._number: int | None = None
         self._pose: tuple[int, int, int] | None = None
@@ -308,19 +324,20 @@ class TimelineWriter:
         self._sources: list[str] = []
         """The sources that commanded the present drive, in the order in which they began."""
         self._since = ""
-        """The end of the text of the present drive's entry: a note if the drive began before this
-        recording, otherwise ""."""
+        """Note at the end of the entry `drive` if the drive began before this recording; otherwise
+        ""."""
         self._now: Instant | None = None
         self._shutting_down = False
         self._continued: Step | None = None
-        """First step of a recording that continues another one; None once its entry is made."""
+        """First step of a recording that continues an earlier recording. None in other recordings,
+        and after the entry `continues` was made."""
         self._losses = LinkLosses()
         self._board = BoardIdentity()
         self._reasons = ReasonChanges()
         self._waiting = WaitingSenders({source.name: source.priority for source in sources})
 
     def step(self, step: Step) -> Iterator[TimelineEntry]:
-        """Yield the entries of a step. The steps must come in order."""
+        """Yield the timeline entries of a step. The steps must come in order."""
         if self._number is None and step.number > 0:
             self._continued = step
         entries, first = list(self._entries(step)), self._continued
@@ -331,7 +348,7 @@ class TimelineWriter:
         yield from entries
 
     def _continues(self) -> Iterator[TimelineEntry]:
-        """Yield the entry `continues`, which says what the robot does as the recording begins."""
+        """Yield the entry `continues`, with the robot's state at the beginning of the recording."""
         first, self._continued = self._continued, None
         if first is None:
             return
@@ -412,10 +429,11 @@ class TimelineWriter:
             self._began_ns = None
 
     def end(self, ending: str = "") -> Iterator[TimelineEntry]:
-        """Yield the entries that follow the last step.
+        """Yield the timeline entries that follow the last step.
 
-        There is an entry `drive` if the robot still drives, and an entry `cut` unless `ending` is
-        "". `ending` says how the recording was cut off.
+        There is an entry `drive` if the robot still drives, and an entry `cut` if the recording was
+        cut off. `ending` says how the recording was cut off, as in `Recording.ending`. It is "" if
+        the daemon ended normally.
         """
         yield from self._continues()
         if self._now is None:
@@ -447,25 +465,33 @@ INCIDENT_WORDS = {
     "wheel_fault": "wheel fault",
     "link_up": "",
 }
-"""Maps the name of each event that a summary uses to the words with which the summary counts it.
-The event `link_up` has no words, because it only shows where a loss of the link ends."""
+"""Maps the name of each event in a summary to the word for this event in the summary, singular. The
+event `link_up` has no word: it is not counted, but shows where a loss of the link ends."""
 
 
 SERIOUS = re.compile(r"(^|, )\d+ (emergency stop|bumper hit|battery stop|stop|fault)s?\b")
-"""Pattern that finds a stop, a bumper hit or a fault in a summary."""
+"""Pattern for the number of stops, bumper hits or faults in a summary. A stop may also be an
+emergency stop or a battery stop. A wheel fault does not count as a fault."""
 
 
 def is_serious(text: str) -> bool:
-    """Return whether the summary `text` counts a stop, a bumper hit or a fault."""
+    """Return whether a summary counts a stop, a bumper hit or a fault.
+
+    `text` is the result of `summary`. A stop may also be an emergency stop or a battery stop.
+    """
     # Ignore the names of the clients, because a name may look like a fault.
     return SERIOUS.search(text.partition(" (stopped by ")[0]) is not None
 
 
 def summary(events: Iterable[TimelineEntry], starts: bool = False) -> str:
-    """Return a text that counts the incidents of a recording.
+    """Return a text that counts the incidents of a recording, such as "start, 2 stops".
 
-    The text also names the clients that stopped the robot. `starts` is true if the recording
-    includes the daemon's start; the text then begins with "start".
+    The text also names the clients that stopped the robot.
+
+    Args:
+        events: the events of the recording in order. Events that are not in `INCIDENT_WORDS` are
+            ignored.
+        starts: true if the recording includes the daemon's start.
     """
     counts: Counter[str] = Counter()
     stopped: list[str] = []

@@ -1,8 +1,9 @@
 """Rebuilds a pickled `Robot` safely, even if an attacker forged the bytes.
 
-Python's own unpickler does whatever the bytes say: it calls functions, imports modules, changes
-classes, and nests objects without limit. This reader knows only the opcodes that a pickled robot
-consists of. It calls only constructors of plain data, and checks each part when it makes the part:
+Python's own unpickler executes all instructions in the bytes. It calls functions, imports modules,
+changes classes, and nests objects without limit. This module executes only the opcodes that occur
+in a pickled robot. It calls only constructors of plain data, and checks each part of the robot when
+it makes the part:
 
     a number, text, bytes    a number has at most 128 bits
     a list, a tuple ...      depth and size are limited; a part that occurs twice counts twice
@@ -10,13 +11,13 @@ consists of. It calls only constructors of plain data, and checks each part when
     any other object         made without its constructor, then given attributes; no attribute
                              hides an attribute of the class
 
-A list of allowed classes in `Unpickler.find_class` is not enough. Even when only the classes of
-`state.py` were allowed, forged bytes took more than 3 s of processor time (nested tuples as keys,
-keys with equal hashes, copies of one dict), allocated more than 2 GB, or changed the class of the
-robot for the whole process.
+A list of allowed classes in `Unpickler.find_class` is not enough. When only the classes of
+`state.py` were allowed, forged bytes still took more than 3 s of processor time (nested tuples as
+keys, keys with equal hashes, copies of one dict), allocated more than 2 GB, or changed the class of
+the robot for the whole process.
 
 Once the bytes refer to an earlier part, that part cannot grow any more. Therefore no part contains
-itself, and the depth and the size of every part are exact.
+itself, and the computed depth and size of every part are exact.
 """
 
 from __future__ import annotations
@@ -31,37 +32,39 @@ import msgspec
 from msgspec import Struct
 
 MAX_BYTES = 1 << 20
-"""Largest size of a pickled robot, bytes. A robot usually has 12 000 to 40 000 bytes. With many
-senders it has more."""
+"""Largest size of a pickled robot, bytes. A robot usually has 12 000 to 40 000 bytes, but more if
+many senders have sent commands."""
 
 MAX_OPCODES = 1 << 17
+"""Largest number of opcodes in a pickled robot."""
 
 MAX_PARTS = 1 << 19
 """Largest number of values in a robot. A value that occurs several times counts each time."""
 
 MAX_COPIED = 4 * MAX_PARTS
-"""Largest number of values that may be copied in total when objects are constructed and when
-attributes are set. Without this limit, a few bytes could copy a large part again and again."""
+"""Largest total number of values that are copied when objects are made and attributes are set.
+Without this limit, a few bytes could copy a large value again and again."""
 
 MAX_KEY = 2**61 - 1
-"""The absolute value of an integer that is used as a key must be below this bound.
+"""Bound on the absolute value of an integer that is a dict key or a set element.
 
-Below it, every integer except -1 is its own hash, so that forged keys cannot collide.
+Every smaller integer except -1 is its own hash, so that an attacker cannot forge many keys with
+equal hashes.
 """
 
 MAX_DEPTH = 50
-"""Largest depth to which values may be nested in each other."""
+"""Largest depth to which values may be nested."""
 
 MAX_INT_BITS = 128
 """Largest number of bits of an integer. Sums of times in ns have more than 64 bits."""
 
 MAX_KEY_PARTS = 4
-"""Largest number of elements of a tuple that is used as a key."""
+"""Largest number of elements in a tuple that is a dict key or a set element."""
 
 FindClass = Callable[[str, str], type]
-"""Takes the names of a module and a class, and returns the class.
+"""Function that takes the name of a module and the name of a class, and returns the class.
 
-Raises `ValueError` for a class that is not a part of a robot.
+It raises `ValueError` if objects of this class cannot be parts of a robot.
 """
 
 ARGUMENTS = {
@@ -71,24 +74,25 @@ ARGUMENTS = {
 """Opcodes that push their argument onto the stack."""
 
 VALUES = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False, "EMPTY_TUPLE": ()}
-"""Opcodes that push a constant onto the stack, each with the constant."""
+"""Maps each opcode that pushes a constant onto the stack to this constant."""
 
 CONTAINERS: dict[str, type] = {"EMPTY_LIST": list, "EMPTY_DICT": dict, "EMPTY_SET": set}
-"""Opcodes that push a new, empty container onto the stack, each with its type."""
+"""Maps each opcode that pushes an empty container onto the stack to the type of the container."""
 
 TUPLES = {"TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3}
-"""Opcodes that make a tuple of the top values of the stack, each with the number of these
+"""Maps each opcode that makes a tuple of the top values of the stack to the number of these
 values."""
 
 SIMPLE = (str, int, float, bool, bytes, type(None))
-"""Allowed types of dict keys and set elements. Members of an Enum, and short tuples of all these
-values, are allowed too."""
+"""Allowed types of dict keys and set elements. Members of an Enum are allowed too, and also short
+tuples of allowed values."""
 
 
 def unpickle(data: bytes, find: FindClass) -> object:
-    """Return the object that the bytes describe. `find` returns the class with a given name.
+    """Return the object that a pickle describes. The bytes may be forged.
 
-    Raises `ValueError` if the bytes are damaged or contain anything that a robot never contains.
+    `find` returns the class for the names of a module and a class. Raises `ValueError` if the bytes
+    are damaged, or if they contain anything that a pickled robot never contains.
     """
     if len(data) > MAX_BYTES:
         raise ValueError(
@@ -114,7 +118,7 @@ def unpickle(data: bytes, find: FindClass) -> object:
 
 
 class _Entry:
-    """A value on the stack, with its nesting depth and its number of parts."""
+    """A value on the stack, with its nesting depth and its size (the number of values in it)."""
 
     __slots__ = ("closed", "depth", "size", "value")
 
@@ -123,12 +127,13 @@ class _Entry:
         self.depth = 0
         self.size = 1
         self.closed = False
-        """True once an opcode has fetched the value from the memo. It then cannot grow any more."""
+        """True once an opcode has fetched the value from the memo. The value may then not grow any
+        more."""
 
     def holds(self, parts: Sequence[_Entry]) -> None:
-        """Update the depth and the size of this value for `parts`, which it is about to contain.
+        """Update the depth and the size of this value for `parts`, which the caller will add to it.
 
-        Raises `ValueError` if a limit is exceeded, or if the value is closed.
+        Raises `ValueError` if a limit is exceeded, or if this value may not grow any more.
         """
         if self.closed:
             raise ValueError(
@@ -156,15 +161,16 @@ class _Entry:
 
 
 class _Machine:
-    """The stack machine that executes the opcodes of a pickle."""
+    """Stack machine that executes the opcodes of a pickle."""
 
     def __init__(self, find: FindClass) -> None:
         self._find = find
         self._stack: list[_Entry] = []
         self._marks: list[int] = []
-        """Heights of the stack at the `MARK` opcodes."""
+        """Height of the stack at each `MARK` opcode whose values were not popped yet."""
         self._memo: list[_Entry] = []
         self._copied = 0
+        """Number of values that were copied so far."""
 
     def result(self) -> object:
         """Return the only value on the stack; raise `ValueError` if there is not exactly one."""
@@ -175,7 +181,8 @@ class _Machine:
     def do(self, name: str, argument: Any) -> None:
         """Execute the opcode `name`.
 
-        Raises `ValueError` for a forbidden opcode. Damaged operands raise other exceptions too.
+        Raises `ValueError` if the opcode is forbidden. If the operands are damaged, it may also
+        raise the other exceptions that `unpickle` converts.
         """
         if name in ARGUMENTS:
             if type(argument) is int and argument.bit_length() > MAX_INT_BITS:
@@ -208,7 +215,6 @@ class _Machine:
         return entry
 
     def _push_of(self, kind: type, parts: list[_Entry]) -> None:
-        """Push a new tuple or frozenset with these parts. It cannot grow later, unlike a list."""
         entry = _Entry(None)
         entry.holds(parts)
         entry.value = kind([part.value for part in parts])
@@ -222,16 +228,16 @@ class _Machine:
         return taken
 
     def _marked(self) -> list[_Entry]:
-        """Remove the last mark. Pop and return all values above it."""
+        """Remove the last mark. Pop and return all values above this mark."""
         mark = self._marks.pop()
         taken = self._stack[mark:]
         del self._stack[mark:]
         return taken
 
     def _copies(self, entry: _Entry) -> None:
-        """Count the values of `entry` as copied.
+        """Add the size of `entry` to the number of copied values.
 
-        Raises `ValueError` if the number of all copied values exceeds `MAX_COPIED`.
+        Raises `ValueError` if this number exceeds `MAX_COPIED`.
         """
         self._copied += entry.size
         if self._copied > MAX_COPIED:
@@ -303,7 +309,7 @@ class _Machine:
         self._push(self._find(module, name))
 
     def construct(self) -> None:
-        """Make an object of a class from the arguments of its constructor."""
+        """Pop a class and a tuple of arguments, and push a new object of the class."""
         kind, given = self._top(2)
         if not isinstance(kind.value, type) or not isinstance(given.value, tuple):
             raise TypeError("an instruction calls an object that is not a class")
@@ -314,7 +320,10 @@ class _Machine:
         self._stack.append(entry)
 
     def make_bare(self) -> None:
-        """Make an object without attributes, and without a call of its constructor."""
+        """Pop a class, and push an object of this class that has no attributes yet.
+
+        The constructor is not called.
+        """
         kind, given = self._top(2)
         if not isinstance(kind.value, type) or given.value != ():
             raise TypeError(
@@ -326,7 +335,10 @@ class _Machine:
         self._push(object.__new__(kind.value))
 
     def set_attributes(self) -> None:
-        """Set the attributes of an object that `make_bare` made."""
+        """Pop a dict, and set its items as attributes of the object that is then on top.
+
+        Only `make_bare` can have made this object.
+        """
         (state,) = self._top(1)
         whole, named = self._stack[-1], state.value
         if not _is_part(type(whole.value)) or not isinstance(named, dict):
@@ -363,13 +375,14 @@ OPCODES: dict[str, Callable[[_Machine], None]] = {
     "NEWOBJ": _Machine.make_bare,
     "BUILD": _Machine.set_attributes,
 }
-"""The method of each opcode that is not in `ARGUMENTS`, `VALUES`, `CONTAINERS` or `TUPLES`."""
+"""Maps each remaining opcode to the method that executes it. `_Machine.do` executes the opcodes in
+`ARGUMENTS`, `VALUES`, `CONTAINERS` and `TUPLES`, and those that fetch a value from the memo."""
 
 
 def _keys(entries: Sequence[_Entry]) -> None:
     """Raise `ValueError` unless every entry is allowed as a dict key or set element.
 
-    Other values may be impossible to hash, slow to hash, or forged so that their hashes collide.
+    The other values cannot be hashed, are slow to hash, or may be forged to have equal hashes.
     """
     for entry in entries:
         value = entry.value
@@ -389,16 +402,17 @@ def _keys(entries: Sequence[_Entry]) -> None:
 def _is_part(kind: Any) -> bool:
     """Return whether objects of the class `kind` can be rebuilt from their attributes alone.
 
-    They cannot if the class is a builtin or defines `__new__`, `__reduce_ex__` or `__setstate__`.
+    Return False if `kind` is a builtin, or defines `__new__`, `__reduce_ex__` or `__setstate__`.
     """
     plain = kind.__new__ is object.__new__ and kind.__reduce_ex__ is object.__reduce_ex__
     return plain and kind.__module__ != "builtins" and not hasattr(kind, "__setstate__")
 
 
 def _made(kind: type, given: tuple[Any, ...]) -> object:
-    """Make an object from the arguments of its constructor.
+    """Return an object of the class `kind`, constructed from the arguments `given`.
 
-    Raises `ValueError` or `TypeError` if the arguments do not suit the class.
+    Raises `ValueError` if the class is not allowed here. Wrong arguments also raise `TypeError` or
+    a msgspec error.
     """
     match given:
         case (dict(),) if kind is Counter:

@@ -1,4 +1,8 @@
-"""Finds which command source drove at each time, and why the others waited or were refused."""
+"""Determines the state of each command source over time.
+
+The state says whether the source drove the robot, waited, was refused or was silent. It comes with
+the reason in words.
+"""
 
 from __future__ import annotations
 
@@ -14,56 +18,65 @@ from acsard.core.values import NS_PER_S, Command, Outputs, Twist
 from acsard.recording.recorded_steps import Step
 
 STATES = ("refused", "waits", "sends", "drives")
-"""States of a command source that is not silent.
+"""States of a command source that is not silent, the most important state first.
 
-In the state `sends`, the robot accepts the source's commands, but the source does not drive. If
-neighboring spans of time with different states are merged, the merged span has the state that comes
-first in this tuple.
+In the state `sends`, the robot accepts the source's commands, but the source does not drive the
+robot. If spans of time with different states are merged, the result has the most important state.
 """
 
 MOVES = ("ready", "driving")
-"""Modes in which the robot can follow a source. In the other modes it follows no source."""
+"""Modes in which the robot can follow a command source. In any other mode it follows no source."""
 
 OTHERS = "others"
-"""Common name of all command sources that are not in the configuration."""
+"""Common name in a report for all command sources that are not in the configuration."""
 
 SAMPLE_S = 0.1
-"""Time between two samples of the sources' states, s.
+"""Longest time between two samples of the sources' states, s.
 
-A change of the mode, its reason, the link or the driving source causes a sample at once.
+A change of the mode, its reason, the link or the driving source causes an additional sample.
 """
 
 MAX_TEXT = 300
 """Maximum length of a sentence or name from a recording, characters. The rest is cut off."""
 
 MAX_SENDERS = 256
-"""Maximum number of senders of which the last command is kept."""
+"""Maximum number of senders whose last command is kept."""
 
 
 class CommandSources:
-    """The states of all command sources over time, with a `Band` for each source."""
+    """The states of all command sources over time."""
 
     def __init__(self, sources: Sequence[Source]) -> None:
+        """Prepare for the first step. `sources` are the sources in the configuration."""
         self._timeouts = {
             source.name: source.timeout for source in sorted(sources, key=lambda s: -s.priority)
         }
         self.bands = {name: Band(STATES) for name in (*self._timeouts, OTHERS)}
-        """The states of each source over time. The source with the highest priority comes first."""
+        """Maps the name of each source to its states over time. Sources with a higher priority come
+        first."""
         self._newest: dict[tuple[str, str], Command] = {}
-        """The last command of each sender of each source. The newest command comes last."""
+        """Maps the pair (source, sender) to the last command of this sender. The newest command
+        comes last."""
         self._counted: Counter[str] = Counter()
-        """For each reason, the number of commands that the robot has refused so far."""
+        """Maps each reason for a refusal to the number of commands that the robot has refused so
+        far for this reason."""
         self._refused: dict[str, tuple[float, str]] = {}
-        """For each refused source: the time until which it counts as refused, s, and the reason."""
+        """Maps the name of each refused source to a pair: the time until which the source counts as
+        refused, s, and the reason in words."""
 
     def name(self, source: str) -> str:
         """Return the name of a source, or `OTHERS` if the source is not configured."""
         return source if source in self._timeouts else OTHERS
 
     def take_commands(self, step: Step, t: float, robot: Robot) -> bool:
-        """Process the commands of a step at time `t`, s. `robot` is the robot after the step.
+        """Process the commands of a step.
 
-        Return True if a command was refused. The caller then takes a new sample of the states.
+        Return True if a command was refused. The caller should then call `sample`.
+
+        Args:
+            step: the recorded step.
+            t: the time of the step in the report, s.
+            robot: the robot, which has just replayed the step.
         """
         commands, before = step.inputs.commands, dict(self._refused)
         for command in commands:
@@ -79,11 +92,9 @@ class CommandSources:
         return before != self._refused
 
     def _find_refused(self, step: Step, t: float, robot: Robot) -> None:
-        """Find the commands of this step that the robot refused, and mark their sources as refused.
-
-        The robot's counters show the reasons, but not the sources. A source counts as refused if
-        the last command that the robot accepted from it is older than its command in this step.
-        """
+        """Find the commands of a step that the robot refused, and mark their sources as refused."""
+        # The robot's counters show the reasons, but not the sources. A source counts as refused if
+        # the last command that the robot accepted from it is older than its command in this step.
         counted = Counter({name: robot.counters[f"command_{name}"] for name in REFUSED})
         new, self._counted = counted - self._counted, counted
         if not new:
@@ -110,12 +121,21 @@ class CommandSources:
         return None
 
     def sample(self, step: Step, t: float, robot: Robot) -> None:
-        """Add the state of each source at time `t`, s, to its band."""
+        """Add the present state of each source to `bands`.
+
+        Args:
+            step: the recorded step.
+            t: the time of the step in the report, s.
+            robot: the robot, which has just replayed the step.
+        """
         for name, state, words in self._states(step, t, robot):
             self.bands[name].add(t, state, words)
 
     def _states(self, step: Step, t: float, robot: Robot) -> Iterator[tuple[str, str, str]]:
-        """Yield for each source: its name, its state ("" if silent), and the reason in words."""
+        """Yield a triple for each source: its name, its state, and the reason in words.
+
+        The state of a silent source is "".
+        """
         mode, reason, _, driver = step.recorded.status
         for source in robot.snapshot(step.inputs.now.mono_ns).sources:
             refusal, wait = self._refusal(source.name, t), source.waits_for
@@ -133,6 +153,9 @@ class CommandSources:
         yield OTHERS, "refused" if refusal else "", refusal
 
     def _refusal(self, name: str, t: float) -> str:
-        """Return why a source counts as refused at time `t`, s, or "" if it does not."""
+        """Return why the source `name` counts as refused at the time `t`, s.
+
+        Return "" if it does not count as refused.
+        """
         until, words = self._refused.get(name, (-math.inf, ""))
         return words if t < until else ""

@@ -1,6 +1,6 @@
-"""Draws the data of a report: the path of the robot, and all other data over time.
+"""Draws the pictures of a report: the path of the robot, and all other data over time.
 
-Times in the pictures are local times in ms since 1970, because plotly does not know time zones.
+The pictures contain times as ms since 1970 in local time, because plotly does not know time zones.
 """
 
 from __future__ import annotations
@@ -34,7 +34,8 @@ from acsard.report.plot_elements import (
 from acsard.report.report_data import Mark, Marks, ReportData
 
 ROW_PX, AXIS_PX = 54, 68
-"""Height of each row in the picture of the sources, px, and additional height for the time axis."""
+"""Height of each row in the picture of the command sources, and additional height for the time
+axis, both in px."""
 
 
 class Line(NamedTuple):
@@ -44,65 +45,71 @@ class Line(NamedTuple):
     colour: str
     points: Sequence[Point]
     shape: str = "linear"
-    """Plotly's interpolation between two points."""
+    """Interpolation between two points: a value of plotly's attribute `line.shape`."""
     width: float = 1.6
     """Line width, px."""
     values: Sequence[float] = ()
-    """Values that the page shows at the pointer. If empty, the page shows the values of
-    `points`."""
+    """For each point, the value that the page shows when the user points at it. If `values` is
+    empty, the page shows the values of `points`."""
 
 
 GAP_PX = 30
 """Height of the gap above each diagram of a picture, px. The gap holds the diagram's title."""
 
 LEAST_LINEAR, LEAST_ANGULAR = 0.1, 0.2
-"""Smallest spans of the scales of the forward speed, m/s, and of the turn rate, rad/s.
-
-Otherwise the scale of a robot that never moves would be empty.
-"""
+"""Smallest spans of the scales in the diagrams of the forward speed, m/s, and of the turn rate,
+rad/s. Without them the scale would be empty if the robot never moves."""
 
 BENEATH = 3.4
-"""Width of a curve that lies under another curve, px.
+"""Width of a curve that is drawn under another curve, px.
 
-It is wide, so that it stays visible on both sides of the other curve.
+It is larger than the width of the other curve, so that the lower curve stays visible on both sides.
 """
 
 
 class Clip(NamedTuple):
-    """An excursion: a time in which a curve exceeds the scale, and is drawn at the edge."""
+    """An excursion of a curve: a time in which the curve exceeds the scale of its diagram.
+
+    During an excursion, the curve is drawn at the upper or lower edge of the diagram.
+    """
 
     t: float
-    """Time at which the curve leaves the diagram, s."""
+    """Time in the report at which the excursion begins, s."""
     edge: float
-    """Value at the edge of the diagram, at which the curve is drawn."""
+    """Value at the edge of the diagram."""
     value: float
-    """The curve's furthest value beyond the edge."""
+    """The largest value of the curve beyond the upper edge, or the smallest value beyond the lower
+    edge."""
 
 
 MARKS_APART = 0.02
 """Smallest distance between two excursions, as a fraction of the diagram's width.
 
-Excursions that are closer count as one and have one triangle.
+Excursions beyond the same edge that are closer count as a single excursion with one triangle.
 """
 
+# The space shows a commanded speed that the robot reaches only after a ramp. It is limited, so that
+# a command of 99 m/s does not flatten the other curves.
 HEADROOM = 0.5
-"""Space in a diagram above and below the limited and measured speeds, as a fraction of their span.
-
-It shows a commanded speed that the robot reaches only after a ramp. The scale is limited, so that a
-command of 99 m/s does not flatten the other curves.
-"""
+"""Space in a diagram above and below the limited and measured speeds, as a fraction of the span of
+these speeds."""
 
 
 def clipped(
     points: Sequence[Point], others: Sequence[Sequence[Point]], least: float, gap: float
 ) -> tuple[list[Point], list[Clip]]:
-    """Limit a curve to the scale of a diagram. Return the limited curve, and its excursions.
+    """Limit a curve to the scale of a diagram.
+
+    Return a pair: the points of the limited curve, and the excursions of the curve.
 
     Args:
-        points: the curve; NaN interrupts it.
-        others: the curves that determine the scale. `HEADROOM` is added above and below their span.
-        least: smallest span of the scale.
-        gap: excursions beyond the same edge that are at most this time apart count as one, s.
+        points: the points of the curve. The value NaN makes a gap.
+        others: the other curves in the diagram, which determine the scale. `HEADROOM` is added
+            above and below them.
+        least: a lower limit on the span of the other curves. If their span is smaller, the scale is
+            computed for this span.
+        gap: a time, s. Excursions beyond the same edge that are at most this time apart count as a
+            single excursion.
     """
     values = [0.0, *(p.value for curve in others for p in curve if math.isfinite(p.value))]
     room = HEADROOM * max(max(values) - min(values), least)
@@ -122,39 +129,42 @@ def clipped(
 
 
 class Part(NamedTuple):
-    """One of the diagrams in a picture. All diagrams of a picture share the time axis."""
+    """A diagram in a picture. All diagrams in a picture share the time axis."""
 
     title: str
     lines: list[Line]
     beyond: Sequence[Clip] = ()
-    """The excursions of the first curve of `lines` beyond the scale of the diagram."""
+    """The excursions of the first curve in `lines`."""
 
 
 Row = tuple[str, list[Span]]
-"""A row of the picture of the sources: its name, and the spans of time that are drawn as bands."""
+"""A row in the picture of the command sources: its name, and the spans of time that are drawn as
+bands."""
 
 DRIVES = "drives"
 
 
 class BandStyle(NamedTuple):
-    """Appearance of the bands that show one state.
+    """Appearance of the bands for one state, in the picture of the command sources.
 
-    The state "drives" has a style for each source that drove.
+    The state "drives" has a style of its own for each source that drove the robot.
     """
 
     kind: str
-    """State that the bands show, such as "drives"."""
+    """State that the bands show, such as "waits"."""
     source: str
-    """Name of the source that drives; "" if the style applies to all rows."""
+    """Name of the command source if `kind` is "drives"; "" for a style that applies to all rows."""
     colour: str
     pattern: str = ""
+    """Fill pattern, as in `PATTERNS`."""
 
     @property
     def meaning(self) -> str:
+        """Words for the legend, such as "joystick drives" or "waits"."""
         return f"{self.source} {self.kind}".strip()
 
     def of(self, row: Row) -> list[Span]:
-        """Return the spans of a row that are drawn with this style."""
+        """Return the spans in a row that are drawn with this style."""
         name, spans = row
         applies = self.source in ("", name)
         return [span for span in spans if span.kind == self.kind] if applies else []
@@ -171,7 +181,7 @@ def _styles(rows: list[Row]) -> Iterator[BandStyle]:
 
 
 def _keys(styles: list[BandStyle]) -> list[Key]:
-    """Return one legend entry for each pair of color and pattern, with all its meanings."""
+    """Return the entries of the legend. Styles with equal color and pattern share an entry."""
     meanings: dict[tuple[str, str], list[str]] = {}
     for style in styles:
         meanings.setdefault((style.colour, style.pattern), []).append(style.meaning)
@@ -182,7 +192,7 @@ def _keys(styles: list[BandStyle]) -> list[Key]:
 
 
 HEADINGS = 12
-"""Approximate number of heading arrows along a path."""
+"""Approximate number of arrows along the path that show the robot's heading."""
 
 NOTED = {
     "fault": ("✖", "x", COLOURS["error"]),
@@ -194,13 +204,12 @@ NOTED = {
     "link_stale": ("▲", "triangle-up", "#e0b400"),
     "link_late": ("⬟", "pentagon", "#8f4f22"),
 }
-"""Events that are drawn on the path, by name.
-
-A value contains the symbol in the legend, plotly's name for this symbol, and the color.
-"""
+"""Maps the name of each event that is drawn on the path to a triple: the symbol in the legend,
+plotly's name for this symbol, and the color."""
 
 
 def path_figure(data: ReportData) -> Figure:
+    """Return the picture of the robot's path, with the positions of the events in `NOTED`."""
     places = data.path.places()
     keys: list[Key] = []
     traces: list[Trace] = []
@@ -232,7 +241,10 @@ def path_figure(data: ReportData) -> Figure:
 
 
 def _events(name: str, marks: Marks, dot: dict[str, Any]) -> Trace | None:
-    """Draw the events of one name at their places; return None if no such event has a place."""
+    """Draw the events with the name `name` at the robot's positions.
+
+    Return None if no such event has a position.
+    """
     named = [mark for mark in marks.all() if mark.name == name]
     placed = [(mark, mark.place) for mark in named if mark.place is not None]
     if not placed:
@@ -249,14 +261,14 @@ def _places(name: str, places: list[Place], mode: str, **look: object) -> Trace:
 
 
 def _with_gaps(places: list[Place]) -> list[Place]:
-    """Insert a gap before each place whose `Place.new` is true, except before the first place."""
+    """Return the places with a gap before each jump of the path (`Place.new`)."""
     gap = Place(0.0, math.nan, math.nan, 0.0)
     found = [item for place in places for item in ((gap, place) if place.new else (place,))]
     return found[1:] if found and found[0] is gap else found
 
 
 def _spread(places: list[Place]) -> list[Place]:
-    """Return about `HEADINGS` places at equal distances along the path."""
+    """Return about `HEADINGS` places of the path, at about equal distances along the path."""
     distances = [0.0]
     for before, after in pairwise(places):
         metres = 0.0 if after.new else math.hypot(after.x - before.x, after.y - before.y)
@@ -280,20 +292,23 @@ def _dot(symbol: str, colour: str, size: int) -> dict[str, Any]:
 
 
 class TimeFigures:
-    """Draws all pictures of a report."""
+    """Draws the pictures of a report that have a time axis."""
 
     def __init__(self, data: ReportData, offset_s: float) -> None:
-        """Draw `data`; `offset_s` is the offset of the local time from UTC, s."""
+        """Prepare to draw `data`. `offset_s` is local time minus UTC, s."""
         self._data = data
         self._zero_ms = 1000 * ((data.began or 0.0) + offset_s)
+        """Local time of the first step of the report, ms since 1970."""
 
     def all(self) -> list[Figure]:
+        """Return all pictures of the report in the order of the page, including the path."""
         return [
             path_figure(self._data), self.speeds(), self.sources(), self.events(), self.wheels(),
             self.serial(), self.loop(),
         ]  # fmt: skip
 
     def speeds(self) -> Figure:
+        """Return the picture of the commanded, limited and measured speeds."""
         data, parts = self._data, list[Part]()
         gap = MARKS_APART * data.seconds
         for title, curves, least in (
@@ -330,6 +345,7 @@ class TimeFigures:
         return self._stack("speeds", "Speed", caption, parts, 210)
 
     def wheels(self) -> Figure:
+        """Return the picture of the commanded and measured speeds of the wheels."""
         curves = zip(WHEELS, self._data.commanded_wheels, self._data.measured_wheels, strict=True)
         parts = [
             Part(
@@ -345,6 +361,7 @@ class TimeFigures:
         return self._stack("wheels", "The four wheels", caption, parts, 150)
 
     def serial(self) -> Figure:
+        """Return the picture of the numbers of sent, answered and lost serial lines."""
         counts = self._data.serial
         bad = [Line("dropped", COLOURS["error"], counts.dropped.curve.points(), "hvh")]
         if not self._data.config.mcu.reply_period:
@@ -366,6 +383,7 @@ class TimeFigures:
         return self._stack("link", "The serial line", caption, parts, 170)
 
     def loop(self) -> Figure:
+        """Return the picture of the delays of the control loop."""
         late = Line("late", LIMITED, self._data.lateness.points(), "hv")
         caption = (
             "Each control step begins a little after it is due. This picture shows how much "
@@ -374,6 +392,7 @@ class TimeFigures:
         return self._stack("loop", "The control loop", caption, [Part("late, ms", [late])], 200)
 
     def sources(self) -> Figure:
+        """Return the picture of the mode, the link and the states of the command sources."""
         data, silent = self._data, list[str]()
         rows: list[Row] = [
             ("mode", data.modes.spans()),
@@ -406,7 +425,7 @@ class TimeFigures:
         return Figure("sources", title, caption, _keys(styles), height, traces, axes)
 
     def _bars(self, style: BandStyle, spans: list[tuple[int, Span]]) -> Trace:
-        """Draw the spans of one style.
+        """Draw the spans of time that have one style as bands.
 
         Each element of `spans` is a pair: the number of a row, and a span in this row.
         """
@@ -433,6 +452,7 @@ class TimeFigures:
         }
 
     def events(self) -> Figure:
+        """Return the picture of the events, with a row for each level."""
         levels, kept = ("info", "warning", "error"), self._data.marks
         traces = [
             self._marks(level, at, [mark for mark in kept.all() if mark.level == level])
@@ -475,11 +495,14 @@ class TimeFigures:
         return layout() | {"xaxis": axis, "margin": {"l": 44, "r": 12, "t": 8, "b": 44}}
 
     def _stack(self, name: str, title: str, caption: str, parts: list[Part], px: int) -> Figure:
-        """Draw diagrams below each other, each `px` px high, with one time axis and one legend."""
+        """Return a picture of diagrams below each other, with one time axis and one legend.
+
+        `px` is the height of each diagram, px.
+        """
         traces, notes = list[Trace](), list[dict[str, Any]]()
         axes = self._timed()
         axes["margin"] |= {"t": GAP_PX}
-        # Each cell of the grid is a part. All parts share the x axis.
+        # Each cell of plotly's grid contains one diagram. All diagrams share the x axis.
         names = ["", *map(str, range(2, len(parts) + 1))]
         axes["grid"] = {"subplots": [[f"xy{n}"] for n in names], "ygap": GAP_PX / px}
         for n, part in zip(names, parts, strict=True):
@@ -508,7 +531,7 @@ class TimeFigures:
         )
 
     def _clips(self, line: Line, clips: Sequence[Clip], axis: str) -> Trace:
-        """Draw a triangle at each place at which the curve leaves the diagram."""
+        """Draw a triangle at the beginning of each excursion of a curve."""
         symbols = ["triangle-up" if clip.value > clip.edge else "triangle-down" for clip in clips]
         return scatter(
             f"{line.name} outside",
@@ -522,9 +545,10 @@ class TimeFigures:
 
 
 def _hover(name: str, values: Sequence[float]) -> dict[str, Any]:
-    """Return plotly's settings for the text at the pointer: the curve's name, a value and the time.
+    """Return plotly's settings for the text that appears when the user points at a curve.
 
-    The value is one of `values`, or y if `values` is empty.
+    The text contains the name of the curve, the value and the time. The value comes from `values`,
+    or from the curve if `values` is empty.
     """
     shown = "customdata" if values else "y"
     text = f"{name} %{{{shown}:.3~f}}<br>%{{x|%H:%M:%S.%L}}<extra></extra>"

@@ -1,9 +1,9 @@
 """Makes the report: one HTML file that needs no other file.
 
-No text of unknown origin can become code in the file, because each text passes through `escaped`.
-The pictures are JSON without any `<`, in a block that browsers do not execute. As a second barrier,
-the file's content security policy allows only the two scripts of the file, identified by their
-hashes, and forbids the page to load anything.
+A text of unknown origin cannot become code in the file, because each text passes through `escaped`.
+The pictures are JSON without the character `<`, in a block that browsers do not execute. As a
+second barrier, the file's content security policy allows only the two scripts in the file, which it
+identifies by their hashes. It also forbids the page to load anything.
 """
 
 from __future__ import annotations
@@ -124,11 +124,15 @@ addEventListener("afterprint", () => paper(false));
 
 
 MAX_OPEN = 40
-"""Maximum number of events for which the list of events is unfolded when the page loads."""
+"""If the report has at most this number of events, the list of events is unfolded when the page
+loads."""
 
 
 def escaped(text: str) -> str:
-    """Return `text` as HTML that shows exactly this text, and does nothing else."""
+    """Return `text` escaped for HTML, so that a browser shows it and never interprets it as markup.
+
+    White space becomes " ", and other unprintable characters become U+FFFD.
+    """
     return html.escape(printable(text))
 
 
@@ -137,8 +141,12 @@ def page(
 ) -> str:
     """Return the report as the text of one HTML file.
 
-    `library` is the code of plotly. `clock` formats times as local time. `offset_s` is the offset
-    of the local time from UTC, s.
+    Args:
+        data: the data of the report.
+        origin: the robot and the program that made the recording.
+        library: the JavaScript code of plotly.
+        clock: function that formats a time as local time.
+        offset_s: local time minus UTC, s.
     """
     figures = TimeFigures(data, offset_s).all()
     title = escaped(f"{origin.robot}, {clock(data.began or 0.0, True)}")
@@ -178,10 +186,19 @@ def page(
 def drawn(
     recording: Recording, library: str, span: Span = WHOLE, progress: Progress = no_progress
 ) -> tuple[str, list[str]]:
-    """Replay a part of a recording. Return a pair: the report as HTML, and the notes in it.
+    """Replay a recording, and make the report of a part of it.
 
-    `library` is the code of plotly. `progress` is called with the wall-clock time that the replay
-    has reached, ns since 1970. Raises `RecordingError` if the part has no step.
+    Return a pair: the text of the HTML file, and the list of the notes in the report.
+
+    Args:
+        recording: the recording to replay.
+        library: the JavaScript code of plotly.
+        span: the part of the recording that the report shows.
+        progress: function that is called every `PROGRESS_STEPS` steps with the wall-clock time of
+            the step, ns since 1970.
+
+    Raises:
+        RecordingError: the part has no step, or the recording cannot be replayed.
     """
     about, replayed = recording.about, DisplayReplay(recording)
     began = about.wall_ns / NS_PER_S
@@ -247,7 +264,7 @@ def _reasons(data: ReportData) -> str:
 
 def _events(data: ReportData, clock: Clock) -> str:
     left_out, marks = data.marks.left_out, data.marks.all()
-    # A recording may cross midnight, and the clock may be set while it is made.
+    # A recording may cross midnight, and the clock may be set during a recording.
     dated = len({date(mark.seconds) for mark in marks}) > 1
 
     def time_of(mark: Mark) -> str:

@@ -1,8 +1,8 @@
 """Makes the elements of a report's pictures, in the format of the library plotly.
 
-The pictures are plain lists and dicts. Columns of numbers are doubles in base64, because plotly
-reads this form and JSON cannot represent NaN. `page.py` sets the colors of background, grid and
-text. The colors in this module suit a light and a dark background.
+The pictures are plain lists and dicts, which `page.py` encodes as JSON. Columns of numbers are
+doubles in base64, because JSON cannot represent NaN. Plotly reads this form. The colors in this
+module suit a light and a dark background. `page.py` sets the colors of background, grid and text.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ UNKNOWN = "#9a9a9a"
 SOURCE_COLOURS = (
     "#159a6b", "#2f6fd8", "#b04fc4", "#8f4f22", "#1ab2d2", "#8a8f00", "#e0588c", "#4a2f8f",
 )  # fmt: skip
-"""Colors of the command sources that drive. Neighbors in this list are easy to distinguish."""
+"""Colors of the command sources that drive the robot. Successive colors are easy to distinguish."""
 
 PATTERNS = ("", "/", "x", ".", "-")
-"""Fill patterns of the bands of sources.
+"""Fill patterns of the bands of the command sources that drive the robot.
 
 The first sources have the first pattern and different colors. When all colors are used, they are
 used again with the next pattern.
@@ -45,27 +45,31 @@ used again with the next pattern.
 
 
 def source_style(number: int) -> tuple[str, str]:
-    """Return a pair: the color and the pattern of the source that was the `number`th to drive.
+    """Return the pair (color, fill pattern) for the bands in which a command source drives.
 
-    `number` counts from 0.
+    `number` counts the sources that drive, from 0.
     """
     beyond, place = divmod(number, len(SOURCE_COLOURS))
     return SOURCE_COLOURS[place], PATTERNS[beyond % len(PATTERNS)]
 
 
 WRAP = 42
-"""Maximum length of a line of text at the pointer, characters. It fits on a phone."""
+"""Maximum length of a line in the text that appears at the pointer, characters. A line of this
+length fits on a phone."""
 
 Trace = dict[str, Any]
-"""Plotly's description of one curve, or of one set of marks or bars."""
+"""One curve, or one set of marks or bars, as plotly describes it."""
 
 
 class Key(NamedTuple):
-    """An entry of a legend: symbol, color and meaning."""
+    """An entry of a picture's legend."""
 
     sign: str
+    """Symbol, such as "●"."""
     colour: str
+    """CSS color of the symbol."""
     meaning: str
+    """Words beside the symbol."""
 
 
 class Figure(NamedTuple):
@@ -81,33 +85,36 @@ class Figure(NamedTuple):
     """Height, px."""
     data: list[Trace]
     layout: dict[str, Any]
-    """Plotly's description of axes, margins and notes."""
+    """Axes, margins and titles, as plotly describes them."""
     timed: bool = True
-    """True if the x axis is the time.
+    """True if the x axis of the picture is the time.
 
-    If the user zooms one picture with a time axis, the page zooms all of them.
+    If the user zooms such a picture, the page zooms all pictures with a time axis.
     """
 
 
 def label(text: str) -> str:
-    """Return `text`, escaped for plotly and wrapped to lines of at most `WRAP` characters."""
+    """Return a text for plotly: escaped, and wrapped to lines of at most `WRAP` characters."""
     lines = textwrap.wrap(printable(text), WRAP) or [""]
     return "<br>".join(html.escape(line) for line in lines)
 
 
 def numbers(values: Iterable[float]) -> dict[str, str]:
-    """Return a column of numbers as doubles in base64, in the form that plotly reads."""
+    """Return a column of numbers in a form that plotly reads: as doubles in base64."""
     data = struct.pack(f"<{len(values := list(values))}d", *values)
     return {"dtype": "f8", "bdata": binascii.b2a_base64(data, newline=False).decode()}
 
 
 def scatter(name: str, x: Iterable[float], y: Iterable[float], **look: object) -> Trace:
-    """Return a curve or marks at these points. `look` contains more of plotly's attributes."""
+    """Return a curve, or a set of marks, through points with the coordinates `x` and `y`.
+
+    `name` is the name of the curve. `look` contains further attributes of plotly's trace `scatter`.
+    """
     return {"type": "scatter", "name": name, "x": numbers(x), "y": numbers(y), **look}
 
 
 def sentence(mark: Mark) -> str:
-    """Return the text that the page shows when the user points at an event."""
+    """Return the text that the page shows when the user points at an event. It is escaped."""
     head = f"<b>{label(mark.name.replace('_', ' '))}</b>"
     by = [label(f"by {mark.by}")] if mark.by else []
     return "<br>".join([head, label(mark.words), *by])
@@ -128,9 +135,12 @@ def layout() -> dict[str, Any]:
 
 
 def note(text: str, x: float, y: float) -> dict[str, Any]:
-    """Return a title in a picture.
+    """Return a title that is written into a picture.
 
-    `x` is a fraction of the picture's width, and `y` is a value on the y axis.
+    Args:
+        text: the title, not escaped.
+        x: the left edge of the title, as a fraction of the picture's width.
+        y: the middle of the title, as a value on the y axis.
     """
     return {
         "text": label(text), "x": x, "y": y, "xref": "paper", "yref": "y", "xanchor": "left",

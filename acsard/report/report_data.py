@@ -2,7 +2,7 @@
 
 The mode, the reasons, the path, the events and the driving source come from the recording. The
 commanded, limited and measured speeds come from a replay of the recorded inputs. The data are
-thinned as they arrive, so a day takes no more memory than a minute.
+thinned while they arrive, so the data of a day need no more memory than the data of a minute.
 """
 
 from __future__ import annotations
@@ -26,17 +26,15 @@ from acsard.report.command_sources import MAX_TEXT, SAMPLE_S, CommandSources
 NS_PER_MS = 1_000_000
 
 MODES = ("fault", "stopped", "shutdown", "waiting", "inactive", "driving", "ready")
-"""Modes of the robot.
+"""Modes of the robot, the most important mode first.
 
-If neighboring spans of time with different modes are merged, the merged span has the mode that
-comes first in this tuple.
+If spans of time with different modes are merged, the result has the most important mode.
 """
 
 LINKS = ("down", "stale", "booting", "up")
-"""States of the serial link.
+"""States of the link to the board, the most important state first.
 
-If neighboring spans of time with different states are merged, the merged span has the state that
-comes first in this tuple.
+If spans of time with different states are merged, the result has the most important state.
 """
 
 MAX_EVENT_TEXT = 1000
@@ -46,14 +44,12 @@ The daemon's longest text has 308 characters.
 """
 
 FIRST, LAST = 30, 30
-"""Numbers of events of each name that are kept.
-
-`FIRST` events from the beginning of the recording and `LAST` events from its end are kept.
-"""
+"""Numbers of events that are kept for each event name: the first `FIRST` events, and the last
+`LAST` events."""
 
 
 class Mark(Struct, frozen=True):
-    """An event of a recording, with the place of the robot at that time."""
+    """An event of a recording, with the position of the robot at that time."""
 
     t: float
     """Time since the first step of the report, s."""
@@ -61,16 +57,17 @@ class Mark(Struct, frozen=True):
     text: str
     level: str
     by: str
-    """The client that caused the event, or the source that commanded a drive; "" if unknown."""
+    """The client that caused the event, or the sources that commanded a drive; "" if unknown."""
     count: int
-    """Number of equal events that this mark stands for."""
+    """Number of equal events that the log combined to this event."""
     place: Place | None
-    """Place of the robot according to odometry; None before the first pose."""
+    """Pose of the robot according to odometry; None before the first pose."""
     seconds: float
-    """Time of the event, s since 1970, as the robot's clock showed it when the event happened."""
+    """Wall-clock time of the event, s since 1970. A later change of the clock has no effect."""
 
     @property
     def words(self) -> str:
+        """The text, and the number of events if it is larger than 1."""
         return f"{self.text}{how_often(self.text, self.count)}"
 
 
@@ -80,23 +77,21 @@ class Marks:
     def __init__(self) -> None:
         self._first: dict[str, list[tuple[int, Mark]]] = {}
         self._last: dict[str, deque[tuple[int, Mark]]] = {}
-        """The last events with each name.
-
-        Each is a pair: the number of the event in the order of all events, and the event.
-        """
+        """`_first` maps each event name to the first events with this name, and `_last` maps it to
+        the last events. An event is a pair: its number in the order of all events, and its mark."""
         self._count = 0
+        """Number of marks that were added."""
         self.counts: Counter[str] = Counter()
-        """Number of events with each name.
-
-        A mark that stands for several equal events is counted as several.
-        """
+        """Maps each event name to the number of events with this name. Events that are not kept
+        count too. If the log combined several equal events, each of them counts."""
         self.left_out = 0
+        """Number of marks that were added, but are not kept."""
 
     def add(self, mark: Mark) -> None:
         """Add an event.
 
-        If `FIRST` + `LAST` events of its name are already kept, the oldest of the last `LAST`
-        events is dropped.
+        If `FIRST` + `LAST` events with this name are already kept, drop the oldest of the last
+        `LAST` events.
         """
         self.counts[mark.name] += mark.count
         self._count += 1
@@ -110,6 +105,7 @@ class Marks:
         last.append(row)
 
     def all(self) -> list[Mark]:
+        """Return all events that are kept, in order."""
         rows = [row for kept in (self._first, self._last) for rows in kept.values() for row in rows]
         return [mark for _, mark in sorted(rows, key=lambda row: row[0])]
 
@@ -122,27 +118,33 @@ class Driven(Struct):
 
 
 class Lateness:
-    """Measures how late the daemon ran the step of each control period.
+    """Computes how late the daemon ran the step of each control period.
 
-    The recording states how many periods were missed, so each step has a known period number. The
-    times at which the periods were due follow from these numbers, except for a constant offset. The
-    offset is chosen so that the smallest delay is 0.
+    The delays are relative: the smallest delay in the report counts as 0.
     """
 
+    # The recording contains the number of missed periods, so the number of each step's period is
+    # known. The times at which the periods were due follow from these numbers, except for a
+    # constant offset. The offset is chosen so that the smallest delay is 0.
+
     def __init__(self, rate_hz: float) -> None:
+        """Prepare for the first step. `rate_hz` is the number of control periods in a second."""
         self._period_ns = int(NS_PER_S / rate_hz)
         self._curve = Curve()
+        """Delay of each period, relative to the delay of the first step, ms."""
         self._number = 0
+        """Number of the last period. The period of the first step has the number 0."""
         self._ahead = 0
-        """Number of lines that `at_once` has counted since the last step of a control period."""
+        """Number of calls of `at_once` since the last step of a control period."""
         self._began_ns: int | None = None
+        """Monotonic time of the first step of a control period, ns; None before this step."""
         self._earliest = math.inf
         """Smallest delay of a step so far, relative to the delay of the first step, ns."""
         self.missed = 0
-        """Number of periods without a step."""
+        """Number of control periods without a step."""
 
     def at_once(self) -> None:
-        """Count a line that the daemon sent at once for a fresh command.
+        """Process an extra line that the daemon sent immediately for a fresh command.
 
         This line replaces the line of the next control period.
         """
@@ -154,8 +156,8 @@ class Lateness:
         Args:
             t: the time of the step in the report, s.
             now_ns: the monotonic time of the step, ns.
-            missed: the number of periods without a step since the last call.
-            known: False if the recording lacks the steps just before this step. The number of the
+            missed: the number of control periods without a step since the last call.
+            known: false if the recording lacks the steps just before this step. The number of the
                 period is then computed from `now_ns`.
         """
         period_ns, began_ns = self._period_ns, self._began_ns
@@ -168,7 +170,7 @@ class Lateness:
             self._number, missed = round((now_ns - began_ns) / period_ns), 0
         behind_ns = now_ns - began_ns - self._number * period_ns
         if missed and self._ahead and behind_ns < self._earliest - period_ns / 2:
-            # The line that was sent for a fresh command replaced that of the missed period.
+            # The line that was sent for a fresh command replaced the line of the missed period.
             self._number -= 1
             behind_ns += period_ns
         self._ahead = 0
@@ -177,28 +179,30 @@ class Lateness:
         self._curve.add(t, (behind_ns + missed * period_ns) / NS_PER_MS)
 
     def points(self) -> list[Point]:
-        """Return the delay of each period, ms, at its time in s. The smallest delay is 0."""
+        """Return the curve of the delays: time in the report, s, and delay, ms.
+
+        The smallest delay is 0.
+        """
         least = self._earliest / NS_PER_MS
         return [Point(t, value - least) for t, value in self._curve.points()]
 
     @property
     def most_ms(self) -> float:
+        """Largest delay of a control period, ms."""
         return max([point.value for point in self.points()], default=0.0)
 
 
 class LineCount:
-    """Number of serial lines of one kind.
-
-    `curve` contains the number in each second, and `total` the number in all seconds.
-    """
+    """Number of serial lines of one kind, in each second and in total."""
 
     def __init__(self) -> None:
         self.curve, self.total = Curve(), 0
+        """`curve` contains the number of lines in each second. `total` is the sum of them."""
 
     def add(self, t: float, count: int) -> None:
         """Add the number of lines in one second.
 
-        `t` is the time in the middle of that second, s.
+        `t` is the time in the middle of this second, s.
         """
         self.curve.add(t, count)
         self.total += count
@@ -209,36 +213,44 @@ class SerialCounts:
 
     def __init__(self) -> None:
         self.sent, self.good = LineCount(), LineCount()
+        """`sent` counts the lines that the daemon sent to the board. `good` counts the lines from
+        the board that the daemon accepted."""
         self.dropped, self.unanswered = LineCount(), LineCount()
+        """`dropped` counts the lines from the board that were unreadable or implausible.
+        `unanswered` counts the sent lines that the board did not answer."""
         self._second: int | None = None
+        """Number of the present second of the report; None before the first step."""
         self._sent = 0
         """Number of lines that the daemon has sent in the present second."""
         self._base = 0
         """Number of lines that the daemon had received at the first step of the report."""
         self._before = (0, 0)
-        """Numbers of good and of dropped lines when the present second began.
-
-        They count from the daemon's start.
-        """
+        """Pair: the numbers of accepted and of dropped lines when the present second began, counted
+        from the daemon's start."""
         self._now = (0, 0)
-        """Numbers of good and of dropped lines at the last step.
-
-        They count from the daemon's start.
-        """
+        """Pair: the numbers of accepted and of dropped lines at the last step, counted from the
+        daemon's start."""
         self._outstanding: int | None = None
-        """Number of sent lines without an answer: the smallest number at any step of this second.
+        """Smallest number of sent lines without an answer at any step of the present second.
 
-        At other steps, the number is larger because the answer to the newest line has not arrived
-        yet.
+        At other steps of the second, the number is larger, because the answer to the newest line
+        has not arrived yet.
         """
         self._lost: int | None = None
-        """Number of answers that were lost before this second.
+        """Number of answers that were lost before the present second.
 
-        It is the largest `_outstanding` of the earlier seconds.
+        It is the largest value of `_outstanding` in the earlier seconds.
         """
 
     def step(self, t: float, sent: bool, counters: Mapping[str, int]) -> None:
-        """Process a step at time `t`, s; `counters` are the robot's counters after the step."""
+        """Process a step.
+
+        Args:
+            t: the time of the step in the report, s.
+            sent: true if the daemon sent a line in this step.
+            counters: the robot's counters after the step. `lines` counts the readable lines from
+                the board, and each `line_...` counts the lines that were dropped for one reason.
+        """
         received = self._now = _received(counters)
         if self._second is None:
             self._second, self._before, self._base = int(t), received, sum(received)
@@ -251,9 +263,10 @@ class SerialCounts:
         self._sent += sent
 
     def _end(self, received: tuple[int, int]) -> None:
-        """Store the counts of the present second. The next step may be many seconds later.
+        """Add the counts of the present second to the curves.
 
-        `received` contains the numbers of good and of dropped lines since the daemon's start.
+        `received` is the pair of the numbers of accepted and of dropped lines since the daemon's
+        start.
         """
         t = float(self._second or 0) + 0.5
         good, dropped = (now - then for now, then in zip(received, self._before, strict=True))
@@ -272,7 +285,7 @@ class SerialCounts:
 
 
 def _received(counters: Mapping[str, int]) -> tuple[int, int]:
-    """Return a pair: the numbers of accepted and of dropped lines.
+    """Return the pair: number of accepted lines, number of dropped lines.
 
     Implausible lines count as dropped.
     """
@@ -281,73 +294,90 @@ def _received(counters: Mapping[str, int]) -> tuple[int, int]:
 
 
 class ReportData:
-    """Collects the data of a report from the steps in a window of time."""
+    """Collects the data of a report from the steps of a recording in a range of time.
+
+    Call `step` for each step of the recording in order, until `over` is true. Then call `end`.
+    """
 
     def __init__(
         self, config: Config, begin: float | None = None, end: float | None = None
     ) -> None:
-        """Collect the steps between the wall-clock times `begin` and `end`, s since 1970.
+        """Prepare for the first step.
 
-        None means no limit.
+        Args:
+            config: the configuration at the beginning of the recording.
+            begin: wall-clock time at which the report begins, s since 1970; None for no limit.
+            end: wall-clock time at which the report ends, s since 1970; None for no limit.
         """
         self._window = (-math.inf if begin is None else begin, math.inf if end is None else end)
         self.config = config
         """Configuration at the beginning of the recording."""
         self.path = Track()
         self.linear = {name: Curve() for name in ("commanded", "limited", "measured")}
+        """The commanded, limited and measured forward speed, m/s."""
         self.angular = {name: Curve() for name in ("commanded", "limited", "measured")}
+        """The commanded, limited and measured turn rate, rad/s."""
         self.commanded_wheels, self.measured_wheels = (
             [Curve() for _ in range(4)],
             [Curve() for _ in range(4)],
         )
-        """Commanded and measured speed of each wheel, rad/s, in the order of `WHEELS`."""
+        """Commanded speeds and measured speeds of the wheels, rad/s, in the order of `WHEELS`."""
         self.modes, self.links = Band(MODES), Band(LINKS)
         self.sources = CommandSources(config.commands.sources)
         self.serial = SerialCounts()
         self.lateness = Lateness(config.rate_hz)
         self.marks = Marks()
         self.began: float | None = None
-        """Wall-clock time of the first collected step, s since 1970; None before this step.
+        """Wall-clock time of the first step of the report, s since 1970; None before this step.
 
-        All times `t` are in s since this time.
+        All times `t` of the report are in s since this time.
         """
         self.ended = 0.0
-        """Wall-clock time of the last collected step, s since 1970."""
+        """Wall-clock time of the last step of the report, s since 1970."""
         self.seconds = self.metres = 0.0
-        """Duration of the collected steps, s, and distance that the robot drove in them, m."""
+        """Duration of the report, s, and distance that the robot drove in this time, m."""
         self.driven: dict[str, Driven] = {}
-        """Maps each source to the time and the distance that it drove the robot."""
+        """Maps the name of each source to the total time and distance for which it drove the
+        robot."""
         self.fastest = Twist()
-        """Maximum absolute values of the measured speed, m/s, and the measured turn rate, rad/s."""
+        """Maximum absolute values of the measured forward speed, m/s, and of the measured turn
+        rate, rad/s."""
         self.steps = self.missing = 0
-        """Number of collected steps, and number of steps that are missing between them."""
+        """Number of steps in the report, and number of steps that are missing between them."""
         self._timeline = TimelineWriter(config)
         self._mono_ns = self._wall_ns = 0
         """Monotonic and wall-clock time of the first step of the recording, ns."""
         self._wall = -math.inf
-        """Time of the last step, s since 1970.
+        """Time of the last step, s since 1970, without changes of the wall clock.
 
-        It is the wall-clock time of the first step plus the monotonic time since then, so it
-        ignores a change of the clock.
+        It is the wall-clock time of the first step of the recording, plus the monotonic time since
+        this step.
         """
         self._number: int | None = None
+        """Number of the last step; None before the first step."""
         self._place: Place | None = None
+        """The last pose; None before the first pose."""
         self._jumps = True
-        """True if the next pose does not continue the path.
-
-        It is then the first pose, or a request has set the pose.
-        """
+        """True if the next pose does not continue the path: it is the first pose, or a request has
+        set the pose."""
         self._sampled = self._sent = -math.inf
-        """Time of the last sample of the status, and time of the last sent line, s."""
+        """Time of the last sample of the status, and time of the last sent line, both in s."""
         self._status: tuple[str, ...] = ()
+        """Status of the robot at the last sample."""
 
     @property
     def over(self) -> bool:
-        """True if the last step was after the end of the window."""
+        """True if the last step was after the end of the report."""
         return self._wall > self._window[1]
 
     def step(self, step: Step, outputs: Outputs, robot: Robot) -> None:
-        """Add a recorded step, its replayed outputs, and the replayed robot after the step."""
+        """Add a step of the recording. A step outside of the report's range changes only the state.
+
+        Args:
+            step: the recorded step.
+            outputs: the replayed outputs of the step.
+            robot: the robot, which has just replayed the step.
+        """
         now = step.inputs.now
         if self._number is None:
             self._mono_ns, self._wall_ns = now.mono_ns, now.wall_ns
@@ -375,7 +405,8 @@ class ReportData:
     def end(self, ending: str = "") -> None:
         """Finish the data. Call this method after the last step.
 
-        `ending` says how the recording ends, as in `TimelineWriter.end`.
+        `ending` says how the recording was cut off. It is "" if the daemon ended normally, or if
+        the report ends before the recording.
         """
         t = self.seconds
         for entry in self._timeline.end(ending) if self.began is not None else ():
@@ -391,10 +422,10 @@ class ReportData:
     # Distance and speeds.
 
     def _drive(self, step: Step, t: float, inside: bool) -> None:
-        """Process the poses of a step at the time `t`, s.
+        """Process the poses of a step at the time `t` of the report, s.
 
-        If `inside` is true, they are added to the path, and to the time and distance of the driving
-        source.
+        `inside` is true if the step is in the range of the report. The poses then become a part of
+        the path, and the step counts for the time and the distance of the driving source.
         """
         mode, _, _, source = step.recorded.status
         driven = self._driven(source) if mode == "driving" and inside else None
@@ -440,10 +471,10 @@ class ReportData:
             )
 
     def _add_sent(self, curve: Curve, step: Step, t: float, speed: float) -> None:
-        """Add a speed to a curve if the step sent a line.
+        """Add a speed to a curve if the daemon sent a line in the step.
 
-        If no line was sent for longer than the timeout of the microcontroller's watchdog, add a
-        gap to the curve.
+        If the daemon sent no line for longer than `WATCHDOG_S`, add a gap to the curve instead. The
+        watchdog of the microcontroller stops the robot after this time.
         """
         if step.recorded.sent is not None:
             curve.add(t, speed)
@@ -466,8 +497,8 @@ class ReportData:
     def _sample(self, step: Step, t: float, robot: Robot, refused: bool) -> None:
         """Sample the mode, the link and the sources if a sample is due.
 
-        A sample is due every `SAMPLE_S`, after a change of the status, and if `refused` is true
-        because a command was refused.
+        A sample is due every `SAMPLE_S`, after a change of the status, and if `refused` is true.
+        `refused` says whether a command was refused in this step.
         """
         mode, reason, link, _ = status = step.recorded.status
         if status == self._status and t - self._sampled < SAMPLE_S and not refused:

@@ -1,4 +1,4 @@
-"""Describes a recording in words, for the summary, the notes and the tables of a report."""
+"""Describes a recording in words, for the summary, the notes and two tables of a report."""
 
 from __future__ import annotations
 
@@ -20,18 +20,21 @@ from acsard.daemon.late_causes import cause_in
 from acsard.report.report_data import Mark, ReportData
 
 Clock = Callable[[float, bool], str]
-"""Function that formats a time in s since 1970 as local time.
+"""Function that returns a time as text in local time.
 
-The date is included if its second argument is true.
+The first argument is the time in s since 1970. If the second argument is true, the text contains
+the date.
 """
 
 MAX_REASONS = 8
-"""Maximum number of rows in the table of reasons."""
+"""Maximum number of rows in the table of the reasons why command sources did not drive."""
 
 NUMBER = re.compile(r"\d+(\.\d+)?")
+"""Pattern for a number in a reason. Reasons that differ only in numbers share a row."""
 
 FINE_S = 0.05
-"""Longest time that one point of a picture may cover without a note in the report, s."""
+"""Resolution of the pictures, s. If one point of a picture covers more time, the report has a note
+about this."""
 
 MAX_NAMES = 5
 """Maximum number of names or texts that are listed in one sentence."""
@@ -50,12 +53,13 @@ class Origin(Struct, frozen=True):
 
 
 class Setting(NamedTuple):
-    """A setting that differs from its default."""
+    """A setting that differs from its default. Its values are texts for the report."""
 
     key: str
     here: str
-    """Value in the recording."""
+    """Value in the recorded configuration; "-" if the recorded configuration lacks the setting."""
     default: str
+    """Default value; "-" if the default configuration lacks the setting."""
 
 
 OF_THE_BOARD = {
@@ -63,13 +67,13 @@ OF_THE_BOARD = {
     "bumper_pressed": "bumper hit",
     "battery_stop": "battery stop",
 }
-"""Words for the events in which the board caused a stop, by the name of the event."""
+"""Maps the name of each event in which the board caused a stop to words for this event."""
 
 
 def differences(config: Config) -> list[Setting]:
-    """Return the settings that differ from their defaults.
+    """Return the settings in a configuration that differ from their defaults.
 
-    The result includes all keys of a command source that was added or removed.
+    If a command source was added or removed, the result includes all settings of this source.
     """
     here, default = (dict(flat(effective(each))) for each in (config, Config()))
     return [
@@ -88,7 +92,11 @@ def _shown(table: dict[str, object], key: str) -> str:
 
 
 def summary(data: ReportData) -> str:
-    """Return a summary of the recording in two sentences."""
+    """Return a summary of the recording in two sentences.
+
+    The first sentence says how far and how fast the robot drove. The second sentence contains the
+    numbers of faults, stops and other incidents.
+    """
     fast, counts = data.fastest, data.marks.counts
     driving_s = sum(driven.seconds for driven in data.driven.values())
     drive = (
@@ -121,10 +129,11 @@ def _names(marks: list[Mark]) -> str:
 
 
 def reasons(data: ReportData) -> list[tuple[str, str, str, float]]:
-    """Return the reasons why command sources did not drive, with the longest duration first.
+    """Return the rows of the table with the reasons why command sources did not drive.
 
-    Each row contains the source, its state, the reason, and the total duration, s. Reasons that
-    differ only in numbers share a row.
+    Each row contains the source, its state, the reason in words, and the total time for which the
+    reason applied, s. Reasons that differ only in numbers share a row. The result contains the
+    `MAX_REASONS` rows with the longest times, the longest first.
     """
     durations: dict[tuple[str, str, str], dict[str, float]] = {}
     for name, band in data.sources.bands.items():
@@ -141,9 +150,9 @@ def reasons(data: ReportData) -> list[tuple[str, str, str, float]]:
 
 
 def _first_of_each(marks: list[Mark], clock: Clock) -> str:
-    """Return the different texts of the marks, each with the time at which it first occurred.
+    """Return one text that lists the different texts of the marks, at most `MAX_NAMES` of them.
 
-    They are joined to one text, with at most `MAX_NAMES` of them.
+    Each listed text comes after the time of the first mark that has this text.
     """
     first: dict[str, Mark] = {}
     for mark in marks:
@@ -153,7 +162,7 @@ def _first_of_each(marks: list[Mark], clock: Clock) -> str:
 
 
 def _late(marks: Iterable[Mark], clock: Clock) -> str:
-    """Return the causes of late control periods, each with its first time.
+    """Return a text that lists the causes of missed control periods, each with its first time.
 
     Return "" if no event names a cause.
     """
@@ -166,7 +175,11 @@ def _late(marks: Iterable[Mark], clock: Clock) -> str:
 
 
 def notes(data: ReportData, origin: Origin) -> list[str]:
-    """Return the notes of `origin`, and notes about missing steps, the clock and the resolution."""
+    """Return the notes for the user of the report.
+
+    These are the notes of `origin`, and notes about missing steps, about a change of the clock, and
+    about the resolution of the pictures.
+    """
     found = list(origin.notes)
     if data.missing:
         found.append(
@@ -207,7 +220,8 @@ def rows(data: ReportData, origin: Origin, clock: Clock) -> Iterator[tuple[str, 
     for name, title in {"fault": "Faults", "stop": "Stops", **titles}.items():
         marks = [mark for mark in data.marks.all() if mark.name == name]
         count = data.marks.counts[name]
-        # Few boards can report the stops in `OF_THE_BOARD`, so only stops that happened have a row.
+        # Few boards can report the events in `OF_THE_BOARD`. Such an event has a row only if it
+        # happened.
         if count or name not in OF_THE_BOARD:
             yield title, f"{count}: {_first_of_each(marks, clock)}" if count else "none"
     lines = data.serial

@@ -1,1 +1,1 @@
-"""Prints the output of the subcommands, and asks the person near the robot questions."""
+"""Prints the output of the subcommands, and asks questions of the person near the robot."""

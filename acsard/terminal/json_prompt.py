@@ -1,12 +1,12 @@
 """The prompt for `--json-lines`: another program, such as the robot's page, asks the person.
 
 This module writes texts and questions to standard output as JSON objects, one per line. It reads
-answers, key presses and signs of life from standard input. If the input ends, or if the program
-sends no line for `HEARD_S` while something may move, this module interrupts the subcommand as
-Ctrl-C does.
+answers, key presses and signs of life from standard input. It interrupts the subcommand, as Ctrl-C
+does, if the input ends. It does the same if the other program sends no line for `HEARD_S` while
+something may move.
 
-deploy/web/README.md describes the fields. The OpenAPI document of `web/openapi.py` describes the
-lines with the docstrings of the classes below.
+deploy/web/README.md describes the fields. The docstrings of the classes below become part of the
+OpenAPI document (`web/openapi.py`).
 """
 
 from __future__ import annotations
@@ -32,17 +32,16 @@ from acsard.terminal.prompt import Ask
 
 T = TypeVar("T")
 
+# The other program sends a line every 0.1 s, even if the line is only `{}`. TCP resends a lost
+# packet after 0.2 s, and again after another 0.4 s. So a line that is lost twice still arrives
+# within this time. If this computer is too busy to keep the limit, a guided drive ends because it
+# receives nothing from the daemon for 0.5 s (calibration/guided/leg_driver.py). When a person
+# drives by hand, the timeout of the command source replaces this limit.
 HEARD_S = 0.9
-"""Maximum silence of the other program while something may move, s.
+"""Longest time without a line from the other program while something may move, s.
 
-After a longer silence the subcommand sends zero speeds, so the robot begins to stop within a second
-of the other program's last line. That program sends a line every 0.1 s, even if the line is only
-`{}`. TCP resends a lost packet after 0.2 s, and again after another 0.4 s, so a line that is lost
-twice still arrives in time.
-
-If this computer is too busy to keep the limit, a guided drive ends because it receives nothing from
-the daemon for 0.5 s (calibration/guided/leg_driver.py). When a person drives by hand, the timeout
-of the command source replaces this limit.
+After a longer time the subcommand is interrupted and sends zero speeds. So the robot begins to stop
+within a second of the other program's last line.
 """
 
 LISTEN_S = 0.05
@@ -52,9 +51,10 @@ LINE_BYTES = 65536
 
 
 class Line(Struct, frozen=True):
-    """An input line: an answer, a key press (`key`), or a sign of life if it is neither.
+    """An input line: an answer, a key press, or only a sign of life.
 
-    `answer` is the number of the answered question, or 0. Unknown fields are ignored.
+    If the line is an answer, `answer` is the number of the question, and `value` is the answer.
+    Otherwise `answer` is 0. If the line is a key press, `key` is true. Unknown fields are ignored.
     """
 
     answer: int = 0
@@ -73,7 +73,7 @@ class Subject(Struct, frozen=True):
 
 
 class JobMessage(Struct, frozen=True):
-    """A message that stays on the screen."""
+    """A message for the person. It stays on the screen."""
 
     message: str
 
@@ -85,39 +85,43 @@ class Doing(Struct, frozen=True):
 
 
 class Progress(Struct, frozen=True):
-    """Completed share of the present drive or of the check, 0 to 1."""
+    """The completed share of the present drive or of the check, from 0 to 1."""
 
     progress: float
 
 
 class Question(Struct, frozen=True, omit_defaults=True, kw_only=True):
-    """A question. The reply is one of `answers`, or a number if `answers` is empty."""
+    """A question for the person.
+
+    The answer is one of the texts in `answers`. If `answers` is empty, the answer is a number from
+    `least` to `most`, in the unit `unit`.
+    """
 
     question: int
-    """Number of the question, which the answer must contain."""
+    """Number of the question. The line with the answer must contain this number."""
     words: str
     answers: Sequence[str] = ()
     unit: str = ""
     least: float | None = None
     most: float | None = None
     usual: float | None = None
-    """Default for an empty answer."""
+    """Number that an empty answer stands for. Without it, an empty answer is rejected."""
     leg: bool = False
-    """True if the robot drives after the answer. A key press then stops the robot."""
+    """True if the robot drives after the answer. A key press stops this drive."""
     by_key: bool = False
     """True if a key press is the intended end of the drive that follows the answer."""
     wrong: str = ""
-    """Explanation of why the previous answer was rejected."""
+    """Explanation why the previous answer to this question was rejected, or an empty text."""
 
 
 class Found(Struct, frozen=True):
-    """One finding of a check, sent as soon as it is made."""
+    """One finding of a check. It is sent as soon as it is known."""
 
     finding: Finding
 
 
 class Result(Struct, frozen=True):
-    """The complete result, as a terminal shows it. From then on, nothing moves."""
+    """The complete result as text, as a terminal shows it. After this line nothing moves."""
 
     result: str
 
@@ -125,7 +129,7 @@ class Result(Struct, frozen=True):
 class JsonPrompt:
     """Prompt that exchanges JSON lines with another program over standard input and output.
 
-    The conversation lasts until the end of the `with` block.
+    It is a context manager: it reads standard input until the end of the `with` block.
     """
 
     def __init__(self) -> None:
@@ -146,7 +150,8 @@ class JsonPrompt:
     def __exit__(self, *error: object) -> None:
         with self._news:
             self._left = True
-        # Wait with a limit: the thread hangs if it prints and the other program does not read.
+        # Wait with a time limit. The thread hangs if it prints while the other program does not
+        # read.
         self._reader.join(1.0)
 
     # Output
@@ -170,7 +175,10 @@ class JsonPrompt:
         self.progress(min(0.99, self._found / 16))
 
     def result(self, text: str) -> None:
-        """Send the result as a terminal shows it, and record that nothing moves any more."""
+        """Send the result `text`. From now on, a silence of the other program is harmless.
+
+        The caller promises that nothing moves any more.
+        """
         self._moves = False
         self.progress(1.0)
         self._tell(Result(text.strip("\n")))
@@ -190,10 +198,10 @@ class JsonPrompt:
         )
 
     def keys(self, wait_s: float) -> str:
-        """Wait up to `wait_s` s for a key press, and return " " if a key was pressed, else "".
+        """Wait up to `wait_s` s for a key press. Return " " if a key was pressed, else "".
 
-        A key that was pressed earlier counts too, unless it was pressed before the last answer or
-        reported by an earlier call.
+        A key press before this call counts too, but only if it came after the last answer. Each key
+        press is returned only once.
         """
         with self._news:
             self._news.wait_for(lambda: self._pressed, wait_s)
@@ -201,10 +209,12 @@ class JsonPrompt:
             return " " if pressed else ""
 
     def offer(self, config: str | None, keys: Mapping[str, object], trouble: str = "") -> bool:
-        """Offer to write these keys into the configuration file; return whether they were written.
+        """Ask whether to write `keys` into the configuration file, and do so if the person agrees.
 
-        `config` is the path of the file, or None to search for it. `trouble` is a reason not to
-        write, or "". If there is a reason, or if the file cannot be changed, say so and do not ask.
+        Return whether the file was written. `keys` maps dotted keys of the configuration to values.
+        `config` is the path of the file, or None to search for the file. `trouble` is a reason not
+        to write, or "". If there is such a reason, or if the file cannot be changed, send a message
+        with the reason, and do not ask.
         """
         try:
             if trouble:
@@ -224,9 +234,9 @@ class JsonPrompt:
         return wanted == "write"
 
     def _choose(self, words: str, answers: Sequence[str], **more: bool) -> str:
-        """Ask for one of `answers`, and repeat the question after any other answer.
+        """Ask a question until the answer is one of `answers`, and return this answer.
 
-        `words` is the text of the question, and `more` are further fields of `Question`.
+        `words` is the text of the question. `more` contains further fields of `Question`.
         """
 
         def chosen(value: str | float | None) -> str:
@@ -240,10 +250,10 @@ class JsonPrompt:
         print(msgspec.json.encode(message).decode(), flush=True)
 
     def _ask(self, read: Callable[[str | float | None], T], **about: object) -> T:
-        """Ask a question until `read` accepts the answer, and return `read(answer)`.
+        """Ask a question until `read` accepts the answer, and return the result of `read`.
 
-        `read` raises `ValueError` with a description of valid answers. `about` are the fields of
-        the `Question`.
+        `read` gets the answer. It raises `ValueError` with a description of valid answers to reject
+        it. `about` contains the fields of the `Question`.
         """
         self._moves, wrong = False, ""
         while True:
@@ -256,7 +266,8 @@ class JsonPrompt:
             self._tell(question)
             with self._news:
                 while self._open:
-                    # Wait with a limit: a signal just before the wait begins would not end it.
+                    # Wait with a time limit, because a signal that arrives just before the wait
+                    # begins does not end it.
                     self._news.wait(LISTEN_S)
             try:
                 got = read(self._answer.value)
@@ -269,10 +280,10 @@ class JsonPrompt:
     # Input
 
     def _listen(self) -> None:
-        """Read the input until the conversation is over.
+        """Read standard input until the end of the `with` block.
 
-        If reading ends earlier for one of the reasons in `_heard_out()`, print the reason and send
-        SIGINT to the main thread.
+        If `_heard_out` returns a reason to interrupt the subcommand, or if the input cannot be
+        read, send SIGINT to the main thread and print the reason.
         """
         try:
             self._end(self._heard_out())
@@ -281,10 +292,10 @@ class JsonPrompt:
             raise
 
     def _heard_out(self) -> str:
-        """Read the input until the subcommand must be interrupted, and return the reason in words.
+        """Read standard input, and return the reason why the subcommand must be interrupted.
 
-        The reason is the end of the input, a line that is too long, or a silence of more than
-        `HEARD_S` while something may move. Return "" if the conversation is over.
+        The reason is the end of the input, a line that is too long, or no line for `HEARD_S` while
+        something may move. Return "" after the end of the `with` block.
         """
         held, heard_s = b"", time.monotonic()
         while not self._left:
@@ -309,13 +320,14 @@ class JsonPrompt:
         try:
             said = self._lines.decode(line)
         except (msgspec.MsgspecError, ValueError, RecursionError):
-            # The line answers nothing, so the question stays open.
+            # The line does not answer the question, which therefore stays open.
             return
         with self._news:
             if said.key:
                 self._pressed = True
             elif said.answer and said.answer == self._open:
-                # Forget a key that was pressed before the answer. A later key stops the leg.
+                # Forget a key that was pressed before the answer. A later key press stops the
+                # drive.
                 self._open, self._answer, self._pressed = 0, said, False
             self._news.notify_all()
 

@@ -1,7 +1,7 @@
 """Prints tables and sentences, in color on a terminal and as plain text elsewhere.
 
-The text is never interpreted as markup. The caller must first make texts from other programs
-printable.
+No text is interpreted as markup. Text from other programs may contain control characters, so the
+caller must make it printable first.
 """
 
 from __future__ import annotations
@@ -17,11 +17,13 @@ from rich.table import Table
 from rich.text import Text
 
 WHOLE = 10_000
-"""Width, characters, that is larger than any row of a table. With this width, no row is wrapped, so
-a row can be copied from the terminal."""
+"""Width that is larger than any row of a table, characters.
+
+With this width, no row is wrapped, so that a person can copy a row from the terminal.
+"""
 
 SENTENCES = 100
-"""Largest width of output that contains sentences, characters."""
+"""Largest width of the lines of output that contains sentences, characters."""
 
 
 def table(
@@ -30,10 +32,11 @@ def table(
     right: Collection[int] = (),
     gap: int = 2,
 ) -> Table:
-    """Return rows as a table in columns.
+    """Return a table with the given rows.
 
-    `heads` are the headings of the columns. `right` contains the numbers of the right-aligned
-    columns, counted from 0. `gap` is the number of spaces between columns.
+    `heads` contains the headings of the columns; without headings the table has no head. `right`
+    contains the numbers of the right-aligned columns, counted from 0. `gap` is the number of spaces
+    between columns.
     """
     cells = list(rows)
     made = Table(
@@ -48,14 +51,15 @@ def table(
 
 
 def has_screen() -> bool:
-    """Return whether standard output is a terminal that can show full-screen output."""
+    """Return whether standard output is a terminal that can show a full screen."""
     return sys.stdout.isatty() and os.environ.get("TERM", "") not in ("", "dumb", "unknown")
 
 
 def show(*parts: RenderableType, most: int = WHOLE) -> None:
-    """Print each part on its own lines, which have at most `most` characters.
+    """Print each part, such as a table or a text, on its own lines.
 
-    With the default, `WHOLE`, no row of a table is wrapped.
+    A line has at most `most` characters; longer text is wrapped. With the default, no row of a
+    table is wrapped.
     """
     console = _console(sys.stdout)
     if console.is_terminal and most < WHOLE:
@@ -65,7 +69,7 @@ def show(*parts: RenderableType, most: int = WHOLE) -> None:
 
 
 def show_whole(text: Text) -> None:
-    """Print a text without wrapping, so that a command in it can be copied from the terminal."""
+    """Print a text without wrapping its lines, so that a person can copy a command from it."""
     console = _console(sys.stdout)
     if console.is_terminal:
         console.print(text, soft_wrap=True)

@@ -1,6 +1,7 @@
-"""The interface `Prompt`, and the signals that end a subcommand that asks a person.
+"""Defines the interface through which a subcommand asks a person, and the signals that end it.
 
-Change the implementations of the interface together: `TerminalPrompt`, `NoPrompt` and `JsonPrompt`.
+`TerminalPrompt`, `NoPrompt` and `JsonPrompt` implement the interface `Prompt`. Change all of them
+together.
 """
 
 from __future__ import annotations
@@ -20,25 +21,30 @@ from acsard.core.values import AcsardError
 
 
 class NobodyError(AcsardError):
-    """No person is there to answer a question."""
+    """A question needs an answer, but no person can be asked."""
 
 
 class Ask(Struct, frozen=True):
-    """A question whose answer is a number within bounds, such as a tape measurement."""
+    """A question whose answer is a number, such as a distance that a person measures by tape.
+
+    `words` is the text of the question, and `unit` is the unit of the answer. The number must be
+    from `least` to `most`.
+    """
 
     words: str
     unit: str
     least: float
     most: float
     usual: float | None = None
-    """Default, which an empty answer selects; None if there is no default."""
+    """Default, which an empty answer selects, or None without a default."""
     name: str = ""
     """Name under which the method of calibration stores the answer."""
 
     def number(self, text: str) -> float:
-        """Return the number in an answer, which may have a decimal comma.
+        """Return the number in the answer `text`, or the default if `text` is empty.
 
-        Raises `ValueError` with a description of valid numbers.
+        The number may have a decimal comma. If the number is not valid, or if `text` is empty and
+        there is no default, raise `ValueError` with a description of valid numbers.
         """
         try:
             number = self.usual if not text else float(text.replace(",", "."))
@@ -50,68 +56,73 @@ class Ask(Struct, frozen=True):
 
 
 class Prompt(Protocol):
-    """Interface through which a subcommand asks the person near the robot.
+    """Interface through which a subcommand informs and asks the person near the robot.
 
-    Every method that asks raises `KeyboardInterrupt` if the person quits. A leg is one drive of a
-    guided calibration, which the person starts and any key stops.
+    Every method that asks raises `KeyboardInterrupt` if the person quits.
     """
 
     def begin(self, subject: str, *, simulated: bool) -> None:
-        """Show which robot or board the subcommand checks or calibrates."""
+        """Show `subject`, the name of the robot or board that is checked or calibrated.
+
+        `simulated` says whether it is simulated.
+        """
 
     def say(self, text: str) -> None:
-        """Show a text that stays visible."""
+        """Show a text that stays on the screen."""
 
     def doing(self, text: str) -> None:
-        """Show a text about the present activity, which replaces the text of the last call."""
+        """Show the present activity. The text replaces the text of the previous call."""
 
     def progress(self, share: float) -> None:
-        """Show the completed share of the present drive or check, 0 to 1."""
+        """Show the completed share of the present drive or check, from 0 to 1."""
 
     def found(self, finding: Finding) -> None:
-        """Show a finding of a check, as soon as it is made."""
+        """Show one finding of a check. Call this as soon as the finding is known."""
 
     def result(self, text: str) -> None:
-        """Show the result. The caller promises that nothing moves any more."""
+        """Show the result. Call this only when nothing moves any more."""
 
     def offer(self, config: str | None, keys: Mapping[str, object], trouble: str = "") -> bool:
-        """Offer to write the settings `keys` into the configuration file.
+        """Offer to write settings into the configuration file, and return whether this was done.
 
-        Return whether they were written. `config` is the file's path, or None to search for it.
-        `trouble` is a reason not to write, or "".
+        `config` is the path of the file, or None to search for the file. `keys` maps dotted keys of
+        the configuration to values. `trouble` is a reason not to write, or "".
         """
 
     def ask(self, question: str, answers: Sequence[str]) -> str | None:
-        """Ask the question. Return one of `answers`, or None if no person is there to choose."""
+        """Ask a question. Return one of `answers`, or None if no person can choose an answer."""
 
     def start(self, text: str, by_key: bool = False) -> None:
-        """Show the text, and wait until the person starts a drive.
+        """Show a text, and wait until the person starts a drive.
 
-        `by_key` is true if a key press is the intended end of this drive.
+        Any key press stops the drive. `by_key` says whether a key press is its intended end.
         """
 
     def number(self, ask: Ask) -> float:
-        """Ask the question, and return the number, or the default of `ask` if no person is there.
+        """Ask for a number, and return it. Return the default of `ask` if no person can be asked.
 
         Raises `NobodyError` if there is neither a person nor a default.
         """
 
     def keys(self, wait_s: float) -> str:
-        """Wait up to `wait_s` s for a key press; return the pressed keys, or "" if none."""
+        """Wait up to `wait_s` s for a key press. Return the pressed keys, or "" without a press."""
 
 
 SIGNALS = signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP
-"""The signals that end a subcommand that moves something. The signal of Ctrl-Z is among them,
-because a suspended subcommand would leave a wheel turning."""
+"""The signals that end a subcommand that moves something.
+
+The signal of Ctrl-Z (SIGTSTP) is one of them, because a suspended subcommand would leave a wheel
+turning.
+"""
 
 
 @contextmanager
 def ended_by_signals(says: str = "", *, exits: bool = False) -> Iterator[None]:
-    """Raise `KeyboardInterrupt` in the `with` block on any of `SIGNALS`; ignore further signals.
+    """Raise `KeyboardInterrupt` in the `with` block when one of `SIGNALS` arrives.
 
-    The cleanup of the block can then send zero speeds. `says` is printed when a signal arrives. If
-    `exits` is true, a signal other than that of Ctrl-C raises `SystemExit` with the exit code of
-    that signal instead.
+    Further signals are then ignored until the end of the block, so that its cleanup can send zero
+    speeds. `says` is printed when the signal arrives. If `exits` is true, a signal other than
+    SIGINT raises `SystemExit` instead, with 128 plus the number of the signal.
     """
     before = [signal.getsignal(number) for number in SIGNALS]
 

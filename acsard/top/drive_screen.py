@@ -1,4 +1,7 @@
-"""The lines of text in which `acsard drive` shows the robot, for any width. This module is pure."""
+"""Formats the lines of text with which `acsard drive` shows the robot. This module is pure.
+
+The lines fit on a terminal of any width.
+"""
 
 from __future__ import annotations
 
@@ -24,28 +27,29 @@ HELP = (
 
 
 class Teleop(Struct, frozen=True):
-    """Everything that `acsard drive` shows."""
+    """The data that `acsard drive` shows: the robot's state and the speeds that the keys set."""
 
     robot_id: str
     endpoint: str
     source: str
     linear: float
-    """Forward speed that a key sets, m/s."""
+    """Forward speed that a driving key requests, m/s."""
     angular: float
-    """Turn rate that a key sets, rad/s."""
+    """Turn rate that a driving key requests, rad/s."""
     state: RobotState | None
     age: float
     """Seconds since `state` arrived, or since the wait for the first state began."""
     objection: str = ""
-    """Reason why the robot does not follow the keys, or "" if it follows them."""
+    """Reason why the robot does not follow the keys, in words; "" if it follows the keys."""
     silent: bool = False
-    """True if the robot is silent, so the shown data is old."""
+    """True if no state has arrived for too long, so the shown data is old."""
 
 
 def lines(seen: Teleop, width: int, height: int | None = None) -> list[Text]:
-    """Return the lines of the screen, at most `height` of at most `width` characters each.
+    """Return the lines of the screen of `acsard drive`.
 
-    If `height` is None, the number of lines has no limit.
+    There are at most `height` lines, or any number if `height` is None. A line has at most `width`
+    character cells. A `width` below 20 counts as 20.
     """
     width = max(20, width)
     head = printable(f"{seen.robot_id} as {seen.source}  {seen.endpoint}")
@@ -74,7 +78,11 @@ def lines(seen: Teleop, width: int, height: int | None = None) -> list[Text]:
 
 
 def news(seen: Teleop, width: int) -> list[str]:
-    """Return the content of the screen, without the help, as lines for printed reports."""
+    """Return the lines of a report about the robot, for a terminal that cannot show a screen.
+
+    The report has the content of the screen, but not the help about the keys. A line has at most
+    `width` characters. A `width` below 20 counts as 20.
+    """
     told = [f"keys ask for {asked(seen)}"]
     if seen.state is None or seen.silent:
         return _words([silence(seen), *told], width)
@@ -85,9 +93,10 @@ def news(seen: Teleop, width: int) -> list[str]:
 
 
 def parting(seen: Teleop, width: int) -> list[str]:
-    """Return the lines to print when `acsard drive` ends.
+    """Return the lines of the last report, which is printed when `acsard drive` ends.
 
-    They state whether the robot moves, its mode with the reason, and its pose and speeds.
+    The report says whether the robot still moves, and contains its mode with the reason, its pose
+    and its speeds. A line has at most `width` characters.
     """
     if seen.state is None or seen.silent:
         return _words([f"drive ended: {silence(seen)}"], width)
@@ -99,9 +108,9 @@ def parting(seen: Teleop, width: int) -> list[str]:
 
 
 def released(seen: Teleop) -> bool:
-    """Return whether the robot stands and no longer follows the source of this drive.
+    """Return whether the robot stands still and no longer follows the source of this drive.
 
-    Return False if no state has arrived.
+    Return False if no state has arrived. A robot without a measured speed counts as standing still.
     """
     if seen.state is None or moves(seen.state):
         return False
@@ -109,27 +118,27 @@ def released(seen: Teleop) -> bool:
 
 
 def moves(state: RobotState) -> bool:
-    """Return whether any measured speed differs from zero; False if no speed is known."""
+    """Return whether any measured speed is not zero. Return False if no speed is known."""
     return any((state.linear, state.angular, *state.wheels))
 
 
 def silence(seen: Teleop) -> str:
-    """Return a sentence which says that no state has arrived yet, or none for some time."""
+    """Return a sentence which says that the first state, or a new state, has not arrived."""
     if seen.state is None and not seen.silent:
         return "waiting for the first state message of the daemon"
     return f"nothing received from the daemon for {seen.age:.0f} s: does it run?"
 
 
 def reason(state: RobotState) -> str:
-    """Return the reason of the mode, without the name of the mode."""
+    """Return the reason of the robot's mode, without the name of the mode before it."""
     return printable(state.reason.removeprefix(f"{state.mode}: "))
 
 
 def refused(objection: str) -> str:
-    """Return a sentence which says why the robot does not follow the keys.
+    """Return a sentence which says that the keys do not drive the robot, and why.
 
-    `objection` is the reason. If the robot requires a zero command, the sentence also says how to
-    send it with the keys.
+    `objection` is the reason. If the robot requires a zero command first, the sentence also says
+    which key sends a zero command.
     """
     mend = " (press space, then press the key again)" if "must send a zero" in objection else ""
     return f"your keys do not drive the robot: {printable(objection)}{mend}"
@@ -140,15 +149,15 @@ def asked(seen: Teleop) -> str:
 
 
 def measured(state: RobotState) -> list[Text]:
-    """Return pose and twist, each with its unit."""
+    """Return the robot's pose and measured twist as short texts with units."""
     told = [*place(state.x, state.y, state.yaw), *speeds(state.linear, state.angular)]
     return [Text(one) for one in told]
 
 
 def _words(told: Sequence[str], width: int, figures: Sequence[Text] = ()) -> list[str]:
-    """Return lines with the sentences `told`, and below them lines with `figures`.
+    """Return lines with the sentences `told`, followed by lines with the values `figures`.
 
-    No line has more than `width` characters. Wrapped lines are indented.
+    A line has at most `width` characters. All lines except the first are indented.
     """
     width = max(20, width)
     lines = wrap("; ".join(told), width, subsequent_indent="  ", break_on_hyphens=False)

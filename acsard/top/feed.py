@@ -1,4 +1,4 @@
-"""The data of `acsard top`: the robot's received states and the `info` of its daemon."""
+"""Collects the data of `acsard top`: the states of the robot, and the `info` of its daemon."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from acsard.top.text import ScreenData
 
 
 class Feed:
-    """The received states of a robot."""
+    """Receives the states of a robot, and keeps those of about the last second."""
 
     def __init__(self, robot: Client) -> None:
         self._robot = robot
-        # If no daemon answers, this first query fails with the usual message.
+        # Query `info` first: if no daemon answers, this query raises an error with a clear message.
         self._info = self._ask_info()
         self._watch = Watch(robot, clock.steady_s())
         self._past: deque[tuple[float, RobotState]] = deque()
 
     def ask(self) -> None:
-        """Query the present state instead of waiting for the next published one.
+        """Query the robot's present state, without waiting for the next published state.
 
         Raises `ReplyError` if the reply cannot be decoded, and the errors of `Client.get`.
         """
@@ -36,7 +36,7 @@ class Feed:
                 f"cannot read the daemon's state ({error}); does the daemon run another version of "
                 "acsard? Use the same version here"
             ) from None
-        # A state that arrived before the answer is usually older than the answer, but not always.
+        # First process the states that have arrived. One of them may be newer than the answer.
         self.poll()
         held, now = self._watch.state, clock.steady_s()
         if held is None or state.stamp.to_ns() > held.stamp.to_ns():
@@ -44,7 +44,7 @@ class Feed:
             self._take(state, now)
 
     def poll(self) -> None:
-        """If states have arrived since the last call, store the newest of them."""
+        """Store the newest of the states that have arrived since the last call, if any."""
         now = clock.steady_s()
         for state in self._watch.look(now)[-1:]:
             self._take(state, now)
@@ -59,7 +59,10 @@ class Feed:
             self._past.popleft()
 
     def seen(self, hint: str = "") -> ScreenData:
-        """Return the data for the screen; `hint` is shown in the header."""
+        """Return the data for the screen of `acsard top`.
+
+        `hint` is a text for the header of the screen, such as the key that quits.
+        """
         now, watch, past = clock.steady_s(), self._watch, self._past
         return ScreenData(
             self._robot.where.robot_id,

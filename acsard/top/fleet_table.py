@@ -21,24 +21,25 @@ ROOM = (32, 8, 6, 7, 7, 22, 21, 6)
 """Maximum widths, in characters, of all columns except the last, which gets the remaining width."""
 
 NAME, WHY = 12, 32
-"""Minimum widths of the columns ROBOT and WHY, characters. If the terminal is too narrow, ROBOT
-shrinks to its minimum before WHY becomes shorter."""
+"""Minimum widths of the columns ROBOT (`NAME`) and WHY (`WHY`), characters. On a narrow terminal,
+ROBOT shrinks to its minimum before WHY becomes shorter than its minimum."""
 
 BATTERY = HEADS.index("BATTERY")
-"""Index of the column with the state of charge. The table has this column only if a robot reports a
-battery."""
+"""Index of the column BATTERY. The table has this column only if any robot reports a battery."""
 
 URGENT = ("fault", "stopped", "GONE", "SILENT")
-"""Modes and kinds of absence that need attention. The table lists robots in this order.
+"""Modes and kinds of absence that need attention.
 
-Other robots follow, first those with a warning.
+The table lists the robots with these in this order. The other robots follow, those with a warning
+first.
 """
 
 
 def table(rows: Sequence[Row], width: int, height: int | None = None) -> list[str]:
-    """Return a header and a line for each robot, the urgent robots first.
+    """Return a header line, and a line for each robot, the urgent robots first.
 
-    There are at most `height` lines of at most `width` characters.
+    There are at most `height` lines, or any number if `height` is None. If some robots do not fit,
+    the last line says how many. A line has at most `width` characters.
     """
     cells = [HEADS, *map(told, sorted(rows, key=_order))]
     widest = [max(len(row[n]) for row in cells) for n in range(len(HEADS))]
@@ -66,10 +67,10 @@ def table(rows: Sequence[Row], width: int, height: int | None = None) -> list[st
 
 
 def shortened(names: Sequence[str], room: int) -> list[str]:
-    """Shorten each name that has more than `room` characters, by cutting out a part of it.
+    """Return the names, with a part replaced by "…" in each name of more than `room` characters.
 
-    The cut begins after the same number of characters in each name. It is near the middle of the
-    shortened names, unless a cut elsewhere keeps more names distinct.
+    The part begins at the same position in each long name. It is near the middle of the shortened
+    names, unless another position keeps more names distinct.
     """
     if all(len(name) <= room for name in names):
         return list(names)
@@ -86,7 +87,7 @@ def shortened(names: Sequence[str], room: int) -> list[str]:
 
 
 def told(row: Row) -> tuple[str, ...]:
-    """Return the texts of the cells of a robot's row, in the order of the headings `HEADS`."""
+    """Return the texts of the table cells for a robot, in the order of the headings `HEADS`."""
     name = printable(row.robot_id)
     if row.state is None:
         why = "waiting for its state" if row.here else "not there"
@@ -106,10 +107,9 @@ def told(row: Row) -> tuple[str, ...]:
 
 
 def _why(state: RobotState) -> str:
-    """Return the warnings in brief, the reason of the mode, and details of the warnings.
+    """Return the text of the column WHY: warnings in brief, reason of the mode, and details.
 
-    The details also contain the speed limit, if there is one. If the mode is one of `URGENT`, its
-    reason comes first.
+    If the mode is in `URGENT`, the reason of the mode comes first.
     """
     why = reason(state)
     found, parts = [one for one in warnings(state) if one.brief not in why], [why]
@@ -121,7 +121,6 @@ def _why(state: RobotState) -> str:
 
 
 def _place(state: RobotState) -> str:
-    """Return the pose as text: x and y in m, and the heading in degrees."""
     figures = (state.x, 1), (state.y, 1), (math.degrees(state.yaw), 0)
     return " ".join(signed(value, decimals, 7).strip() for value, decimals in figures) + "°"
 
@@ -133,9 +132,9 @@ def _absence(row: Row) -> str:
 
 
 def _order(row: Row) -> tuple[int, str]:
-    """Return the sort key of a row: the urgency, then the robot's id.
+    """Return the sort key of a row: a number that is lower for urgent robots, and the robot's id.
 
-    For a robot that is gone or silent, the absence counts instead of the mode.
+    The mode of a robot that is gone or silent does not count.
     """
     what = _absence(row) or ("" if row.state is None else row.state.mode)
     if what in URGENT:
@@ -145,19 +144,22 @@ def _order(row: Row) -> tuple[int, str]:
 
 
 class Roster(Fleet):
-    """The robots that `acsard fleet` shows, and the reason why others may be missing."""
+    """The robots that `acsard fleet` shows, and the reason why robots may be missing."""
 
     def rows(self) -> list[Row]:
-        """Query silent robots, and return one row per robot."""
+        """Send the queries that are due, and return one row per robot.
+
+        In the rows, `here` is False and not None for a robot that was never present.
+        """
         self.ask(self.due())
         return [replace(row, here=bool(row.here)) for row in super().rows()]
 
     def gather(self) -> list[Row]:
-        """Wait for the robots, and return the rows.
+        """Wait for the first reports of the robots, and return one row per robot.
 
-        The wait ends when all robots that the user named have reported, but at most after 1.5 s.
-        If no robot is present by then, the wait continues up to 3 s, because the first answer is
-        late on a busy computer. If no robot is present after 3 s, return [].
+        The wait ends when all robots that the user named have reported, and after 1.5 s at the
+        latest. If no robot is present after 1.5 s, the wait continues for up to 3 s, because the
+        first answer can be late on a busy computer. If no robot is present after 3 s, return [].
         """
         began, rows = time.monotonic(), self.rows()
         while not self.whole:
@@ -185,7 +187,7 @@ class Roster(Fleet):
 
     @property
     def more(self) -> str:
-        """A sentence which says that some robots are left out, or "" if no robot is left out."""
+        """A sentence which says that the table leaves out some robots; "" if it leaves out none."""
         if not self.left_out:
             return ""
         return (
@@ -194,7 +196,7 @@ class Roster(Fleet):
         )
 
     def hint(self) -> str:
-        """Return a sentence that explains why there are no robots to show."""
+        """Return a sentence for an empty table. It explains why no robot is shown."""
         if ALL in self._ids:
             return nobody(self._robot.where.endpoint)
         return "no robot that you named with --id is present: correct --id, or start their daemons"

@@ -1,14 +1,15 @@
 """Drives the robot from the keyboard with the keys of teleop_twist_keyboard.
 
 A terminal reports a key press but never its release. Each press therefore drives the robot for
-`HOLD_S`. Once the keyboard repeats a held key, each repeat drives the robot for `REPEAT_S` only.
-When the time of the last press or repeat is over, `acsard drive` sends three zero commands and then
-nothing. If this program was not running for more than 0.5 s, the keys that the operator typed in
-that time do not drive the robot.
+`HOLD_S`. After the first `REPEATS` repeats of a held key, each further repeat drives the robot for
+`REPEAT_S` only. When this time is over, `acsard drive` sends three zero commands and then nothing.
+If this program was not running for more than 0.5 s, the keys that the operator typed in that time
+do not drive the robot.
 
 A key that was pressed before a stop must not drive the robot after the `clear`, even if an SSH
-connection pauses and the key seems to be released. So if the robot ceases to follow while a key is
-held, the key drives again only after a key that stops, or after 1.5 s without a driving key.
+connection pauses and the key seems to be released. So if the robot stops following while a key is
+held, this key no longer drives the robot. Driving keys work again after a key that stops the robot,
+or after 1.5 s without a driving key.
 """
 
 from __future__ import annotations
@@ -35,29 +36,30 @@ from acsard.top.drive_screen import Teleop
 HOLD_S = 0.6
 """Time for which one key press drives the robot, s.
 
-It must be longer than a keyboard's delay before the first repeat (0.25 to 0.5 s).
+This time must be longer than a keyboard's delay before the first repeat (0.25 to 0.5 s).
 """
 
 REPEAT_S, REPEATS = 0.25, 3
-"""Time for which each repeat of a held key drives the robot, s (`REPEAT_S`), and number of repeats
+"""Time for which a repeat of a held key drives the robot, s (`REPEAT_S`), and number of repeats
 after which a key counts as held (`REPEATS`).
 
-The repeats must be less than `REPEAT_S` apart. Keyboards repeat a key 10 to 30 times a second.
+Presses of the same key count as repeats if they are less than `REPEAT_S` apart. Keyboards repeat a
+key 10 to 30 times a second.
 """
 
 BURST = 8
 """Largest number of keys that may arrive together and still drive the robot.
 
-If more keys arrive together, they were delayed, usually by an SSH connection that stalled. The
+If more keys arrive together, something has delayed them, usually a stalled SSH connection. The
 operator may have released the key long ago.
 """
 
 BURST_S = 0.2
 """Time after the arrival of delayed keys, s, in which all further keys count as delayed too. One
-read from the terminal may not return all the delayed keys."""
+read from the terminal may not return all delayed keys."""
 
 OVER = "the robot did not follow while this key was held: press space, then press the key again"
-"""The reason why a key does not drive although the robot could follow."""
+"""Text for the operator if a held key does not drive the robot although the robot could follow."""
 
 _MOVES = {
     "i": (1, 0), "o": (1, -1), "u": (1, 1), "j": (0, 1), "l": (0, -1),
@@ -71,29 +73,30 @@ _SPEEDS = {
 
 
 class Keyboard:
-    """Converts key presses to commands. The class is pure."""
+    """Converts key presses to velocity commands. The class is pure."""
 
     def __init__(self, linear: float, angular: float) -> None:
         self.linear, self.angular = linear, angular
         self._move = (0, 0)
         self._pressed, self._repeats = -math.inf, 0
-        """Monotonic time of the last press of a driving key, s, and number of its repeats. After a
-        key that stops, the time is minus infinity."""
+        """Monotonic time of the last press of a driving key, s, and number of repeats of this key.
+        After a key that stops the robot, the time is minus infinity."""
         self._begun, self._over = 0.0, False
-        """Monotonic time at which the present hold began, s, and whether `end_hold` has ended it.
-        Driving keys belong to one hold if they are at most `RELEASED_NS` apart."""
+        """Monotonic time at which the present hold began, s, and whether `end_hold` has ended this
+        hold. A hold is a series of driving keys that are at most `RELEASED_NS` apart."""
         self._until = 0.0
         self._old_until = 0.0
         """Monotonic time until which all keys count as delayed and only stop the robot, s."""
         self._zeros = ZEROS
 
     def take(self, text: str, now: float, waited: float = 0.0) -> None:
-        """Process the keys of one read from the terminal at `now` (monotonic clock, s).
+        """Process the keys of one read from the terminal.
 
-        The keys may have waited for up to `waited` s. They count as delayed if `waited` is above
-        `GRACE_S`, or if more than `BURST` keys arrive together. Delayed keys do not show what the
-        operator wants now, so they only stop the robot. After a wait of more than `GRACE_S`, the
-        robot is also stopped if no key was typed but an earlier press would still drive it.
+        `text` contains the keys, and `now` is the time of the read (monotonic clock, s). `waited`
+        is the time since the previous read, s, for which the keys may have waited. The keys count
+        as delayed if `waited` is above `GRACE_S`, or if more than `BURST` keys arrive together.
+        Delayed keys do not show what the operator wants now, so they only stop the robot. If
+        `waited` is above `GRACE_S`, an earlier press does not drive the robot any more either.
         """
         keys = split(text)
         if len(keys) > BURST or waited > GRACE_S:
@@ -108,7 +111,10 @@ class Keyboard:
             self.press(key, now)
 
     def press(self, key: str, now: float) -> None:
-        """Process a key, or an arrow's escape sequence, pressed at `now` (monotonic clock, s)."""
+        """Process a key that was pressed at `now` (monotonic clock, s).
+
+        `key` is one character, or the escape sequence of an arrow key.
+        """
         if key in _SPEEDS:
             self.linear *= _SPEEDS[key][0]
             self.angular *= _SPEEDS[key][1]
@@ -129,9 +135,10 @@ class Keyboard:
     def end_hold(self, now: float) -> None:
         """Stop the robot, and ignore the key that is held at `now` (monotonic clock, s).
 
-        Call this when a state that has just arrived shows that the robot does not follow. The call
-        has no effect if the state may be older than the hold. If no key seems to be held, a network
-        may still delay the repeats of one, and these have no effect either.
+        Call this when a state arrives that shows that the robot does not follow. If the operator
+        has begun to hold the key less than `SETTLED_S` ago, do nothing, because the state may be
+        older. If no key seems to be held, a network may be delaying the repeats of a held key.
+        Repeats that then arrive together do not drive the robot either.
         """
         held = self._held(now)
         if self._over or (held and now - self._begun <= SETTLED_S):
@@ -141,7 +148,10 @@ class Keyboard:
             self._stop(now)
 
     def ignores(self, now: float) -> bool:
-        """Return whether the key that is held at `now` (monotonic clock, s) has no effect."""
+        """Return whether a key is held that does not drive the robot since a call of `end_hold`.
+
+        `now` is the present time on the monotonic clock, s.
+        """
         return self._over and self._held(now)
 
     def _held(self, now: float) -> bool:
@@ -151,7 +161,10 @@ class Keyboard:
         self._move, self._until, self._zeros = (0, 0), now, ZEROS
 
     def wish(self, now: float) -> Twist | None:
-        """Return the command to send at `now` (monotonic clock, s), or None to send nothing."""
+        """Return the command to send at `now` (monotonic clock, s), or None to send nothing.
+
+        Each call that returns a final zero reduces the number of zeros that are still to be sent.
+        """
         if now < self._until:
             return Twist(self.linear * self._move[0], self.angular * self._move[1])
         if self._zeros:
@@ -173,7 +186,10 @@ class Ride:
         self._fine = self._stepped = clock.steady_s()
 
     def step(self, typed: str) -> None:
-        """Process the typed keys, send the command that is due, and process received states."""
+        """Process the typed keys, send the command that is due, and process the received states.
+
+        `typed` contains the keys of one read from the terminal; "" if no key was typed.
+        """
         now = clock.steady_s()
         now_ns = round(now * NS_PER_S)
         waited, self._stepped = now - self._stepped, now
@@ -181,7 +197,8 @@ class Ride:
         wish = self._keyboard.wish(now)
         if wish is not None:
             self._commander.take(Wish(wish), now_ns)
-        # Send one command per step: the daemon may miss a zero that a speed follows directly.
+        # Send only one command per step. If a nonzero command followed a zero immediately, the
+        # daemon could miss the zero.
         sent = self._commander.send(now_ns)
         if sent is not None:
             self._robot.send(sent.twist.linear, sent.twist.angular)
@@ -190,7 +207,7 @@ class Ride:
         self.take()
 
     def take(self) -> None:
-        """Process the states that have arrived, and query the state if it is late."""
+        """Process the states that have arrived. If no state has arrived for some time, query it."""
         now, before = clock.steady_s(), self._watch.state
         for state in self._watch.look(now):
             if ends_hold(state, self._robot.source) or restarted(before, state):
@@ -223,7 +240,7 @@ class Ride:
 
 
 def split(text: str) -> list[str]:
-    """Split the text of one terminal read into keys. An arrow key has three characters."""
+    """Split the text of one read from the terminal into keys. An arrow key has three characters."""
     keys, at = [], 0
     while at < len(text):
         size = 3 if text.startswith("\x1b[", at) else 1

@@ -1,7 +1,7 @@
 """Builds the parts of the screen of `acsard top` for a narrow terminal. This module is pure.
 
-The screen shows the same values as the one of `wide_screen.py`. The latencies since the start of
-the daemon come last, so a screen with few lines cuts them off first.
+The narrow screen shows the same values as the wide screen (`wide_screen.py`). The latencies since
+the start of the daemon come last, so a terminal with few lines cuts them off first.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from acsard.top.wide_screen import (
 )
 
 BELOW = 80
-"""Width of the terminal, in character cells, below which the narrow layout is used."""
+"""Terminals with fewer character cells per line than this number get the narrow layout."""
 
 BAR = 4
 
@@ -57,10 +57,10 @@ def motion(state: RobotState, width: int) -> list[Text]:
 
 
 def sources(state: RobotState, room: int, width: int) -> list[Text]:
-    """Return lines about each command source.
+    """Return lines about each command source: priority, age of the last command, reason to wait.
 
-    They show its priority, the age of its last command, and what it waits for. If the sources need
-    more than about `room` lines, the last line names the other sources.
+    If the sources need more than about `room` lines, the last line counts the sources that do not
+    fit, and names the first of them. A line has at most `width` character cells.
     """
     lines = [rule(width, [(0, "sources"), (16, "priority"), (26, "seen")])]
     left = list(state.sources)
@@ -81,7 +81,11 @@ def sources(state: RobotState, room: int, width: int) -> list[Text]:
 
 
 def link(seen: ScreenData, state: RobotState, width: int) -> list[Text]:
-    """Return the lines about the serial link and the commands, and about rejected inputs."""
+    """Return the lines about the serial link, the commands and the rejected inputs.
+
+    `seen` contains the data of the screen, and `state` is the state to show. A line has at most
+    `width` character cells.
+    """
     before = seen.before or state
     lines = [rule(width, [(0, title(seen, state))])]
     if state.certificate_expiry:
@@ -123,9 +127,9 @@ def timing(state: RobotState, width: int) -> list[Text]:
 
 
 def folded(text: str, width: int, inset: int) -> list[Text]:
-    """Wrap a sentence, with lines indented by `inset` cells.
+    """Wrap a text to `width` character cells, and indent its lines by `inset` cells.
 
-    If the sentence begins with a label such as "gyro", its first line is not indented.
+    If the text begins with a label such as "gyro", its first line is not indented.
     """
     first = "" if text.startswith(("gyro ", "track ", "board ", "last one ")) else " " * inset
     wide = max((cell_len(one) for one in text), default=1)  # a character may be two cells wide

@@ -1,8 +1,8 @@
 """Builds one screen of `acsard top` from a robot's state, as lines of colored text.
 
-This module is pure. Lines are cut to the width of the terminal, so no message can break the layout.
-If the terminal has too few lines, the screen leaves out the empty lines first, and then command
-sources.
+This module is pure. It cuts all lines to the width of the terminal, so no message can break the
+layout. If the terminal has too few lines, the screen first leaves out the empty lines, and then
+some command sources.
 """
 
 from __future__ import annotations
@@ -25,10 +25,11 @@ MOST_SOURCES = 32
 
 
 def screen(seen: ScreenData, width: int, height: int | None = None) -> Group:
-    """Return the screen in at most `height` lines, or in any number if `height` is None.
+    """Return the screen of `acsard top`.
 
-    A line has at most `width` character cells. A `width` below 20 counts as 20, and a `width` above
-    `WIDEST` counts as `WIDEST`.
+    The screen has at most `height` lines, or any number if `height` is None. A line has at most
+    `width` character cells. A `width` below 20 counts as 20, and a `width` above `WIDEST` counts as
+    `WIDEST`.
     """
     width = max(20, min(WIDEST, width))
     head = [_header(seen, width), *(_no_news(seen, width) if seen.silent else _mode(seen, width))]
@@ -49,7 +50,7 @@ def screen(seen: ScreenData, width: int, height: int | None = None) -> Group:
     used = len(head) + sum(map(len, sections))
     airy = height is None or height - used >= len(sections) - 1
     body = [line for part in sections for line in ([Text(), *part] if airy else part)]
-    body = body[1:] if airy else body  # the mode already leaves an empty line below it
+    body = body[1:] if airy else body  # no empty line between the head and the first section
     if seen.silent:
         for line in body:
             line.stylize("dim")
@@ -61,7 +62,10 @@ def screen(seen: ScreenData, width: int, height: int | None = None) -> Group:
 
 
 def _unmeasured(state: RobotState) -> RobotState:
-    """Return the state without speeds, which are outdated while the link to the board is not up."""
+    """Return the state without its speeds.
+
+    Use this while the link to the board is not up, because the speeds are then outdated.
+    """
     return replace(state, linear=math.nan, angular=math.nan, wheels=[])
 
 
@@ -76,11 +80,9 @@ def _header(seen: ScreenData, width: int) -> Text:
 
 
 def _mode(seen: ScreenData, width: int) -> list[Text]:
-    """Return the robot's mode as a colored label, with the reason of the mode beside or below it.
-
-    A wide screen always uses two lines for mode and reason. Otherwise, the lines below would move
-    when the reason becomes long.
-    """
+    """Return lines with the robot's mode as a colored label, and with the reason of the mode."""
+    # On a wide screen, always return two lines. Otherwise, the lines below would move when the
+    # reason becomes long.
     state = seen.state
     if state is None:
         return [Text("waiting for the first state message of the daemon", "yellow")]
@@ -94,7 +96,7 @@ def _mode(seen: ScreenData, width: int) -> list[Text]:
 
 
 def _warnings(state: RobotState, width: int) -> list[Text]:
-    """Return the robot's warnings as text (one line on a wide screen), or [] if there is none.
+    """Return lines with the robot's warnings, or [] if the robot gives no warning.
 
     A single warning is shown with its details. Several warnings are shown by name only.
     """
@@ -108,7 +110,10 @@ def _warnings(state: RobotState, width: int) -> list[Text]:
 
 
 def _split(words: str, room: int) -> tuple[str, str]:
-    """Split a text into at most `room` characters and the rest, between two words if possible."""
+    """Return the pair (first `room` characters, rest) of a text, split between words if possible.
+
+    If the text has at most `room` characters, the rest is "".
+    """
     if len(words) <= room:
         return words, ""
     at = words.rfind(" ", 0, room + 1)
@@ -116,7 +121,7 @@ def _split(words: str, room: int) -> tuple[str, str]:
 
 
 def _no_news(seen: ScreenData, width: int) -> list[Text]:
-    """Return a bar across the screen that marks the data below as old."""
+    """Return a red bar across the screen, which warns that the data below the bar is old."""
     since = lasting(int(min(seen.age, 1e9)))
     words = f"NOTHING RECEIVED FOR {since}: does the daemon run?"
     if seen.undecodable:

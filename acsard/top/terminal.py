@@ -1,8 +1,7 @@
 """Shows the screens of the commands `acsard top`, `acsard fleet` and `acsard drive`.
 
-A signal or the end of the input ends each screen. The letter `q` ends the screens of `top` and
-`fleet`.
-If the terminal cannot show a screen, `acsard drive` prints lines instead.
+A signal or the end of the input ends each screen. The key `q` also ends the screens of `top` and
+`fleet`. If the terminal cannot show a screen, `acsard drive` prints reports instead.
 """
 
 from __future__ import annotations
@@ -34,15 +33,17 @@ from acsard.top.keyboard import Ride
 from acsard.top.screen import screen
 
 PERIOD_S = 0.25
-"""Interval at which a screen is drawn, s."""
+"""Time between two updates of a screen, s."""
 
 KEYS_S = 0.05
-"""Longest time between two reads of the keyboard in `acsard drive`, s."""
+"""Longest time for which `acsard drive` waits for a key before it does its other work, s."""
 
 NEWS_S, SAME_S, QUIET_S = 0.5, 1.0, 10.0
-"""Shortest time between two printed reports of `acsard drive`, s: `NEWS_S` if the content has
-changed, `SAME_S` if it has not changed and the robot moves, and `QUIET_S` if it has not changed and
-the robot stands."""
+"""Shortest time between two printed reports of `acsard drive`, s.
+
+If the content has changed since the last report, this time is `NEWS_S`. Otherwise it is `SAME_S`
+while the robot moves, and `QUIET_S` while the robot stands still.
+"""
 
 NO_END = 10**9
 
@@ -75,7 +76,7 @@ def live(feed: Feed) -> None:
 def drive(ride: Ride) -> None:
     """Drive the robot with the typed keys, and show its state.
 
-    This ends when the input ends or a signal arrives.
+    The function returns when the input ends or a signal arrives.
     """
     if has_screen():
         console = Console()
@@ -87,10 +88,10 @@ def drive(ride: Ride) -> None:
 def part(ride: Ride) -> None:
     """Wait until the robot has stopped, but at most 2 s, and print a last report.
 
-    If standard input or output is not a terminal, do nothing. Without the wait, the report would
-    say that the robot still moves, or that it still follows the source of this drive. The daemon
-    follows a source until its timeout, 0.25 s by default.
+    If standard input or output is not a terminal, do nothing.
     """
+    # Without the wait, the report would say that the robot still moves, or that it still follows
+    # the source of this drive. The daemon follows a source until its timeout, 0.25 s by default.
     left = clock.steady_s()
     while os.isatty(0) and os.isatty(1):
         ride.take()
@@ -145,11 +146,11 @@ def _screen(console: Console) -> Live:
 
 
 def _hold(shows: Callable[[list[bool]], bool]) -> None:
-    """Show a screen by calling `shows` until a signal arrives or `shows` returns False.
+    """Show a screen with the function `shows`, until a signal arrives or `shows` returns False.
 
-    The argument of `shows` is a list that becomes non-empty when the user presses Ctrl-Z. Then
-    `shows` must close the screen and return True. This function suspends the program, and calls
-    `shows` again when the user resumes the program with `fg`.
+    The argument of `shows` is an empty list. When the user presses Ctrl-Z, an element is added to
+    the list. Then `shows` must close the screen and return True. This function suspends the
+    program, and calls `shows` again when the user resumes the program with `fg`.
     """
     _be_lenient()
     suspend: list[bool] = []
@@ -161,9 +162,9 @@ def _hold(shows: Callable[[list[bool]], bool]) -> None:
 
 
 def _steer(ride: Ride, console: Console, suspend: list[bool]) -> bool:
-    """Drive the robot with the typed keys, and show its state on the screen.
+    """Do the work of `drive` on a screen until the user presses Ctrl-Z or the input ends.
 
-    Return True on Ctrl-Z, and False when the input ends.
+    Return True for Ctrl-Z, which makes `suspend` non-empty, and False for the end of the input.
     """
     with keys() as read, _screen(console) as shown:
         due = 0.0
@@ -176,12 +177,12 @@ def _steer(ride: Ride, console: Console, suspend: list[bool]) -> bool:
                 due = time.monotonic() + PERIOD_S
                 shown.update(Group(*lines(ride.seen(), *console.size)), refresh=True)
     for letter in ("k", "", ""):
-        ride.step(letter)  # stop the robot: no steps run while suspended
+        ride.step(letter)  # stop the robot, because a suspended program sends no commands
     return True
 
 
 def _be_lenient() -> None:
-    """Let standard output replace characters that its encoding lacks, instead of failing."""
+    """Make standard output replace characters that its encoding does not contain."""
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")
 
@@ -245,10 +246,6 @@ def keys() -> Iterator[Callable[[float], str | None]]:
 
 
 def _drive_in_lines(ride: Ride) -> None:
-    """Drive the robot with the typed keys, and print reports about the robot.
-
-    This ends when the input ends or a signal arrives.
-    """
     due, page = News(), Page()
     with until_told(), keys() as read:
         while (typed := read(KEYS_S)) is not None:
@@ -260,9 +257,9 @@ def _drive_in_lines(ride: Ride) -> None:
 
 
 def output_size() -> os.terminal_size:
-    """Return the size of the terminal that shows the output.
+    """Return the size of the terminal that shows the standard output, in columns and lines.
 
-    If the output goes to a file or a pipe, return a size that is practically unlimited.
+    If the standard output is a file or a pipe, return a practically unlimited size.
     """
     unlimited = os.terminal_size((NO_END, NO_END))
     return shutil.get_terminal_size() if sys.stdout.isatty() else unlimited
@@ -276,9 +273,10 @@ class News:
         self._at = -QUIET_S
 
     def tell(self, seen: Teleop, now: float) -> bool:
-        """Return whether the caller must print a report now. If so, count the report as printed.
+        """Return whether the caller must print a report now.
 
-        `now` is the time on a monotonic clock, s.
+        If the result is True, the report counts as printed. `seen` is the content of the report,
+        and `now` is the time on a monotonic clock, s.
         """
         state = seen.state
         words = ("", "") if state is None else (state.mode, state.reason)
@@ -292,7 +290,7 @@ class News:
 
 
 class Page:
-    """Adds the help about the keys to the printed reports before it scrolls out of sight."""
+    """Repeats the help about the keys between printed reports, so that it stays in sight."""
 
     def __init__(self) -> None:
         self._shown = NO_END
@@ -300,8 +298,9 @@ class Page:
         It is `NO_END` before the help is first printed."""
 
     def with_help(self, told: list[str], height: int) -> list[str]:
-        """Return the lines `told`, with the help above them if it would scroll out of sight.
+        """Return the lines of a report, with the help about the keys above them if necessary.
 
+        The help is necessary if the lines `told` would scroll the last printed help out of sight.
         `height` is the number of lines of the terminal.
         """
         self._shown += len(told)

@@ -1,6 +1,6 @@
 """Formats the values and the lines of the screen of `acsard top`. This module is pure.
 
-Every value becomes a text of bounded length, whatever arrives on the bus. Text from the bus reaches
+The text of each value has a limited length, whatever arrives on the bus. Text from the bus reaches
 the terminal only through `clean`, and only inside rich's `Text`, which does not interpret markup.
 """
 
@@ -25,7 +25,7 @@ MODES = {
     "stopped": "bold white on red",
     "fault": "bold white on red",
 }
-"""Color of each mode, as a style of the library rich."""
+"""Style of each mode's label (color and weight), in the notation of the library rich."""
 
 
 class ScreenData(Struct, frozen=True):
@@ -42,14 +42,14 @@ class ScreenData(Struct, frozen=True):
     """Seconds since `state` arrived, or since the wait for the first state began."""
     info: Info | None = None
     undecodable: int = 0
-    """Number of state messages that could not be decoded since the last one that could be."""
+    """Number of messages that could not be decoded since the last readable state."""
     hint: str = ""
     silent: bool = False
     """True if no state has arrived for too long, so the shown data is old."""
     passed: float = 0.0
-    """Seconds between the arrivals of `before` and `state`, on the local clock.
+    """Seconds between the arrivals of `before` and `state`, on this computer's clock.
 
-    If the difference of their stamps has another value, the robot's clock was adjusted.
+    If the stamps of the two states differ by another time, the robot's clock was adjusted.
     """
 
 
@@ -57,25 +57,26 @@ _EIGHTHS = " ▏▎▍▌▋▊▉█"
 
 
 def clean(text: str) -> str:
-    """Return the text with control, invisible and zero-width characters replaced by visible ones.
+    """Return at most 256 characters of a text, without invisible characters.
 
-    The text is cut after 256 characters.
+    Control, invisible and zero-width characters are replaced by visible characters.
     """
     # No screen shows more than 256 characters of a text.
     return "".join(c if cell_len(c) else "\ufffd" for c in printable(text[:256]))
 
 
 def count(number: int) -> str:
-    """Format an integer with thousands separators, or with an exponent from 10^10 on."""
+    """Format an integer with thousands separators. From 10^10 on, use an exponent instead."""
     if abs(number) < 10**10:
         return f"{number:,}"
     return f"{float(max(-(10**300), min(10**300, number))):.1e}"
 
 
 def rate(later: int, earlier: int, seconds: float) -> str:
-    """Return a counter's increase per second as text with 7 characters, or "-/s" if unknown.
+    """Return a counter's increase per second as text, at least 7 characters long.
 
-    `seconds` is the time in which the counter rose from `earlier` to `later`.
+    If the rate is not known, the text is "-/s". `seconds` is the time in which the counter rose
+    from `earlier` to `later`.
     """
     # After a clock change or a restart of the daemon, a wrong rate must not be shown.
     if not 0.05 <= seconds <= 60.0 or not 0 <= later - earlier < 10**6:
@@ -85,9 +86,10 @@ def rate(later: int, earlier: int, seconds: float) -> str:
 
 
 def bar(value: float, scale: float, cells: int) -> str:
-    """Return a bar whose length shows the magnitude of `value`.
+    """Return a horizontal bar of block characters whose length is proportional to `value`.
 
-    If the magnitude is `scale` or more, the bar has `cells` characters.
+    The sign of `value` is ignored. If the magnitude is `scale` or more, the bar has `cells`
+    characters. If `value` is not finite, return "".
     """
     if not math.isfinite(value):
         return ""
@@ -103,16 +105,16 @@ def row(label: str, told: str, style: str = "") -> Text:
 
 
 def ends(left: Text, right: Text, width: int) -> Text:
-    """Return a line of `width` cells with one text at its left end and another at its right end.
+    """Return a line of `width` cells with `left` at its left end and `right` at its right end.
 
-    If both do not fit, the left text is cut.
+    If the line is too short, cut `left`.
     """
     left.truncate(max(0, width - right.cell_len - 2), overflow="ellipsis")
     return left.append(" " * (width - left.cell_len - right.cell_len)).append_text(right)
 
 
 def rule(width: int, titles: Sequence[tuple[int, str | Text]]) -> Text:
-    """Return a horizontal line with titles, given as pairs (column, title)."""
+    """Return a horizontal line with titles. `titles` are pairs: the column, and the title."""
     line = Text()
     for at, title in titles:
         if at:
@@ -122,9 +124,9 @@ def rule(width: int, titles: Sequence[tuple[int, str | Text]]) -> Text:
 
 
 def flow(parts: Sequence[Text], width: int, inset: int = 0) -> list[Text]:
-    """Arrange the parts in lines of at most `width` cells, with as many parts per line as fit.
+    """Return lines of at most `width` cells, each with as many of the parts as fit.
 
-    Lines after the first begin with `inset` blanks.
+    A longer part gets a longer line of its own. Lines after the first begin with `inset` blanks.
     """
     lines: list[Text] = []
     for part in parts:

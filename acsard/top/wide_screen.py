@@ -22,7 +22,7 @@ WIDEST = 116
 """Maximum width of the screen in character cells. Longer lines are harder to read."""
 
 SHORT_WORDS, LONG_WORDS = 21, 56
-"""Widths of the short and the long explanation in `FIGURES`, in character cells."""
+"""Widths of the two explanations in `FIGURES`, character cells: short and long."""
 
 MOST_REASONS, MOST_PORT = 16, 34
 
@@ -48,11 +48,15 @@ FIGURES = {
         "from sending a line to its answer (checked link only)",
     ),
 }
-"""Short and long explanation of each latency. `a → b` means the time from event a to event b."""
+"""Maps the name of each latency to a short and a long explanation. `a → b` means the time from
+event a to event b."""
 
 
 def motion(state: RobotState, width: int) -> list[Text]:
-    """Return lines with pose and twist on the left, and the wheel speeds on the right."""
+    """Return lines with the robot's pose and twist on the left, and its wheel speeds on the right.
+
+    `width` is the width of the screen in character cells.
+    """
     (right, left, rear_left, rear_right), scale = speeds(state)
     cells = 6 + max(0, width - 80) // 2
     at = ((0, "pose and twist"), (40, "wheels rad/s"), (56, "left"), (68 + cells, "right"))
@@ -70,9 +74,9 @@ def motion(state: RobotState, width: int) -> list[Text]:
 
 
 def speeds(state: RobotState) -> tuple[tuple[float, ...], float]:
-    """Return a pair: the four wheel speeds, and the speed that a full bar stands for, rad/s.
+    """Return a pair: the four measured wheel speeds, and the speed that a full bar shows, rad/s.
 
-    An unknown speed is NaN.
+    An unknown wheel speed is NaN.
     """
     wheels = (*state.wheels[:4], *[math.nan] * (4 - len(state.wheels)))
     top = max((abs(speed) for speed in wheels if math.isfinite(speed)), default=0.0)
@@ -80,9 +84,10 @@ def speeds(state: RobotState) -> tuple[tuple[float, ...], float]:
 
 
 def wheel(speed: float, scale: float, cells: int) -> Text:
-    """Return a wheel's direction of rotation as a symbol, its speed in rad/s, and a bar.
+    """Return a text that shows a wheel's speed: a symbol for the direction, a number, and a bar.
 
-    The bar has `cells` cells if the speed is `scale` rad/s or more.
+    `speed` is in rad/s, or NaN if it is unknown. The bar has `cells` cells if the magnitude of the
+    speed is `scale` rad/s or more.
     """
     if speed == 0.0 or not math.isfinite(speed):
         sign, style = "·", "dim"
@@ -97,7 +102,8 @@ def wheel(speed: float, scale: float, cells: int) -> Text:
 def sources(state: RobotState, room: int, width: int) -> list[Text]:
     """Return a heading, and at most `room` lines with one command source each.
 
-    If there are more sources than lines, the last line names all remaining sources.
+    If there are more sources than lines, the last line counts the remaining sources, and names the
+    first of them. `width` is the width of the screen in character cells.
     """
     room_name = 13 + max(0, width - 80) // 2
     start = room_name + 3
@@ -111,7 +117,10 @@ def sources(state: RobotState, room: int, width: int) -> list[Text]:
 
 
 def hidden(left: Sequence[SourceState]) -> str:
-    """Return a line that counts and names the command sources that do not fit on the screen."""
+    """Return a line about the command sources `left`, which do not fit on the screen.
+
+    The line contains their number, and the names of at most `MOST_REASONS` of them.
+    """
     names = ", ".join(clean(source.name) for source in left[:MOST_REASONS])
     return f"  and {count(len(left))} more: {names}"
 
@@ -121,9 +130,10 @@ def drives(source: SourceState, state: RobotState) -> bool:
 
 
 def waits(source: SourceState, state: RobotState) -> str:
-    """Return in words what a command source waits for before it can drive the robot.
+    """Return a text which says why a command source does not drive the robot.
 
-    If the source waits for nothing, the text says that it drives, or names the robot's mode.
+    If the source drives, the text says so. If the source waits for nothing, the text names the
+    robot's mode.
     """
     if source.waits_for:
         return clean(source.waits_for)
@@ -145,8 +155,8 @@ def _source(source: SourceState, state: RobotState, room: int) -> Text:
 def link(seen: ScreenData, state: RobotState, width: int) -> list[Text]:
     """Return the lines about the serial link, the commands and the rejected inputs.
 
-    Further lines show the gyro, the effective track and the board's inputs, each only if the robot
-    reports it.
+    There are also lines about the gyro, the effective track and the board's inputs, if the robot
+    reports them. `seen` contains the data of the screen, and `state` is the state to show.
     """
     before = seen.before or state
     head = title(seen, state)
@@ -192,10 +202,14 @@ def certificate(state: RobotState) -> Text:
 
 
 def rates(seen: ScreenData, state: RobotState, before: RobotState) -> Callable[[str], str]:
-    """Return a function that maps a counter's name to a text with the counter's rate and total."""
-    # The stamps give the exact time between the two states. If it differs from the time between the
-    # arrivals of the states by more than a network's delay, the robot's clock was set, so use the
-    # time between the arrivals.
+    """Return a function that returns a text with the rate and the total of a counter.
+
+    The function takes the name of the counter. The rate is the increase per second from the earlier
+    state `before` to `state`.
+    """
+    # The stamps give the exact time between the two states. If this time differs by more than 0.2 s
+    # (a network's delay) from the time between the arrivals of the states, the robot's clock was
+    # set. In this case, use the time between the arrivals.
     seconds = (state.stamp.to_ns() - before.stamp.to_ns()) / NS_PER_S
     if abs(seconds - seen.passed) > 0.2:
         seconds = seen.passed
@@ -208,7 +222,10 @@ def rates(seen: ScreenData, state: RobotState, before: RobotState) -> Callable[[
 
 
 def board(state: RobotState) -> str:
-    """Return the reported emergency stop, bumpers and battery in words; "" if none is reported."""
+    """Return the emergency stop, the bumpers and the battery in words, as the board reports them.
+
+    Leave out what the board does not report. If it reports nothing, return "".
+    """
     told = [f"emergency stop {clean(state.emergency_stop)}"] if state.emergency_stop else []
     if state.bumpers is not None:
         told.append(f"bumpers {''.join('X' if one else '.' for one in state.bumpers)}")
@@ -218,9 +235,9 @@ def board(state: RobotState) -> str:
 
 
 def overrun(state: RobotState) -> Text:
-    """Return the number of messages on the bus that the daemon dropped because too many arrived.
+    """Return a text with the number of bus messages that the daemon dropped.
 
-    Return an empty text if the daemon dropped none.
+    The daemon drops messages if too many arrive. If it has dropped no message, the text is empty.
     """
     lost = state.counters.get("bus_overrun", 0)
     return Text(f"bus overrun {count(lost)}" if lost else "", "yellow")
@@ -238,9 +255,9 @@ def _port(info: Info) -> str:
 
 
 def missed(state: RobotState, before: RobotState) -> Text:
-    """Return the number of control periods that the daemon missed.
+    """Return a text with the number of control periods that the daemon has missed.
 
-    The text is yellow if the number is larger than in the earlier state `before`.
+    The text is yellow if the number has increased since the earlier state `before`.
     """
     missed = state.counters.get("missed_periods", 0)
     grows = missed > before.counters.get("missed_periods", 0)
@@ -258,9 +275,11 @@ def _refusals(state: RobotState, before: RobotState) -> list[Text]:
 
 
 def refused(state: RobotState, before: RobotState) -> list[tuple[str, list[Text]]]:
-    """Return the numbers of rejected lines, commands and gyro messages, by kind and by reason.
+    """Return texts with the numbers of rejected inputs, as pairs of kind and texts.
 
-    A number is yellow if it is larger than in the earlier state `before`.
+    The kinds are lines of the board, commands and gyro messages. Each text contains a reason for
+    the rejection and a number. The text is yellow if the number has increased since the earlier
+    state `before`.
     """
     kinds = []
     for kind, prefix in (("lines", "line_"), ("commands", "command_"), ("gyro", "imu_")):
@@ -293,7 +312,10 @@ def timing(state: RobotState, width: int) -> list[Text]:
 
 
 def spread(found: Spread | None) -> Text:
-    """Return median, 99th percentile and maximum of a latency, in three columns of 7 cells."""
+    """Return median, 99th percentile and maximum of a latency, in three columns of 7 cells.
+
+    `found` is None if the latency is unknown. Each column then shows "-".
+    """
     if found is None or found.count <= 0:
         return Text("-".rjust(7) * 3, "dim")
     p50, p99, most = (rough(1e-6 * us, 1e-6).rjust(7) for us in (found.p50, found.p99, found.max))

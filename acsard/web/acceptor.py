@@ -1,11 +1,11 @@
-"""Accepts TCP connections, and refuses those beyond the limits before they use much memory.
+"""Accepts TCP connections, and cuts connections beyond the limits before they use much memory.
 
 A connection goes through these states:
 
-1. silent: no byte has arrived yet. The connection costs only a file descriptor and a place in
+1. silent: no byte has arrived yet. The connection costs only a file descriptor and an entry in
    `Sockets`, because TLS starts with the first byte.
-2. waiting: the TLS handshake may not start yet, because too many handshakes are running, or because
-   the client's network has started handshakes too often.
+2. waiting: the TLS handshake may not start yet. Either too many handshakes are running, or the
+   client's network has started handshakes too often.
 3. starting: the TLS handshake is running.
 4. open: aiohttp reads the connection's requests.
 """
@@ -35,7 +35,8 @@ from acsard.web.limits import HANDSHAKES, SOCKETS_HERE, UNREAD_BYTES, Sockets, s
 from acsard.web.metrics import Counts
 
 HANDSHAKE_S, HANDSHAKES_AT_ONCE = 3.0, 32
-"""Time limit for a TLS handshake, s; maximum number of handshakes that run at the same time."""
+"""Time limit for one TLS handshake, s (`HANDSHAKE_S`), and maximum number of TLS handshakes that
+run at the same time (`HANDSHAKES_AT_ONCE`)."""
 
 HURRIED_S = 0.3
 """Minimum age, s, of a running TLS handshake that may be aborted to make room for a waiting one.
@@ -50,8 +51,8 @@ UNREAD_S = 5.0
 receive window closed."""
 
 READ_BYTES = 16384
-"""Size of the read buffer of each TLS connection, bytes. The buffer holds one TLS record. asyncio's
-default is 256 KiB."""
+"""Size of the read buffer of each TLS connection, bytes. One TLS record fits into the buffer.
+asyncio's default is 256 KiB."""
 
 PAUSE_S = 0.05
 """Time, s, for which the server accepts no connections after the process has run out of file
@@ -61,7 +62,7 @@ Factory = Callable[[], "Reader"]
 
 
 class Acceptor:
-    """Accepts TCP connections at the listening addresses, and cuts those that exceed a limit.
+    """Accepts TCP connections at the listening addresses, and cuts connections beyond the limits.
 
     Connections from the robot itself have a separate limit, so clients on other machines cannot
     lock out a browser on the robot.
@@ -88,17 +89,18 @@ class Acceptor:
     def listen(self, opened: socket.socket, secure: ssl.SSLContext | None, make: Factory) -> None:
         """Accept connections at the listening socket `opened`.
 
-        `secure` is None for plain HTTP. `make` creates the HTTP handler of one connection.
+        `secure` is the TLS context, or None for plain HTTP. `make` creates the HTTP handler of one
+        connection.
         """
         sslproto.SSLProtocol.max_size = READ_BYTES
-        # A browser sends no request before it has the answer to the last one. aiohttp would queue
-        # 32 requests, whose headers can take megabytes.
+        # A browser waits for the answer before it sends the next request on a connection. aiohttp
+        # would queue 32 requests, whose headers can take megabytes.
         web_protocol.MAX_MSG_QUEUE_SIZE = 1
         self._listeners.append(opened)
         self._resume(opened, secure, make)
 
     def close(self) -> None:
-        """Stop accepting connections, and cut those whose client is not identified yet."""
+        """Stop accepting connections. Also cut the open connections of unidentified clients."""
         loop = asyncio.get_running_loop()
         for opened in self._listeners:
             loop.remove_reader(opened)
@@ -109,9 +111,9 @@ class Acceptor:
                 one.cut()
 
     def spoke(self, transport: asyncio.BaseTransport | None, body: StreamReader) -> None:
-        """Record that the headers of a request have arrived, which ends the time limit `REQUEST_S`.
+        """End the time limit `REQUEST_S` of a connection, because a request's headers have arrived.
 
-        `transport` identifies the connection, and `body` is the stream from which the body of this
+        `transport` identifies the connection. `body` is the stream from which the body of this
         request is read.
         """
         if (one := _connection(transport)) is not None:
@@ -120,16 +122,17 @@ class Acceptor:
     def admitted(self, transport: asyncio.BaseTransport | None, who: Who) -> None:
         """Record that the client of a connection has been identified as `who`.
 
-        If connections must be closed to make room, those without an identity are closed first.
+        If the server must close connections to make room, it first closes connections whose client
+        is not identified. `transport` identifies the connection.
         """
         if (one := _connection(transport)) is not None:
             one.pool.prove(one, who.token)
 
     def tidy(self, valid: Collection[str]) -> None:
-        """Cut each connection whose token was not in `valid` in two consecutive calls.
+        """Cut each connection whose token is missing in `valid` for the second call in a row.
 
-        `valid` contains the digests of all valid tokens. Call this once a second. After the first
-        of the two calls, a WebSocket client still has time to receive the reason.
+        `valid` contains the digests of all valid tokens. Call this method once a second. Between
+        the first and the second call, a WebSocket client has time to receive the reason.
         """
         before = self._ended
         self._ended = {one for pool in (self._here, self._away) for one in pool.ended(valid)}
@@ -158,10 +161,9 @@ class Acceptor:
             _Connection(self, pool, accepted, peer, secure, make).enter()
 
     def _no_file(self, opened: socket.socket, secure: ssl.SSLContext | None, make: Factory) -> None:
-        """Close an old connection because the process has no free file descriptor.
+        """Close an old connection, because the process has no free file descriptor.
 
-        The listening socket `opened` accepts new connections again after `PAUSE_S`. The arguments
-        are those of `listen()`.
+        The listening socket `opened` accepts connections again after `PAUSE_S`.
         """
         loop = asyncio.get_running_loop()
         loop.remove_reader(opened)
@@ -172,26 +174,26 @@ class Acceptor:
     # The connections call the methods below.
 
     def crowded(self, one: _Connection) -> None:
-        """Cut a connection for which there is no room, or whose request headers are too long.
+        """Cut a connection and count the refusal under the reason `crowded`.
 
-        The refusal is counted under the reason `crowded`.
+        Call this if there is no room for the connection, or if its request headers are too long.
         """
         self._counts.refuse("crowded", one.peer)
         one.cut()
 
     def slow(self, one: _Connection) -> None:
-        """Cut a connection that has exceeded a time limit, and count the refusal."""
+        """Cut a connection that exceeds a time limit, and count the refusal as `slow`."""
         self._counts.refuse("slow", one.peer)
         one.cut()
 
     def wait(self, one: _Connection) -> None:
-        """Queue a connection for its TLS handshake. `_next()` starts it when the limits permit."""
+        """Queue a connection. Its TLS handshake starts as soon as the limits allow it."""
         self._waiting.setdefault(one.network, {})[one] = None
         if self._again is None:
             self._next()
 
     def give_up(self, one: _Connection) -> None:
-        """Remove a connection from those that wait for their TLS handshake."""
+        """Remove a connection from the queue of connections that wait for their TLS handshake."""
         same = self._waiting.get(one.network, {})
         same.pop(one, None)
         if not same:
@@ -207,7 +209,10 @@ class Acceptor:
             self._next()
 
     def _next(self) -> None:
-        """Start one waiting TLS handshake if the limits allow it, and schedule the next call."""
+        """Start one waiting TLS handshake if the limits allow it.
+
+        If any handshake was waiting, schedule the next call of this method.
+        """
         loop, self._again = asyncio.get_running_loop(), None
         if not self._waiting:
             return
@@ -229,16 +234,16 @@ class Acceptor:
         self._again = loop.call_later(0.005, self._next)
 
     def _has_room(self, now: float) -> bool:
-        """Return whether a TLS handshake may start at the time `now`.
+        """Return whether a TLS handshake may start at the time `now`, s on the event loop's clock.
 
-        If `HANDSHAKES_AT_ONCE` handshakes run, try to make room. The network with the most running
-        handshakes loses the oldest of them, unless it is younger than `HURRIED_S`. `now` is in s on
-        the event loop's clock.
+        If `HANDSHAKES_AT_ONCE` handshakes are running, abort one to make room: the oldest handshake
+        of the network with the most handshakes. If that handshake is younger than `HURRIED_S`,
+        abort nothing and return False.
         """
         if len(self._starting) < HANDSHAKES_AT_ONCE:
             return True
-        # The network with the most handshakes loses one, so a slow client in another network keeps
-        # its handshake.
+        # Only the network with the most handshakes loses one. So a slow client in another network
+        # can finish its handshake.
         networks = Counter(one.network for one in self._starting)
         most = max(networks.values())
         oldest, begun = next(
@@ -252,7 +257,7 @@ class Acceptor:
 
 
 class _Connection(asyncio.Protocol):
-    """One TCP connection. After a TLS handshake, if any, it passes received data to a `Reader`."""
+    """One TCP connection. After the TLS handshake, if any, a `Reader` gets the received data."""
 
     def __init__(
         self,
@@ -275,9 +280,10 @@ class _Connection(asyncio.Protocol):
         self._inner: Reader | None = None
 
     def enter(self) -> None:
-        """Acquire a place in `Sockets`, and wait for the client's first byte.
+        """Add this connection to its pool, and wait for the client's first byte.
 
-        Cut the connection if there is no place for it.
+        If the pool refuses this connection, cut it. If the pool displaces an older connection to
+        make room, cut the older connection.
         """
         gone = self.pool.enter(self.network, self)
         if gone is self:
@@ -308,7 +314,7 @@ class _Connection(asyncio.Protocol):
             self._acceptor.wait(self)
 
     def start(self) -> None:
-        """Start the TLS handshake. For plain HTTP, open the connection immediately."""
+        """Start the TLS handshake. For plain HTTP, pass the connection to aiohttp immediately."""
         self._task = self._loop.create_task(self._open())
 
     async def _open(self) -> None:
@@ -350,7 +356,7 @@ class _Connection(asyncio.Protocol):
     def spoke(self, body: StreamReader) -> None:
         """Record that the head of a request (request line and headers) has arrived.
 
-        The time limit `REQUEST_S` ends, and the size of the next head is counted from 0. `body` is
+        This ends the time limit `REQUEST_S`, and resets the size of the head to 0 bytes. `body` is
         the stream from which the body of this request is read.
         """
         self._head, self._body = 0, body
@@ -422,7 +428,7 @@ class Reader(RequestHandler):
     def reads_head(self) -> bool:
         """Whether the next received bytes belong to the head of a request.
 
-        False on a WebSocket, and while received requests wait to be handled.
+        This is False on a WebSocket, and while a received request waits for its handler.
         """
         return not self._upgraded and not self._messages
 
@@ -433,9 +439,10 @@ class Reader(RequestHandler):
         exc: BaseException | None = None,
         message: str | None = None,
     ) -> web.StreamResponse:
-        """Return the answer to bytes that are not an HTTP request.
+        """Return a JSON error as the answer to received bytes that are not a valid HTTP request.
 
-        Without this method, aiohttp would log a traceback.
+        If `status` is 500 or more, a handler has failed, and aiohttp makes the answer. This method
+        replaces one of aiohttp, which logs a traceback for invalid bytes too.
         """
         if status >= 500:
             return super().handle_error(request, status, exc, message)

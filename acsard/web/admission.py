@@ -1,8 +1,9 @@
 """Decides whether an HTTP request reaches its handler.
 
-It checks, in this order, whether the client is on the robot (`callers.py`), the origin of the web
-page that sent the request, the token, the request rate, and the role. A path that does not exist
-requires a token too, so a client without a token does not learn which paths exist.
+The module checks, in this order: the client's address and the requested host (`callers.py`), the
+origin of the web page that sent the request, the token, the request rate, and the client's role.
+A path that does not exist requires a token too, so a client without a token does not learn which
+paths exist.
 """
 
 from __future__ import annotations
@@ -43,11 +44,12 @@ from acsard.web.socket_messages import MAX_BYTES
 from acsard.web.tokens import Token, Vault, owner_in
 
 HOST = re.compile(r"([A-Za-z0-9.-]{1,253}|\[[0-9A-Fa-f:.]{2,45}\])(:[0-9]{1,5})?")
-"""Pattern of a valid `Host` header. It is strict, because the value is copied into an answer."""
+"""Pattern of a valid `Host` header. The pattern is strict, because the server copies the host into
+the content security policy of an answer."""
 
 REASONS: dict[int, Reason] = {404: "path", 405: "path", 413: "too_big"}
-"""Maps the HTTP status of an error of aiohttp to the reason under which the error is counted. Any
-other status is counted as `malformed`."""
+"""Reason under which an error that aiohttp raises is counted, by the HTTP status of the error. An
+error with any other status is counted as `malformed`."""
 
 WORDS = {
     404: "this address does not exist; GET /api lists all addresses",
@@ -55,18 +57,21 @@ WORDS = {
 }
 
 WHO: web.RequestKey[Who] = web.RequestKey("who", Who)
-"""Key under which a request object holds the client's identity. The identity is missing if the path
-is open to every client."""
+"""Key under which a request object contains the client's identity. The request contains no identity
+if its path is open to every client."""
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 READ_EVERY_S = 0.005
-"""Shortest interval between two reads of the token file, s. Each read starts a thread. Before
-this limit existed, each request of a flood started a thread, and a stop was delayed by 200 ms."""
+"""Shortest interval between two reads of the token file, s. Each read starts a thread. Before this
+limit existed, a flood of requests started a thread per request, and delayed a stop by 200 ms."""
 
 
 class Lookups:
-    """Shares each read of the token file among all requests that arrive before the read starts."""
+    """Reads the token file for many requests at once.
+
+    All requests that arrive before a read starts share the result of that read.
+    """
 
     def __init__(self, vault: Vault) -> None:
         self._vault, self._lock = vault, asyncio.Lock()
@@ -76,7 +81,7 @@ class Lookups:
     async def read(self) -> Sequence[Token]:
         """Read the token file, and return the robot's tokens.
 
-        The read starts after this call, so it sees all earlier changes of the file. Raises
+        The result contains all changes of the file that were made before this call. Raises
         `TimeoutError` if the disk does not answer.
         """
         if self._next is None:
@@ -133,9 +138,8 @@ class Admission:
     async def owner(self, peer: str, shown: Sequence[str]) -> Who:
         """Return the owner of the first valid token in a request.
 
-        `peer` is the client's IP address, and `shown` contains the tokens in the request.
-
-        Raises `RefusedError` if no token is valid, and `TimeoutError` if the disk does not answer.
+        `peer` is the client's IP address, and `shown` contains the tokens in the request. Raises
+        `RefusedError` if no token is valid, and `TimeoutError` if the disk does not answer.
         """
         if not any(shown):
             raise RefusedError(
@@ -143,8 +147,8 @@ class Admission:
             )
         tokens = await self._lookups.read()
         who = next(filter(None, (owner_in(tokens, text) for text in shown)), None)
-        # A valid token is accepted even while guessing is throttled, so another client's wrong
-        # guesses lock nobody out.
+        # A valid token is accepted even if too many wrong tokens have arrived. So the guesses of
+        # one client cannot lock out another client.
         if who is not None:
             return replace(who, address=peer)
         if not self._guesses.take(network_of(peer), clock.mono_ns()):
@@ -162,7 +166,7 @@ class Admission:
                 await self._pace_stranger(request)
                 return self._preflight(request)
             waits = await self._admit(request, self._rows.get(request.match_info.route))
-            # For a POST, only the answer is delayed, so the server sends a stop without delay.
+            # For a POST, delay only the answer, so that the server sends a stop immediately.
             if waits and request.method != "POST":
                 await asyncio.sleep(HOLD_S)
             answer = await handler(request)
@@ -195,19 +199,19 @@ class Admission:
             return problem(error.status, WORDS.get(error.status, error.reason))
 
     async def _pace_stranger(self, request: web.Request) -> None:
-        """Delay a request without a valid token by `HOLD_S` if it exceeds the limit `STRANGERS`.
+        """Wait for `HOLD_S` if the client's network exceeds the limit `STRANGERS`.
 
-        All requests without a valid token from the client's network share this limit.
+        Call this for each request without a valid token.
         """
         if not self._strangers.take(network_of(peer_of(request)), clock.mono_ns()):
             await asyncio.sleep(HOLD_S)
 
     async def _admit(self, request: web.Request, row: Route | None) -> bool:
-        """Store the client's identity in the request; return whether the request must be delayed.
+        """Check a request; return True if it must be delayed because it exceeds a rate limit.
 
-        `row` is the route of the path, or None for an unknown path. The request must be delayed if
-        the client exceeds the rate limit of the path and `row.waits` is true. Raises `RefusedError`
-        if the client may not use the path.
+        Also store the client's identity in the request, unless the path is open to every client.
+        `row` is the route of the path, or None for an unknown path. Raises `RefusedError` if the
+        client may not use the path, or exceeds its rate limit while `row.waits` is false.
         """
         said = asked_of(request)
         here = place(said, self._names | {own_address(request)}) == "here"
@@ -217,8 +221,8 @@ class Admission:
             require_own_origin(said)
         if is_open:
             # A browser loads the files of the page over several connections before it requests a
-            # path that needs a token. If such a connection shows a valid token already, this is
-            # recorded, so that the connection is not closed to make room for another one.
+            # path that needs a token. If such a request already contains a valid token, record the
+            # client's identity, so that other clients cannot displace this connection.
             shown = [] if here else tokens_shown(request, self._robot)
             if who := next(filter(None, map(self._vault.known, shown)), None):
                 self._acceptor.admitted(request.transport, who)
@@ -227,7 +231,8 @@ class Admission:
             return False
         who = replace(self._local, address=said.peer)
         if not here:
-            # Cookies are only for the robot's own page. A page in `web.origins` must send a token.
+            # Accept cookies only from the robot's own page. A page in `web.origins` must send a
+            # token.
             shown = tokens_sent(request) if listed else tokens_shown(request, self._robot)
             who = await self.owner(said.peer, shown)
         request[WHO] = who
@@ -254,7 +259,7 @@ class Admission:
         return by_listed_page(asked_of(request), self._origins)
 
     def _preflight(self, request: web.Request) -> web.Response:
-        """Return the answer to a CORS preflight, so a page in `web.origins` may send requests."""
+        """Return the answer to a CORS preflight, which lets a page in `web.origins` use the API."""
         place(asked_of(request), self._names | {own_address(request)})
         return web.Response(
             status=204,
@@ -266,7 +271,7 @@ class Admission:
         )
 
     async def _shared(self, request: web.Request, response: web.StreamResponse) -> None:
-        """Add the CORS headers with which a page in `web.origins` may read the answer."""
+        """Add the CORS headers that let a page in `web.origins` read the answer."""
         if self._origins:
             vary = response.headers.get("Vary", "")
             response.headers["Vary"] = f"{vary}, Origin" if vary else "Origin"
@@ -297,25 +302,32 @@ def peer_of(request: web.Request) -> str:
 
 
 def own_address(request: web.Request) -> str:
-    """Return the address of this machine that the client connected to. A client cannot forge it."""
+    """Return the IP address of this machine to which the client has connected.
+
+    The address comes from the socket, so the client cannot forge it.
+    """
     return unmapped(_reached(request)[0].lower())
 
 
 def own_port(request: web.Request) -> int:
-    """Return the port of this machine that the client connected to."""
+    """Return the TCP port of this machine to which the client has connected."""
     return _reached(request)[1]
 
 
 def tokens_shown(request: web.Request, robot: str) -> list[str]:
-    """Return the tokens in the headers (see `tokens_sent()`), or else those in the cookies."""
+    """Return the tokens in the headers of a request, or if there are none, those in its cookies.
+
+    See `tokens_sent()` for the headers. `robot` is the robot's id, which the names of the cookies
+    contain.
+    """
     return tokens_sent(request) or tokens_in(request.cookies, robot, own_port(request))
 
 
 def tokens_sent(request: web.Request) -> list[str]:
     """Return the tokens in the headers of a request.
 
-    This is the bearer token in `Authorization` or, if there is none, the tokens in
-    `Sec-WebSocket-Protocol`.
+    If the header `Authorization` contains a bearer token, return only this token. Otherwise return
+    the tokens in `Sec-WebSocket-Protocol`.
     """
     kind, _, text = request.headers.get("Authorization", "").partition(" ")
     if kind.lower() == "bearer":

@@ -36,7 +36,7 @@ STATUS: dict[Reason, int] = {
     "path": 404,
     "malformed": 400,
 }
-"""HTTP status for each refusal reason; every other reason gives 403."""
+"""HTTP status of the answer for each reason of a refusal. For any other reason it is 403."""
 
 HEADERS = {
     "X-Content-Type-Options": "nosniff",
@@ -53,13 +53,13 @@ POLICY = (
     "default-src 'self'; connect-src 'self'{connect}; frame-ancestors 'none'; base-uri 'none'; "
     "form-action 'self'"
 )
-"""Content security policy of every answer except a report. `{connect}` is replaced by the
-page's WebSocket URLs. An error answer does not contain these URLs, so a forged `Host` header is
-never copied into it."""
+"""Content security policy of every answer except a report. The server replaces `{connect}` by the
+page's WebSocket URLs. The policy of an error answer does not contain these URLs, so the server
+never copies a forged `Host` header into an answer."""
 
 
 class TroubleError(AcsardError):
-    """A request is permitted but cannot be fulfilled. `status` is the HTTP status of the answer."""
+    """A permitted request cannot be fulfilled now. `status` is the HTTP status of the answer."""
 
     def __init__(self, status: int, text: str) -> None:
         super().__init__(text)
@@ -76,9 +76,9 @@ def problem(status: int, text: str) -> web.Response:
 
 
 def sent(request: web.Request, file: File) -> web.Response:
-    """Return the answer that contains a file, compressed if the client accepts gzip.
+    """Return the answer that contains a file of the page, compressed if the client accepts gzip.
 
-    If the client has the file already, return an answer with the status 304 instead.
+    If the client already has this version of the file, return an answer with the status 304.
     """
     headers = {"ETag": file.tag, "Cache-Control": "no-cache", "Vary": "Accept-Encoding"}
     # An answer with the status 304 contains the policy too, because the browser uses it in place of
@@ -95,9 +95,9 @@ def sent(request: web.Request, file: File) -> web.Response:
 async def sent_in_pieces(
     request: web.Request, body: bytes, headers: Mapping[str, str], within: float
 ) -> web.StreamResponse:
-    """Send a large body without copying it.
+    """Send a large body in pieces, without copying it, and return the answer.
 
-    If sending takes longer than `within` s, cut the connection.
+    If sending takes longer than `within` s, cut the connection. For a HEAD request, send no body.
     """
     if request.method == "HEAD":
         return web.Response(body=body, headers=headers)
@@ -110,10 +110,11 @@ async def sent_in_pieces(
 async def sent_unpacked(
     request: web.Request, packed: bytes, headers: Mapping[str, str], within: float
 ) -> web.StreamResponse:
-    """Send the decompressed gzip data `packed` to a client that does not accept gzip.
+    """Decompress the gzip data `packed` and send the result to a client that does not accept gzip.
 
-    Each piece is decompressed only when the client has received the earlier pieces, so a slow
-    client costs little memory. If sending takes longer than `within` s, cut the connection.
+    Each piece is decompressed only after the earlier pieces were sent, so a slow client costs
+    little memory. If sending takes longer than `within` s, cut the connection. For a HEAD request,
+    send no body.
     """
     if request.method == "HEAD":
         return web.Response(headers=headers)
@@ -153,18 +154,18 @@ def takes_gzip(request: web.Request) -> bool:
 
 
 def cut(transport: asyncio.BaseTransport | None) -> None:
-    """Abort a connection without waiting for the client; do nothing if `transport` is None.
+    """Abort a connection without waiting for the client. Do nothing if `transport` is None.
 
-    On Python 3.11.2, a TLS connection that was closed twice cannot be aborted. It ends when the
-    time limit of its TLS shutdown is over.
+    On Python 3.11.2, a TLS connection that was closed twice cannot be aborted. Such a connection
+    ends at the time limit of its TLS shutdown.
     """
     if transport is None:
         return
     try:
         transport.abort()  # type: ignore[attr-defined]
     except AttributeError:
-        # After a second close, the transport has no TLS protocol any more. Python 3.11.2 does not
-        # check that and raises this error; later versions do nothing.
+        # After a second close, the transport has lost its TLS protocol. Python 3.11.2 then raises
+        # this error. Later versions do nothing.
         if not transport.is_closing():
             raise
 
@@ -197,7 +198,7 @@ TYPES = {
     ".json": "application/json",
     ".webmanifest": "application/manifest+json",
 }
-"""Content type per file suffix. A file with any other suffix is not served."""
+"""Content type of a page file, by file suffix. The server sends no file with any other suffix."""
 
 INLINED = {
     "index.html": {
@@ -205,10 +206,10 @@ INLINED = {
         "style.css": (b'<link rel="stylesheet" href="page/style.css">', "style"),
     }
 }
-"""Maps the name of an outer file to the inner files that are sent inside it.
+"""Page files that contain the text of other files when they are sent, by name.
 
-Each inner file has a pair of values. The first is the HTML element that loads the inner file. The
-second is the name of the element that is sent instead and contains the text of the inner file.
+The value maps the name of each included file to a pair: the HTML element that loads the included
+file, and the name of the HTML element that replaces it and contains the text of the included file.
 """
 
 
@@ -221,24 +222,25 @@ class File(Struct, frozen=True):
     """The body in gzip form, or None if gzip does not make it shorter."""
     tag: str
     policy: str
-    """Directives of the content security policy. They allow the scripts and styles of the files
-    that are sent inside this file."""
+    """Directives that are appended to the content security policy `POLICY`. They allow the scripts
+    and styles of the files that are included in this file (see `INLINED`)."""
     stamp: tuple[tuple[int, int], ...]
-    """Modification time, ns, and size, bytes: first of this file, then of each file that is sent
-    inside it."""
+    """Pairs of modification time, ns, and size, bytes. The first pair belongs to this file, and the
+    others to the files that are included in it."""
 
 
 class Files:
-    """The page's files in a directory, kept in memory until they change on the disk."""
+    """Cache of the page's files. A file is read again when it has changed on the disk."""
 
     def __init__(self, directory: Path = PAGE) -> None:
         self._directory = directory
         self._files: dict[str, File] = {}
 
     def get(self, name: str) -> File | None:
-        """Return the file `name`, or None if it does not exist or may not be served.
+        """Return the file `name`, or None if it does not exist, is unreadable or may not be sent.
 
-        A file may be served if its suffix is in `TYPES` and `name` contains no directory.
+        A file may be sent if its suffix is in `TYPES`, its name does not begin with a dot and
+        contains no directory, and the file is not a symbolic link.
         """
         kind = TYPES.get(Path(name).suffix)
         if kind is None or "/" in name or name.startswith("."):
@@ -258,9 +260,9 @@ class Files:
 
 
 def _read(paths: Sequence[Path], kind: str, stamp: tuple[tuple[int, int], ...]) -> File:
-    """Read the file `paths[0]`, and put the other files into it as `INLINED` says.
+    """Read the file `paths[0]`, and include the text of the other files as `INLINED` says.
 
-    `kind` is the content type, and `stamp` is the value of `File.stamp`.
+    `kind` is the content type of the first file, and `stamp` is the value of `File.stamp`.
     """
     whole, *parts = paths
     body, policy = whole.read_bytes(), ""

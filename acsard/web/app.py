@@ -1,7 +1,7 @@
 """The request handlers of the page's server, and the table of all its paths (`ROUTES`).
 
-A handler raises `RefusedError` if the request itself is at fault, and `TroubleError` if the request
-cannot be fulfilled now.
+A handler raises `RefusedError` if the request itself is wrong or forbidden, and `TroubleError` if a
+permitted request cannot be fulfilled now.
 """
 
 from __future__ import annotations
@@ -53,13 +53,13 @@ from acsard.web.tokens import Vault
 from acsard.web.viewer import HEARTBEAT_S, Parts, Viewer
 
 BODY_S = 5.0
-"""Time limit for receiving the body of a request, s. A usual body has a few hundred bytes."""
+"""Time limit for receiving the body of a request, s. Most bodies have a few hundred bytes."""
 
 REPORT_S = 300.0
 """Time limit for sending a report to a client that does not accept gzip, s."""
 
 DRAWN: dict[State, int] = {"drawing": 202, "busy": 202, "ready": 200, "failed": 503}
-"""HTTP status of the answer for each state of the report of a recording."""
+"""HTTP status of the answer to a request for a recording's report, by the state of the report."""
 
 DEFAULT = WebConfig()
 
@@ -115,16 +115,17 @@ class Page:
         self._seats, self._camera = Seats(), Camera(rules.camera)
         self._has_camera = bool(rules.camera)
         self._sent: dict[str, tuple[File, float]] = {}
-        """The page's files by name, each with the time at which the disk was last checked for a
-        change, s on the event loop's clock."""
+        """Maps the name of each page file to a pair: the file, and the time of the last check
+        whether the file has changed on the disk, s on the event loop's clock."""
         self._viewers: set[Viewer] = set()
         self._admission = Admission(parts.robots.id, names, vault, acceptor, parts.counts, rules)
         self.app = self._admission.application(ROUTES, self)
 
     def end_all(self, why: str) -> None:
-        """Drop the report, close the camera, and end every WebSocket.
+        """End every WebSocket, and stop all work for clients.
 
-        `why` is the reason that the clients receive, with at most 120 characters.
+        The server stops reading the camera, and discards the report of a recording, finished or
+        not. `why` is the reason that the clients receive, with at most 120 characters.
         """
         self._reports.end()
         self._camera.close()
@@ -132,10 +133,11 @@ class Page:
             viewer.end(why)
 
     async def tidy(self) -> None:
-        """Close the connections whose token is not valid any more, and drop an unwanted report.
+        """Close the connections whose token is not valid any more.
 
-        Call this once a second. If the disk does not answer in time, no token counts as valid. A
-        report is unwanted if no client has asked for it for some time.
+        Also discard the report of a recording if no client has requested it for some time. Call
+        this method once a second. If the disk does not answer in time, no token counts as valid. If
+        no thread can be started to read the disk, all connections stay open.
         """
         self._reports.tidy()
         try:
@@ -163,7 +165,8 @@ class Page:
     async def _send(self, request: web.Request, name: str) -> web.StreamResponse:
         now = asyncio.get_running_loop().time()
         file, read = self._sent.get(name, (None, 0.0))
-        # Access to the disk starts a thread, and the whole server waits while a thread starts.
+        # Access the disk at most once a second for each file. Each access starts a thread, and the
+        # whole server waits while a thread starts.
         if file is None or now > read + 1.0:
             if file is not None:
                 # Other requests get the old file until the disk has answered.
@@ -176,7 +179,11 @@ class Page:
         return sent(request, file)
 
     async def token(self, request: web.Request) -> web.StreamResponse:
-        """Check the posted token, and return it in a cookie that no script can read."""
+        """Check the token in the request's body, and return it in a cookie that no script can read.
+
+        Raises `TroubleError` if the browser already has a cookie with more permissions, unless the
+        field `replace` of the body is true.
+        """
         form = await _token_posted(request)
         if not request.secure:
             raise RefusedError("plain", "over plain http, no token is needed: connect without one")
@@ -202,7 +209,7 @@ class Page:
         who, peer = request[WHO], peer_of(request)
         offered = request.headers.get("Sec-WebSocket-Protocol", "")
         if tokens_offered(offered) and PROTOCOL not in map(str.strip, offered.split(",")):
-            # If aiohttp knew none of the offered names, it would log all of them with the token.
+            # If aiohttp knew none of the offered names, it would log all of them, and so the token.
             raise RefusedError(
                 "malformed",
                 f"the WebSocket must offer the subprotocol {PROTOCOL} besides the token",
@@ -280,9 +287,10 @@ class Page:
         return reply(told, 200 if told.success else 409)
 
     async def picture(self, request: web.Request) -> web.StreamResponse:
-        """Wait for a camera picture that the client has not seen, and return it.
+        """Wait for a camera picture that the client does not have, and return the picture.
 
-        If no such picture arrives in time, return an answer with the status 304.
+        The client names its last picture in the header `If-None-Match`. If no other picture arrives
+        in time, return an answer with the status 304.
         """
         seen = request.headers.get("If-None-Match", "").strip('"')
         begun_ns = clock.steady_ns()
@@ -315,7 +323,7 @@ class Page:
         return reply(told, DRAWN[told.report])
 
     async def report(self, request: web.Request) -> web.StreamResponse:
-        """Return a drawn report as an HTML page in a sandboxed origin."""
+        """Return the finished report of a recording as an HTML page in a sandboxed origin."""
         name = request.match_info["name"]
         body = self._reports.drawn(name)
         if body is None:
@@ -342,7 +350,7 @@ class Page:
 
 
 def settings_in(config: Mapping[str, Any]) -> list[Setting]:
-    """Return the settings in `config`, the robot's configuration, that can change at run time."""
+    """Return the settings that may change while the daemon runs. `config` is its configuration."""
     return [
         Setting(key, value, told.what, WHEN[told.when], **_allowed(key))
         for key, value in flat(config)
@@ -388,7 +396,7 @@ async def _token_posted(request: web.Request) -> TokenForm:
 def _limit_buffer(request: web.Request) -> None:
     at = None if request.transport is None else request.transport.get_extra_info("socket")
     if at is not None:
-        # Data that waits in a larger send buffer of the kernel would be old when it arrives.
+        # In a larger send buffer of the kernel, data would wait so long that it arrives outdated.
         at.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 65536)
 
 
@@ -445,4 +453,4 @@ ROUTES: tuple[Route, ...] = (
 )  # fmt: skip
 
 DOCUMENT = msgspec.json.encode(openapi.document(__version__, ROUTES))
-"""The answer to `GET /api`."""
+"""The body of the answer to `GET /api`: the OpenAPI document as JSON."""

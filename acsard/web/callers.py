@@ -1,13 +1,13 @@
-"""Identifies the client of a request from its address and headers, and checks its role.
+"""Identifies the client of a request, and checks the client's role. This module is pure.
 
-This module is pure. A client on the robot itself needs no token and has the role in `web.local`.
-However, any web page in a browser on the robot may open `ws://localhost`, or may let its own host
-name point to 127.0.0.1. So the header `Host` must be a loopback name. The header `Origin`, if there
-is one, must be the origin of the robot's own page or one of those in `web.origins`. A client on
-another machine must use HTTPS, a name or address of the robot, and a token.
+A client on the robot itself needs no token and has the role in `web.local`. However, any web page
+in a browser on the robot may open `ws://localhost`, or may let its own host name point to
+127.0.0.1. So the header `Host` must be a loopback name. If there is a header `Origin`, it must be
+the origin of the robot's own page, or an origin in `web.origins`.
 
-A request through a proxy is refused. A proxy on the robot that rewrites `Host` would make all of
-its clients look local.
+A client on another machine must use HTTPS, a name or address of the robot, and a token. A request
+through a proxy is refused, because a proxy on the robot that rewrites `Host` would make all of its
+clients look local.
 """
 
 from __future__ import annotations
@@ -25,26 +25,28 @@ Reason = Literal[
     "host", "origin", "no_token", "bad_token", "plain", "role", "too_many", "too_fast",
     "too_big", "malformed", "path", "replayed", "crowded", "slow", "proxy", "stuck",
 ]  # fmt: skip
-"""Reason for a refusal. Refusals are counted by reason."""
+"""Reason for the refusal of a request, message or connection. The server counts refusals by
+reason."""
 
 Place = Literal["here", "away"]
 
 HERE = "here"
-"""Name of every client on the robot itself. Other clients have the name of their token."""
+"""Name of each client on the robot itself. Any other client has the name of its token."""
 
 COOKIE = "__Host-acsard"
 """Prefix of the cookie names. Browsers accept a cookie with the prefix `__Host-` only if it has the
 attributes `Secure` and `Path=/` and no attribute `Domain`."""
 
 PROTOCOL, TOKEN = "acsard", "acsard.token."
-"""The WebSocket's subprotocol, and the prefix of a subprotocol name that carries a token."""
+"""Name of the WebSocket subprotocol (`PROTOCOL`), and prefix of a further subprotocol name that
+contains a client's token (`TOKEN`)."""
 
 MOST_TOKENS = 8
-"""Maximum number of tokens in one request that are checked. Further tokens are ignored."""
+"""Maximum number of tokens that the server checks in one request. It ignores further tokens."""
 
 
 class RefusedError(AcsardError):
-    """A request or message of a client is refused; the text gives the reason and the remedy."""
+    """A request or message of a client is refused. The text gives the reason and the remedy."""
 
     def __init__(self, reason: Reason, text: str) -> None:
         super().__init__(text)
@@ -69,19 +71,25 @@ class Who(Struct, frozen=True):
         return has(self.role, least)
 
     def require(self, least: Role, what: str) -> None:
-        """Raise `RefusedError` for the action `what` if the client's role is lower than `least`."""
+        """Raise `RefusedError` if the client's role is lower than `least`.
+
+        `what` is the name of the action that requires the role `least`, for the error message.
+        """
         if not self.may(least):
             raise RefusedError("role", f"{what} is {self.barred(least)}: {MAY[self.role]}")
 
     def barred(self, least: Role) -> str:
-        """Return why the client may not do something that needs the role `least`."""
+        """Return the reason why the client may not use an action that requires the role `least`.
+
+        Call this only for a client whose role is lower.
+        """
         return f"for {least}s; your role is {self.role}"
 
 
 class Asked(Struct, frozen=True):
-    """The properties of a request that decide whether it is admitted.
+    """The properties of a request that decide whether the server admits the request.
 
-    The client may forge all headers.
+    A client may forge all headers.
     """
 
     peer: str
@@ -99,11 +107,11 @@ class Asked(Struct, frozen=True):
 
 
 def place(asked: Asked, names: Collection[str]) -> Place:
-    """Return "here" if the client is on the robot and asks for a loopback name, otherwise "away".
+    """Return "here" if the client is on the robot and requests a loopback name, otherwise "away".
 
     `names` are the robot's names and addresses, in lower case. Raises `RefusedError` for a request
-    through a proxy. A request from "away" is also refused if it uses plain HTTP, or if its host is
-    not in `names`.
+    through a proxy. Otherwise, raises it for a request from "away" that uses plain HTTP, or that
+    requests a host which is not in `names`.
     """
     if asked.proxied:
         raise RefusedError(
@@ -143,8 +151,9 @@ def require_own_origin(asked: Asked) -> None:
 def by_listed_page(asked: Asked, origins: Collection[str]) -> bool:
     """Return whether a web page of an origin in `web.origins` made the browser send this request.
 
-    Return False for the robot's own page, even if `web.origins` lists its origin. The server
-    ignores the cookies of listed pages, but it must accept those of the robot's own page.
+    `origins` are the origins in `web.origins`. Return False for the robot's own page, even if its
+    origin is one of them: the server must accept the cookies of the robot's own page, but it
+    ignores the cookies of the listed pages.
     """
     if asked.origin is None or asked.origin.lower() == _own_origin(asked):
         return False
@@ -156,48 +165,55 @@ def _own_origin(asked: Asked) -> str:
 
 
 def tokens_offered(protocols: str) -> list[str]:
-    """Return the tokens in the header `Sec-WebSocket-Protocol`.
+    """Return the tokens in `protocols`, the value of the header `Sec-WebSocket-Protocol`.
 
-    It is the only header of a WebSocket's request that a script in a browser can set.
+    A script in a browser can set no other header when it opens a WebSocket.
     """
     offered = (one.strip() for one in protocols.split(","))
     return [one.removeprefix(TOKEN) for one in offered if one.startswith(TOKEN)][:MOST_TOKENS]
 
 
 def cookie_name(robot: str, port: int) -> str:
-    """Return the name of the cookie for the page of this robot at this port.
+    """Return the name of the cookie for the page of the robot `robot` at the TCP port `port`.
 
-    A browser sends a host's cookies to all of its ports, so the name differs for each port.
+    A browser sends the cookies of a host to all ports of the host. So each port needs another name.
     """
     return f"{COOKIE}-{robot}-{port}"
 
 
 def tokens_in(cookies: Mapping[str, str], robot: str, port: int) -> list[str]:
-    """Return the tokens in the cookies for this robot, beginning with the one for this port."""
+    """Return the tokens in the cookies of the robot `robot`, at most `MOST_TOKENS`.
+
+    The token for the page at the TCP port `port` comes first. The others are for other ports.
+    """
     own, ours = cookie_name(robot, port), f"{COOKIE}-{robot}"
     names = [name for name in cookies if name.rpartition("-")[0] == ours]
     return [cookies[name] for name in sorted(names, key=lambda name: name != own)][:MOST_TOKENS]
 
 
 def host_name(host: str) -> str:
-    """Return the name or address in a `Host` header, in lower case, without the port."""
+    """Return the host name or address in the value of a `Host` header.
+
+    The result is in lower case, and has no port and no brackets.
+    """
     if host.startswith("["):
         return host[1:].partition("]")[0].lower()
     return host.partition(":")[0].lower()
 
 
 def unmapped(address: str) -> str:
-    """Return an address without the prefix `::ffff:`.
+    """Return an IP address without the prefix `::ffff:` of an IPv4 address in IPv6 notation.
 
-    A dual-stack socket puts this prefix before the address of an IPv4 client.
+    A dual-stack socket adds this prefix to the address of an IPv4 client.
     """
     return address.removeprefix("::ffff:") if "." in address else address
 
 
 def network_of(address: str) -> str:
-    """Return an IPv4 address unchanged, and an IPv6 address as its /64 network.
+    """Return the network for which the server counts the connections of an IP address.
 
-    One machine may use all addresses of a /64 network.
+    This is an IPv4 address itself, or the /64 network of an IPv6 address, because one machine may
+    use all addresses of a /64 network.
     """
     if ":" not in address:
         return address
@@ -208,7 +224,7 @@ def network_of(address: str) -> str:
 
 
 def is_loopback(text: str) -> bool:
-    """Return whether the text is a loopback IP address; a host name never is."""
+    """Return whether the text is a loopback IP address. Return False for every host name."""
     try:
         address = ipaddress.ip_address(text.partition("%")[0])
     except ValueError:

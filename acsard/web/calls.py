@@ -1,7 +1,7 @@
-"""Service calls and queries to the robot.
+"""Sends the service calls and queries of the page's clients to robots.
 
 Each call blocks a thread of its own. Calls of the service `stop` ("stops") have their own limits,
-so a stop never waits for other calls. If several stops are requested in quick succession, the
+so a stop never waits for other calls. If clients request several stops in quick succession, the
 server may send one stop for all of them, after the last request has arrived.
 """
 
@@ -28,19 +28,19 @@ from acsard.web.limits import STOPS_ELSEWHERE
 from acsard.web.robots import Robots
 
 AT_ONCE, STOPS_AT_ONCE = 16, 32
-"""Maximum numbers of simultaneous service calls and queries (`AT_ONCE`), and of simultaneous stops
-of the page's own robot, which are counted separately (`STOPS_AT_ONCE`)."""
+"""Maximum number of service calls and queries at the same time (`AT_ONCE`). Stops are not counted
+in it. `STOPS_AT_ONCE` is the maximum number of simultaneous stops of the page's own robot."""
 
 ELSEWHERE_AT_ONCE = 8
-"""Maximum number of stops of other robots for whose reply the server waits at the same time. Beyond
-this number, a stop is sent without waiting for its reply."""
+"""Maximum number of other robots' replies to a stop for which the server waits at the same time.
+Beyond this number, the server sends a stop without waiting for the reply."""
 
 MERGE_S = 0.02
-"""Shortest interval between two stops that are sent for one client to one robot, s."""
+"""Shortest interval between two stops that the server sends to one robot for one client, s."""
 
 ANSWER_S = 8.0
-"""Time limit for an answer over the bus, s. `Client` has a shorter limit and
-raises an error with a clear message."""
+"""Time limit for an answer over the bus, s. `Client` has a shorter limit, and raises an error with
+a clear message."""
 
 T = TypeVar("T")
 
@@ -65,10 +65,13 @@ class Calls:
         ends: Callable[[], Awaitable[Ending]],
         sees: Callable[[str], bool],
     ) -> None:
-        """Store the arguments, and create the limits.
+        """Create the limits for calls, with none in use.
 
-        `robots` holds the connection to the daemon. `ends` interrupts a running check or
-        calibration. `sees(id)` returns whether the robot with this id is known to the server.
+        Args:
+            robots: object with the connection to the daemon.
+            ends: function that interrupts the running check or calibration, if any.
+            sees: function that returns whether the server has found the robot with the given id on
+                the bus.
         """
         self._robots, self._ends, self._sees = robots, ends, sees
         self._stops, self._merged = Stops(), Merged()
@@ -81,10 +84,20 @@ class Calls:
     async def call(
         self, who: Who, verb: str, payload: Mapping[str, Any], robot: str = ""
     ) -> ServiceReply:
-        """Call the service `verb` for the client `who` and return the reply.
+        """Call the service `verb` for the client `who`, and return the reply.
 
-        `robot` is the id of the robot, or "" for the page's own robot. On another robot, only
-        `stop` may be called. Raises `RefusedError`.
+        A stop of the page's own robot also interrupts the running check or calibration.
+
+        Args:
+            who: the client of the page.
+            verb: the name of the service.
+            payload: the arguments of the service.
+            robot: the id of the robot, or "" for the page's own robot. Only `stop` may be called
+                for another robot.
+
+        Raises:
+            RefusedError: the client may not make this call, or sends too many stops to robots that
+                may not exist.
         """
         require(who, verb)
         other = "" if robot == self._robots.id else robot
@@ -92,8 +105,8 @@ class Calls:
             _require_stop(verb, other)
         if verb != "stop" or other:
             return await self._called(who, verb, payload, other)
-        # A check holds the serial port and turns the wheels, so the daemon cannot stop the wheels:
-        # end the check too.
+        # A running check turns the wheels, and has opened the serial port in place of the daemon.
+        # The daemon cannot stop the wheels then, so interrupt the check too.
         ending, reply = await asyncio.gather(self._ends(), self._called(who, verb, payload, other))
         if not ending.words:
             return reply
@@ -128,10 +141,11 @@ class Calls:
         return reply
 
     async def get(self, robot: str, name: str) -> tuple[str, bytes]:
-        """Query the last value of a robot's key as JSON; return the pair (encoding, payload).
+        """Query the last value of a robot's key as JSON, and return the pair (encoding, payload).
 
         `robot` is the robot's id, and `name` is the key without this id. Raises `MendableError` if
-        there is no connection, if no answer arrives, or if `AT_ONCE` requests are running already.
+        there is no connection to the bus, if no answer arrives, or if `AT_ONCE` calls and queries
+        are running already. Raises `TimeoutError` if the bus is stuck for `ANSWER_S`.
         """
         client = self._robots.client
         if client is None:
@@ -141,13 +155,12 @@ class Calls:
     async def _stop(
         self, robot: str, client: Client, who: Who, request: Callable[[], ServiceReply]
     ) -> ServiceReply:
-        """Stop another robot, and return its reply.
+        """Stop another robot by calling `request`, and return the robot's reply.
 
-        `robot` is the id of the robot, `client` is this server's bus client, and `who` is the
-        client of the page. `request` sends the stop and waits for the reply. A robot that does not
-        exist never replies, so at most `ELSEWHERE_AT_ONCE` calls wait for a reply. Further calls
-        only send the stop.
+        If `ELSEWHERE_AT_ONCE` calls are waiting for a reply already, only send the stop, and return
+        a failure that says so.
         """
+        # A robot that does not exist never replies, so the number of waiting calls is limited.
         with self._elsewhere.held() as free:
             if free:
                 reply = await in_thread(request, ANSWER_S)
@@ -168,7 +181,10 @@ class Calls:
         )
 
     def _require_few(self, who: Who) -> None:
-        """Raise `RefusedError` if a client sends too many stops to robots that may not exist."""
+        """Raise `RefusedError` if a client exceeds the limit `STOPS_ELSEWHERE`.
+
+        Call this for each stop of a robot that may not exist.
+        """
         if not self._unknown.take(who.token or who.name, clock.mono_ns()):
             rate = STOPS_ELSEWHERE
             raise RefusedError(
@@ -188,13 +204,14 @@ class Calls:
 class Merged:
     """Sends at most one stop per `MERGE_S` for each client and robot.
 
-    No stop is lost. The stops that are requested within `MERGE_S` after a stop was sent share the
+    No stop is lost: all stops that a client requests within `MERGE_S` after a sent stop share the
     next stop.
     """
 
     def __init__(self) -> None:
         self._rests: dict[Hashable, asyncio.Event] = {}
-        """Maps (client, robot) to an event that is set `MERGE_S` after the last stop was sent."""
+        """Maps (client, robot) to an event. The event is set `MERGE_S` after the last sent stop,
+        and its entry is then removed."""
         self._next: dict[Hashable, asyncio.Task[ServiceReply]] = {}
         """Maps (client, robot) to the task that waits for the event in `_rests` and then sends a
         stop."""
@@ -202,8 +219,8 @@ class Merged:
     async def ask(self, name: Hashable, stop: Stop) -> ServiceReply:
         """Send a stop by calling `stop`, and return the reply.
 
-        `name` identifies the client and the robot. If a stop with the same `name` is waiting to be
-        sent, share it and its reply instead.
+        If another stop with the same `name` still waits to be sent, return the reply to that stop
+        instead. `name` identifies the client and the robot.
         """
         if name in self._next:
             return await asyncio.shield(self._next[name])
@@ -228,9 +245,9 @@ class Merged:
 
 
 class Stops:
-    """Sends at most `STOPS_AT_ONCE` stops at a time.
+    """Limits the stops of the page's own robot to `STOPS_AT_ONCE` at the same time.
 
-    Beyond this limit, all further callers share one stop, which is sent when the limit allows it.
+    All callers beyond this limit share one stop, which is sent when an earlier stop has ended.
     """
 
     def __init__(self) -> None:
@@ -240,7 +257,8 @@ class Stops:
     async def ask(self, call: Callable[[], ServiceReply]) -> ServiceReply:
         """Send a stop by calling `call`, and return the reply.
 
-        If `STOPS_AT_ONCE` stops are running, share the next stop and its reply with other callers.
+        If `STOPS_AT_ONCE` stops are running, wait for the next stop, and return the reply to it.
+        All callers that wait get this reply.
         """
         if not self._room.locked():
             async with self._room:
@@ -257,7 +275,7 @@ class Stops:
 
 
 def require(who: Who, verb: str) -> None:
-    """Raise `RefusedError` unless the service exists and the role of `who` may call it."""
+    """Raise `RefusedError` unless the service `verb` exists and the client `who` may call it."""
     if verb not in SERVICES:
         raise RefusedError(
             "malformed", f"{verb!r} is not a service; choose one of {', '.join(SERVICES)}"
@@ -280,9 +298,9 @@ def _require_stop(verb: str, robot: str) -> None:
 
 
 def _named(client: Client, robot: str, who: Who) -> Client:
-    """Return a bus client that calls services of `robot`.
+    """Return a bus client for the robot with the id `robot`.
 
-    The robot logs these calls under the name of `who`.
+    The robot logs the service calls of this bus client under the name of the page's client `who`.
     """
     other = client.like(robot)
     other.name = f"{who.name}@page"

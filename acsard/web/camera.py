@@ -1,9 +1,10 @@
 """Fetches the newest picture of a camera's MJPEG stream for the clients of the page.
 
-Another program (ustreamer, go2rtc, mjpg-streamer) serves the stream. One connection reads the
-stream while clients ask for pictures. Only the newest picture is kept, so a client with a slow
-network gets fewer pictures, and no old ones. Some servers repeat the last picture when their camera
-is lost, so a picture that has the same bytes as the previous one does not count as new.
+Another program (ustreamer, go2rtc, mjpg-streamer) serves the stream. While clients request
+pictures, this module reads the stream over one connection. It keeps only the newest picture, so a
+client with a slow network gets fewer pictures, and no old ones. Some servers repeat the last
+picture when their camera is lost, so a picture with the same bytes as the previous picture does not
+count as new.
 """
 
 from __future__ import annotations
@@ -23,18 +24,20 @@ from acsard.host.rate_limits import Places
 from acsard.web.answers import TroubleError
 
 WAIT_S = 1.0
-"""Time limit, s, for each of two waits: the wait for a new picture from the camera, and the wait
-for the permission to send it (see `SENDS`)."""
+"""Time limit, s, of two waits: for a new picture from the camera, and for the permission to send
+the picture (see `SENDS`)."""
 
 CONNECT_S, SILENT_S = 3.0, 3.0
-"""Time limits, s: for connecting to the camera's server, and for each wait for data from it."""
+"""Time limits, s: for connecting to the camera's server (`CONNECT_S`), and for each wait for data
+from that server (`SILENT_S`)."""
 
 MAX_PICTURE, MAX_HEAD = 1_000_000, 4096
-"""Maximum size of a picture and of its header lines, bytes. A full HD picture has a few hundred
-kB."""
+"""Maximum size of a picture (`MAX_PICTURE`), and of the header lines before a picture (`MAX_HEAD`),
+bytes. A full HD picture has a few hundred kB."""
 
 SENDS, SENDS_OF_TOKEN = 8, 2
-"""Maximum number of pictures that are being sent at the same time: in total, and per token."""
+"""Maximum number of pictures that the server sends at the same time: in total (`SENDS`), and to the
+clients with one token (`SENDS_OF_TOKEN`)."""
 
 SEND_S = 5.0
 """Time limit for sending a picture, s. The page in the browser waits no longer than this."""
@@ -51,21 +54,22 @@ class Picture(Struct, frozen=True):
 
 
 class Parts:
-    """Cuts a `multipart/x-mixed-replace` stream into its parts, the pictures."""
+    """Splits a `multipart/x-mixed-replace` stream into pictures."""
 
     def __init__(self, boundary: str) -> None:
-        """Store `boundary`, which comes from the content type of the stream.
+        """Create a splitter for a stream with the boundary `boundary`, from its content type.
 
-        In the stream, two dashes precede each boundary. Some servers also write these dashes in the
-        content type, so they are removed from `boundary`.
+        Some servers write the two dashes that precede each boundary in the stream also in the
+        content type. These dashes are ignored.
         """
         self._end = b"\r\n--" + boundary.strip('"').removeprefix("--").encode()
         self._buffer = bytearray()
 
     def feed(self, data: bytes) -> bytes | None:
-        """Add received bytes; return the newest picture that they complete, or None.
+        """Process the received bytes `data`, and return the newest picture that they complete.
 
-        Raises `ValueError` if a picture or its header lines are too long.
+        Return None if they complete no picture. Raises `ValueError` if a picture or its header
+        lines are too long.
         """
         self._buffer += data
         newest = None
@@ -99,8 +103,8 @@ class Camera:
     def __init__(self, url: str) -> None:
         self._url = url
         self.newest: Picture | None = None
-        """The newest picture. It is None before the first picture, after a failure, and while no
-        client asks for pictures."""
+        """The newest picture. It is None before the first picture, after a failure, and after no
+        client has requested a picture for 5 s."""
         self._number = 0
         self._trouble = "the camera's stream has no picture yet"
         self._asked_ns = 0
@@ -109,11 +113,11 @@ class Camera:
         self._reading: asyncio.Task[None] | None = None
 
     async def after(self, number: int) -> Picture | None:
-        """Wait for a picture that is newer than the one with this number, and return it.
+        """Wait for a picture that the client does not have, and return the picture.
 
-        `number` is 0 if the client has no picture. Return None if no newer picture arrives within
-        `WAIT_S`. Raises `TroubleError` if there is no
-        camera or its stream cannot be read.
+        `number` is the number of the client's last picture, or 0. Return None if the camera sends
+        no other picture within `WAIT_S`. Raises `TroubleError` if no camera is configured, if its
+        stream cannot be read, or if it has not sent any picture yet.
         """
         if not self._url:
             raise TroubleError(
@@ -134,10 +138,10 @@ class Camera:
 
     @asynccontextmanager
     async def sending(self, token: str) -> AsyncIterator[None]:
-        """Hold one of the `SENDS` places for sending a picture during the `with` block.
+        """Count the `with` block as the sending of one picture, for the limits on sent pictures.
 
-        `token` is the client's token. Raises `TroubleError` if no place becomes free within
-        `WAIT_S`.
+        If a limit is reached (`SENDS`, `SENDS_OF_TOKEN`), first wait until another picture has been
+        sent. `token` is the client's token. Raises `TroubleError` after a wait of `WAIT_S`.
         """
         try:
             async with asyncio.timeout(WAIT_S):

@@ -23,19 +23,19 @@ UNROUTED = (
     "daemons forward no messages. To see all robots that are connected to a router, connect this "
     "page's server to that router: acsard web --connect ROUTER --id {robot}"
 )
-"""Note to the viewers if the page's server is connected to a daemon instead of a router."""
+"""Note to the page's users if the page's server is connected to a daemon instead of a router."""
 
 BY_NAME = (
     "{endpoint} allows only exact keys, as every TLS endpoint does, so this page sees no other "
     "robot. To see all robots of a router, run this page's server on the router's machine: "
     "acsard web --connect tcp/127.0.0.1:7447 --id {robot}"
 )
-"""Note to the viewers if the page's server is connected over TLS, which lets the server reach only
-its own robot."""
+"""Note to the page's users if the page's server is connected over TLS. The server can then reach
+only its own robot."""
 
 
 class Fleet:
-    """Tracks all robots on the bus while a viewer of the page is subscribed to the list of them."""
+    """Tracks all robots on the bus while any viewer is subscribed to the list of robots."""
 
     def __init__(self, robots: Robots) -> None:
         self._robots = robots
@@ -43,8 +43,8 @@ class Fleet:
         self._tracked: fleet.Fleet | None = None
         self._busy: set[asyncio.Task[None]] = set()
         self.note = ""
-        """Reason why robots may be missing from the rows, in words. It is "" if the server is
-        connected to a router, and therefore sees all robots of this router."""
+        """Reason why the list of robots may be incomplete, in words. It is "" if the server is
+        connected to a router, because the list then contains all robots of this router."""
 
     def join(self, viewer: object) -> None:
         self._joined.add(viewer)
@@ -55,16 +55,19 @@ class Fleet:
         self._tidy()
 
     def rows(self) -> list[Row]:
-        """Return one row per robot, sorted by id; start the due queries in the background."""
+        """Return one row per robot, sorted by id. Start the queries that are due in the background.
+
+        The result is [] until the subscription to the robots has been made.
+        """
         self._look()
         rows = [] if self._tracked is None else self._tracked.rows()
         return [_row(one) for one in sorted(rows, key=lambda one: one.robot_id)]
 
     def sees(self, robot: str) -> bool:
-        """Return whether the robot is known to this server.
+        """Return whether this server has found the robot with the id `robot` on the bus.
 
-        A robot is known if its liveliness token is present, or if a viewer is subscribed to its key
-        `state` and a state has arrived.
+        That is the case if the robot's liveliness token is present, or if a viewer is subscribed to
+        the robot's key `state` and a state has arrived.
         """
         states = self._robots.streams.followed(robot, STATE)
         here = self._tracked is not None and self._tracked.here(robot)

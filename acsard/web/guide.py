@@ -2,8 +2,9 @@
 
 Only one child runs at a time. The lines that the child prints (`terminal/json_prompt.py`) go only
 to the WebSocket that started the child, and only this WebSocket may answer the child's questions.
-If this WebSocket ends, the child is interrupted as by Ctrl-C, so the child still sends zero speeds.
-The child also ends when this server ends, because the child watches its standard input.
+If this WebSocket ends, the server interrupts the child as Ctrl-C does, so the child still sends
+zero speeds. The child also ends when this server ends, because the child watches its standard
+input.
 """
 
 from __future__ import annotations
@@ -30,8 +31,8 @@ from acsard.web.calls import Ending
 from acsard.web.socket_messages import Begin, Ended, FrameError, Guided, Press, Reply, Running
 
 PATIENCE_S = 6.0
-"""Time, s, that an interrupted child process has to send zero speeds and exit, before it is
-killed."""
+"""Time, s, after which an interrupted child process is killed if it has not exited. Until then it
+can send zero speeds."""
 
 NO_DEVICE = (
     "The page's server sees no serial port. Is the board plugged in? If the server runs as a "
@@ -73,16 +74,19 @@ class Choices(Struct, frozen=True):
     methods: dict[str, str]
     """Maps each calibration method to a description of its requirements."""
     method: str
-    """The recommended method; "" selects the default."""
+    """The recommended calibration method. If it is "", the default method is recommended."""
     advice: str
-    """Reason for the recommendation and the alternatives."""
+    """Text with the reason for the recommendation, and with alternatives; "" for the default."""
     ports: Sequence[Board]
     note: str
     """Advice with the commands to type if this server sees no serial port; otherwise ""."""
 
 
 class _Said(Struct, frozen=True):
-    """The fields of the child's output lines that this server reads. It passes on whole lines."""
+    """The fields that this server reads in an output line of the child.
+
+    The server passes on the whole line to the browser.
+    """
 
     question: int = 0
     leg: bool = False
@@ -93,7 +97,11 @@ class Guide:
     """Runs one check or calibration at a time, and tells all viewers of the page which one runs."""
 
     def __init__(self, reach: Reach, configured: str) -> None:
-        """Store the options that connect a child to the daemon, and the configured serial port."""
+        """Create an instance in which no check or calibration runs.
+
+        `reach` contains the options that connect a child to the daemon. `configured` is the serial
+        port in the configuration.
+        """
         self._reach, self._configured = reach, configured
         self._viewers: dict[object, Say] = {}
         self._errand: _Errand | None = None
@@ -102,8 +110,8 @@ class Guide:
     async def choices(self, *, simulated: bool) -> Choices:
         """Return the checks and calibrations that the page may start now.
 
-        `simulated` is true if the page's robot is simulated. It decides which calibration method is
-        recommended.
+        `simulated` says whether the page's robot is simulated. The recommended calibration method
+        depends on it.
         """
         found = await self._boards()
         way, advice = SIMULATED if simulated else ("", "")
@@ -111,10 +119,10 @@ class Guide:
         return Choices(NEEDS, way, advice, found, "" if sees_one else NO_DEVICE)
 
     def join(self, viewer: object, say: Say) -> None:
-        """Add a viewer, and tell the viewer which check or calibration runs, or that none runs.
+        """Add a viewer, and tell the viewer which check or calibration is running.
 
-        `say` sends a message to the viewer. The message is sent even if nothing runs, because a
-        viewer that connects again may have missed the end of a check or calibration.
+        If none is running, tell the viewer that too. A viewer that connects again may have missed
+        the end of a check or calibration. `say` sends a message to the viewer.
         """
         self._viewers[viewer] = say
         say(Guided(Running("")) if self._errand is None else self._errand.about(viewer))
@@ -126,9 +134,10 @@ class Guide:
             errand.leave()
 
     def begin(self, viewer: object, by: str, asked: Begin) -> str:
-        """Start the check or calibration `asked` for a viewer.
+        """Start the check or calibration `asked` for a viewer, and return "".
 
-        `by` is the name of the viewer's user. Return "" or the reason for a refusal.
+        If another one is still running, return the reason for the refusal instead. `by` is the name
+        of the viewer's user.
         """
         if self._errand is not None:
             return (
@@ -141,7 +150,10 @@ class Guide:
         return ""
 
     def reply(self, viewer: object, reply: Reply) -> str:
-        """Pass a viewer's answer to the child. Return "" or the reason for a refusal."""
+        """Pass a viewer's answer to the child that the viewer started, and return "".
+
+        If the child does not wait for this answer, return the reason for the refusal instead.
+        """
         errand = self._of(viewer)
         if errand is None or not errand.answer(reply):
             return (
@@ -151,9 +163,10 @@ class Guide:
         return ""
 
     def press(self, viewer: object, press: Press) -> None:
-        """Pass a key press to the child that the viewer started, or interrupt this child.
+        """Pass a key press to the child that the viewer started, or interrupt the child.
 
-        `press` says which of the two to do. If the child has ended, do nothing.
+        The field `press` of the message is "key" for the key press, and "leave" to interrupt. If
+        the child has ended, do nothing.
         """
         if (errand := self._of(viewer)) is None:
             return
@@ -165,9 +178,8 @@ class Guide:
     async def stop(self) -> Ending:
         """Interrupt the running check or calibration, and return the result within about 1 s.
 
-        This method is called when a client stops the robot. Any client may do this, not only the
-        one that started the check or calibration. The daemon alone cannot stop the wheels during a
-        check, because the check holds the serial port.
+        Call this whenever any client stops the robot. The daemon alone cannot stop the wheels
+        during a check, because the check has opened the serial port in place of the daemon.
         """
         if self._errand is None or self._task is None:
             return Ending()
@@ -180,7 +192,8 @@ class Guide:
     def heard(self, viewer: object) -> None:
         """Send a sign of life to the child that the viewer started.
 
-        While the robot may move, the child ends if no sign of life arrives for some time.
+        Call this for each message of a viewer. While the robot may move, the child ends if no sign
+        of life arrives for some time.
         """
         if (errand := self._of(viewer)) is not None:
             errand.relay()
@@ -229,10 +242,10 @@ class Guide:
 
 
 def boards(configured: str) -> list[Board]:
-    """Return the serial ports and the simulator. The user chooses one of them for a board check.
+    """Return the serial ports and the simulator, from which the user chooses for a board check.
 
-    `configured` is the port in the configuration, which comes first. Call this function in a
-    thread, because it blocks.
+    `configured` is the port in the configuration. It comes first in the result, even if it does not
+    exist now. Call this function in a thread, because it blocks.
     """
     found: dict[str, str] = {}
     for device in serial_devices():
@@ -244,18 +257,19 @@ def boards(configured: str) -> list[Board]:
     if configured != SIMULATOR and configured not in found:
         found = {configured: "configured" if os.path.exists(configured) else ABSENT, **found}
     found[SIMULATOR] = "the simulator: no real robot moves"
-    # The configured port comes first, because wheels turn during a check. A check that is started
-    # without looking at the list must run on the robot that the operator sees.
+    # The wheels turn during a check, so the configured port comes first: an operator who does not
+    # read the list must check the board of this robot.
     ports = sorted(found, key=lambda port: port != configured)
     return [Board(port, found[port]) for port in ports]
 
 
 def words(begin: Begin, reach: Reach, ports: Collection[str]) -> list[str]:
-    """Return the arguments with which `acsard` carries out the request `begin`.
+    """Return the arguments with which `acsard` runs the check or calibration `begin`.
 
-    `reach` holds the options that connect to the daemon, and `ports` are the ports that a check may
-    use. A text from the browser can only become the value of an option. It must be one of a known
-    set of values, or a plain Zenoh key. Otherwise, this function raises `FrameError`.
+    A text from the browser becomes only the value of an option. `reach` contains the options that
+    connect a calibration to the daemon. `ports` are the ports that a check may use. Raises
+    `FrameError` if a value in `begin` is not in the set of permitted values, or is not a plain
+    Zenoh key.
     """
     config = [f"--config={reach.config}"] if reach.config else []
     if begin.begin == "check":
@@ -289,14 +303,14 @@ def _method(begin: Begin) -> list[str]:
 
 
 class _Errand:
-    """One child process, a check or calibration, and the WebSocket that started it."""
+    """A check or calibration in a child process, and the WebSocket that started it."""
 
     def __init__(self, viewer: object, by: str, name: str, say: Say) -> None:
         self.viewer, self.by, self.name, self.say = viewer, by, name, say
         self.left = False
         self._process: Process | None = None
         self._question = 0
-        """Number of the child's question that is not answered yet; 0 if there is none."""
+        """Number of the question for whose answer the child waits; 0 if it does not wait."""
         self._leg = self._rides = False
         # The browser sends signs of life at about half this rate (page/guide.js), so none is lost.
         self._relayed = Bucket(Rate(20.0))
@@ -307,9 +321,10 @@ class _Errand:
         return Guided(Running(self.name, self.by, viewer is self.viewer))
 
     async def run(self, given: Sequence[str]) -> tuple[int, str]:
-        """Run the child; return the pair (exit code, last error output). Raises `OSError`.
+        """Run the child until it ends, and return the pair (exit code, last error output).
 
-        `given` contains the arguments of `acsard`.
+        `given` contains the arguments of `acsard`. If a signal ended the child, the exit code is
+        128 plus the number of the signal. Raises `OSError` if the child cannot be started.
         """
         if self.left:
             return int(Exit.FAILURE), ""
@@ -322,7 +337,10 @@ class _Errand:
         return code if code >= 0 else 128 - code, self._words()
 
     def answer(self, reply: Reply) -> bool:
-        """Send the child an answer; return False if its question is not the one that is open."""
+        """Send the user's answer to the child, and return True.
+
+        Return False if the child does not wait for the answer to this question.
+        """
         if not self._question or reply.reply != self._question:
             return False
         self._question, self._rides = 0, self._leg
@@ -330,21 +348,21 @@ class _Errand:
         return True
 
     def key(self) -> None:
-        """Tell the child that a key was pressed, which ends the present drive of a calibration.
+        """Tell the child that the user pressed a key, which ends one drive of a calibration.
 
-        Further presses during the same drive are ignored.
+        Do nothing if no drive is running, or if a key has already been pressed during the drive.
         """
         if self._rides:
             self._rides = False
             self._write({"key": True})
 
     def relay(self) -> None:
-        """Tell the child that the operator's browser is still connected and can interrupt it."""
+        """Send the child a sign of life: the user's browser can still interrupt the child."""
         if self._relayed.take(clock.mono_ns()):
             self._write({})
 
     def leave(self) -> None:
-        """Interrupt the child as Ctrl-C does, and kill the child if it does not exit in time.
+        """Interrupt the child as Ctrl-C does. Kill the child if it does not exit in `PATIENCE_S`.
 
         Further calls do nothing.
         """
@@ -366,8 +384,7 @@ class _Errand:
         asyncio.get_running_loop().call_later(PATIENCE_S, self.kill)
 
     def _write(self, message: object) -> None:
-        # No flow control is needed: one answer per question, one key per leg, and small signs of
-        # life.
+        # No flow control is needed, because the messages are few and small.
         if self._process is not None and self._process.returncode is None:
             assert self._process.stdin is not None
             self._process.stdin.write(msgspec.json.encode(message) + b"\n")

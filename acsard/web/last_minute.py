@@ -1,8 +1,8 @@
-"""The plotted values of the last minute, for a page that has just been opened.
+"""Stores the plotted values of the last minute, for a page that has just been opened.
 
-The commanded speeds arrive a hundred times a second on `cmd_vel_out`, so the server receives them
-only while a viewer has subscribed to that key. All other values come from the key `state`. This
-module is pure.
+The commanded speeds arrive on the key `cmd_vel_out`, usually a hundred times a second. So the
+server receives them only while a viewer is subscribed to that key. All other values come from the
+key `state`. This module is pure.
 """
 
 from __future__ import annotations
@@ -18,11 +18,12 @@ from acsard.core.values import NS_PER_S, WHEELS
 LASTS_NS = 60 * NS_PER_S
 
 STEP_NS = NS_PER_S // 5
-"""Nominal time between two rows of plotted values, ns. It is about one pixel wide in a plot on a
-phone."""
+"""Nominal time between two rows of plotted values, ns. In a plot on a phone, this time is about one
+pixel wide."""
 
 EARLY_NS = STEP_NS // 4
-"""A state may become the next row if it arrives at most this long before the row is due, ns."""
+"""Longest time, ns, by which a state may arrive before the next row is due and still become this
+row."""
 
 ROWS = LASTS_NS // (STEP_NS - EARLY_NS)
 """Maximum number of rows in a minute."""
@@ -40,9 +41,9 @@ Column = Sequence[float | None]
 
 
 class Plotted(Struct, frozen=True):
-    """The values to plot: one column for each plotted line, with about five rows a second.
+    """The values to plot: a column for each plotted line, and a row for each moment.
 
-    All columns have the same length as `age`.
+    There are about five rows a second. All columns have the same length as `age`.
     """
 
     age: Sequence[int]
@@ -69,7 +70,7 @@ class Plotted(Struct, frozen=True):
 
 
 class Minute:
-    """The rows of plotted values of the last minute. All times are ns on a monotonic clock."""
+    """The plotted values of the last minute. All times are in ns on the same monotonic clock."""
 
     def __init__(self) -> None:
         self._rows: deque[tuple[int, list[float | None]]] = deque(maxlen=ROWS)
@@ -78,9 +79,9 @@ class Minute:
         return not self._rows or at_ns - self._rows[-1][0] >= STEP_NS - EARLY_NS
 
     def add(self, at_ns: int, state: RobotState, wished: Twist | None) -> None:
-        """Append a row for `state`, which arrived at `at_ns`.
+        """Append a row with the values of `state`, which arrived at the time `at_ns`.
 
-        `wished` is the commanded twist, or None if it is unknown.
+        `wished` is the commanded twist after the limits, or None if it is unknown.
         """
         measured: list[float | None] = [state.linear, state.angular, *state.wheels[: len(WHEELS)]]
         if len(measured) != MEASURED:
@@ -94,7 +95,7 @@ class Minute:
         self._rows.append((at_ns, [None if one is None else round(one, 3) for one in row]))
 
     def plotted(self, now_ns: int) -> Plotted:
-        """Return the rows that are not older than a minute, as columns."""
+        """Return the values of the last minute before `now_ns`, as columns."""
         rows = [row for row in self._rows if now_ns - row[0] <= LASTS_NS]
         columns = [[values[n] for _, values in rows] for n in range(WIDTH)]
         linear, angular, *wheels, wished_linear, wished_angular, late_p99, late_max, volts = columns

@@ -13,30 +13,30 @@ from acsard.host.rate_limits import Places, Rate
 from acsard.web.callers import network_of
 
 SOCKETS, SOCKETS_HERE = 256, 96
-"""Maximum numbers of TCP connections from other machines, and from the robot itself. A browser
-opens six connections in addition to its WebSocket."""
+"""Maximum number of TCP connections from other machines (`SOCKETS`), and from the robot itself
+(`SOCKETS_HERE`). A browser opens six connections in addition to its WebSocket."""
 
 SOCKETS_OF_ONE, SOCKETS_OF_TOKEN = 64, 64
-"""Maximum numbers of TCP connections: from one network without a valid token (`SOCKETS_OF_ONE`),
-and with one valid token (`SOCKETS_OF_TOKEN`). Any further connection with the same token
-counts as a connection without a valid token."""
+"""Maximum number of TCP connections from one network that have shown no valid token
+(`SOCKETS_OF_ONE`), and maximum number that have shown the same valid token (`SOCKETS_OF_TOKEN`).
+Any further connection with this token counts as a connection without a valid token."""
 
 SOCKETS_OF_BROWSER = 7
-"""Number of TCP connections that each token keeps even when all places are taken. One browser needs
-this number."""
+"""Number of TCP connections that each token keeps even if the limit on all connections is reached.
+One browser needs this number."""
 
 SOCKETS_LEAST = 16
-"""Smallest limit on TCP connections from other machines. It applies if the process may open only
-few files."""
+"""Number of TCP connections from other machines that the server always allows, even if the process
+may open only few files."""
 
 OWN_FILES = 128
-"""Number of open files that are reserved for uses other than connections: 20 files are always open,
-and more during a report or calibration."""
+"""Number of open files that are reserved for uses other than TCP connections. 20 such files are
+always open. More are open while a report is drawn or a calibration runs."""
 
 UNREAD_BYTES = 32768
-"""Limit on the bytes that the server holds for a client that does not read them. Above the limit,
-the client's next request waits, and its WebSocket gets no new values. asyncio's default for TLS is
-512 KiB."""
+"""Number of bytes that the server buffers for a client that does not read them. Above this number,
+the client's next request waits, and the client's WebSocket gets no new values. asyncio's default
+for TLS is 512 KiB."""
 
 OVERRUNS = 600
 """Number of messages beyond the rate limit `MESSAGES` after which a WebSocket is closed."""
@@ -47,12 +47,12 @@ token in one network. Because of the last limit, one program cannot lock out oth
 network."""
 
 CONNECTIONS_HERE = 20
-"""Maximum number of WebSockets from the robot itself. These places are only for clients on the
-robot."""
+"""Maximum number of WebSockets from the robot itself. WebSockets from other machines do not count
+here."""
 
 STREAMS, STREAMS_OF_ONE = 200, 50
-"""Maximum numbers of subscribed keys of other robots: in total, and per token. Keys of the page's
-own robot are few and are not counted."""
+"""Maximum number of subscribed keys of other robots: in total (`STREAMS`), and per token
+(`STREAMS_OF_ONE`). The keys of the page's own robot are few and do not count."""
 
 
 REQUESTS = Rate(50.0, 200.0)
@@ -88,8 +88,9 @@ from this server. Before this limit existed, 24 WebSockets with 180 commands a s
 daemon drop half of the commands of a client that was driving."""
 
 STOPS_ELSEWHERE = Rate(4.0, 16.0)
-"""Limit on stops per token to robots that may not exist, as a rate per second and a largest burst.
-A robot is known to exist if this server sees it on the bus or has received its answer to a stop."""
+"""Limit on the stops that a client with one token may send to robots that may not exist, as a rate
+per second and a largest burst. A robot certainly exists if this server has found it on the bus, or
+has received its answer to a stop."""
 
 GUESSES_OF_ONE, GUESSES = Rate(10 / 60, 10.0), Rate(100 / 60, 100.0)
 """Limits on wrong tokens, from one network and in total, as rates per second and largest bursts."""
@@ -99,22 +100,27 @@ C = TypeVar("C", bound=Hashable)
 
 
 def sockets_for(files: int) -> int:
-    """Return the limit on connections from other machines if the process may open `files` files."""
+    """Return the maximum number of TCP connections from other machines.
+
+    `files` is the number of files that this process may open.
+    """
     # A connection needs two files while it fetches a recording.
     return max(SOCKETS_LEAST, min(SOCKETS, (files - OWN_FILES) // 2 - SOCKETS_HERE))
 
 
 class Sockets(Generic[C]):
-    """The open TCP connections. When all places are taken, a new connection displaces an older one.
+    """The open TCP connections, up to a maximum number.
 
-    1. If there are connections without a valid token, the network that has the most of them loses
-       the oldest of them.
+    If the maximum is reached, each new connection displaces an older connection:
+
+    1. If there are connections without a valid token, the network with the most of them loses its
+       oldest connection without a valid token.
     2. If every connection has shown a valid token, the token with the most connections loses its
-       oldest one. If this token has at most `SOCKETS_OF_BROWSER` connections, the new connection is
-       refused instead.
+       oldest connection. However, if this token has at most `SOCKETS_OF_BROWSER` connections, the
+       new connection is refused instead.
 
-    If a network has `SOCKETS_OF_ONE` connections without a valid token, a new connection from it
-    displaces the oldest of these, even if places are free.
+    If a network has `SOCKETS_OF_ONE` connections without a valid token, each new connection from
+    this network displaces the oldest of them, even if the maximum is not reached.
     """
 
     def __init__(self, most: int) -> None:
@@ -125,15 +131,15 @@ class Sockets(Generic[C]):
         self._known: dict[C, str] = {}
         """The token of each connection that is counted under a token (see `SOCKETS_OF_TOKEN`)."""
         self._shown: dict[C, str] = {}
-        """The last valid token that each connection has shown, even if the connection is beyond the
-        limit `SOCKETS_OF_TOKEN`."""
+        """The last valid token that each connection has shown. A connection beyond the limit
+        `SOCKETS_OF_TOKEN` is in this dict too."""
         self._tokens: Counter[str] = Counter()
 
     def enter(self, network: str, one: C) -> C | None:
-        """Give the new connection `one` a place; return the connection to close in exchange.
+        """Add the new connection `one`, and return the connection that the caller must close.
 
-        `network` is the network of the client. Return None if no connection must be closed, and
-        `one` itself if it is refused.
+        Return None if the caller need not close any connection. If the new connection is refused,
+        do not add it, and return `one` itself. `network` is the network of the client.
         """
         own = self._strangers.get(network, {})
         gone = None
@@ -147,9 +153,10 @@ class Sockets(Generic[C]):
         return gone
 
     def displaced(self) -> C | None:
-        """Remove and return the connection that must make room for a new one.
+        """Remove the connection that must make room for a new connection, and return it.
 
-        Return None if no connection may be closed.
+        Return None if every connection has shown a valid token, and no token has more than
+        `SOCKETS_OF_BROWSER` connections.
         """
         if self._strangers:
             network = max(self._strangers, key=lambda name: len(self._strangers[name]))
@@ -165,8 +172,8 @@ class Sockets(Generic[C]):
     def prove(self, one: C, token: str) -> None:
         """Record that the connection `one` has shown the valid token `token`.
 
-        The token is "" for a client on the robot itself. A later token replaces an earlier one,
-        because a browser may get another token.
+        `token` is "" for a client on the robot itself. A later token of the same connection
+        replaces the earlier token, because a browser may get another token.
         """
         network, before = self._networks.get(one), self._known.get(one)
         if network is None:
@@ -193,11 +200,15 @@ class Sockets(Generic[C]):
         self._fewer(token)
 
     def ended(self, valid: Collection[str]) -> list[C]:
-        """Return the connections whose last shown token was valid once but is not in `valid`."""
+        """Return the connections whose token is not valid any more.
+
+        `valid` contains all tokens that are valid now. If a connection has shown several tokens,
+        the last of them counts.
+        """
         return [one for one, token in self._shown.items() if token and token not in valid]
 
     def strangers(self) -> list[C]:
-        """Return the connections that count as connections without a valid token."""
+        """Return all connections that count as connections without a valid token."""
         return [one for network in self._strangers.values() for one in network]
 
     def _fewer(self, token: str) -> None:
@@ -224,14 +235,20 @@ class Seats:
         self._networks = Places(CONNECTIONS, CONNECTIONS_OF_ONE)
 
     def missing(self, address: str, token: str) -> str:
-        """Return "" if there is room for a WebSocket, else the reason and the remedy."""
+        """Return "" if a client may open a WebSocket now, else the reason and the remedy.
+
+        `address` is the client's IP address, and `token` is the client's token.
+        """
         for places, name, full in self._places(address, token):
             if not places.room(name):
                 return full
         return ""
 
     def enter(self, address: str, token: str) -> str:
-        """Acquire a place for a WebSocket; return "", or the reason and the remedy of a refusal."""
+        """Count a new WebSocket and return "". If a limit forbids it, return reason and remedy.
+
+        `address` is the client's IP address, and `token` is the client's token.
+        """
         if full := self.missing(address, token):
             return full
         for places, name, _ in self._places(address, token):
@@ -243,10 +260,10 @@ class Seats:
             places.leave(name)
 
     def _places(self, address: str, token: str) -> list[tuple[Places, str, str]]:
-        """Return the limits that apply to a WebSocket, as triples.
+        """Return the limits that apply to a WebSocket, as a list of triples.
 
-        A triple holds the limit, the name under which the limit counts the WebSocket, and the text
-        of a refusal.
+        Each triple consists of the limit, the name under which the limit counts the WebSocket, and
+        the text of a refusal.
         """
         if not token:
             here = f"{CONNECTIONS_HERE} pages are open on the robot itself: close some"
@@ -271,9 +288,9 @@ class Seats:
 class Shares:
     """Limits the number of resources in use, in total and per holder.
 
-    A resource that several holders share counts once in the total. The server uses this class for
-    subscriptions to keys of other robots. Each holder is then a token, or the name of a client
-    without a token.
+    A resource that several holders share counts once in the total. In this server, a resource is a
+    subscription to a key of another robot. A holder is a token, or the name of a client without a
+    token.
     """
 
     def __init__(self, most: int, of_one: int) -> None:
@@ -282,9 +299,10 @@ class Shares:
         """For each resource, the number of times that each holder has acquired it."""
 
     def enter(self, holder: str, thing: Hashable) -> bool:
-        """Acquire the resource `thing` for `holder`; return False if the limits forbid it.
+        """Acquire the resource `thing` for `holder`, and return True.
 
-        A holder may acquire the same resource several times, and must release it as often.
+        Return False if the limits forbid it. A holder may acquire the same resource several times,
+        and must then call `leave` the same number of times.
         """
         holders = self._held.get(thing)
         if holders is None and len(self._held) >= self._most:
@@ -295,7 +313,7 @@ class Shares:
         return True
 
     def leave(self, holder: str, thing: Hashable) -> None:
-        """Undo one call of `enter` for the same holder and resource."""
+        """Release the resource `thing`. This undoes one successful call of `enter`."""
         holders = self._held[thing]
         holders[holder] -= 1
         if not holders[holder]:

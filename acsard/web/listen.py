@@ -1,4 +1,4 @@
-"""The addresses at which the page's server listens, and the URLs on an invitation."""
+"""Opens the addresses at which the page's server listens, and lists the URLs of the page."""
 
 from __future__ import annotations
 
@@ -13,14 +13,15 @@ from acsard.host.own_identity import own_addresses
 from acsard.web.callers import is_loopback
 
 TRIES = 20
-"""Number of ports that are tried, one after another, starting with the requested one."""
+"""Number of TCP ports that the server tries, one after another, from the requested port on."""
 
 EVERYWHERE_4, EVERYWHERE_6 = "0.0.0.0", "::"
-"""Wildcard addresses: all IPv4 addresses of this machine, and all its IPv4 and IPv6 addresses."""
+"""Wildcard addresses: all IPv4 addresses of this machine (`EVERYWHERE_4`), and all IPv4 and IPv6
+addresses of this machine (`EVERYWHERE_6`)."""
 
 
 class Listen(Struct, frozen=True):
-    """One address to listen at."""
+    """An address at which the page's server listens."""
 
     secure: bool
     """True for HTTPS."""
@@ -34,11 +35,11 @@ class Listen(Struct, frozen=True):
 
     @property
     def url(self) -> str:
-        """The URL to open in a browser, with this machine's own name for a wildcard address."""
+        """The URL to open in a browser. For a wildcard address, it contains the machine's name."""
         return self.url_at(own_name() if self.everywhere else self.host)
 
     def url_at(self, host: str) -> str:
-        """Return the URL with another host name or address."""
+        """Return the URL of this address with `host` in place of its own host name or address."""
         host = f"[{host}]" if ":" in host else host
         return f"http{'s' if self.secure else ''}://{host}:{self.port}/"
 
@@ -49,7 +50,11 @@ def own_name() -> str:
 
 
 def listens(text: str) -> Listen:
-    """Parse an address like http://127.0.0.1:8080 (http only on loopback). Raises `UsageError`."""
+    """Parse an address such as `https://0.0.0.0:8443`.
+
+    Raises `UsageError` if the address is not valid, or if it has the scheme `http` and is not a
+    loopback address.
+    """
     scheme, _, place = text.removesuffix("/").partition("://")
     host, _, port = place.rpartition(":")
     host = host.removeprefix("[").removesuffix("]")
@@ -66,11 +71,12 @@ def listens(text: str) -> Listen:
 
 
 def invitations(listen: Sequence[Listen], tls: str) -> list[str]:
-    """Return the URLs to write on an invitation; the first one is the most likely to work.
+    """Return the URLs at which other machines can open the page, for an invitation.
 
-    `listen` are the addresses of the server, and `tls` is the directory of the certificate. Only
-    HTTPS addresses have such URLs. IP addresses come before names, because not every phone
-    resolves mDNS names. Call `require_certificate` first.
+    The first URL is the most likely to work. IP addresses come before names, because not every
+    phone resolves mDNS names. `listen` are the addresses of the server, of which only those with
+    HTTPS are used. `tls` is the directory of the robot's certificate. Call `require_certificate`
+    first.
     """
     found: list[str] = []
     older_ports = _older_ports(listen)
@@ -81,8 +87,8 @@ def invitations(listen: Sequence[Listen], tls: str) -> list[str]:
         if one.everywhere:
             certified = names_in(tls)
             own = [at for at in own_addresses() if at in certified]
-            # Not every network has IPv6, so IPv4 addresses come first. A `::` socket is not
-            # reachable by IPv4 when another socket has the same port on IPv4.
+            # Not every network has IPv6, so IPv4 addresses come first. A socket at `::` does not
+            # accept IPv4 connections if another socket has the same port on IPv4.
             both = one.host != EVERYWHERE_6 or one.port not in older_ports
             older = [at for at in own if ":" not in at and both]
             newer = [at for at in own if ":" in at and one.host == EVERYWHERE_6]
@@ -92,17 +98,17 @@ def invitations(listen: Sequence[Listen], tls: str) -> list[str]:
 
 
 def opened_by(one: Listen, tls: str) -> list[str]:
-    """Return the URLs that open the page at the address `one`, the most reliable URL first.
+    """Return the URLs of the page at the address `one`, the most reliable URL first.
 
-    `tls` is the directory of the certificate.
+    `tls` is the directory of the robot's certificate.
     """
     return invitations([one], tls) if one.secure else [one.url]
 
 
 def require_certificate(listen: Sequence[Listen], tls: str) -> None:
-    """Raise `MendableError` if an HTTPS address has no usable certificate.
+    """Raise `MendableError` if an address in `listen` uses HTTPS without a usable certificate.
 
-    `tls` is the directory of the certificate.
+    `tls` is the directory of the certificate, or "".
     """
     away = [one for one in listen if one.secure]
     if away and not tls:
@@ -115,28 +121,28 @@ def require_certificate(listen: Sequence[Listen], tls: str) -> None:
 
 
 def bound(listen: Sequence[Listen], next_port: bool) -> list[tuple[Listen, socket.socket]]:
-    """Open a socket at each address.
+    """Open a listening socket at each address; return pairs of the used address and the socket.
 
-    If `next_port` is true and a port is taken, try the next ports, `TRIES` ports in total. Raises
-    `InUseError` if no port is free.
+    If `next_port` is true and a port is in use, try the next ports, `TRIES` ports in total. The
+    used address contains the port that was free. Raises `InUseError` if no socket can be opened at
+    an address.
     """
     older_ports = _older_ports(listen)
     return [_bound(one, next_port, one.port not in older_ports) for one in listen]
 
 
 def _older_ports(listen: Sequence[Listen]) -> set[int]:
-    """Return the ports of the IPv4 addresses and host names.
+    """Return the TCP ports of the IPv4 addresses and host names in `listen`.
 
-    At such a port, a `::` socket must be for IPv6 only.
+    A socket at `::` with one of these ports must not accept IPv4 connections.
     """
     return {one.port for one in listen if ":" not in one.host}
 
 
 def _bound(one: Listen, next_port: bool, both: bool) -> tuple[Listen, socket.socket]:
-    """Open a socket at the address and port of `one`.
+    """Do the work of `bound` for one address.
 
-    If `next_port` is true and the port is taken, use the first free one of the following ports. If
-    `both` is true, a socket at `::` accepts IPv4 connections too.
+    If `both` is true, a socket at `::` accepts IPv4 connections too.
     """
     ports = range(one.port, min(65536, one.port + TRIES)) if next_port else [one.port]
     both = both and one.host == EVERYWHERE_6 and socket.has_dualstack_ipv6()

@@ -1,4 +1,7 @@
-"""The counters of the page's server, and the Prometheus text (format 0.0.4) of `/metrics`."""
+"""Counts the actions and refusals of the page's server, and writes the metrics for Prometheus.
+
+The text of `/metrics` has Prometheus's text format 0.0.4.
+"""
 
 from __future__ import annotations
 
@@ -32,10 +35,14 @@ def text(
 ) -> str:
     """Return all metrics in the text format of Prometheus.
 
-    `robot` is the robot's id, `version` is the daemon's version, and `state` is the newest state.
-    `heard` is true while messages from the daemon arrive; if it is false, the robot's metrics are
-    left out. `viewers` is the number of open WebSockets. `counts` are the server's actions by name,
-    and `refused` are its refusals by reason.
+    Args:
+        robot: the robot's id.
+        version: the version of the daemon.
+        state: the newest state of the robot, or None before the first state.
+        heard: whether messages from the daemon arrive. If not, the robot's metrics are left out.
+        viewers: the number of open WebSockets.
+        counts: the number of the server's actions, by name.
+        refused: the number of the server's refusals, by reason.
     """
     lines: list[str] = []
 
@@ -141,12 +148,11 @@ def _escaped(word: str) -> str:
 
 
 NAMED = 5
-"""Maximum number of clients that a log line about refusals names. It names the clients with the
-most refusals."""
+"""Maximum number of clients that a log line about refusals names: those with the most refusals."""
 
 KNOWN = 1000
-"""Maximum number of clients for which refusals are counted separately between two log lines. The
-limit exists because one client may use many addresses."""
+"""Maximum number of clients whose refusals are counted separately between two log lines. Without
+this limit, a client that uses many addresses could fill the memory."""
 
 
 class Counts:
@@ -158,14 +164,18 @@ class Counts:
         self._refused: Counter[str] = Counter()
         self._told: Counter[str] = Counter()
         self._origins: Counter[str] = Counter()
-        """Number of refusals since the last log line, by the address and name of the client."""
+        """Number of refusals since the last call of `news`, by the client's address and name."""
 
     def add(self, name: str, more: int = 1) -> None:
         with self._lock:
             self._counts[name] += more
 
     def refuse(self, reason: Reason, origin: str = "") -> None:
-        """Count a refusal; `origin` is the client's address and name, or "" if it is unknown."""
+        """Count a refusal.
+
+        `reason` is the reason, and `origin` is the client's address and name, or "" if the client
+        is unknown.
+        """
         with self._lock:
             self._refused[reason] += 1
             if origin and (origin in self._origins or len(self._origins) < KNOWN):
@@ -180,7 +190,10 @@ class Counts:
             return dict(self._refused)
 
     def news(self) -> Event | None:
-        """Return a log event for the refusals since the last call, or None if there were none."""
+        """Return a log event about the refusals since the last call of this method.
+
+        Return None if nothing was refused since then.
+        """
         with self._lock:
             new = self._refused - self._told
             self._told = Counter(self._refused)

@@ -1,7 +1,7 @@
-"""The page's interface for programs as an OpenAPI 3.1 document. This module is pure.
+"""Describes the page's interface for programs as an OpenAPI 3.1 document. This module is pure.
 
-The paths come from the table `app.ROUTES`, and the schemas from msgspec and `json_schema.SCHEMAS`.
-So a new route, key or field appears in the document without a change here.
+The paths come from the table `app.ROUTES`. The schemas come from the msgspec types and from
+`json_schema.SCHEMAS`. So a new route, key or field appears in the document without a change here.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ Refs = dict[Any, Described]
 """Maps each type to a reference to its schema."""
 
 TO_ROBOT, FROM_ROBOT = "ToRobot", "FromRobot"
-"""Names of two schemas: that of the WebSocket messages that clients send, and that of the messages
-that the server sends."""
+"""Names of the schemas of the WebSocket messages that clients send (`TO_ROBOT`), and of the
+WebSocket messages that the server sends (`FROM_ROBOT`)."""
 
 VALUE = "Value."
-"""Prefix of the schema names for the messages of subscribed keys."""
+"""Prefix of the names of the schemas that describe the values of subscribed keys."""
 
 GUIDED = "Guided"
 
@@ -44,11 +44,10 @@ LINES = (
     json_prompt.JobMessage, json_prompt.Doing, json_prompt.Progress, json_prompt.Question,
     json_prompt.Found, json_prompt.Result,
 )  # fmt: skip
-"""Types of the values that the field `guide` of a WebSocket message may have. The field reports on
-a running check or calibration."""
+"""Types of the field `guide` of a WebSocket message, which reports on a check or calibration."""
 
 KEYS = {topic.key: topic.type for topic in FOLLOWED}
-"""Message type of each key to which a client can subscribe."""
+"""Maps each key to which a client can subscribe to the name of its message type."""
 
 
 def _ref(name: str) -> Described:
@@ -60,7 +59,7 @@ def _raw(schema: Described) -> Any:
 
 
 def _value(key: str, kind: str) -> type[Struct]:
-    """Return the type of the WebSocket messages that contain the values of the key `key`.
+    """Return the type of the WebSocket messages that contain the values of the bus key `key`.
 
     `kind` is the name of the schema of these values.
     """
@@ -90,11 +89,14 @@ ERRORS = {
     "429": "Too many requests, or too many wrong tokens.",
     "default": "Any other failure.",
 }
-"""Descriptions of the errors that every path may return, by HTTP status."""
+"""Description of each error that any path may return, by HTTP status."""
 
 
 def document(version: str, routes: Sequence[Route]) -> Described:
-    """Return the document that answers `GET /api`; `version` is the version of acsard."""
+    """Return the OpenAPI document of the paths `routes`. `version` is the version of acsard.
+
+    Routes without a summary are left out.
+    """
     described = [row for row in routes if row.summary]
     bodies = [body.kind for row in described for body in row.gives.values()]
     bodies += [row.takes for row in described if row.takes is not None]
@@ -166,11 +168,9 @@ def _needed(kind: type | str) -> bool:
 
 
 def _messages() -> Described:
-    """Return the schemas of the bus messages, by name.
-
-    The types in `$defs` become schemas of their own, because most programs
-    that read the document cannot resolve `$defs`.
-    """
+    """Return the schemas of the bus messages, by name."""
+    # The types in `$defs` become schemas of their own, because most programs that read the document
+    # cannot resolve `$defs`.
     found: Described = {}
     for name, schema in SCHEMAS.items():
         whole = _flat(schema, f"{name}.")
@@ -181,10 +181,10 @@ def _messages() -> Described:
 
 
 def _flat(node: Any, before: str) -> Any:
-    """Return a copy of `node` in which each reference to `$defs` is a reference to a component.
+    """Return a copy of a JSON Schema in which references to `$defs` are references to components.
 
-    `node` is a JSON Schema or a part of one. The component of the definition X is named
-    `before` + X.
+    `node` is the JSON Schema or a part of it. The name of a component is `before` followed by the
+    name in `$defs`.
     """
     if isinstance(node, list):
         return [_flat(one, before) for one in node]
@@ -196,11 +196,12 @@ def _flat(node: Any, before: str) -> Any:
 
 
 def _components(kinds: Iterable[Any]) -> tuple[Described, Refs]:
-    """Return a pair: schemas by name, and a reference to a schema for each type in `kinds`.
+    """Return a pair: the schemas by name, and the reference to the schema of each type in `kinds`.
 
-    The schemas are those of the types in `kinds` and of the types that are nested in them.
+    The schemas describe the types in `kinds`, and the types that are nested in these types.
     """
-    # In one call, msgspec gives different names to two types that have the same name.
+    # Pass all types to msgspec in one call: it then gives different names to two types that have
+    # the same name.
     unique = list(dict.fromkeys(kinds))
     refs, parts = msgspec.json.schema_components(
         unique,
@@ -212,10 +213,9 @@ def _components(kinds: Iterable[Any]) -> tuple[Described, Refs]:
 
 
 def _of_the_socket(refs: Refs) -> Described:
-    """Return the schemas `ToRobot`, `FromRobot` and `Guided`, by name.
+    """Return the schemas `ToRobot`, `FromRobot` and `Guided`, which describe WebSocket messages.
 
-    Together they describe all WebSocket messages. `refs` maps the types of messages to references
-    to their schemas.
+    `refs` maps each message type to a reference to the schema of this type.
     """
     guided = msgspec.defstruct(
         GUIDED,

@@ -1,4 +1,4 @@
-"""Lists and sends the recordings in the black box's directory, and draws reports of them."""
+"""Lists the recordings in the directory of the black box, and draws reports of recordings."""
 
 from __future__ import annotations
 
@@ -30,23 +30,23 @@ POLICY = (
     "'unsafe-inline'; img-src data: blob:; base-uri 'none'; form-action 'none'; "
     "frame-ancestors 'none'"
 )
-"""Content security policy of a report. Without `allow-same-origin`, the report has an opaque
-origin. The browser also enforces the report's own policy, which names the allowed scripts by their
-hashes."""
+"""Content security policy of a report. Because `allow-same-origin` is missing, the report has an
+opaque origin. The browser also enforces the policy inside the report, which contains the hashes of
+the allowed scripts."""
 
 LISTED_NS = NS_PER_S // 4
 
 NICE = 19
 
 DRAW_S = 600.0
-"""Time limit for drawing a report, s. To draw the report of a full recording (one to four hours)
-takes minutes."""
+"""Time limit for drawing a report, s. The report of a full recording (one to four hours) takes
+minutes."""
 
 ALONE_NS = 60 * NS_PER_S
-"""Time, ns, after which the drawing of a report is cancelled if no client asks for its progress."""
+"""Time, ns, after which the server stops drawing a report if no client requests the progress."""
 
 KEEP_NS = 900 * NS_PER_S
-"""Time, ns, after which a finished report is dropped if no client asks for it again."""
+"""Time, ns, after which the server discards a finished report if no client requests it again."""
 
 BYTES = 32 << 20
 """Maximum size of a report, bytes; a typical one has 5 to 8 MB."""
@@ -81,29 +81,28 @@ class Recording(Struct, frozen=True):
 
 
 class BlackBox:
-    """The recordings that the daemon of the page's robot has made.
+    """The recordings of the daemon of the page's robot.
 
-    Every method raises `TroubleError` if the recordings are not available.
+    Every method raises `TroubleError` if the recordings cannot be read, for example because they
+    are on another machine.
     """
 
     def __init__(self, robots: Robots) -> None:
         self._robots = robots
         self._listing: asyncio.Future[list[Recording]] | None = None
         self._listed_ns = 0
-        """Monotonic time at which `_listing` began, ns."""
+        """Monotonic time at which the task `_listing` was started, ns."""
 
     async def rows(self) -> list[Recording]:
-        """Return all recordings, oldest first. The list may be up to `LISTED_NS` old.
-
-        All requests within this time share one list. Otherwise, a client that requests the list all
-        the time would use so much processor time that the stops of other clients are delayed.
-        """
+        """Return all recordings, oldest first. The list may be up to `LISTED_NS` old."""
+        # All requests within `LISTED_NS` share one list. Otherwise, a client that requests the list
+        # all the time would use so much processor time that the stops of other clients are late.
         place, now_ns = self._place(), clock.mono_ns()
         old = now_ns - self._listed_ns > LISTED_NS
         if self._listing is None or (old and self._listing.done()):
             self._listing = asyncio.ensure_future(in_thread(lambda: rows(place), READ_S))
-            # Read the error here too, because all clients may be gone by then. asyncio would log an
-            # error that nothing has read.
+            # All clients may have gone when the listing fails. Retrieve the error here too, because
+            # asyncio logs every error that nothing retrieves.
             self._listing.add_done_callback(
                 lambda listing: listing.cancelled() or listing.exception()
             )
@@ -114,9 +113,10 @@ class BlackBox:
             raise _unread(place, error) from None
 
     async def found(self, name: str) -> tuple[Path, tuple[int, int]]:
-        """Return a pair: a recording's path, and a stamp that changes when the recording changes.
+        """Return the path of the recording `name`, and a stamp that shows changes of the file.
 
-        Raises `RefusedError` if the recording does not exist.
+        The stamp is the pair (modification time in ns, size in bytes). Raises `RefusedError` if the
+        recording does not exist.
         """
         place = self._place()
 
@@ -154,7 +154,10 @@ class BlackBox:
 
 
 def rows(directory: Path) -> list[Recording]:
-    """Return all recordings of a directory, oldest first; raises `OSError`."""
+    """Return all recordings in a directory, oldest first. Raises `OSError` if reading fails.
+
+    If the directory does not exist, return [].
+    """
     return [_row(path) for path in _files(directory)]
 
 
@@ -184,7 +187,10 @@ def _row(path: Path) -> Recording:
 
 
 def _begun(path: Path) -> float | None:
-    """Return the start time in the file name, s since 1970, or None if the name has none."""
+    """Return the start time in a recording's file name, s since 1970.
+
+    Return None if the name contains no time.
+    """
     try:
         told = time.strptime(path.name.partition("-")[2].partition(".")[0], STAMP)
     except ValueError:
@@ -203,7 +209,7 @@ State = Literal["drawing", "ready", "failed", "busy"]
 
 
 class ReportState(Struct, frozen=True, omit_defaults=True):
-    """The state of a report."""
+    """The progress or the result of drawing the report of a recording."""
 
     report: State
     text: Annotated[str, Meta(description="why the report failed, or why the client must wait")] = (
@@ -238,27 +244,32 @@ class Reports:
     """Draws one report at a time, in a child process, and keeps the newest report in memory.
 
     A recording may contain text from unknown senders, so a report could contain a malicious script.
-    There are three defenses. The report escapes the text. The content security policy inside the
-    report allows exactly two scripts, and does not allow the report to load anything. `POLICY`
-    gives the report an opaque origin, so a script in the report could use neither the cookie nor
-    the interface of the robot's page.
+    There are three defenses:
+
+    1. The program that draws the report escapes the text.
+    2. The content security policy inside the report allows exactly two scripts, and does not allow
+       the report to load anything.
+    3. `POLICY` gives the report an opaque origin. So a script in the report could not use the
+       cookie or the interface of the robot's page.
     """
 
     def __init__(self, command: Sequence[str] = ()) -> None:
-        """Set the command that draws a report; the path of the recording is added at its end.
+        """Create an instance without a report.
 
-        If `command` is empty, it is `acsard recording report --supervised`.
+        `command` is the command that draws a report, without its last argument, the path of the
+        recording. If it is empty, use `acsard recording report --supervised`.
         """
         self._command = command or acsard("recording", "report", "--supervised")
         self._one: _Drawing | None = None
         self._work: asyncio.Task[None] | None = None
 
     def ask(self, path: Path, stamp: tuple[int, int]) -> ReportState:
-        """Return the progress of the report of a recording, and start drawing the report if needed.
+        """Return the progress of the report of a recording. Start drawing the report if needed.
 
-        `path` and `stamp` are from `BlackBox.found()`. A report is drawn again if the previous
-        drawing failed, or if `stamp` shows that the recording has changed since then. However, this
-        happens only after a client has received the previous result.
+        While the report of another recording is being drawn, return the state "busy". A failed
+        report is drawn again, and so is the report of a recording that has changed since. However,
+        the first call for the same recording after a drawing has ended returns the result of that
+        drawing. `path` and `stamp` are the results of `BlackBox.found()`.
         """
         one, now_ns = self._one, clock.mono_ns()
         if one is not None and not one.ended and one.path != path:
@@ -277,9 +288,10 @@ class Reports:
         return ReportState("drawing", percent=one.percent, seconds=round(seconds, 1))
 
     def drawn(self, name: str) -> bytes | None:
-        """Return the report of the recording `name` as gzip, or None if it is not finished.
+        """Return the report of the recording `name`, compressed by gzip.
 
-        Each call restarts the time `KEEP_NS` after which the report is dropped.
+        Return None if this report is not finished or not in memory. Each call restarts the time
+        `KEEP_NS` after which the report is discarded.
         """
         one = self._one
         if one is None or one.path.name != name or not one.packed:
@@ -288,10 +300,10 @@ class Reports:
         return one.packed
 
     def tidy(self) -> None:
-        """Cancel the drawing, or drop the finished report, if no client asks for it any more.
+        """Discard the report if no client has requested it for some time.
 
-        Call this once a second. The drawing is cancelled `ALONE_NS` after the last request, and a
-        finished report is dropped `KEEP_NS` after it.
+        This time is `ALONE_NS` while the report is being drawn, and `KEEP_NS` after that. Call this
+        method once a second.
         """
         one = self._one
         if one is None:
@@ -301,7 +313,7 @@ class Reports:
             self.end()
 
     def end(self) -> None:
-        """Cancel the drawing of a report, or drop the finished report."""
+        """Stop drawing the report, and discard it."""
         if self._work is not None:
             self._work.cancel()
         self._one = self._work = None
@@ -342,7 +354,6 @@ class _FailedError(Exception):
 
 
 def _why(said: str) -> str:
-    """Return the reason for a failure from the child's error output `said`."""
     last = said.rpartition("\n")[2]
     if last.startswith("MemoryError"):
         return TOO_MUCH
@@ -360,9 +371,9 @@ async def _body(child: Process) -> bytes:
 
 
 async def _listened(child: Process, one: _Drawing) -> str:
-    """Read the child's error output until it ends, and return its lines as text.
+    """Read the child's error output until its end, and return the error text in it.
 
-    A line that is a number is the progress in percent. It is stored in `one` and not returned.
+    A line of digits is the progress in percent. Store it in `one` instead of returning it.
     """
     assert child.stderr is not None
     said = ""

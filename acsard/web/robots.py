@@ -1,4 +1,4 @@
-"""The robot of this page: the connection to its daemon, its last state, and its reachability."""
+"""Connects to the daemon of the page's robot, follows the robot's state, and detects silence."""
 
 from __future__ import annotations
 
@@ -33,17 +33,18 @@ AGAIN_S = 1.0
 """Delay before the next attempt to reach a daemon that does not answer, s."""
 
 ASK_S, ASK_SOON_S = 10.0, 1.0
-"""Delay before the next query of the values of `About`, s: after a query that the daemon answered,
-and after a query that it did not answer."""
+"""Delay before the next query of the values of `About`, s: after a query that the daemon has
+answered (`ASK_S`), and after a query without an answer (`ASK_SOON_S`)."""
 
 PATH_S, PATH_POINTS, PATH_STEP_M = 600.0, 5000, 0.02
-"""Limits of the drawn path: maximum age of a point, s; maximum number of points; minimum distance
-between two points, m."""
+"""Limits of the path that the page draws: maximum age of a point, s (`PATH_S`), maximum number of
+points (`PATH_POINTS`), and minimum distance between two points, m (`PATH_STEP_M`)."""
 
 T = TypeVar("T")
 
 Connect = Callable[[], Client]
-"""Function that connects to the daemon, or raises `UnreachableError`. It blocks."""
+"""Function that connects to the daemon, and blocks until it is connected. It raises
+`UnreachableError` if the daemon is not reachable."""
 
 
 class About(Struct, frozen=True):
@@ -57,28 +58,28 @@ class About(Struct, frozen=True):
     """Highest turn rate, rad/s."""
     state_hz: float
     recordings: str
-    """Directory of the black box, "" if nothing is recorded."""
+    """Directory of the black box on the daemon's machine; "" if the daemon records nothing."""
     timeouts: Mapping[str, float]
     """Timeout of each command source, s, by the name of the source."""
 
 
 def _path() -> Track:
-    # The last argument, 1 m, is the longest step of a path. No robot drives this far between two
-    # states, so a longer step means that the pose was set, and the path restarts.
+    # The last argument, 1 m, is the longest step of a path. No robot drives 1 m between two states.
+    # So after a longer step the pose was set, and the path restarts.
     return Track(PATH_POINTS, PATH_STEP_M, PATH_S, 1.0)
 
 
 class _Asking:
-    """The bus client that a `Watch` uses. Queries run in threads, so the event loop never waits."""
+    """Bus client for a `Watch`. Its queries run in threads, so the event loop never waits."""
 
     def __init__(self, client: Client) -> None:
         self.subscribe, self._client = client.subscribe, client
         self._asked: asyncio.Task[None] | None = None
 
     def ask(self, name: str, take: Callable[[zenoh.Sample], object]) -> None:
-        """Query the key `name`, unless an earlier query is still running.
+        """Query the key `name`, and call `take` with each reply.
 
-        `take` is called with each reply.
+        Do nothing if an earlier query is still running.
         """
         if self._asked is None or self._asked.done():
             self._asked = asyncio.create_task(self._ask(name, take))
@@ -92,11 +93,13 @@ class Robots:
     """The connection to the daemon of the page's robot, and the data for a newly opened page."""
 
     def __init__(self, address: Address, connect: Connect, about: About, counts: Counts) -> None:
-        """Store the arguments. `run()` connects to the daemon.
+        """Create an instance without a connection. `run()` connects to the daemon.
 
-        `address` is the address of the daemon, and `connect` connects to it. `about` holds the
-        values of the local configuration, which are used until the daemon answers. `counts` are the
-        counters of the page's server.
+        Args:
+            address: the address of the daemon.
+            connect: function that connects to the daemon.
+            about: the values from the local configuration, which are used until the daemon answers.
+            counts: the counters of the page's server.
         """
         self.id, self.endpoint = address.robot_id, address.endpoint
         self.certificate = shown_at(address.endpoint, address.tls)
@@ -117,7 +120,8 @@ class Robots:
     async def run(self) -> None:
         """Connect to the robot's daemon, and process the robot's states until cancelled.
 
-        Raises `MendableError` if another attempt to connect cannot help.
+        While the daemon is not reachable, try again every `AGAIN_S`. Raises `MendableError` if the
+        connection fails for a reason that another attempt cannot change.
         """
         client = self.client = await self._reached()
         asking = asyncio.create_task(self._ask_again_and_again())
@@ -132,17 +136,18 @@ class Robots:
 
     @property
     def state(self) -> RobotState | None:
-        """The newest state, or None before the first state."""
+        """The newest state of the robot, or None before the first state."""
         return None if self._watch is None else self._watch.state
 
     def ask_anew(self) -> None:
-        """Query the values of `about` now, without waiting for the next regular query."""
+        """Query the values of `about` from the daemon now, before the next regular query."""
         self._asks.set()
 
     def way(self) -> dict[str, list[tuple[float, float]]]:
-        """Return the points (x, y) of the robot's recent paths, m, by the name of the path.
+        """Return the points (x, y) of two paths in the last ten minutes, m, by name of the path.
 
-        "path" is the robot's path in the odom frame, and "truth" is the true path of a simulator.
+        "path" is the robot's path in the odom frame. "truth" is the true path of a simulated robot,
+        and is empty for a real robot.
         """
         return {
             name: [(round(place.x, 3), round(place.y, 3)) for place in path.places()]
@@ -209,11 +214,11 @@ class Robots:
     def _wished(self, now_ns: int) -> Twist | None:
         """Return the newest twist that the daemon has published on the key `cmd_vel_out`.
 
-        Return None if this twist is too old, or if no viewer is subscribed to the key.
+        Return None if this twist is older than 2 s, or if no viewer is subscribed to the key.
         """
         stream = self.streams.followed(self.id, "cmd_vel_out")
         raw = None if stream is None else stream.raw()
-        # A commanded twist that is older than this is not plotted.
+        # A twist that is older than 2 s does not belong to the row that is plotted now.
         if stream is None or raw is None or now_ns - stream.at_ns > 2 * NS_PER_S:
             return None
         try:
@@ -246,7 +251,7 @@ class Robots:
                 pass
 
     async def _ask(self) -> bool:
-        """Query the values of `about`; return whether the daemon answered."""
+        """Query the values of `about` from the daemon; return True if all of them have arrived."""
         client = self.client
         assert client is not None
         try:

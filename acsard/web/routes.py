@@ -1,7 +1,7 @@
-"""Defines `Route`, a row of the table of paths `app.ROUTES`. This module is pure.
+"""Defines the type of the rows in `app.ROUTES`, the table of all paths of the page's server.
 
-The router, the admission of requests, the rate limits and the OpenAPI document use that table. The
-rows for the keys and services of the bus are created in this module.
+The router, the admission of requests, the rate limits and the OpenAPI document use that table. This
+module also creates the rows for the keys and services of the bus. The module is pure.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ from acsard.host.rate_limits import Rate
 from acsard.web.limits import REQUESTS, STOPS
 
 Handler = Callable[[Any, Any], Awaitable[Any]]
-"""Function that takes the page and the request, and returns the response."""
+"""Coroutine function that takes the `Page` and the request, and returns the answer."""
 
 RECORDINGS: Role = "operator"
-"""The least role that may fetch recordings, and reports of recordings."""
+"""Lowest role that may download recordings, and may draw and download reports of recordings."""
 
 JSON, FORM = "application/json", "application/x-www-form-urlencoded"
 
 PARAMETERS = {"type": "[A-Za-z0-9_]{1,80}"}
-"""Regular expressions of path parameters, by name. A parameter that is not listed matches any text
-without a slash."""
+"""Regular expression of a path parameter, by the parameter's name. A parameter with any other name
+matches any text without a slash."""
 
 _PARAMETER = re.compile(r"{(\w+)}")
 
@@ -52,20 +52,21 @@ class Body(Struct, frozen=True):
     what: str
     """Description for the OpenAPI document."""
     kind: Any = ""
-    """Type of the body, or the name of a bus message in `SCHEMAS`; "" for any value."""
+    """Type of the body, or the name of a bus message in `SCHEMAS`; "" if it may be any value."""
     media: str = JSON
     """Media type of the body; "" for an answer without a body."""
 
 
 class Route(Struct, frozen=True):
-    """One row of the table of routes: an HTTP method on a path."""
+    """A row of the table `app.ROUTES`: a path with an HTTP method, and the rules for its use."""
 
     method: Literal["GET", "POST"]
     """HTTP method. A route for "GET" also accepts HEAD."""
     path: str
-    """The path as OpenAPI writes it: `{name}` is a parameter."""
+    """Path in the notation of OpenAPI, in which `{name}` is a parameter."""
     least: Role | None
-    """Least role that may use the path; None opens it to every client, without a token."""
+    """Lowest role that may use the path. If it is None, every client may use the path, even without
+    a token."""
     handler: Handler
     summary: str = ""
     """Description for the OpenAPI document. If it is "", the document leaves the route out."""
@@ -78,13 +79,14 @@ class Route(Struct, frozen=True):
     """Maps an HTTP status to the body of the answer. An answer with any other status contains a
     `Problem`."""
     rate: Rate = REQUESTS
-    """Limit on the requests of each token, as a rate. All routes with the same rate share one
-    limit."""
+    """Limit on the requests with one token. All routes with the same rate share one limit."""
     waits: bool = False
-    """True if a request beyond `rate` is delayed; False if it is refused. If true, the server
-    carries out a POST immediately and delays only the answer. `rate` then applies to each token in
-    each network separately, so a program cannot use up the limit of a page that uses the same token
-    in another network."""
+    """True if the server delays a request beyond `rate`; False if it refuses the request.
+
+    If it is True, the server performs a POST immediately and delays only the answer. `rate` then
+    applies to each token in each network separately. So a program cannot use up the limit of a page
+    that uses the same token in another network.
+    """
 
     @property
     def parameters(self) -> list[str]:
@@ -92,21 +94,21 @@ class Route(Struct, frozen=True):
 
     @property
     def pattern(self) -> str:
-        """The path as aiohttp's router needs it, with a regular expression for each parameter."""
+        """Path in the notation of aiohttp's router, with a regular expression per parameter."""
         patterns = {name: PARAMETERS.get(name, "[^{}/]+") for name in self.parameters}
         return _PARAMETER.sub(lambda found: f"{{{found[1]}:{patterns[found[1]]}}}", self.path)
 
 
 def asked(topic: Topic) -> bool:
-    """Return whether a program may query the last value of the key that `topic` describes."""
+    """Return whether the page's server has a path for the last value of the key of `topic`."""
     own = topic.direction in ("out", "query") and "<key>" not in topic.key
     return own and topic.query in ROLES
 
 
 def values(handler: Handler) -> Iterator[Route]:
-    """Yield a route `GET /api/<key>` for each key whose last value a program may query.
+    """Yield the route `GET /api/<key>` for each key whose last value a program may query.
 
-    `handler` answers the requests.
+    `handler` is the handler of all these routes.
     """
     for topic in filter(asked, TOPICS):
         path = f"/api/{topic.key.replace('<Type>', '{type}')}"
@@ -115,9 +117,9 @@ def values(handler: Handler) -> Iterator[Route]:
 
 
 def services(handler: Handler) -> Iterator[Route]:
-    """Yield a route `POST /api/srv/<name>` for each service of the robot.
+    """Yield the route `POST /api/srv/<name>` for each service of the robot.
 
-    `handler` answers the requests.
+    `handler` is the handler of all these routes.
     """
     notes = {topic.key: topic.note for topic in TOPICS}
     for key, verb in VERBS.items():

@@ -38,12 +38,13 @@ from acsard.web.viewer import Parts
 TIDY_S, TELL_S = 1.0, 1.0
 
 FIELD_BYTES, FIELDS = 8190, 64
-"""Maximum size of the request line and of a header, bytes; maximum number of headers. A browser
-sends the cookies for all ports of a host in one header, so a lower limit could lock out a
-browser."""
+"""Maximum size of the request line and of each header, bytes (`FIELD_BYTES`), and maximum number of
+headers in a request (`FIELDS`). A browser sends the cookies for all ports of a host in one header,
+so a lower limit on the size could lock out a browser."""
 
 LEAVE_S = 0.3
-"""Time, s, that the server has at its shutdown to send zero velocities for viewers that drive."""
+"""Longest time, s, for which the server at its shutdown sends zero velocities for viewers that
+drive a robot. aiohttp also waits at most this long for running requests."""
 
 
 class Wanted(Struct, frozen=True):
@@ -53,22 +54,23 @@ class Wanted(Struct, frozen=True):
     address: Address
     listen: tuple[Listen, ...]
     tls: str
-    """Directory of the robot's certificate, for HTTPS; "" without one."""
+    """Directory of the robot's certificate, for HTTPS; "" if the robot has no certificate."""
     state: Path
-    """Directory of the access tokens."""
+    """Directory that contains the file with the access tokens."""
     file: str = ""
-    """Configuration file named on the command line, or ""."""
+    """Path of the configuration file from the command line; "" if the command line names none."""
     supervised: bool = False
-    """True if the daemon started this server. Such a server uses a later port if the requested one
-    is taken, and ends when its standard input closes."""
+    """True if the daemon started this server. Such a server uses a later TCP port if the requested
+    port is in use, and ends when its standard input closes."""
 
 
 async def serve(wanted: Wanted, announce: Callable[[Sequence[Listen]], None], log: Log) -> None:
     """Run the page's server until a signal arrives, or until the daemon that started it ends.
 
-    `announce` is called with the addresses at which the server listens. Raises `MendableError`.
+    `announce` is called with the addresses at which the server listens. Raises `MendableError` if
+    the server cannot start, or cannot connect to the bus.
     """
-    # A command or a stop waits at most this long while another thread holds the interpreter.
+    # While another thread holds the interpreter lock, a command or a stop waits for 0.5 ms at most.
     sys.setswitchinterval(0.0005)
     leaving = asyncio.Event()
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
@@ -78,7 +80,8 @@ async def serve(wanted: Wanted, announce: Callable[[Sequence[Listen]], None], lo
         # The daemon, which started this server, must have priority over it.
         os.nice(5)
     counts = Counts()
-    # Record the state of the certificate files before they are read, so no change is missed.
+    # `CertificateFiles` records the state of the files. Create it before the files are read, so
+    # that it notices every later change.
     files = CertificateFiles(*files_in(wanted.tls))
     secure, names = _certified(wanted)
     robots = Robots(wanted.address, lambda: _connected(wanted.address), _about(wanted), counts)
@@ -112,7 +115,10 @@ async def serve(wanted: Wanted, announce: Callable[[Sequence[Listen]], None], lo
 
 
 async def _until(leaving: asyncio.Event, parts: Parts, page: Page, wanted: Wanted) -> None:
-    """Run the background tasks until `leaving` is set or a task ends. Raises the task's error."""
+    """Run the background tasks until `leaving` is set, or until one of the tasks ends.
+
+    If an error ended a task, raise this error.
+    """
     work: list[asyncio.Future[Any]] = [
         asyncio.create_task(leaving.wait()),
         asyncio.create_task(parts.robots.run()),
@@ -144,9 +150,9 @@ async def _tell(counts: Counts, log: Log) -> None:
 
 
 async def _held(leaving: asyncio.Event) -> None:
-    """Send signs of life to the parent process; set `leaving` when the parent ends this process.
+    """Send signs of life to the parent process until cancelled.
 
-    The parent ends this process by closing the standard input.
+    Set `leaving` when the parent closes the standard input of this process.
     """
     parent, loop = Parent(sys.stdin.fileno()), asyncio.get_running_loop()
 
@@ -187,10 +193,10 @@ def _about(wanted: Wanted) -> About:
 
 
 def _certified(wanted: Wanted) -> tuple[ssl.SSLContext | None, set[str]]:
-    """Return a pair: the TLS context, and the host names by which other machines reach this one.
+    """Return a pair: the TLS context, and the names and addresses of this machine for the network.
 
-    If no address uses HTTPS, return None and an empty set. Raises `MendableError` for a bad
-    certificate.
+    If the server listens at no HTTPS address, return None and an empty set. Raises `MendableError`
+    if the certificate is not usable.
     """
     if not any(one.secure for one in wanted.listen):
         return None, set()
@@ -206,7 +212,10 @@ def _load(context: ssl.SSLContext, directory: str) -> None:
 
 
 def _names(directory: str) -> set[str]:
-    """Return the names of this machine and the names in its certificate, without loopback names."""
+    """Return this machine's names, and the names and addresses in its certificate, in lower case.
+
+    Loopback names and addresses are left out. `directory` contains the certificate.
+    """
     names = {socket.gethostname().lower(), own_name(), *map(str.lower, names_in(directory))}
     return {one for one in names if one != "localhost" and not is_loopback(one)}
 
@@ -214,16 +223,16 @@ def _names(directory: str) -> set[str]:
 async def _renew(
     context: ssl.SSLContext, names: set[str], files: CertificateFiles, directory: str, log: Log
 ) -> None:
-    """When the certificate files change, load them into `context`, and add their names to `names`.
+    """Load the certificate into `context` whenever its files change, until cancelled.
 
-    Open connections keep the old certificate. `files` detects the changes, and `directory` is the
-    directory of the files.
+    Also add the host names in the new certificate to `names`. Open connections keep the old
+    certificate.
     """
     while True:
         await asyncio.sleep(TIDY_S)
         if not files.renewed():
             continue
-        # If the files change while they are read, the next round reads them again.
+        # If the files are replaced while they are read, a later round reads them again.
         with suppress(OSError, ValueError):
             _load(context, directory)
             names |= _names(directory)

@@ -1,10 +1,11 @@
 """The messages of `/ws`, in both directions. This module is pure.
 
-Each message is one JSON object. An incoming message is called a frame. It contains exactly one of
-the fields in `KINDS` (`subscribe`, `cmd`, `call`, ...), which gives its kind. A frame with none
-or several of these fields, or with an unknown field, is refused as a whole. An outgoing message is
-identified by its first field. `socket_sender.py` builds the messages with the values of subscribed
-keys, because these values are JSON already.
+Each message is one JSON object. A message from a client is called a frame. Exactly one of the
+fields in `KINDS` (`subscribe`, `cmd`, `call`, ...) must be in a frame, and gives its kind. A frame
+with none or several of these fields, or with an unknown field, is refused as a whole.
+
+The first field of a message to a client gives its kind. The messages with the values of subscribed
+keys are built in `socket_sender.py`, because these values are JSON already.
 """
 
 from __future__ import annotations
@@ -21,18 +22,19 @@ from acsard.core.values import AcsardError, Role
 from acsard.web.last_minute import Plotted
 
 MAX_BYTES = 65536
-"""Maximum size of a message from a client, bytes. A command has about a hundred."""
+"""Maximum size of a message from a client, bytes. A command has about a hundred bytes."""
 
 MAX_RATE, USUAL_RATE = 50.0, 10.0
-"""Maximum and default rate at which the messages of a subscribed key are sent, per second."""
+"""Rates at which the server sends the values of a subscribed key, Hz: the maximum (`MAX_RATE`), and
+the default (`USUAL_RATE`)."""
 
 LATEST_STAMP_MS = MOST // 1_000_000 - 86_400_000.0
-"""Largest stamp that a command may have, ms since 1970: one day before the largest one that the
-daemon accepts. When a client disconnects, the server sends a zero velocity with a later stamp than
-the client's last command, and the daemon must accept it."""
+"""Limit below which the stamp of a command must be, ms since 1970: one day before the largest stamp
+that the daemon accepts. When a client disconnects, the server sends a zero velocity whose stamp is
+later than that of the client's last command, and the daemon must accept this stamp too."""
 
 PROGRAM = "app"
-"""Command source of a command that does not name one. The page in the browser names `teleop`."""
+"""Command source of a command that names no source. The page in the browser names `teleop`."""
 
 Short = Annotated[str, Meta(max_length=80)]
 Device = Annotated[str, Meta(max_length=200)]
@@ -41,7 +43,7 @@ Device = Annotated[str, Meta(max_length=200)]
 class FrameError(AcsardError):
     """A message of a client is not valid.
 
-    `about` is the kind that the client meant, or "message" if the kind is unclear.
+    `about` is the kind of the message (see `KINDS`), or "message" if the kind is unclear.
     """
 
     def __init__(self, about: str, text: str) -> None:
@@ -53,18 +55,18 @@ class _Frame(Struct, frozen=True, forbid_unknown_fields=True):
     """Base class of the messages that a client sends. Unknown fields are not allowed."""
 
     least: ClassVar[Role] = "viewer"
-    """Least role that may send the message. A call needs the role of its service in addition."""
+    """Lowest role that may send the message. A `Call` also requires the role of its service."""
 
     @property
     def kind(self) -> str:
-        """Name of the field that identifies this kind of message. It is the first field."""
+        """Kind of this message: the name of its first field."""
         return self.__struct_fields__[0]
 
 
 class Subscribe(_Frame, frozen=True):
     """Subscribe to a key of a robot.
 
-    From then on, the server sends new messages of this key, at most `rate` messages per second.
+    The server then sends each new value of this key, but at most `rate` values per second.
     """
 
     subscribe: Short
@@ -87,7 +89,7 @@ class Wish(_Frame, frozen=True):
 
 
 class Command(_Frame, frozen=True):
-    """Drive at this velocity.
+    """Drive at the velocity `cmd`.
 
     `stamp` is the time of the command on the sender's own clock, ms since 1970.
     """
@@ -96,7 +98,7 @@ class Command(_Frame, frozen=True):
     cmd: Wish
     stamp: float
     steady: bool = False
-    """True if the clock of `stamp` is never adjusted, like the browser's `performance.now()`."""
+    """True if `stamp` is from a clock that is never adjusted, such as `performance.now()`."""
     source: Short = PROGRAM
     """Name of one of the robot's command sources."""
 
@@ -107,7 +109,7 @@ class Command(_Frame, frozen=True):
 
     @property
     def moves(self) -> bool:
-        """Whether the command sets a speed other than zero."""
+        """Whether the linear or the angular velocity of the command is not zero."""
         return self.cmd.linear_x != 0.0 or self.cmd.angular_z != 0.0
 
 
@@ -121,15 +123,16 @@ class Call(_Frame, frozen=True):
 
 
 class Ping(_Frame, frozen=True):
-    """Ask the server to send a pong with the number of this ping."""
+    """Request a pong, which contains the number `ping` and the time of the server."""
 
     ping: float
 
 
 class Begin(_Frame, frozen=True):
-    """Check the board at `port`, or calibrate with `method`; "" selects the default method."""
+    """Start a check of the board at `port`, or a calibration with `method` ("" for the default)."""
 
-    least: ClassVar[Role] = "maintainer"  # both turn wheels and write configuration files
+    # A check and a calibration turn the wheels and write configuration files.
+    least: ClassVar[Role] = "maintainer"
     begin: Literal["check", "calibrate"]
     port: Device = ""
     method: Short = ""
@@ -138,14 +141,17 @@ class Begin(_Frame, frozen=True):
 
 
 class Reply(_Frame, frozen=True):
-    """Answer the question whose number is `reply`. If `value` is null, it selects the default."""
+    """Answer the question number `reply`. If `value` is null, the default is the answer."""
 
     reply: Annotated[int, Meta(ge=0, le=1 << 31)]
     value: float | Short | None = None
 
 
 class Press(_Frame, frozen=True):
-    """Press a key in the running check or calibration ("key"), or interrupt it ("leave")."""
+    """Control the running check or calibration.
+
+    "key" presses a key in the check or calibration, and "leave" interrupts it.
+    """
 
     press: Literal["key", "leave"]
 
@@ -153,7 +159,8 @@ class Press(_Frame, frozen=True):
 Frame = Subscribe | Unsubscribe | Command | Call | Ping | Begin | Reply | Press
 
 KINDS: dict[str, type[Frame]] = {kind.__struct_fields__[0]: kind for kind in get_args(Frame)}
-"""Maps the name of the field that identifies a message of a client to the type of the message."""
+"""Maps each kind of message from a client to the type of the message. The kind is the name of the
+first field."""
 
 _heads = msgspec.json.Decoder(dict[str, msgspec.Raw])
 _decoders: dict[str, msgspec.json.Decoder[Frame]] = {
@@ -177,7 +184,7 @@ def decode(text: str) -> Frame:
 
 
 def _require(frame: Frame) -> None:
-    # JSON has no NaN, and msgspec refuses a number that is too large to be finite.
+    # All numbers are finite here: JSON has no NaN, and msgspec refuses numbers that are too large.
     if isinstance(frame, Command) and not 0.0 < frame.stamp < LATEST_STAMP_MS:
         raise FrameError("cmd", "`stamp` must be the time of the sender's clock in ms since 1970")
     if isinstance(frame, Subscribe) and not 0.0 < frame.rate <= MAX_RATE:
@@ -192,7 +199,7 @@ Point = tuple[float, float]
 
 
 class Limits(Struct, frozen=True):
-    """Highest speeds: m/s and rad/s."""
+    """The robot's highest speeds: `linear` in m/s, `angular` in rad/s."""
 
     linear: float
     angular: float
@@ -205,16 +212,16 @@ class Greeting(Struct, frozen=True):
     version: str
     role: Role
     sender: str
-    """Public name of this viewer. It is the value of `state.sender` while the viewer drives."""
+    """Public name of this viewer. While the viewer drives, `state.sender` has this value."""
     limits: Limits
     simulated: bool
     state_rate: float
     """Rate of the key `state`, Hz."""
     barred: Mapping[str, str]
-    """The actions that the client's role does not allow, each with the reason in words. An action
-    is the name of a service, "drive", "recordings" or "begin" (a check or calibration)."""
+    """Maps each action that the client's role does not allow to the reason in words. An action is
+    the name of a service, "drive", "recordings" or "begin" (a check or calibration)."""
     camera: bool
-    """True if a camera is configured. `GET /api/camera` returns its pictures."""
+    """True if a camera is configured. The path `/api/camera` then returns its pictures."""
 
 
 class Hello(Struct, frozen=True):
@@ -224,7 +231,7 @@ class Hello(Struct, frozen=True):
 
 
 class DrivenPath(Struct, frozen=True):
-    """Points (x, y) of the robot's path in the last ten minutes, m, odom frame, oldest first."""
+    """Points (x, y) of the robot's path in the last ten minutes: m, odom frame, oldest first."""
 
     path: Sequence[Point]
     truth: Sequence[Point]
@@ -232,13 +239,13 @@ class DrivenPath(Struct, frozen=True):
 
 
 class LastMinute(Struct, frozen=True):
-    """Plotted values of the last minute."""
+    """The values that the page plots for the last minute."""
 
     minute: Plotted
 
 
 class Answer(Struct, frozen=True):
-    """Answer to a call. `answer` is the id of the call."""
+    """Answer to a call. `answer` is the id of the call, and `ok` is true if the call succeeded."""
 
     answer: int | str
     ok: bool
@@ -250,35 +257,35 @@ class Row(Struct, frozen=True):
 
     robot: str
     mode: str | None
-    """Mode as in `state`. It is "gone" after the daemon has ended, and None while the robot is
-    silent."""
+    """Mode of the robot, as in `state`. It is "gone" after the daemon has ended, and None while the
+    robot is silent."""
     reason: str
     speed: float | None
     """Measured forward speed, m/s."""
     link: str
     age: float | None
-    """Seconds since the last state arrived; None before the first state."""
+    """Time since the last state of the robot arrived, s; None before the first state."""
     version: str
     """Version of the daemon; "" until it is reported."""
     warnings: Sequence[str] = ()
     """Warnings of the robot, in words. A robot with warnings may still be ready."""
     place: Sequence[float] | None = None
-    """x and y in m, and yaw in rad, in the odom frame; None while the robot is silent or gone."""
+    """Pose in the odom frame: x and y, m, and yaw, rad. None while the robot is silent or gone."""
     battery: str = ""
     """State of charge or, if it is unknown, the voltage, in words; "" if neither is known."""
 
 
 class Rows(Struct, frozen=True):
-    """All known robots of the fleet."""
+    """List of all robots that this server has found on the bus."""
 
     fleet: Sequence[Row]
     note: str
-    """Reason why robots may be missing, in words. It is "" if the page's server is connected to a
-    router, and therefore sees all robots of this router."""
+    """Reason why the list of robots may be incomplete, in words. It is "" if the page's server is
+    connected to a router, because the list then contains all robots of this router."""
 
 
 class Pong(Struct, frozen=True):
-    """The number of a ping, and the time of this server in ms since 1970."""
+    """Answer to a ping: the number of the ping, and the server's time `now` in ms since 1970."""
 
     pong: float
     now: float
@@ -298,9 +305,10 @@ class Gone(Struct, frozen=True):
 
 
 class Running(Struct, frozen=True, omit_defaults=True):
-    """Name of the running check or calibration, or "" if neither runs.
+    """Report that a check or calibration is running, or that none is running.
 
-    `by` is the name of the user who started it. `yours` is true if this viewer started it.
+    `running` is "check" or "calibrate", or "" if none is running. `by` is the name of the user who
+    started the check or calibration. `yours` is true if this WebSocket has started it.
     """
 
     running: str
@@ -309,7 +317,10 @@ class Running(Struct, frozen=True, omit_defaults=True):
 
 
 class Ended(Struct, frozen=True):
-    """Report that a check or calibration has ended: exit code, its meaning, and error text."""
+    """Report that a check or calibration has ended.
+
+    `ended` is the exit code, `meaning` is its meaning in words, and `text` is the error text.
+    """
 
     ended: int
     meaning: str

@@ -1,6 +1,6 @@
-"""The outgoing side of one WebSocket: its subscribed keys, and the messages that it sends.
+"""Sends messages and the values of subscribed keys to the client of one WebSocket.
 
-While the client does not read, new values of the keys are skipped instead of queued.
+While the client does not read, the server skips new values of the keys instead of queueing them.
 """
 
 from __future__ import annotations
@@ -28,17 +28,17 @@ from acsard.web.socket_messages import Refused, Subscribe, Unsubscribe
 from acsard.web.streams import KEYS, UNREADY, Stream
 
 REPORTS = Rate(1.0)
-"""Limit on the reports with which the server tells a client about its refused messages, per second.
-It applies to each kind of message and each reason separately."""
+"""Limit on the reports about refused messages that one client receives, as a rate per second. It
+applies to each kind of message and each reason separately."""
 
 
 class Following:
-    """A key to which the client has subscribed, and the time at which to send its next value."""
+    """A key to which the client is subscribed, and the time at which to send its next value."""
 
     def __init__(self, robot: str, name: str, own: str, period: float) -> None:
-        """Store a subscription to the key `name` of `robot`, with at most one value per `period` s.
+        """Create a subscription to the key `name` of the robot with the id `robot`.
 
-        `own` is the id of the page's own robot.
+        The client gets at most one value per `period` s. `own` is the id of the page's own robot.
         """
         self.robot, self.name, self.period = robot, name, period
         told = {"key": name} if robot == own else {"key": name, "robot": robot}
@@ -54,12 +54,15 @@ class Outgoing:
     def __init__(
         self, socket: web.WebSocketResponse, request: web.Request, counts: Counts, origin: str
     ) -> None:
-        """Store the connection; `origin` is the client's address and name for the log."""
+        """Create an instance for the WebSocket `socket`, which the request `request` has opened.
+
+        `origin` is the client's address and name for the log.
+        """
         self._socket, self._transport, self._counts = socket, request.transport, counts
         self._origin = origin
         self.following: dict[tuple[str, str], Following] = {}
         """Subscribed keys by (robot, key)."""
-        # If more than 200 messages wait, the oldest ones are dropped.
+        # The queue is limited, because the client may not read.
         self._out: deque[bytes] = deque(maxlen=200)
         self._pong: bytes | None = None
         """Payload of the newest ping that is not answered yet, or None."""
@@ -68,7 +71,7 @@ class Outgoing:
         self._closing = False
 
     def say(self, message: object) -> None:
-        """Queue a message, which is sent as soon as the client has read the earlier data."""
+        """Queue a message. If more than 200 messages wait, the oldest message is dropped."""
         self._out.append(msgspec.json.encode(message))
         self._news.set()
 
@@ -76,10 +79,10 @@ class Outgoing:
         self._news.set()
 
     def refuse(self, what: str, reason: Reason, text: str) -> None:
-        """Count a refused message, and report the reason to the client within the limit `REPORTS`.
+        """Count a refused message, and report the refusal to the client.
 
-        `what` is the kind of the message, `reason` is the reason under which it is counted, and
-        `text` is the reason in words for the client.
+        Reports beyond the limit `REPORTS` are left out. `what` is the kind of the refused message,
+        `reason` is the reason under which it is counted, and `text` is the reason in words.
         """
         self._counts.refuse(reason, self._origin)
         if self._reports.take(f"{what} {reason}", clock.mono_ns()):
@@ -88,8 +91,8 @@ class Outgoing:
     async def pump(self, look_around: Callable[[float], float]) -> None:
         """Send messages until the task is cancelled or the connection closes.
 
-        After each round of sending, `look_around(now)` is called. It returns the time at which it
-        must be called again. Both times are in s on the event loop's clock.
+        After each round of sending, call `look_around` with the present time. It returns the time
+        of its next call. Both times are in s on the event loop's clock.
         """
         loop = asyncio.get_running_loop()
         try:
@@ -128,10 +131,10 @@ class Outgoing:
         cut(self._transport)
 
     def pong(self, data: bytes) -> None:
-        """Queue the answer to a ping; it replaces an unsent answer to an earlier ping.
+        """Queue the answer to a ping with the payload `data`.
 
-        `data` is the payload of the ping. The WebSocket protocol allows the replacement. Without
-        it, a client that sends pings and does not read the answers could fill the memory.
+        The answer replaces an unsent answer to an earlier ping, as the WebSocket protocol allows.
+        Otherwise, a client that sends pings and does not read the answers could fill the memory.
         """
         self._pong = data
         self._news.set()
@@ -182,8 +185,12 @@ processor time from the commands."""
 class Keys:
     """The subscriptions of one WebSocket.
 
-    `holder` is the name under which the limits count the subscriptions: the client's token, or the
-    name of a client without a token.
+    Args:
+        out: the outgoing side of the WebSocket, which stores its subscriptions.
+        robots: the connection to the bus.
+        start: function that starts a task, which ends with the WebSocket.
+        holder: the name under which the limits count the subscriptions: the client's token, or the
+            name of a client without a token.
     """
 
     def __init__(
@@ -196,7 +203,10 @@ class Keys:
         self._out, self._robots, self._start, self._holder = out, robots, start, holder
 
     def subscribe(self, frame: Subscribe) -> None:
-        """Subscribe to a key or change its rate, or tell the client why this is refused."""
+        """Subscribe to a key, or change the rate of a key that is subscribed already.
+
+        If the message is not valid or exceeds a limit, report the reason to the client instead.
+        """
         robot, key = frame.robot or self._robots.id, frame.subscribe
         try:
             require_id(robot)
@@ -235,7 +245,7 @@ class Keys:
 
     def unsubscribe(self, frame: Unsubscribe) -> None:
         name = frame.robot or self._robots.id, frame.unsubscribe
-        # Remove the key now, because the client may subscribe again in the next message.
+        # Remove the key immediately, because the client's next message may subscribe to it again.
         one = self._out.following.pop(name, None)
         if one is not None:
             self._leave(one)

@@ -1,7 +1,7 @@
-"""Keeps the newest message of each followed key, as JSON for all viewers of the page.
+"""Keeps the newest message of each subscribed key, as JSON for all viewers of the page.
 
-The daemon sends msgpack. Zenoh's thread only stores a message. It is converted to JSON when the
-first viewer needs it.
+The daemon sends msgpack. Zenoh's thread only stores each message. A message is converted to JSON
+when the first viewer needs it, and only once for all viewers.
 """
 
 from __future__ import annotations
@@ -27,13 +27,14 @@ from acsard.web.limits import STREAMS, STREAMS_OF_ONE, Shares
 Take = Callable[[zenoh.Sample], None]
 
 KEYS = frozenset(topic.key for topic in FOLLOWED)
-"""Keys that a viewer may follow."""
+"""Keys of a robot to which a viewer may subscribe."""
 
 DECLARE_S = 3.0
 
 STATE = "state"
-"""Key of a robot's state. The server queries it only for the page's own robot. For another robot,
-a router's storage would answer with an old state even if that robot has been off for a week."""
+"""Key of a robot's state. The server queries this key only for the page's own robot. For another
+robot, a router's storage could answer with an old state, even a week after the robot was switched
+off."""
 
 UNREADY = (TimeoutError, zenoh.ZError, UsageError)
 """Errors that mean that the bus is stuck or the session is closed. A later attempt may succeed."""
@@ -52,7 +53,7 @@ class Stream:
 
     @property
     def number(self) -> int:
-        """Number of the newest message, counted from 1; 0 before the first message."""
+        """Number of messages that have arrived. It is also the number of the newest message."""
         return self._newest[0]
 
     @property
@@ -65,23 +66,29 @@ class Stream:
             self._newest = (self._newest[0] + 1, sample, clock.steady_ns())
 
     def answered(self, sample: zenoh.Sample) -> None:
-        """Store the answer to a query as the newest message.
+        """Store the answer to a query as the first message.
 
-        If a published message has arrived already, ignore the answer, because it is older.
+        Ignore the answer if any message has already arrived, because that message may be newer.
         """
         with self._taking:
             if not self._newest[0]:
                 self._newest = (1, sample, clock.steady_ns())
 
     def value(self) -> tuple[int, bytes, float]:
-        """Return a triple for the newest message: its number, its JSON text, and its age in ms."""
+        """Return a triple for the newest message: its number, its JSON text, and its age in ms.
+
+        Before the first message, the number is 0 and the JSON text is null.
+        """
         number, sample, at_ns = self._newest
         if sample is not None and self._text[0] != number:
             self._text = number, as_json(*encoded(sample))
         return number, self._text[1], max(0.0, (clock.steady_ns() - at_ns) / 1e6)
 
     def raw(self) -> tuple[str, bytes] | None:
-        """Return the newest message as the pair (encoding, payload), or None if there is none."""
+        """Return the newest message as the pair (encoding, payload).
+
+        Return None before the first message.
+        """
         sample = self._newest[1]
         return None if sample is None else encoded(sample)
 
@@ -89,20 +96,22 @@ class Stream:
 class Streams:
     """Subscriptions to keys of robots.
 
-    All users of a key share one subscription, which ends when the last user leaves.
+    All users of a key share one subscription on the bus, which ends when the last user leaves.
     """
 
     def __init__(self) -> None:
         self._streams: dict[tuple[str, str], Stream] = {}
         self._ending: set[asyncio.Task[None]] = set()
         self.shares = Shares(STREAMS, STREAMS_OF_ONE)
-        """Limits the subscriptions to keys of other robots. A caller must acquire a share before it
-        calls `follow()` for such a key, and release the share when it calls `leave()`."""
+        """Limits on the subscriptions to keys of other robots. For such a key, the caller must call
+        `shares.enter()` before each `follow()`, and `shares.leave()` together with each `leave()`.
+        """
 
     async def follow(self, client: Client, robot: str, key: str) -> Stream:
-        """Return the stream of a robot's key, and subscribe to the key if it has no user yet.
+        """Return the stream of a robot's key. Subscribe to the key if it has no user yet.
 
-        Call `leave` after use. Raises one of the errors in `UNREADY` if the bus is not ready.
+        The caller must call `leave` after use. `client` is this server's bus client, and `robot` is
+        the id of the robot. Raises one of the errors in `UNREADY` if the bus is stuck or closed.
         """
         name = robot, key
         stream = self._streams.get(name)
@@ -119,7 +128,7 @@ class Streams:
         return stream
 
     def followed(self, robot: str, key: str) -> Stream | None:
-        """Return the stream of a robot's key, or None if no user follows the key."""
+        """Return the stream of a robot's key, or None if the key has no user."""
         return self._streams.get((robot, key))
 
     def leave(self, robot: str, key: str) -> None:
@@ -170,7 +179,7 @@ async def _ended(subscriber: Any) -> None:
 
 
 def as_json(encoding: str, payload: bytes) -> bytes:
-    """Return a message as JSON, or the JSON value null if the message cannot be decoded."""
+    """Return a JSON or msgpack message as JSON, or as `null` if it cannot be decoded."""
     try:
         known = detect(encoding, payload) == "json"
         told = msgspec.json.decode(payload) if known else msgspec.msgpack.decode(payload)

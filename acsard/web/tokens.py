@@ -1,7 +1,7 @@
-"""Access tokens for clients on other machines.
+"""Creates, stores and checks the access tokens of clients on other machines.
 
-Only a hash of each token is stored, until the token expires or is revoked. A token is 32 random
-bytes, so nobody can compute it from its SHA-256 hash.
+The token file contains the SHA-256 hash of each token, and not the token itself. A token has 32
+random bytes, so nobody can compute a token from its hash.
 """
 
 from __future__ import annotations
@@ -50,29 +50,36 @@ class Token(Struct, frozen=True):
 
 
 class Vault:
-    """The access tokens of one robot. Their file also contains those of the user's other robots."""
+    """The access tokens of one robot. The token file also contains tokens of other robots."""
 
     def __init__(self, directory: Path, robot: str) -> None:
         self.path, self.robot = directory / FILE, robot
         self._read: tuple[tuple[int, int] | None, list[Token]] = None, []
-        """Two values in one tuple, because several threads replace them: the stamp of the token
-        file when it was last read (modification time, ns, and inode number), and all tokens in
-        it."""
+        """Pair: the token file's stamp (modification time, ns, and inode number) when the file was
+        last read, and all tokens in the file. They are in one tuple, because several threads
+        replace them."""
 
     def known(self, text: str) -> Who | None:
         """Return the owner of the token `text`, or None if the token is not valid.
 
-        This call does not read the token file, so it does not notice a recent change of the file.
+        This method does not read the token file. It uses the tokens that the last call of another
+        method has read.
         """
         return owner_in(self._own(self._read[1]), text)
 
     def left_s(self, digest: str) -> int:
-        """Return the time until the token with this digest expires, s; 0 for an unknown token."""
+        """Return the time until the token with this digest expires, s.
+
+        Return 0 if the token has expired or is unknown.
+        """
         ends = [one.ends for one in self.all() if one.digest == digest]
         return max(0, int(max(ends, default=0) - time.time()))
 
     def all(self) -> list[Token]:
-        """Return this robot's tokens, including expired ones; none if the file cannot be read."""
+        """Return this robot's tokens, including expired tokens.
+
+        Return [] if the token file does not exist or cannot be read.
+        """
         return self._own(self._shared())
 
     def _own(self, tokens: list[Token]) -> list[Token]:
@@ -98,9 +105,10 @@ class Vault:
         return frozenset(one.digest for one in self.all() if one.ends > now_s)
 
     def unknown_to(self, service: Path = SERVICE) -> str:
-        """Return a warning if `acsard web` as a service on this machine reads another token file.
+        """Return a warning if the service `acsard-web` of this machine reads another token file.
 
-        `service` is the state directory of the service. Return "" if there is nothing to warn of.
+        Return "" if the service reads this token file or is not installed. `service` is the state
+        directory of the service.
         """
         if self.path.parent == service or not os.path.lexists(service):
             return ""
@@ -112,8 +120,9 @@ class Vault:
     def invite(self, role: Role, name: str, days: int, hours: int = 0) -> tuple[str, Token]:
         """Create a token that expires after `days` plus `hours`; return the pair (text, record).
 
-        The text is the token itself. It is not stored, so the caller must show it to the user.
-        Raises `UsageError` if the name is taken or if the robot has `MOST` tokens already.
+        The text is the token itself. The text is not stored, so the caller must show it to the
+        user. Also delete the expired tokens of all robots. Raises `UsageError` if a token of this
+        robot has the same name, or if the robot has `MOST` tokens already.
         """
         with self._changing() as tokens:
             now_s = int(time.time())
@@ -135,9 +144,9 @@ class Vault:
         return text, token
 
     def revoke(self, name: str) -> None:
-        """Delete the token with this name; the token is not valid from then on.
+        """Delete the robot's token with this name, so that the token is not valid any more.
 
-        Raises `UsageError` if it does not exist.
+        Raises `UsageError` if the robot has no token with this name.
         """
         with self._changing() as tokens:
             ours = [one for one in tokens if one.robot == self.robot]
@@ -153,8 +162,8 @@ class Vault:
     def _changing(self) -> Iterator[list[Token]]:
         """Lock the token file during the `with` block, and yield the list of all robots' tokens.
 
-        The block may change the list. At its end, the list is written to the file, unless an
-        exception occurred.
+        The block may change the list. At the end of the block, write the list to the file, unless
+        the block has raised an exception.
         """
         directory = self.path.parent
         try:
@@ -194,8 +203,9 @@ class Vault:
 def place() -> Path:
     """Return the directory of the token file.
 
-    It is the state directory of the systemd service if this process is that service, or if it runs
-    as root and the directory exists. Otherwise, it is in the home directory of the user.
+    If this process is a systemd service, return the state directory of the service. If it runs as
+    root and `SERVICE` exists, return `SERVICE`. Otherwise, return a directory for the user's state,
+    usually in the home directory.
     """
     if "STATE_DIRECTORY" in os.environ:
         return Path(os.environ["STATE_DIRECTORY"].partition(":")[0])
@@ -206,7 +216,10 @@ def place() -> Path:
 
 
 def owner_in(tokens: Sequence[Token], text: str) -> Who | None:
-    """Return the owner of the token `text`, or None if it has expired or is not in `tokens`."""
+    """Return the owner of the token with the text `text`.
+
+    Return None if the token has expired, or if `tokens` does not contain it.
+    """
     if not text or len(text) > 200:
         return None
     digest, found = _digest(text), None

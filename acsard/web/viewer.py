@@ -1,7 +1,7 @@
 """Serves one WebSocket of a page or a program. To the daemon, each WebSocket is one sender.
 
-Incoming messages never wait for outgoing ones, so a client that does not read can still stop the
-robot.
+Incoming messages never wait for outgoing messages. So a client that reads nothing can still stop
+the robot.
 """
 
 from __future__ import annotations
@@ -54,25 +54,26 @@ ACTIONS: dict[str, Role] = {
     "recordings": RECORDINGS,
     "begin": Begin.least,
 }
-"""Maps each action to the least role that may use it. The page disables the controls of the actions
-that its user may not use."""
+"""Maps the name of each action to the lowest role that may use the action. The page disables the
+controls of those actions that its user may not use."""
 
 HEARTBEAT_S = 10.0
-"""Interval of the pings, s. The connection ends if a ping is not answered within half of this
-time."""
+"""Interval of the pings that the server sends, s. If a client does not answer a ping within half of
+this time, the connection ends."""
 
 CALLS_AT_ONCE = 8
 
 FLEET, FLEET_S, FLEET_FIRST_S = "fleet", 1.0, 0.2
-"""Name to which a client subscribes for the list of all robots; interval of the lists, s; delay of
-the first list, s. Without the delay, the first list would be empty."""
+"""`FLEET` is the name to which a client subscribes for the list of all robots. The server sends the
+list every `FLEET_S` s, and for the first time after `FLEET_FIRST_S` s. Without this delay, the
+first list would be empty."""
 
 
 class ViewerCommands:
-    """Puts the newest velocity command of each viewer on the bus.
+    """Sends the newest velocity command of each viewer on the bus.
 
-    A command is sent once, with the stamp of its sender, or it is dropped. The server itself
-    creates only one kind of command: a zero velocity for a viewer that was driving and has
+    Each command is sent at most once, with the stamp that its viewer has given to it. The server
+    itself creates only one kind of command: a zero velocity for a viewer that was driving and has
     disconnected.
     """
 
@@ -80,18 +81,23 @@ class ViewerCommands:
         self._client, self._counts = client, counts
         self._rates = Buckets(COMMANDS)
         self.outbox = Outbox(partial(counts.add, "commands_dropped"))
-        """Queue of commands, with the thread that sends them. If the thread dies, the server
-        must exit, because it could not stop the robot of a viewer that disconnects."""
+        """Queue of commands, with the thread that sends them. If an error ends the thread, the
+        server must exit. Otherwise it could not stop the robot when a viewer disconnects."""
 
     def give(
         self, owner: str, source: str, commander: Commander, sender: Sender, wish: Wish
     ) -> bool:
-        """Queue the command `wish`; it replaces an unsent command of the same commander.
+        """Queue a command and return True. It replaces an unsent command of the same commander.
 
-        `owner` is the client's token, or the public name of a viewer on the robot itself. `source`
-        is the command source. `commander` holds the viewer's commands for this source, and `sender`
-        signs them. If the owner exceeds the rate limit `COMMANDS`, return False and queue nothing.
-        However, a zero that follows a speed is always queued.
+        If the owner exceeds the rate limit `COMMANDS`, queue nothing and return False. However, a
+        zero after a nonzero command is always queued.
+
+        Args:
+            owner: the client's token, or the public name of a viewer on the robot itself.
+            source: the command source.
+            commander: the viewer's commander for this source.
+            sender: the signer of the viewer's commands.
+            wish: the command.
         """
         ends = wish.twist == REST and commander.moves
         if not self._rates.take(owner, clock.mono_ns()) and not ends:
@@ -120,7 +126,7 @@ class ViewerCommands:
 
 
 class Parts:
-    """The parts of the server that all viewers and the page share."""
+    """The objects that `Page` and all viewers share, such as the connection to the daemon."""
 
     def __init__(self, robots: Robots, guide: Guide, counts: Counts) -> None:
         self.robots, self.guide, self.counts = robots, guide, counts
@@ -129,7 +135,7 @@ class Parts:
 
 
 class Viewer:
-    """One client that is connected by a WebSocket: a page in a browser, or a program."""
+    """A client that is connected by a WebSocket: a page in a browser, or a program."""
 
     def __init__(
         self,
@@ -146,8 +152,8 @@ class Viewer:
         whole = sender_id(who.name)
         self._sender, self._commanders = Sender(whole), dict[str, Commander]()
         self.sender = public_name(whole, parts.robots.certificate)
-        """Public name of this client, as in `state.sender`. It does not reveal the secret sender
-        id."""
+        """Public name of this client, which `state.sender` contains while the client drives. It
+        does not reveal the secret sender id."""
         self._socket = socket
         self._bucket = Bucket(MESSAGES)
         self._overruns = self._calling = 0
@@ -232,8 +238,7 @@ class Viewer:
     def _ping(self, message: aiohttp.WSMessage) -> None:
         """Answer a ping of the WebSocket protocol, and ignore a pong.
 
-        Both count toward the rate limit `MESSAGES`, as other messages do. If the client exceeds the
-        limit too often, cut the connection.
+        If pings, pongs and other messages exceed the rate limit too often, cut the connection.
         """
         if not self._bucket.take(clock.mono_ns()):
             self._overruns += 1
@@ -279,8 +284,9 @@ class Viewer:
             return
         stamp_ns = frame.stamp_ns
         if stamp_ns == self._stamp_ns and not frame.moves:
-            # Some clocks do not advance for a while. A zero command with the stamp of the last
-            # command is still a genuine release, so it gets a later stamp.
+            # The clock of some clients advances in coarse steps. So a zero with the stamp of the
+            # last command may still mean that the user has released the control. Accept it with a
+            # later stamp.
             stamp_ns += 1
         if stamp_ns <= self._stamp_ns:
             self._out.refuse(
@@ -303,8 +309,7 @@ class Viewer:
 
     def _call(self, frame: Call) -> None:
         if frame.call == "stop":
-            # Stops are in a separate set of tasks, which are not cancelled when the connection
-            # ends.
+            # Keep stops in a separate set of tasks, which continue when the connection ends.
             self._start(self._answer(frame), self._stops)
         else:
             if self._calling >= CALLS_AT_ONCE:
@@ -316,10 +321,9 @@ class Viewer:
             self._start(self._answer(frame))
 
     def _refuse(self, frame: Frame, text: str) -> None:
-        """Refuse a message because it exceeds a limit.
+        """Refuse a message because it exceeds a rate limit. `text` is the reason in words.
 
-        If the message is a call, send the reason as the answer, because the client waits for an
-        answer.
+        The client waits for an answer to a call, so send the reason as that answer.
         """
         if isinstance(frame, Call):
             self._counts.refuse("too_fast", self.who.origin)
@@ -375,10 +379,10 @@ class Viewer:
         self._out.say(socket_messages.Hello(greeting))
 
     def _look_around(self, now: float) -> float:
-        """Tell the client about changes of the connection to the daemon and of `About`.
+        """Tell the client if the daemon has become unreachable, or if the facts in `About` changed.
 
-        Also send the list of robots when it is due. Return the time at which this method must be
-        called again. This time and `now` are in s on the event loop's clock.
+        Also send the list of robots if it is due. Return the time at which the caller must call
+        this method again. This time and `now` are in s on the event loop's clock.
         """
         if self._robots.gone != self._gone:
             self._gone = self._robots.gone

@@ -6,8 +6,8 @@ until the robot has driven 100 m. For the heading error, it makes all turns left
 the drive until the robot has turned by 360 deg.
 
 The errors of stamps, quantization, gaps and contradicting wheels are measured with feedback lines.
-The error of the track is measured with a gyro. The noise of the gyro follows from the variance of
-the heading that the odometry publishes. All other errors are taken from the settings in
+The error of the track is measured with a gyro. The noise of the gyro is computed from the variance
+of the heading that the odometry publishes. All other errors are taken from the settings in
 `[odometry]`.
 """
 
@@ -33,28 +33,38 @@ from acsard.core.values import REST, PoseCovariance
 Cause = Literal["time", "quantization", "gaps", "slip", "parameters", "gyro"]
 
 Basis = Literal["measured", "settings", "unknown"]
-"""How the size of an error is known: measured, from the settings in `[odometry]`, or not at all."""
+"""Basis on which the size of an error is known.
+
+The size is measured, or taken from the settings in `[odometry]`, or unknown.
+"""
 
 METRES = 100.0
-"""Distance after which the position error is given, m."""
+"""Distance of driving after which the budget gives the position error, m."""
 
 LEAST_M, LEAST_RAD = 0.2, 0.2
-"""Minimum distance (m) and minimum turn (rad) of a drive from which errors can be extrapolated."""
+"""Minimum distance and turn of a drive, m and rad.
+
+A drive that is shorter than `LEAST_M` gives no position errors. A drive that turns less than
+`LEAST_RAD` gives no heading errors.
+"""
 
 LEAST_LINES = 20
-"""Minimum number of feedback lines. With fewer, the robot is assumed to stand still."""
+"""Minimum number of feedback lines.
+
+If there are fewer lines, the robot is assumed to stand still.
+"""
 
 STEP_S = 0.1
-"""Minimum duration of the steps into which a drive is divided, s."""
+"""Minimum duration of the steps into which a measured drive is divided, s."""
 
 MOST_STEPS = 20_000
 """Maximum number of steps in 100 m of driving. A slow drive has longer steps than `STEP_S`."""
 
 STRAIGHT = Steps(np.array([[0.05, 0.0] + [0.0] * 7]))
 SPIN = Steps(np.array([[0.0, 0.05] + [0.0] * 7]))
-"""A step of 0.05 rad in place (`SPIN`), and a step of 0.05 m ahead (`STRAIGHT`), without errors.
+"""Steps without errors: 0.05 m straight ahead (`STRAIGHT`), and 0.05 rad in place (`SPIN`).
 
-The budget of a robot that stood still is computed for a drive that repeats these steps.
+If the robot stood still, its budget is computed for a drive that repeats these steps.
 """
 
 
@@ -62,17 +72,20 @@ NOISE = (
     "distance_variance_per_metre", "yaw_variance_per_metre", "yaw_variance_per_radian",
     "wheel_slip_std",
 )  # fmt: skip
-"""Settings of `[odometry]` that state the errors due to skidding."""
+"""Settings of `[odometry]` that state how large the errors due to skidding are."""
 
 PARAMETERS = (
     "wheel_separation_multiplier_std", "left_wheel_radius_multiplier_std",
     "right_wheel_radius_multiplier_std", "wheel_radius_ratio_std", "distance_scale_std",
 )  # fmt: skip
-"""Settings of `[odometry]` that state the errors of wheel radii and track."""
+"""Settings of `[odometry]` that state how large the errors of wheel radii and track are."""
 
 
 class Share(Struct, frozen=True):
-    """The odometry errors of one cause alone, as standard deviations; None for unknown errors."""
+    """The odometry errors that one cause alone makes, as standard deviations.
+
+    An error is None if it is unknown.
+    """
 
     cause: Cause
     mm_per_100_m: float | None
@@ -97,16 +110,17 @@ class Budget(Struct, frozen=True):
     quantum: float
     """Quantization step of the wheel speeds in feedback lines, rad/s."""
     counts: int
-    """Encoder counts per wheel turn, from feedback lines or the configuration; 0 if unknown."""
+    """Encoder counts per wheel turn; 0 if neither feedback lines nor the configuration show them.
+    """
     gyro: bool
-    """True if the heading comes from a gyro."""
+    """True if the odometry takes the heading from a gyro."""
     still: bool
     """True if the robot hardly moved.
 
-    `shares` then contains only two causes: skidding, and the errors of wheel radii and track.
+    The budget then contains only two causes: skidding, and the errors of wheel radii and track.
     """
     at_rest: tuple[float, float]
-    """Standard deviations of the speed, m/s, and of the turn rate, rad/s, of a robot at rest.
+    """Standard deviations of speed, m/s, and turn rate, rad/s, while the robot stands still.
 
     The cause is the rounding of the wheel speeds in feedback lines.
     """
@@ -117,15 +131,16 @@ class Budget(Struct, frozen=True):
     """Mean ratio of effective track to wheel separation according to the gyro; None if unknown."""
     learned_std: float = 0.0
     learned_used: bool = False
-    """True if the odometry uses `learned` for the turns that the gyro does not measure."""
+    """True if the odometry uses `learned` as the track while the gyro does not measure the turns.
+    """
     coarse: bool = False
     """True if the encoders are coarse and the daemon does not know their counts per wheel turn."""
 
     def largest(self, *bases: Basis) -> Share | None:
-        """Return the share with the largest position error among those whose `basis` is in `bases`.
+        """Return the share with the largest position error, or None if all errors are 0.
 
-        If all position errors are 0, return the share with the largest heading error. If the
-        heading errors are 0 as well, return None.
+        Only the shares whose `basis` is in `bases` are compared. If all position errors are 0, the
+        heading errors are compared instead.
         """
         known = [share for share in self.shares if share.basis in bases]
         for size in (_millimetres, _degrees):
@@ -135,11 +150,11 @@ class Budget(Struct, frozen=True):
         return None
 
     def total(self) -> tuple[float | None, float | None]:
-        """Return a pair of total errors: of the position, mm, and of the heading, deg.
+        """Return a pair of total errors: of the position after 100 m, mm, and of the heading, deg.
 
-        The position error is that after 100 m, and the heading error that after one full turn. The
-        causes are independent, so each total is the root of the sum of the squared errors. A total
-        is None if this error is unknown for all causes.
+        The heading error is that after one full turn. The causes are independent, so a total is
+        the square root of the sum of the squared errors. A total is None if this error is unknown
+        for all causes.
         """
         return _squares([share.mm_per_100_m for share in self.shares]), _squares(
             [share.deg_per_turn for share in self.shares]
@@ -147,7 +162,7 @@ class Budget(Struct, frozen=True):
 
 
 class Received(Struct, frozen=True):
-    """The messages about a drive that this program received from the bus."""
+    """The messages of one drive that this program received from the daemon."""
 
     lines: list[Line]
     sent: list[float]
@@ -157,19 +172,23 @@ class Received(Struct, frozen=True):
     counted: bool = False
     """True if feedback lines carry encoder counts and the microcontroller's time."""
     gyro: bool = False
-    """True if the heading comes from a gyro."""
+    """True if the odometry takes the heading from a gyro."""
     learned: float | None = None
     """Effective track according to the gyro, divided by the configured track; None if unknown."""
     deviation: float = 0.0
     """Relative standard deviation of `learned`."""
     used: bool = False
-    """True if the odometry uses `learned` for the turns that the gyro does not measure."""
+    """True if the odometry uses `learned` as the track while the gyro does not measure the turns.
+    """
     coarse: bool = False
     """True if the encoders are coarse and the daemon does not know their counts per wheel turn."""
 
 
 def budget(received: Received, config: Config, metres: float = METRES) -> Budget:
-    """Return the error budget of a drive, with the position error after `metres` m."""
+    """Return the error budget of a drive.
+
+    `metres` is the distance after which the budget gives the position error, m.
+    """
     model, lines = _Model(config, metres), received.lines
     still = _standing(received, config, model)
     if len(lines) < LEAST_LINES:
@@ -191,7 +210,7 @@ def budget(received: Received, config: Config, metres: float = METRES) -> Budget
 
 
 def _standing(received: Received, config: Config, model: _Model) -> Budget:
-    """Return the budget of a robot that stands still, with the errors that settings declare."""
+    """Return the budget of a robot that stands still, with the errors that the settings state."""
     lines, odometry, known = received.lines, config.odometry, model.declares_parameters
     shares = (
         model.share("slip", "settings", STRAIGHT, SPIN, _only(odometry, *NOISE)),
@@ -257,8 +276,11 @@ class _Model:
     def __init__(self, config: Config, metres: float) -> None:
         self.odometry, self.kinematics = config.odometry, Kinematics(config.drive)
         self.rolls = self.turns = True
-        """`rolls` is true if the drive is long enough to extrapolate position errors from it.
-        `turns` is true if it has enough turns to extrapolate heading errors."""
+        """Whether the drive is long enough to extrapolate its errors.
+
+        `rolls` is true if the robot drove far enough for position errors. `turns` is true if the
+        robot turned enough for heading errors.
+        """
         self._metres = metres
 
     @property
@@ -272,6 +294,7 @@ class _Model:
         """Return the errors that one cause makes.
 
         Args:
+            cause: the cause of the errors.
             basis: how the size of the errors is known. If it is "unknown", the errors are None.
             ahead: the steps to repeat for the position error.
             left: the steps to repeat for the heading error, with all turns to the left.
@@ -316,7 +339,7 @@ class _Model:
 
 
 def _only(odometry: OdometryConfig, *kept: str) -> OdometryConfig:
-    """Return the settings with all error settings set to 0, except the settings named in `kept`."""
+    """Return the settings with all error settings set to 0, except the settings in `kept`."""
     zeros = {name: 0.0 for name in (*NOISE, *PARAMETERS) if name not in kept}
     return replace(odometry, pose_covariance_diagonal=(0.0,) * 6, **zeros)
 

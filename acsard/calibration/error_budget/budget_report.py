@@ -55,6 +55,7 @@ CALIBRATE = (
 
 
 def parts(budget: Budget) -> Iterator[RenderableType]:
+    """Yield the parts of the printed report: sentences, and a table of the causes."""
     if budget.still:
         yield _standing(budget)
     else:
@@ -68,7 +69,8 @@ def parts(budget: Budget) -> Iterator[RenderableType]:
 def advice(budget: Budget) -> str:
     """Return advice on the largest measured cause of errors.
 
-    If the settings of `[odometry]` state a larger error, the advice covers its cause as well.
+    If the settings of `[odometry]` state a larger error of another cause, the text also contains
+    advice on that cause.
     """
     if budget.still:
         return (

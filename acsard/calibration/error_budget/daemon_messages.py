@@ -1,4 +1,4 @@
-"""Follows a running daemon, and collects its messages as the input of the error budget."""
+"""Follows a running daemon, and collects its messages for the error budget."""
 
 from __future__ import annotations
 
@@ -30,25 +30,26 @@ KEYS = ("odom", "wheel_states", "cmd_vel_out")
 """Zenoh keys of the messages that an error budget needs."""
 
 MOST = 60_000
-"""Number of feedback lines that are kept, ten minutes at 100 Hz. Older lines are dropped."""
+"""Maximum number of feedback lines that are kept: ten minutes at 100 Hz.
 
-SHARE_COARSE = 0.1
-"""Limit for the fraction of the feedback lines that show coarse encoders.
-
-Above this limit, the report says that the encoders are coarse.
+Older lines are dropped.
 """
 
-LEAST_LOST, SHARE_LOST = 3, 0.01
-"""Limits for the feedback lines that this program missed: a number, and a fraction of all lines.
+SHARE_COARSE = 0.1
+"""Fraction of feedback lines that show coarse encoders, above which the report mentions them."""
 
-The larger of the two limits applies. This program always seems to miss a few lines, because it
-reads the daemon's counters and messages at different moments.
+LEAST_LOST, SHARE_LOST = 3, 0.01
+"""Limits for the number of feedback lines that this program missed.
+
+At most `LEAST_LOST` lines may be missed, or the fraction `SHARE_LOST` of all lines if that is
+more. A few lines always seem to be missed, because this program reads the daemon's counters and
+messages at different moments.
 """
 
 SAMPLED = "checked with samples"
-"""Value of `check` in the message `diagnostics`.
+"""Value of `check` in the message `diagnostics` if feedback lines carry samples.
 
-It means that feedback lines carry encoder counts and the microcontroller's time.
+The samples are encoder counts and the microcontroller's time.
 """
 
 LOOK_S = 0.05
@@ -56,7 +57,7 @@ LOOK_S = 0.05
 
 
 def budgets(robot: Client, config: Config, seconds: float) -> Iterator[Budget]:
-    """Every `seconds` s, yield the error budget of the whole drive so far.
+    """Yield the error budget of the whole drive so far, every `seconds` s.
 
     Raises `ReplyError` if no feedback lines arrive, or if a message cannot be decoded.
     """
@@ -97,10 +98,16 @@ def _follow(feed: Feed, queues: Mapping[str, Subscription], seconds: float) -> N
 
 
 class Feed:
-    """Collects the messages of a daemon. Call `add()` for each message, and then `received()`."""
+    """Collects the messages of a daemon.
+
+    Call `add()` for each message, and then `received()`.
+    """
 
     def __init__(self, config: Config, first: RobotState) -> None:
-        """Start an empty collection. `first` is the daemon's state before the first message."""
+        """Start an empty collection.
+
+        `first` is the daemon's state before the first message.
+        """
         self._config, self._first = config, first
         self._start_ns = first.stamp.to_ns()
         self._odom: dict[int, Odometry] = {}
@@ -121,7 +128,10 @@ class Feed:
             self._join(message.header.stamp.to_ns())
 
     def received(self, last: RobotState, diagnostics: DiagnosticArray) -> Received:
-        """Return the drive so far. `last` is the daemon's latest state."""
+        """Return the messages of the drive so far.
+
+        `last` is the daemon's latest state, and `diagnostics` its latest message `diagnostics`.
+        """
         learned, deviation, used = _learned(diagnostics)
         return Received(
             list(self._lines),
@@ -177,7 +187,7 @@ def _value(diagnostics: DiagnosticArray, key: str) -> str:
 
 
 def _learned(diagnostics: DiagnosticArray) -> tuple[float | None, float, bool]:
-    """Return three values for `Received`, from the diagnostics: `learned`, `deviation`, `used`."""
+    """Return a triple from the diagnostics: `learned`, `deviation` and `used` of `Received`."""
     names = ("learned_multiplier", "wheel_separation_multiplier", "learned_multiplier_std")
     learned, configured, std = (_value(diagnostics, name) for name in names)
     used = _value(diagnostics, "multiplier_in_use") == learned != configured

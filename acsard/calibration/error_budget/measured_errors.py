@@ -1,21 +1,5 @@
 """Measures the motion of a drive, and the errors of each step of this motion, from feedback lines.
 
-Late stamps and lost lines: the board makes its lines at a fixed period, or as answers to the lines
-of the daemon, so the times of its lines form a grid. A line cannot arrive before the board made it.
-The line with the smallest delay among its neighbors therefore shows where the grid is. If even this
-line arrives a whole period later than expected, a line was lost.
-
-Rounding: a feedback line carries wheel speeds with two decimals. Independent rounding errors have a
-standard deviation of q / sqrt(12), where q is the quantization step. A wheel at a constant speed
-repeats the same error, so n equal values in a row make one error of n times this size. If a wheel
-passes through a value while it becomes faster or slower, the errors before and after the middle of
-the equal values cancel.
-
-Encoder counts: some firmware counts encoder edges in each period, and reports multiples of the
-speed of one count per period. An edge that comes too late for one period is counted in the next
-period, so errors of the count do not accumulate. The errors from rounding the multiples to two
-decimals do accumulate, but they can be computed.
-
 Some errors of a step are independent of the errors of other steps. They are given as variances.
 Other errors have the same sign in each step and add up. They are given as motion that the pose
 missed.
@@ -43,11 +27,11 @@ Counts = npt.NDArray[np.int64]
 AHEAD = 30
 """Number of consecutive feedback lines, of which at least one is assumed not to be delayed.
 
-At 100 Hz they take 0.3 s. A busy host does not keep the daemon from running for longer.
+At 100 Hz, these lines take 0.3 s. A busy host does not keep the daemon from running for longer.
 """
 
 MISSING = 0.6
-"""If the smallest delay among `AHEAD` lines grows by this number of periods, a line was lost."""
+"""Growth of the smallest delay among `AHEAD` lines, in periods, that shows a lost line."""
 
 FOLLOWED = 0.05
 """Gain of the low-pass filter that follows the smallest delay among `AHEAD` lines.
@@ -60,19 +44,25 @@ CLUSTERED, ALIKE_TIMES = 0.4, 0.25
 
 An interval is near the median if it differs from the median by less than the fraction
 `ALIKE_TIMES`. The period is the median if more than the fraction `CLUSTERED` of the intervals are
-near it. Otherwise the lines arrive in bursts, and the period is the mean.
+near the median. Otherwise the lines arrive in bursts, and the period is the mean.
 """
 
 
 class LineTimes(Struct, frozen=True):
+    """The delays of feedback lines, and the number of lines that were lost."""
+
     late: Floats
     """Delay of each line minus the median delay, s."""
     missing: Counts
-    """Number of lines that were lost before each line."""
+    """Number of feedback lines that were lost just before each line."""
     period: float
     """Mean interval between two lines, s."""
 
 
+# The board makes its lines at a fixed period, or as answers to the lines of the daemon, so the
+# times of its lines form a grid. A line cannot arrive before the board made it. The line with the
+# smallest delay among its neighbors therefore shows where the grid is. If even this line arrives a
+# whole period later than expected, a line was lost.
 def line_times(t: Floats, sent: Floats) -> LineTimes:
     """Estimate the delay of each feedback line, and the number of lines that were lost before it.
 
@@ -93,7 +83,7 @@ def line_times(t: Floats, sent: Floats) -> LineTimes:
 
 
 def _even(t: Floats) -> LineTimes:
-    """Estimate the delays of the feedback lines of a board that sends them at a fixed period.
+    """Estimate the delays of feedback lines from a board that sends them at a fixed period.
 
     `t` contains the stamps of the feedback lines, s.
     """
@@ -113,10 +103,10 @@ def _even(t: Floats) -> LineTimes:
 
 
 def _asked(t: Floats, sent: Floats) -> LineTimes | None:
-    """Estimate the delays of the feedback lines of a board that answers each line of the daemon.
+    """Estimate the delays of feedback lines from a board that answers each line of the daemon.
 
-    Return None if the daemon sent too few lines, or if its lines do not cover the whole time of the
-    feedback lines.
+    Return None if the daemon sent too few lines, or if its lines do not cover the whole time of
+    the feedback lines.
 
     Args:
         t: the stamp of each feedback line, s.
@@ -136,7 +126,7 @@ def _asked(t: Floats, sent: Floats) -> LineTimes | None:
 
 
 def _missing(at: Floats) -> Counts:
-    """Return for each line the number of lines that were lost just before it.
+    """Return, for each feedback line, the number of lines that were lost just before it.
 
     `at` contains the time of each line divided by the period of the lines. These times may count
     from any moment.
@@ -160,7 +150,7 @@ def _missing(at: Floats) -> Counts:
 BLOCK_S = 0.5
 """Length of the intervals in which the errors of stamps are correlated, s.
 
-They are correlated because one stall of the computer delays all lines that arrive during it.
+The errors are correlated because one stall of the computer delays all lines that arrive during it.
 """
 
 LEAST_LINES, ALIKE = 20, 0.99
@@ -173,16 +163,16 @@ proportional to time (cosine above `ALIKE`), the fit cannot separate noise and s
 LATEST_S = 0.1
 """Largest delay of a feedback line, s, that counts as an error of its stamp.
 
-There is a gap between two successive lines if they are at least `LATEST_S` apart, the wheel
-positions did not change between them, and the later line reports a speed.
+It is also the shortest gap in the feedback. A gap is an interval between two lines in which the
+wheel positions did not change although the later line reports a speed.
 """
 
 Wheels = tuple[float, float, float, float]
-"""Values of the four wheels, in the order of `acsard.core.values.WHEELS`."""
+"""Numbers for the four wheels, in the order of `acsard.core.values.WHEELS`."""
 
 
 class Line(Struct, frozen=True):
-    """A feedback line and the odometry computed from it."""
+    """A feedback line of the board, and the heading that the odometry computed with it."""
 
     at: float
     """Stamp of the line, s since the start of the measurement."""
@@ -197,7 +187,7 @@ class Line(Struct, frozen=True):
 
 
 class Motion(Struct, frozen=True):
-    """The motion from each feedback line to the next, and its errors.
+    """The motion from each feedback line to the next line, and its errors.
 
     The arrays have one row less than there are lines.
     """
@@ -212,20 +202,21 @@ class Motion(Struct, frozen=True):
     yaw_variance: Floats | None
     """Variance that the noise of the gyro adds to each turn, rad2; None if it is unknown."""
     late: Floats
-    """Errors of distance and turn due to wrong stamps of lines, rows of (m, rad)."""
+    """Errors of distance and turn due to wrong stamps of lines: rows of (m, rad)."""
     lateness: float
     """RMS error of the time stamps of feedback lines, s."""
     filled: Floats
-    """Errors of the motion that the odometry assumed for lost lines, as variances (m2, rad2).
+    """Errors of the motion that the odometry assumed for lost lines: variances (m2, rad2).
 
     The rows of all other lines are 0.
     """
     unfilled: Floats
-    """Motion that the pose missed during a gap, and its variances: rows of (m, rad, m2, rad2).
+    """Motion that the pose missed in each gap, and its variances: rows of (m, rad, m2, rad2).
 
     The rows without a gap are 0.
     """
     missing: int
+    """Number of feedback lines that were lost during the drive."""
     unseen: float
     """Total duration of the gaps in the feedback, s."""
 
@@ -238,8 +229,9 @@ def motion(lines: list[Line], sent: Floats, kinematics: Kinematics, whole: bool)
         sent: the time at which the daemon sent each of its lines to the board, s.
         kinematics: the geometry of the robot.
         whole: whether this program received every feedback line that the daemon received. If it is
-            false, a missing line may have been lost between the daemon and this program, so a
-            missing line does not count as an error of the odometry.
+            false, a line may have been lost only between the daemon and this program, which is not
+            an error of the odometry. Lost lines then count only in gaps that the odometry did not
+            fill.
     """
     t = np.array([line.at for line in lines])
     found = line_times(t, sent)
@@ -266,11 +258,8 @@ def motion(lines: list[Line], sent: Floats, kinematics: Kinematics, whole: bool)
 def _noise(t: Floats, speeds: Floats, turns: Floats, variances: Floats) -> Floats | None:
     """Return the variance, rad2, that the gyro's noise adds to the heading between two lines.
 
-    The gyro's scale error also adds to the variance of the heading: S^2 A^2, where S is the
-    relative standard deviation of the scale, and A is the turn since the pose was last set. A
-    further turn dA adds 2 S^2 A dA. A is unknown at the first line, so a least-squares fit
-    estimates A and the noise together. Return None if the fit cannot separate the two. The result
-    is 0 for lines at which the wheels stand still.
+    The result is 0 for lines at which the wheels stand still. Return None if the noise cannot be
+    separated from the gyro's scale error.
 
     Args:
         t: the time of each feedback line, s.
@@ -278,6 +267,11 @@ def _noise(t: Floats, speeds: Floats, turns: Floats, variances: Floats) -> Float
         turns: the turn from each feedback line to the next, rad.
         variances: the variance of the heading at each feedback line, rad2.
     """
+    # The gyro's scale error also adds to the variance of the heading: S^2 A^2, where S is the
+    # relative standard deviation of the scale, and A is the turn since the pose was last set. A
+    # further turn dA adds 2 S^2 A dA. A is unknown at the first line, so a least-squares fit
+    # estimates A and the noise together.
+    #
     # Leave out the lines in which the variance falls, because the pose was set there.
     dt, moves = np.diff(t), speeds[1:].any(axis=1) & (variances[1:] > variances[:-1] / 2)
     levers, before = 2 * GYRO_SCALE**2 * turns, np.cumsum(turns) - turns / 2
@@ -294,12 +288,10 @@ def _noise(t: Floats, speeds: Floats, turns: Floats, variances: Floats) -> Float
 
 
 def _late(t: Floats, twists: list[Twist], found: LineTimes) -> Floats:
-    """Return the errors of the motion due to wrong stamps, rows of (m, rad).
-
-    A wrong stamp changes the interval dt before a line, and thus the distance, which is speed times
-    dt. It changes the next interval by the opposite amount. Summation by parts gives each line one
-    error: the delay of the line times (speed in this line - speed in the next line).
-    """
+    """Return the errors of the motion due to wrong stamps: rows of (m, rad)."""
+    # A wrong stamp changes the interval dt before a line, and thus the distance, which is speed
+    # times dt. It changes the next interval by the opposite amount. Summation by parts gives each
+    # line one error: the delay of the line times (speed in this line - speed in the next line).
     speeds = np.array([(one.linear, one.angular) for one in twists])
     near = np.abs(found.late) <= LATEST_S
     # A constant delay causes no error, so subtract the mean delay.
@@ -312,7 +304,7 @@ def _late(t: Floats, twists: list[Twist], found: LineTimes) -> Floats:
 def _gaps(
     t: Floats, twists: list[Twist], rolled: list[Twist], found: LineTimes, whole: bool
 ) -> tuple[Floats, Floats, int, float]:
-    """Return four values: `filled`, `unfilled`, `missing` and `unseen` of `Motion`.
+    """Return the four values `filled`, `unfilled`, `missing` and `unseen` of `Motion`.
 
     Args:
         t: the time of each feedback line, s.
@@ -353,15 +345,27 @@ def _gaps(
 
 
 TOGETHER = 0.8
-"""Two wheels are assumed to have equal rounding errors if their speeds are equal in at least this
-fraction of lines."""
+"""Fraction of lines in which two wheels must report equal speeds.
+
+From this fraction on, the two wheels are assumed to have equal rounding errors.
+"""
 
 LEAST_VALUES = 3
-"""Minimum number of different speeds that are needed to find a quantization step."""
+"""Minimum number of different speeds from which a quantization step is computed."""
 
 
+# A feedback line carries wheel speeds with two decimals. Independent rounding errors have a
+# standard deviation of q / sqrt(12), where q is the quantization step. A wheel at a constant speed
+# repeats the same error, so n equal values in a row make one error of n times this size. If a wheel
+# passes through a value while it becomes faster or slower, the errors before and after the middle
+# of the equal values cancel.
+#
+# Some firmware counts encoder edges in each period, and reports multiples of the speed of one count
+# per period. An edge that comes too late for one period is counted in the next period, so errors of
+# the count do not accumulate. The errors from rounding the multiples to two decimals do accumulate,
+# but they can be computed.
 class Rounding(Struct, frozen=True):
-    """Rounding errors of wheel speeds.
+    """The errors that the rounding of wheel speeds in feedback lines causes.
 
     `variance` and `offset` have a row for each feedback line and the columns of `values.WHEELS`.
     """
@@ -371,9 +375,12 @@ class Rounding(Struct, frozen=True):
     offset: Floats
     """Computed error of the angle that a wheel rolled since the previous line, rad."""
     alike: Floats
-    """Matrix that is 1 for each pair of wheels with equal rounding errors, else 0; shape (4, 4)."""
+    """Matrix of pairs of wheels, shape (4, 4).
+
+    An element is 1 if the two wheels have equal rounding errors, and 0 otherwise.
+    """
     quantum: float
-    """Quantization step, rad/s."""
+    """Quantization step of the wheel speeds, rad/s."""
     count: float
     """Angle by which a wheel turns in one encoder count, rad; 0 if the lines do not show it."""
 
@@ -381,8 +388,8 @@ class Rounding(Struct, frozen=True):
 def rounding(speeds: Floats, period: float) -> Rounding:
     """Estimate the errors that the rounding of wheel speeds causes.
 
-    `speeds`, rad/s, has a row for each line and a column for each wheel. `period` is the
-    time between lines, s.
+    `speeds`, rad/s, has a row for each feedback line and a column for each wheel. `period` is the
+    time between two lines, s.
     """
     moving = np.any(speeds != 0.0, axis=1)
     same = speeds[moving][:, :, None] == speeds[moving][:, None, :]
@@ -399,11 +406,11 @@ def rounding(speeds: Floats, period: float) -> Rounding:
 def _runs(values: Floats) -> Floats:
     """Return the variance of a wheel's rounding error in each line, divided by q^2 / 12.
 
-    q is the quantization step. `values` contains the wheel's speed in each line. Of n equal speeds
-    in a row, the last one has the variance n^2, and the others have 0. If the wheel passed through
-    this speed while it became faster or slower, the last one has the variance 1. Speeds of 0 have
-    the variance 0.
+    q is the quantization step. `values` contains the wheel's speed in each feedback line.
     """
+    # Of n equal speeds in a row, the last one has the variance n^2, and the others have 0. If the
+    # wheel passed through this speed while it became faster or slower, the last one has the
+    # variance 1.
     found = np.zeros(len(values))
     ends = np.append(np.flatnonzero(np.diff(values)), len(values) - 1)
     starts = np.append(0, ends[:-1] + 1)
@@ -419,8 +426,8 @@ def _runs(values: Floats) -> Floats:
 
 
 def _quantum(speeds: Floats) -> float:
-    """Return the step, rad/s, of which all speeds are multiples, or 0 if there is none."""
-    # A value that is repeated for a whole drive is no more evidence than a single value.
+    """Return the quantization step of which all speeds are multiples, rad/s; 0 if no step fits."""
+    # Count each value once, because its repetitions do not add evidence.
     seen = np.unique(np.abs(speeds[speeds != 0.0]))
     return quantization_step(seen) if len(seen) >= LEAST_VALUES else 0.0
 
@@ -438,7 +445,7 @@ class Steps(Struct, frozen=True):
     - 8: variance of the turn if a gyro measured it (rad2)
     """
     by_gyro: bool = False
-    """Whether a gyro measured the turns. Otherwise the wheels did."""
+    """True if a gyro measured the turns, and false if the wheels did."""
 
     def to_the_left(self) -> Steps:
         """Return the steps with each right turn mirrored, so that all turns are to the left."""
@@ -448,10 +455,10 @@ class Steps(Struct, frozen=True):
 
 
 class Driving:
-    """Divides a drive into steps of about `step_s` s.
+    """A measured drive, from which the errors of each cause are computed.
 
-    Each method returns the steps with the errors of one cause. `gyro` is true if a gyro measured
-    the turns.
+    The drive is divided into steps of about `step_s` s. Most methods return all steps, with the
+    errors of one cause. `gyro` is true if a gyro measured the turns.
     """
 
     def __init__(
@@ -489,11 +496,11 @@ class Driving:
         return self._steps(squares)
 
     def missed(self) -> Steps:
-        """Return all steps, each with the error that gaps in the feedback have caused in it."""
+        """Return the steps with the errors that gaps in the feedback cause."""
         return self._steps(self._motion.filled, self._motion.unfilled)
 
     def rounded(self) -> Steps:
-        """Return the steps with the errors from the rounding of reported speeds to two decimals."""
+        """Return the steps with the errors that the rounding of the reported speeds causes."""
         found = self._rounding
         if found.count:
             return self._steps(missed=self._of_wheels(found.offset[1:]))
@@ -504,10 +511,10 @@ class Driving:
         return self._steps(np.column_stack(variances))
 
     def contradicted(self) -> Steps:
-        """Return all steps, each with the error that its front and rear wheels show.
+        """Return the steps with the errors that differences between front and rear wheels show.
 
-        The wheels of a side differ. One of them is assumed to be right, so the mean of both is
-        wrong by half their difference.
+        One wheel of each side is assumed to be right. The mean of both wheels is then wrong by
+        half of their difference.
         """
         turned = np.diff([line.positions for line in self._lines], axis=0)
         front_right, front_left, rear_left, rear_right = turned.T
@@ -515,10 +522,10 @@ class Driving:
         return self._steps(missed=self._of_wheels(np.column_stack([right, left, left, right])))
 
     def _of_wheels(self, off: Floats) -> Floats:
-        """Return the motion that the pose missed because of errors of the rolled angles.
+        """Return the motion that the pose missed because rolled angles are wrong.
 
-        `off` contains these errors, rad, with a column for each wheel. The result has rows of (m,
-        rad, 0, 0).
+        `off` contains the errors of the angles, rad, with a column for each wheel. The result has
+        rows of (m, rad, 0, 0).
         """
         moved = off @ self._weights.T
         return np.hstack([moved, np.zeros_like(moved)])
@@ -527,10 +534,10 @@ class Driving:
         self, variances: Floats | None = None, missed: Floats | None = None,
         gyro: Floats | None = None,
     ) -> Steps:  # fmt: skip
-        """Return the steps of the drive with these errors; None means no errors of this kind.
+        """Return the steps of the drive with the given errors. None means no errors of this kind.
 
-        Each array has a row for every line but the first. In `Steps.rows`, `variances` fills the
-        columns 2 and 3, `missed` the columns 4 to 7, and `gyro` the column 8.
+        Each array has a row for every line except the first. In `Steps.rows`, `variances` fills
+        the columns 2 and 3, `missed` the columns 4 to 7, and `gyro` the column 8.
         """
         moved, count = self._motion, len(self._motion.distance)
         errors = [

@@ -1,12 +1,11 @@
 """The types of a guided drive: `Method`, `Leg`, `Move` and measurements, and the robot's `Setup`.
 
-`acsard calibrate` and the web page import this module for the names of the methods. This module
-does not import numpy, so that both start quickly.
+`acsard calibrate` and the web page import this module for the names of the methods. It does not
+import numpy, so that both programs start quickly.
 
-A guided drive keeps the robot within its limits and on a floor of 3 m x 3 m. Before the calibration
+A guided drive stays within the robot's limits and on a floor of 3 m x 3 m. Before the calibration,
 the turn that a command causes is unknown, because the robot may skid. The plan must therefore work
-for an effective track of 1 to 2.5 times the wheel separation. Each drive has one of these forms, so
-that the robot stays on the floor:
+for an effective track of 1 to 2.5 times the wheel separation. Each drive has one of these forms:
 
 - It goes out and comes back on the same path.
 - It is straight, and a person placed the robot in the right direction.
@@ -34,7 +33,7 @@ NEEDS: dict[str, str] = {
     "wall": "a straight wall and a tape measure",
     "umbmark": "a tape measure and marks",
 }
-"""Equipment that a person needs for each method, by the method's name in `--method`."""
+"""Equipment that the person needs for each method, by the name of the method in `--method`."""
 
 SIMULATED = (
     "positions",
@@ -43,7 +42,7 @@ SIMULATED = (
     "method gyro asks for a distance, which you leave empty. The methods tape, wall and umbmark "
     "are for a real robot.",
 )
-"""The method of calibration to use first on the simulator, and the reason."""
+"""Method of calibration to try first on the simulator, and the reason for this choice."""
 
 
 class GuideError(AcsardError):
@@ -60,7 +59,10 @@ class DisturbedError(GuideError):
 
 
 class Move(Struct, frozen=True):
-    """A twist, and the time for which the tool commands it. A zero twist makes a pause."""
+    """A twist, and the time for which the tool commands it.
+
+    A move with a zero twist is a pause.
+    """
 
     seconds: float
     linear: float = 0.0
@@ -70,22 +72,22 @@ class Move(Struct, frozen=True):
 
 
 UNITS = {"m": 1.0, "mm": 1e-3, "deg": math.pi / 180}
-"""Factors that convert the units of tape readings to m or rad."""
+"""Factors that convert the units of the person's answers to m or rad."""
 
 
 Quantity = Literal["turned", "angle", "distance", "ahead", "aside"]
-"""The quantity that a tape reading gives about the motion since the last known pose of the robot.
+"""Kind of a measurement of the robot's motion since its pose was last known.
 
 - `turned`: the turn in rad, positive to the left, including whole turns.
 - `angle`: the turn in rad, positive to the left, with an unknown number of whole turns.
 - `distance`: the straight-line distance in m.
-- `ahead`: the displacement in m along the heading of that pose.
-- `aside`: the displacement in m to the left of that heading.
+- `ahead`: the displacement in m along the heading of the known pose.
+- `aside`: the displacement in m to the left of the heading of the known pose.
 """
 
 
 class Mean(Struct, frozen=True):
-    """A measurement that is the mean of the person's answers, plus a known constant."""
+    """A measurement that is computed as the mean of the person's answers, plus a known constant."""
 
     quantity: Quantity
     answers: tuple[str, ...]
@@ -93,27 +95,30 @@ class Mean(Struct, frozen=True):
     deviation: float
     """Standard deviation of the measurement, m or rad."""
     plus: float = 0.0
-    """Constant to add, m or rad, for example the whole turns that the person does not measure."""
+    """Constant to add, m or rad, for example the whole turns that the answers do not include."""
     over: tuple[str, ...] = ()
     """Names of the legs whose total motion the person measured; () means the leg just driven."""
 
 
 class Slant(Struct, frozen=True):
-    """A measurement of the robot's turn, computed from the distances of two points from a line."""
+    """A measurement of the robot's turn, computed from the distances of two points to a line.
+
+    The two points are on the robot. The line may be a wall.
+    """
 
     quantity: Quantity
     near: str
-    """Name of the answer that gives the distance of one point of the robot from the line.
+    """Name of the answer with the distance of one point of the robot from the line.
 
     A turn to the left moves this point towards the line.
     """
     far: str
-    """Name of the answer that gives the distance of the other point of the robot from the line.
+    """Name of the answer with the distance of the other point of the robot from the line.
 
     A turn to the left moves this point away from the line.
     """
     apart: str
-    """Name of the answer with the distance between the two points.
+    """Name of the answer with the distance between the two points of the robot.
 
     The tool asks for this distance once, before the first leg.
     """
@@ -123,7 +128,7 @@ class Slant(Struct, frozen=True):
     "" means that the robot started parallel to the line.
     """
     plus: float = 0.0
-    """Whole and half turns to add, rad, because the angle to the line does not show them."""
+    """Whole and half turns to add, rad, because the distances to the line do not show them."""
     over: tuple[str, ...] = ()
     """Names of the legs whose total motion the person measured; () means the leg just driven."""
 
@@ -136,13 +141,16 @@ class Leg(Struct, frozen=True):
 
     name: str
     words: str
-    """Text for the person before the leg: what to do, and which moves the robot will make."""
+    """Text that tells the person, before the leg, what to do and how the robot will move."""
     moves: tuple[Move, ...]
     asks: tuple[Ask, ...] = ()
     """Questions that the person answers after the moves."""
     measures: tuple[Measure, ...] = ()
     by_key: bool = False
-    """Whether the person ends the last move with a key. The move's duration is then a timeout."""
+    """Whether the person ends the last move with a key.
+
+    The duration of this move is then a timeout.
+    """
     placed: bool = False
     """Whether a person places the robot before this leg, so that the leg begins at a known pose."""
 
@@ -155,31 +163,42 @@ ROOM = 3.0
 """Side length of the square floor that must be free, m."""
 
 MOST_S = 90.0
-"""Limit for the driving time of all legs of a method together, s. A test checks each method."""
+"""Limit for the total driving time of all legs of a method, s.
+
+A test checks this limit for each method.
+"""
 
 USUAL_SPEED = 0.3
 """Speed straight ahead in a guided drive, m/s, unless the robot's limits are lower."""
 
 FASTEST_WHEEL = 0.5
-"""Largest rolling speed of the wheels in a turn, m/s."""
+"""Largest rolling speed of the wheels while the robot turns in a guided drive, m/s."""
 
 REACH = 0.75
-"""Assumed distance from the robot's middle to its outermost point, in wheel separations."""
+"""Assumed distance from the robot's middle to its outermost point, as a multiple of the wheel
+separation."""
 
 EDGE = 0.1
-"""Margin between the robot and the edge of the floor, m."""
+"""Distance to keep between the robot and the edge of the floor, m."""
 
 LONGEST, SHORTEST = 2.0, 0.8
-"""Longest and shortest straight drive, m."""
+"""Largest and smallest length of the straight drive, m."""
 
 LEAST_SPEED, LEAST_TURN = 0.05, 0.2
-"""Smallest `limits.linear_speed` (m/s) and `limits.angular_speed` (rad/s) for a guided drive."""
+"""Smallest limits with which a guided drive is possible.
+
+`LEAST_SPEED` applies to the speed straight ahead, m/s, and `LEAST_TURN` to `limits.angular_speed`,
+rad/s.
+"""
 
 STOPS_IN = 0.1
 """Distance that the robot may still roll after a leg has ended, m."""
 
 WIDEST = 2.5
-"""Largest ratio of effective track to wheel separation that the plan covers. The smallest is 1."""
+"""Largest ratio of effective track to wheel separation for which the plan works.
+
+The smallest ratio is 1.
+"""
 
 
 class Setup(Struct, frozen=True):
@@ -193,9 +212,9 @@ class Setup(Struct, frozen=True):
     reach: float
     """Distance from the robot's middle to its outermost point, m."""
     turning: float
-    """Largest turn rate that a command may have within the limits, rad/s."""
+    """Largest turn rate that the robot's limits permit in a command, rad/s."""
     wheel: float
-    """Largest rolling speed of the wheels in a turn, m/s."""
+    """Largest rolling speed of the wheels while the robot turns, m/s."""
     odometry: OdometryConfig = OdometryConfig()
     feedback: FeedbackConfig = FeedbackConfig()
 
@@ -216,20 +235,21 @@ class Setup(Struct, frozen=True):
         return self.from_edge + self.length - ROOM / 2
 
     def ahead(self, metres: float) -> Move:
-        """Return a straight move; a negative distance goes backwards."""
+        """Return a straight move of `metres` m. A negative distance is a move backwards."""
         return Move(abs(metres) / self.speed, math.copysign(self.speed, metres))
 
     def spin(self, rate: float, seconds: float) -> Move:
-        """Return a turn in place at `rate`, rad/s, positive to the left, for `seconds`.
+        """Return a turn in place for `seconds` s, positive to the left.
 
-        A robot that skids turns more slowly than `rate`.
+        `rate` is the turn rate, rad/s, of a robot that does not skid. A robot that skids turns
+        more slowly.
         """
         return Move(seconds, 0.0, self.command(rate))
 
     def arc(self, rate: float, metres: float) -> Move:
-        """Return a curve of the length `metres`, m; a negative length goes backwards.
+        """Return a curve of the length `metres`, m. A negative length is a curve backwards.
 
-        `rate` is the turn rate of a robot without skidding, rad/s, positive to the left.
+        `rate` is the turn rate, rad/s, of a robot that does not skid, positive to the left.
         """
         straight = self.ahead(metres)
         return Move(straight.seconds, straight.linear, self.command(rate))
@@ -237,8 +257,11 @@ class Setup(Struct, frozen=True):
     def turn(self, angle: float, rate: float, track: float) -> Move:
         """Return a turn in place by `angle`, with a command that compensates for skidding.
 
-        `angle` is in rad, positive to the left. `rate` is the true turn rate, rad/s, which the
-        limits may reduce. `track` is the ratio of effective track to wheel separation.
+        Args:
+            angle: the angle of the turn, rad, positive to the left.
+            rate: the true turn rate, rad/s. If the limits do not permit it, the robot turns more
+                slowly.
+            track: the ratio of effective track to wheel separation.
         """
         command = abs(self.command(rate * track))
         seconds = abs(angle) * track / (command * self.rate_per_command)
@@ -247,8 +270,8 @@ class Setup(Struct, frozen=True):
     def command(self, rate: float) -> float:
         """Return the turn rate to command, rad/s, for a true turn rate of `rate`, rad/s.
 
-        The command gives this turn rate to a robot that does not skid. If the command would exceed
-        the robot's limits, the result is the largest command within these limits.
+        The robot turns at `rate` if it does not skid. If the command would exceed the robot's
+        limits, the result is the largest command within these limits.
         """
         per_command = self.rate_per_command
         most = min(2 * self.wheel / self.drive.wheel_separation, self.turning * per_command)
@@ -256,9 +279,9 @@ class Setup(Struct, frozen=True):
 
     @property
     def rate_per_command(self) -> float:
-        """Turn rate of a robot without skidding, rad/s, for a commanded turn rate of 1 rad/s.
+        """Turn rate, rad/s, for a commanded turn rate of 1 rad/s, of a robot that does not skid.
 
-        It differs from 1 because the configured multipliers compensate for skidding.
+        The rate differs from 1 because the configured multipliers compensate for skidding.
         """
         bare = replace(
             self.drive, wheel_separation_multiplier=1.0, left_wheel_radius_multiplier=1.0,
@@ -271,19 +294,20 @@ class Setup(Struct, frozen=True):
 Legs = Callable[[Setup, float], tuple[Leg, ...]]
 """Function that returns the legs of a method.
 
-Its arguments are the robot's setup, and the ratio of effective track to wheel separation. The first
-`turned` measurement shows the ratio. The legs up to that measurement must not depend on the ratio.
+Its arguments are the robot's setup, and the ratio of effective track to wheel separation. The
+first `turned` measurement shows this ratio. The legs up to that measurement must not depend on the
+ratio.
 """
 
+# The largest ratio does not always need the longest time, because with a smaller ratio a leg may
+# have one more full turn.
 TRACKS = [1.0 + 0.05 * step for step in range(round((WIDEST - 1.0) / 0.05) + 1)]
-"""Ratios of effective track to wheel separation for which the driving time is checked.
-
-All these ratios are checked, because the largest ratio does not always need the longest time. With
-a smaller ratio, a leg may have one more full turn.
-"""
+"""Ratios of effective track to wheel separation for which the driving time is computed."""
 
 
 class Method(Struct, frozen=True):
+    """A method of calibration by a guided drive."""
+
     legs: Legs
     asks: tuple[Ask, ...] = ()
     """Questions that the person answers before the first leg."""
@@ -294,7 +318,7 @@ class Method(Struct, frozen=True):
     """
 
     def longest_s(self, setup: Setup) -> float:
-        """Return the total driving time of all legs, s.
+        """Return the total driving time of all legs, s, for the least favorable effective track.
 
         The time depends on the ratio of effective track to wheel separation. The result is the
         longest of the times for the ratios in `TRACKS`.
@@ -303,7 +327,7 @@ class Method(Struct, frozen=True):
 
 
 def setup(config: Config) -> Setup:
-    """Return the speeds and lengths of the guided drive of this robot.
+    """Return the setup of this robot: the speeds and lengths of its guided drive.
 
     Raises `GuideError` if the robot is too large or its limits are too low.
     """

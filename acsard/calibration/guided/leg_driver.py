@@ -1,7 +1,7 @@
 """Decides the commands of one leg from the daemon's messages and from key presses.
 
 A leg is one drive of a guided calibration. `LegDriver` goes through the phases of `Phase`. An
-unexpected condition ends the leg, and `LegDriver.halted` then contains the reason.
+unexpected condition ends the leg early. `LegDriver.halted` then contains the reason.
 """
 
 from __future__ import annotations
@@ -23,16 +23,17 @@ HELD_UP = (
 )
 
 OBEYED_S = 1.5
-"""Time allowed for the robot to follow a changed command, including the ramp, s."""
+"""Time for which the robot may take to follow a changed command, including the ramp, s."""
 
 DEVIATES_S = 1.0
-"""Time for which the robot may deviate from the command before the leg is halted, s."""
+"""Time for which the robot may deviate from the command, s, before the leg is halted."""
 
 LINEAR_OFF, ANGULAR_OFF, OFF_SHARE = 0.05, 0.15, 0.3
-"""Limits for the difference between the measured twist of the wheels and the commanded twist.
+"""Limits for the deviation of the measured twist from the commanded twist.
 
-The linear difference may be `LINEAR_OFF` m/s plus the fraction `OFF_SHARE` of the linear command.
-The angular difference may be `ANGULAR_OFF` rad/s plus `OFF_SHARE` of the angular command.
+The measured twist is computed from the wheel speeds. The linear speed may deviate by `LINEAR_OFF`
+m/s plus the fraction `OFF_SHARE` of the commanded linear speed. The turn rate may deviate by
+`ANGULAR_OFF` rad/s plus `OFF_SHARE` of the commanded turn rate.
 """
 
 STILL = 0.02
@@ -41,8 +42,8 @@ STILL = 0.02
 STANDING_S, STANDS_S = 0.5, 6.0
 """Times for the end of a leg, s.
 
-The leg is done when the wheels have stood still for `STANDING_S`. If that takes longer than
-`STANDS_S`, the leg is halted.
+The leg is done when the wheels have stood still for `STANDING_S`. If the leg is not done
+`STANDS_S` after the last move, it is halted.
 """
 
 ENTER = "\r\n"
@@ -50,11 +51,14 @@ PRESSED = "a key was pressed"
 
 
 class Phase(StrEnum):
+    """The phases of a leg, in their order. `HALTED` can follow any phase except `DONE`."""
+
     OPENING = "opening"
-    """The driver commands zero until the daemon accepts its commands."""
+    """The tool commands zero until the daemon accepts the commands of this leg."""
     MOVING = "moving"
+    """The tool commands the moves of the leg."""
     SETTLING = "settling"
-    """The driver commands zero until the wheels stand still."""
+    """The tool commands zero until the wheels stand still."""
     DONE = "done"
     HALTED = "halted"
 
@@ -62,17 +66,20 @@ class Phase(StrEnum):
 class LegDriver:
     """Decides the commands of one leg.
 
-    Every argument `now` is the present time, s, on one monotonic clock, which also advances during
-    a suspend.
+    Every argument `now` is the present time, s. All these times come from one monotonic clock,
+    which also advances while the computer is suspended.
     """
 
     def __init__(self, leg: Leg, source: str, drive: DriveConfig, now: float, sender: str) -> None:
-        """Start a leg. The daemon identifies the commands of this leg by `source` and `sender`."""
+        """Start a leg.
+
+        The daemon recognizes the commands of this leg by their `source` and `sender`.
+        """
         self._leg, self._source, self._sender = leg, source, sender
         self._kinematics = Kinematics(drive)
         self.phase = Phase.OPENING
         self.halted = ""
-        """The reason why the leg was cut short; "" if it was not."""
+        """The reason why the leg ended early; "" if it did not end early."""
         self.disturbed = False
         """True if the reason in `halted` is temporary, so that the leg can be repeated."""
         self.silent = False
@@ -86,7 +93,8 @@ class LegDriver:
         self._waits = "no message with the daemon's state has arrived"
         """The reason why the daemon does not accept the commands yet; "" if it accepts them."""
         self._starved = f"the daemon has received no command of source {source} for {OPENING_S:g} s"
-        """The reason for halting the leg if this computer was too busy to send commands."""
+        """Reason to halt the leg if the daemon receives no commands, because this computer is too
+        busy."""
         self._still_since: float | None = None
         self._deviates_since: float | None = None
 
@@ -95,7 +103,7 @@ class LegDriver:
         return self.phase in (Phase.DONE, Phase.HALTED)
 
     def progress(self, now: float) -> float:
-        """Return the fraction of the leg that is done; 1 when it is over."""
+        """Return the fraction of the leg that is done, from 0 to 1; 1 when the leg is over."""
         if self.over:
             return 1.0
         if self._number < 0:
@@ -104,7 +112,7 @@ class LegDriver:
         return min(0.99, max(0.0, (behind - self._ends + now) / self._leg.seconds))
 
     def key(self, pressed: str, now: float) -> None:
-        """Handle a key press, which halts the leg except in two cases.
+        """Process a key press. It halts the leg, with two exceptions.
 
         In the last move of a leg with `Leg.by_key`, a key ends this move as planned, and further
         keys are ignored. In the phase OPENING, Enter is ignored, because the person may still hold
@@ -113,8 +121,8 @@ class LegDriver:
         if self.phase is Phase.OPENING and pressed in ENTER:
             return
         if self.phase is Phase.MOVING and now - self._stepped > QUIET_S / 2:
-            # This process was paused, and the robot stopped meanwhile. The person may have pressed
-            # a key only because the robot stopped.
+            # This process was paused, and the robot stopped during the pause. The person may have
+            # pressed a key only because the robot stopped.
             self._halt(HELD_UP)
         last = self._number == len(self._leg.moves) - 1
         if self.phase is Phase.MOVING and self._leg.by_key and last:
@@ -123,6 +131,7 @@ class LegDriver:
             self._halt(PRESSED)
 
     def state(self, state: RobotState, now: float) -> None:
+        """Process the daemon's `state`. Halt the leg if the robot does not follow its commands."""
         self._received = now
         why = self._objection(state)
         if state.mode in (*NEVER, "waiting"):
@@ -143,7 +152,7 @@ class LegDriver:
             self._tolerate_briefly(why or deviation, now, disturbed=disturbed)
 
     def wheels(self, fastest: float, now: float) -> None:
-        """Handle wheel feedback. `fastest` is the speed of the fastest wheel, rad/s."""
+        """Process wheel speeds from the daemon. `fastest` is that of the fastest wheel, rad/s."""
         self._received = now
         if fastest > STILL:
             self._still_since = None
@@ -153,10 +162,10 @@ class LegDriver:
     def step(self, now: float) -> Twist:
         """Return the command to send now."""
         held_up, self._stepped = now - self._stepped, now
-        # While this process was paused, the robot has braked, and the time of the move may have run
-        # out. The next move would then begin at the wrong place. The pause also hides whether the
-        # daemon was silent. If the pause came before the first move, the person who started the leg
-        # may have left meanwhile.
+        # If this process was paused, the robot has braked, and the time of the move may be over.
+        # The next move would then begin at the wrong place. The pause also hides whether the daemon
+        # was silent. If the pause came before the first move, the person who started the leg may
+        # have left in the meantime.
         if held_up > QUIET_S / 2 and self.phase in (Phase.OPENING, Phase.MOVING):
             self._halt(HELD_UP, disturbed=True)
         elif now - self._received > QUIET_S:
@@ -192,8 +201,8 @@ class LegDriver:
             return
         move = self._leg.moves[self._number]
         self._command = Twist(move.linear, move.angular)
-        # Add the duration to the planned end of the last move, not to `now`. A late step then does
-        # not lengthen the drive.
+        # Add the duration to the planned end of the previous move, not to `now`. A late step then
+        # does not lengthen the drive.
         self._ends, self._changed = self._ends + move.seconds, now
 
     def _settle(self, now: float) -> None:
@@ -210,12 +219,13 @@ class LegDriver:
             )
 
     def _tolerate_briefly(self, why: str, now: float, *, disturbed: bool) -> None:
-        """Halt the leg if the daemon or the robot has deviated from its commands for `DEVIATES_S`.
+        """Halt the leg if the robot has deviated from the commands for `DEVIATES_S`.
 
-        `why` says how it deviates now, or is "" if it does not. A shorter deviation is harmless: if
-        this computer is busy for a moment, it sends commands late, and the robot only slows down.
+        `why` is the reason of the present deviation, or "" if the robot does not deviate now.
         `disturbed` is true if the leg can be repeated.
         """
+        # A short deviation is harmless. If this computer is busy for a moment, it sends commands
+        # late, and the robot only slows down.
         if not why:
             self._deviates_since = None
         elif self._deviates_since is None:
@@ -224,10 +234,7 @@ class LegDriver:
             self._halt(why, disturbed=disturbed)
 
     def _objection(self, state: RobotState) -> str:
-        """Return the reason why the robot does not follow the commands of this leg.
-
-        Return "" if it follows them.
-        """
+        """Return the reason why the robot does not follow this leg's commands; "" if it does."""
         if why := objection(state, self._source, self._sender):
             return why
         # A source with a long timeout still drives the robot after its commands stop arriving.
@@ -237,15 +244,13 @@ class LegDriver:
         return ""
 
     def _deviation(self, state: RobotState, now: float) -> str:
-        """Return a sentence about how the wheels deviate from the command, or "" if they do not.
-
-        The command is compared with wheel speeds, and not with the turn rate of a gyro, because a
-        robot that skids turns less than commanded.
-        """
+        """Return a sentence about how the wheels deviate from the command; "" if they do not."""
         if now - self._changed < OBEYED_S:
             return ""
         if not state.wheels:
             return "the microcontroller sends no feedback: check its cable and its power supply"
+        # Compare the command with the wheel speeds, and not with the turn rate of a gyro, because a
+        # robot that skids turns less than commanded.
         twist = self._kinematics.twist(WheelSpeeds(*state.wheels))
         for commanded, actual, off, unit in (
             (self._command.linear, twist.linear, LINEAR_OFF, "m/s"),

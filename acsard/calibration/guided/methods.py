@@ -1,10 +1,10 @@
-"""The table of the methods of calibration by a guided drive, and the legs of each.
+"""The methods of calibration by a guided drive, and the legs of each method.
 
-UMBmark is by Borenstein & Feng, UMBmark: A Benchmark Test for Measuring Odometry Errors in Mobile
-Robots (1995). The robot drives squares, and a person measures the displacement between the start
-and the end of each square. The paper evaluates these measurements with two formulas for small
-errors. Here they go into the fit of `tape_readings.py` instead, because the track of a robot that
-skids is far from the configured track.
+The method "umbmark" follows Borenstein & Feng, UMBmark: A Benchmark Test for Measuring Odometry
+Errors in Mobile Robots (1995). The robot drives squares, and a person measures the displacement
+between the start and the end of each square. The paper evaluates these measurements with two
+formulas for small errors. Here the measurements go into the fit of `tape_readings.py` instead,
+because the track of a robot that skids is far from the configured track.
 """
 
 from __future__ import annotations
@@ -27,34 +27,40 @@ from acsard.calibration.multipliers import LEAST_M
 from acsard.terminal.prompt import Ask
 
 TAPE_M = 0.005
-"""Standard deviation of a straight drive's length by tape, m. It covers the errors at both ends."""
+"""Standard deviation of the length of a straight drive that a person measures by tape, m.
+
+It covers the errors at both ends of the tape.
+"""
 
 BY_EYE = 0.07
 """Standard deviation of a heading that a person judges by eye, rad."""
 
 END_M = 0.003
-"""Standard deviation of a measured distance between the robot and its marks after a square, m.
+"""Standard deviation of a distance between the robot and its marks after a square, m.
 
 It includes the error with which the person made the marks beside the robot.
 """
 
 FIRST_TURN = 1.2
-"""Turn rate of the first turn in place, rad/s, for a robot without skidding."""
+"""Turn rate of the first turn in place, rad/s, if the robot does not skid."""
 
 MISSED = 1.1
-"""Timeout of the first turn, as a multiple of the time for a full turn.
+"""Timeout of the first turn, as a multiple of the longest time for a full turn.
 
-This time is that of a robot with the ratio `WIDEST` of effective track to wheel separation.
+The robot with the largest effective track (`WIDEST`) needs the longest time.
 """
 
 MOST_SPIN_S = 24.0
-"""Longest time that several full turns in place may take together in one leg, s."""
+"""Longest total time of the full turns in place in one leg, s."""
 
 STOP, SETTLE = Move(0.6), Move(1.0)
-"""Pauses between moves. In `STOP` the robot comes to rest; in `SETTLE` it also stops shaking."""
+"""Pauses between moves.
+
+In `STOP`, the robot comes to rest. In `SETTLE`, the robot also stops shaking.
+"""
 
 ROUND = "once round"
-"""Name of the leg in which the robot turns once in place. A person ends this leg with a key."""
+"""Name of the leg in which the robot turns once in place, until the person presses a key."""
 
 FROM_MARK = Ask(
     "How far is the marked wheel from its mark now, in a straight line?", "m", LEAST_M, 2 * ROOM,
@@ -74,7 +80,11 @@ def _at_the_edge(setup: Setup) -> str:
 def once_round(setup: Setup, until: str, asks: tuple[Ask, ...] = (), *measures: Measure) -> Leg:
     """Return the leg of one left turn in place, which the person ends with a key.
 
-    `until` completes the instruction "Press SPACE ...". `asks` and `measures` are those of the leg.
+    Args:
+        setup: the robot, and the speeds of its drive.
+        until: the end of the instruction "Press SPACE ...".
+        asks: the questions after the turn.
+        measures: the measurements that follow from the answers.
     """
     longest = MISSED * 2 * math.pi * WIDEST
     rate = abs(setup.command(FIRST_TURN)) * setup.rate_per_command
@@ -84,7 +94,7 @@ def once_round(setup: Setup, until: str, asks: tuple[Ask, ...] = (), *measures: 
 
 
 def turns(setup: Setup, rate: float, track: float, most: int) -> int:
-    """Return the number of full turns in place that fit into `MOST_SPIN_S`, from 1 to `most`.
+    """Return how many full turns in place fit into `MOST_SPIN_S`, from 1 to `most`.
 
     `rate` is the true turn rate, rad/s. `track` is the ratio of effective track to wheel
     separation.
@@ -114,7 +124,7 @@ TO_LINE = (
 LINE = "front", "rear", "wheelbase"
 """Names of the answers for `Slant.near`, `Slant.far` and `Slant.apart`.
 
-They are for a line on the robot's left.
+The answers describe a line on the left of the robot.
 """
 
 
@@ -170,7 +180,10 @@ OUT_M = 0.9
 """Distance that the robot drives away from the wall before several turns in place, m."""
 
 HALF_RATE, ROUND_RATE = 0.8, 1.2
-"""True turn rates in the method "wall", rad/s: of half turns, and of several full turns."""
+"""True turn rates in the method "wall", rad/s.
+
+`HALF_RATE` is that of half turns, and `ROUND_RATE` that of several full turns.
+"""
 
 SQUARE = (
     "Push the robot's back flat against the wall by hand, so that both its rear corners touch it"
@@ -328,21 +341,21 @@ def _umbmark(setup: Setup, track: float) -> tuple[Leg, ...]:
 # floor although its effective track is unknown.
 
 FAST, SLOW, CURVE = 1.5, 0.75, 0.8
-"""Turn rates of fast turns, slow turns and curves, rad/s, for a robot without skidding."""
+"""Turn rates of fast turns, slow turns and curves, rad/s, if the robot does not skid."""
 
 SPIN_S, CURVE_M, TURN_RAD = 7.5, 1.2, 5.0
 """Sizes of moves in the methods "gyro" and "positions".
 
 - `SPIN_S`: the duration of a turn in place in "gyro", s.
-- `CURVE_M`: the length of a curve, m.
-- `TURN_RAD`: the angle of a turn in place in "positions", rad, that a robot without skidding turns.
+- `CURVE_M`: the longest length of a curve, m.
+- `TURN_RAD`: the angle of a turn in place in "positions", rad, if the robot does not skid.
 """
 
 PETALS = ((FAST, CURVE), (-FAST, -CURVE), (SLOW, 0.0), (-SLOW, CURVE), (FAST, -CURVE))
 """Moves of the method "positions": each pair is a turn in place, and a curve there and back.
 
-The two numbers are the turn rates of the turn and of the curve without skidding, rad/s. A curve
-with the rate 0 is straight.
+The two numbers are the turn rates of the turn and of the curve, rad/s, if the robot does not skid.
+A curve with the rate 0 is straight.
 """
 
 STANDING, PAUSE, SHORT = Move(2.5), Move(1.4), Move(0.7)
@@ -408,7 +421,7 @@ def _positions(setup: Setup, track: float) -> tuple[Leg, ...]:
 def _there_and_back(setup: Setup, rate: float) -> tuple[Move, ...]:
     """Return a curve there and back, which stays on the floor whatever the robot's heading is.
 
-    `rate` is the turn rate without skidding, rad/s.
+    `rate` is the turn rate, rad/s, of a robot that does not skid.
     """
     metres = min(CURVE_M, ROOM / 2 - setup.from_edge)
     return setup.arc(rate, metres), SHORT, setup.arc(-rate, -metres), SHORT

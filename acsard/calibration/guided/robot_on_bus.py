@@ -2,7 +2,7 @@
 
 The senders stamp their messages with different clocks, or not at all. The stamps of one sensor
 therefore show only the intervals between its messages. The recorder assumes that the message with
-the smallest delay from stamp to arrival has no delay. The fit finds the delays that remain.
+the smallest delay from stamp to arrival has no delay. The fit then finds the delay that remains.
 """
 
 from __future__ import annotations
@@ -35,18 +35,22 @@ from acsard.terminal.prompt import Prompt
 SOURCE = "app"
 
 LOOK_S = 0.005
-"""Period of polling the keyboard and the message queues, s. A key takes effect within this time."""
+"""Period at which the keyboard and the message queues are polled, s.
+
+A key takes effect within this time.
+"""
 
 SHOWN_S = 0.2
 """Interval between updates of the progress display of a leg, s."""
 
 RETURNS_S = 3.0
-"""If a silent daemon sends its state again within this time, s, the leg is repeated."""
+"""Time within which a silent daemon must send its state again, s, so that the leg is repeated."""
 
 POSITIONS = (Odometry, PoseStamped)
-"""Types of a position message, in the order in which they are tried.
+"""Types of a position message, in the order in which a sample is decoded as one of them.
 
-A CDR payload does not name its type. Decoding a pose as odometry fails, because a pose is shorter.
+A CDR payload does not name its type. `Odometry` comes first because a pose is too short to be
+decoded as `Odometry`.
 """
 
 Take = Callable[[Any, float], object]
@@ -56,7 +60,8 @@ Take = Callable[[Any, float], object]
 class Sensor:
     """A subscription to one Zenoh key.
 
-    The first message that can be decoded as one of `types` fixes the type of all later messages.
+    The first message decides which one of `types` the messages have. All later messages must have
+    the same type.
     """
 
     def __init__(self, session: zenoh.Session, key: str, types: tuple[type, ...]) -> None:
@@ -65,9 +70,10 @@ class Sensor:
         self._decoders: list[Decoder[Any]] = [Decoder(type_) for type_ in types]
 
     def receive(self, take: Take, now: float) -> int:
-        """Pass the arrived messages to `take` with the time `now`, s, and return their number.
+        """Pass each message that has arrived to `take`, and return the number of messages.
 
-        Raises `GuideError` if a message cannot be decoded.
+        `now` is the present time, s, which `take` receives as the time of arrival. Raises
+        `GuideError` if a message cannot be decoded.
         """
         count = 0
         while (sample := self._samples.try_recv()) is not None:
@@ -78,7 +84,8 @@ class Sensor:
     def await_first(self, what: str) -> None:
         """Wait until a message arrives on the key, and discard it.
 
-        Raises `GuideError`, which names the message as `what`, if none arrives within `FIRST_S`.
+        Raises `GuideError` if no message arrives within `FIRST_S`. Its text calls the message
+        `what`.
         """
         end = clock.steady_s() + FIRST_S
         while not self.receive(lambda message, now: None, 0.0):
@@ -108,7 +115,7 @@ class Sensor:
 STREAMS = {
     "wheels": FOUR, "gyro": ("yaw_rate",), "places": ("x", "y"), "commands": APPLIED,
 }  # fmt: skip
-"""Maps each kind of recorded message to the columns of a log that its values fill."""
+"""Columns of a log that the values of each kind of recorded message fill."""
 
 
 class Sample(Struct, frozen=True):
@@ -125,8 +132,8 @@ class Sample(Struct, frozen=True):
 class Recorder:
     """Collects the samples of one leg.
 
-    Every argument `came` is the time of arrival of the message, s. `joints` names the wheel joints:
-    front right, front left, rear left, rear right.
+    Every argument `came` is the time of arrival of the message, s. `joints` contains the names of
+    the wheel joints: front right, front left, rear left, rear right.
     """
 
     def __init__(self, joints: Sequence[str]) -> None:
@@ -134,7 +141,7 @@ class Recorder:
         self.samples: dict[str, list[Sample]] = {name: [] for name in STREAMS}
 
     def wheels(self, message: JointState, came: float) -> float:
-        """Add wheel speeds and return the speed of the fastest wheel, rad/s."""
+        """Add a sample of the wheel speeds, and return the speed of the fastest wheel, rad/s."""
         speeds = dict(zip(message.name, message.velocity, strict=False))
         self._add("wheels", message.header.stamp, came, tuple(speeds[j] for j in self._joints))
         return max(map(abs, speeds.values()))
@@ -174,8 +181,8 @@ class Recorder:
 def times(samples: Sequence[Sample]) -> Floats:
     """Return the times at which the samples were made, s, on this computer's clock.
 
-    They are computed from the stamps (`on_arrival_clock`). If any stamp is missing, they are the
-    times of arrival.
+    The times are computed from the stamps (`on_arrival_clock`). If any sample has no stamp, the
+    times are the times of arrival.
     """
     came = np.array([sample.came for sample in samples])
     made = np.array([math.nan if s.made is None else s.made for s in samples])
@@ -202,8 +209,8 @@ class RobotOnBus:
     def positions(self, key: str, session: zenoh.Session | None) -> None:
         """Record the positions on `key` in each later leg. Raises `GuideError` if none arrive.
 
-        `session` is the Zenoh session that receives the positions. None means the session that also
-        commands the robot.
+        `session` is the Zenoh session that receives the positions. If it is None, the session that
+        commands the robot also receives the positions.
         """
         sensor = Sensor(session or self._client.session, self._full(key), POSITIONS)
         sensor.await_first("a position (PoseStamped or Odometry)")
@@ -288,6 +295,6 @@ class RobotOnBus:
     def _full(self, key: str) -> str:
         """Return the full Zenoh key for `key`.
 
-        If `acsard topics` lists the key, this robot's id is put in front of it.
+        If `key` is a key of acsard, such as "imu", the id of this robot is put in front of it.
         """
         return self._client.key(key) if by_key(key) is not None else key

@@ -34,14 +34,14 @@ MOST_REPEATS = 2
 MOST_SIMULATED_REPEATS = 20
 """Maximum number of times that a disturbed leg is repeated on the simulator.
 
-It is large because no person has to put the simulated robot back.
+The number is large because no person has to put the simulated robot back.
 """
 
 
 def begins_again(legs: Sequence[Leg], number: int, *, sensor: bool) -> int:
-    """Return the index of the leg with which the drive continues after the disturbed leg `number`.
+    """Return the index of the leg with which the drive continues after a disturbed leg.
 
-    If `sensor` is true, a sensor measures the motion, and only the disturbed leg is repeated.
+    If a sensor measures the motion (`sensor`), only the disturbed leg `number` is repeated.
     Otherwise a person measures by tape, relative to the place where the person put the robot. The
     drive then returns to the last leg before which the person placed the robot.
 
@@ -54,7 +54,7 @@ def begins_again(legs: Sequence[Leg], number: int, *, sensor: bool) -> int:
 
 
 def angle_before(leg: Leg) -> str:
-    """Return the name of the earlier leg after which a person measured the start angle of `leg`.
+    """Return the name of the earlier leg after which the person measured the start angle of `leg`.
 
     Return "" if `leg` needs no start angle, or if its measurements cover several legs.
     """
@@ -66,7 +66,7 @@ def guide(
     name: str, setup: Setup, prompt: Prompt, ride: Callable[[Leg], Run], *,
     simulated: bool = False, true_positions: bool = False,
 ) -> Calibration:  # fmt: skip
-    """Lead a person through the legs of a method of calibration, and return the result.
+    """Lead a person through the legs of a method of calibration, and return the calibration.
 
     Args:
         name: the name of the method, as in `METHODS`.
@@ -80,7 +80,8 @@ def guide(
         GuideError: the drive cannot continue.
         LogError: a recording has too few samples.
         NobodyError: no person answers the questions.
-        RefusedError: the measurements are impossible or contradict each other.
+        RefusedError: the measurements are impossible or contradict each other, or the drive gives
+            no useful calibration.
     """
     method = METHODS[name]
     longest = method.longest_s(setup)

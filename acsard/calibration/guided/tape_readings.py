@@ -2,8 +2,8 @@
 
 A reading is one measurement of the robot's motion since its pose was last known: a distance, a
 turn, or a displacement. A Gauss-Newton fit compares all readings with the path of the wheels. A
-reading differs from this path because of the error of tape and eye, and because the robot skids. If
-there are enough readings, their scatter shows how much the robot skidded.
+reading differs from this path because of the errors of tape and eye, and because the robot skids.
+If there are enough readings, their scatter shows how much the robot skidded.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from acsard.calibration.solve import Calibration, Drives
 from acsard.core.config.settings import DriveConfig, OdometryConfig
 
 SKIDDING = 0.015
-"""Standard deviation of the heading due to skidding, rad, after 1 m.
+"""Standard deviation of the heading due to skidding, rad, after the wheels have rolled 1 m.
 
 The deviation grows with the square root of the rolled distance.
 """
@@ -45,18 +45,18 @@ SKIDDING_LENGTH = 0.002
 """Standard deviation of a distance due to skidding, as a fraction of the distance."""
 
 UNKNOWN = 1.0
-"""Prior standard deviation of the mean wheel radius, as a fraction."""
+"""Prior standard deviation of the mean wheel radius, as a fraction of the wheel radius."""
 
 PRIOR_FREE = 4.0
 """Weight of the assumed noise of the readings, in degrees of freedom.
 
-The fit averages the assumed noise with the noise that the scatter of the readings shows. The noise
-from the scatter has the number of surplus readings as its weight.
+The fit averages two estimates of the noise: the assumed noise, and the noise that the scatter of
+the readings shows. The weight of the second estimate is the number of surplus readings.
 """
 
 MOST_STEPS = 50
 SMALL = 1e-9
-"""If a step changes every parameter by less than this, the fit has converged."""
+"""Largest change of a parameter in the last step of a fit that has converged."""
 
 WORST_CONDITION = 1e8
 """Largest condition number of normal equations from which the parameters can be computed."""
@@ -64,28 +64,31 @@ WORST_CONDITION = 1e8
 ACTIVE = [P.LEFT, P.RIGHT, P.INVERSE_TRACK, P.TRACK_GROWTH]
 
 PRECISE = 0.2
-"""Largest relative standard deviation of a `turned` reading from which the fit may start.
+"""Largest relative standard deviation of a `turned` reading with which the fit may start.
 
-The first value for the effective track is computed from this reading.
+The first estimate of the effective track is computed from this reading.
 """
 
 
 class Reading(Struct, frozen=True, dict=True):
-    """A measurement by tape, in rad or m, of the robot's motion over one or more recorded legs."""
+    """A measurement of the robot's motion over one or more recorded legs, in rad or m.
+
+    A person made it by tape or by eye.
+    """
 
     rides: tuple[Run, ...]
     """The recorded legs that the measurement covers, in order."""
     quantity: Quantity
     value: float
     deviation: float
-    """Standard deviation of the measurement by tape or eye."""
+    """Standard deviation of the measurement by tape or by eye, rad or m."""
 
     @cached_property
     def steps(self) -> WheelSteps:
         return joined(self.rides)
 
     def residual(self, prediction: float) -> float:
-        """Return the measured value minus `prediction`.
+        """Return the measured value minus `prediction`, rad or m.
 
         For an `angle`, the result is reduced by whole turns to a value from -pi to pi.
         """
@@ -94,7 +97,7 @@ class Reading(Struct, frozen=True, dict=True):
 
 
 class Predicted(Struct, frozen=True):
-    """A prediction of a reading from the rolling of the wheels."""
+    """A prediction of a reading, computed from the rolling of the wheels."""
 
     value: float
     derivatives: Floats
@@ -104,17 +107,21 @@ class Predicted(Struct, frozen=True):
 
 
 class TapeFit(Struct, frozen=True):
+    """The result of a fit to tape readings."""
+
     parameters: Floats
     covariance: Floats
     residuals: Floats
-    """Measured minus predicted value of each reading."""
+    """Measured value minus predicted value of each reading, rad or m."""
     held_out: Floats
-    """Residual of each reading with the parameters that fit all other readings. The residual is NaN
-    if the fit to the other readings fails."""
+    """Residual of each reading with parameters that were fitted to all other readings.
+
+    The residual is NaN if the fit to the other readings fails.
+    """
 
 
 def joined(rides: Sequence[Run]) -> WheelSteps:
-    """Return the motion of the wheels in several recorded legs as if they were one leg."""
+    """Return the rolling of the wheels in several recorded legs as if they were one leg."""
     parts = [wheel_steps(ride) for ride in rides]
     ends = np.cumsum([0.0] + [float(part.t[-1]) for part in parts])
     later = [part.t[1:] + end for part, end in zip(parts, ends, strict=False)]
@@ -124,9 +131,13 @@ def joined(rides: Sequence[Run]) -> WheelSteps:
 
 
 def predicted(steps: WheelSteps, quantity: Quantity, base: Base, parameters: Floats) -> Predicted:
-    """Return a prediction of a reading of `quantity`.
+    """Return a prediction of a reading, computed from the rolling of the wheels.
 
-    It is computed from the rolling of the wheels in `steps`, with these parameters.
+    Args:
+        steps: the rolling of the wheels in the legs of the reading.
+        quantity: the quantity that the reading measures.
+        base: the configured geometry.
+        parameters: the parameters of the fit, shape (COUNT,).
     """
     driven = path(steps, base, parameters)
     rolled = base.radius * float(np.abs(steps.left).sum() + np.abs(steps.right).sum()) / 2
@@ -142,8 +153,8 @@ def predicted(steps: WheelSteps, quantity: Quantity, base: Base, parameters: Flo
         derivatives[index] = (np.conj(along) * by_parameter[-1]).real
     variance = (SKIDDING_LENGTH * abs(place)) ** 2
     if quantity != "distance":
-        # A heading error on the way displaces the end by the error times the distance that is still
-        # to go. The mean square of this distance is a third of the span squared.
+        # A heading error during the drive displaces the end point by the error times the remaining
+        # distance. The mean square of this distance is a third of the span squared.
         span = extent(driven.place)
         variance += heading_variance * span**2 / 3
     return Predicted(float((np.conj(along) * place).real), derivatives, variance)
@@ -174,7 +185,8 @@ def fit_readings(readings: Sequence[Reading], base: Base) -> TapeFit:
 def _starting_parameters(readings: Sequence[Reading], base: Base) -> Floats:
     """Return parameters from which the fit can start.
 
-    They are accurate enough to find the number of whole turns in each `angle` reading.
+    The parameters are accurate enough to find the number of whole turns in each `angle` reading.
+    Raises `RefusedError` if a measured turn is far from the turn of the wheels.
     """
     start = base.start()
     for reading in readings:
@@ -194,7 +206,7 @@ def _starting_parameters(readings: Sequence[Reading], base: Base) -> Floats:
 def _compared(
     readings: Sequence[Reading], base: Base, parameters: Floats
 ) -> Iterator[tuple[Predicted, float, float]]:
-    """Yield the prediction, the residual and the weight of each reading."""
+    """Yield, for each reading, its prediction, its residual and its weight."""
     for reading in readings:
         prediction = predicted(reading.steps, reading.quantity, base, parameters)
         weight = 1 / (reading.deviation**2 + prediction.variance)
@@ -206,17 +218,18 @@ def _solved(readings: Sequence[Reading], base: Base, start: Floats) -> tuple[Flo
 
     The first item is the array of the fitted parameters, shape (COUNT,). The second item is the
     matrix on the left-hand side of the normal equations of the last step, shape (COUNT, COUNT). It
-    is J^T W J plus the prior information about the track growth and the mean radius. J contains the
-    derivatives of the predicted readings with respect to the parameters, and W contains the weights
-    of the readings.
+    is J^T W J plus the prior information about the track growth and the mean radius. J contains
+    the derivatives of the predicted readings with respect to the parameters, and W contains the
+    weights of the readings.
 
     Args:
         readings: the measurements by tape.
         base: the configured geometry.
         start: the parameters from which the fit starts.
 
-    Raises `RefusedError` if the readings do not determine the parameters, or if the fit does not
-    converge because the readings contradict each other.
+    Raises:
+        RefusedError: the readings do not determine the parameters, or the fit does not converge
+            because the readings contradict each other.
     """
     parameters, configured = start.copy(), base.start()
     for _ in range(MOST_STEPS):
@@ -272,21 +285,30 @@ def _held_out_residual(
 READ_M = 0.002
 """Standard deviation of a distance that a person measures by tape, m.
 
-The place of a robot that a person puts on a line has the same standard deviation.
+It is also the standard deviation of the position of a robot that a person places at a line.
 """
 
 CREDIBLE = 0.85, 3.0
 """Range of credible ratios of effective track to wheel separation."""
 
 Answers = dict[tuple[str, str], float]
-"""The answers, m or rad, by leg and question. The leg is "" for questions before the first leg."""
+"""The person's answers, in m or rad, by the names of leg and question.
+
+The name of the leg is "" for questions before the first leg.
+"""
 
 
 def reading(measure: Measure, leg: str, rides: Mapping[str, Run], answers: Answers) -> Reading:
-    """Return the reading that `measure` defines, from a person's answers after the leg `leg`.
+    """Return the reading that `measure` defines, computed from the person's answers.
 
-    `rides` contains the recording of each leg, by the leg's name. Raises `RefusedError` if the
-    answers are impossible.
+    Args:
+        measure: the definition of the reading.
+        leg: the name of the leg after which the person measured.
+        rides: the recording of each leg, by the name of the leg.
+        answers: the answers so far.
+
+    Raises:
+        RefusedError: the answers are impossible.
     """
     driven = tuple(rides[name] for name in measure.over or (leg,))
     if isinstance(measure, Mean):
@@ -307,8 +329,9 @@ def reading(measure: Measure, leg: str, rides: Mapping[str, Run], answers: Answe
 def track_ratio(reading: Reading, drive: DriveConfig) -> float:
     """Return the approximate ratio of effective track to wheel separation.
 
-    The next legs are planned with this ratio. `reading` is the measurement of one full turn of the
-    robot. Raises `GuideError` if the ratio is not credible.
+    `reading` is the measurement of one full turn of the robot. The ratio is limited to the range
+    from 1 to `WIDEST`, because the next legs are planned with it. Raises `GuideError` if the ratio
+    is not credible (`CREDIBLE`).
     """
     # Use the measured radius and separation without the configured multipliers.
     base = Base(drive.wheel_radius, drive.wheel_separation, 1.0, 1.0, 1.0)
@@ -326,10 +349,15 @@ def track_ratio(reading: Reading, drive: DriveConfig) -> float:
 
 
 def slant(near: float, far: float, apart: float) -> float:
-    """Return the angle in rad between the robot and a line, positive after a turn to the left.
+    """Return the angle between the robot and a line, rad, positive after a turn to the left.
 
-    `near` and `far` are the distances from the line, m, of two points `apart` m from each other. A
-    turn to the left decreases `near`. Raises `RefusedError` if the distances are impossible.
+    The angle is computed from the distances of two points of the robot to the line. Raises
+    `RefusedError` if the distances are impossible.
+
+    Args:
+        near: distance of the point that a turn to the left moves towards the line, m.
+        far: distance of the other point, m.
+        apart: distance between the two points, m.
     """
     sine = (far - near) / apart
     if abs(sine) > 0.98:
@@ -350,9 +378,10 @@ ADVICE = (
 )
 
 TURNED, STRAIGHT = np.pi, 0.5
-"""Limits for the angle that the robot turns in a drive, rad.
+"""Limits for the angle that the robot turns in the legs of a reading, rad.
 
-Above `TURNED`, the drive counts as a turn; below `STRAIGHT`, it counts as straight.
+Above `TURNED`, the reading shows an error of turns. Below `STRAIGHT`, it shows an error of
+straight driving.
 """
 
 
@@ -366,8 +395,8 @@ def calibrated(
     base = Base.of(drive)
     rides = list({id(ride): ride for reading in readings for ride in reading.rides}.values())
     fit = fit_readings(readings, base)
-    # No gyro is compared with the rows, so the blocks only have to be short enough to show the turn
-    # rates.
+    # The rows are not compared with a gyro, so the blocks only have to be short enough to show the
+    # turn rates.
     rows = heading.rows(None, rides, blocks(rides, 4.0))
     by_wheels = heading.turned(rows, base, fit.parameters)
     rate = rates(rows, by_wheels)
@@ -395,8 +424,8 @@ def calibrated(
 def _improvement(readings: Sequence[Reading], base: Base, fit: TapeFit, rate: Rates) -> Improvement:
     """Return the odometry errors with the configured and with the new parameters.
 
-    Each reading shows one error. To measure the error with the new parameters, the parameters are
-    fitted to all other readings. If this fit fails, the parameters that fit all readings are used.
+    Each reading shows one error. The new parameters are fitted to all other readings. If that fit
+    fails, the parameters that fit all readings are used.
     """
     sums = {name: np.zeros(3) for name in ("turn", "straight", "place")}
     present = fit.parameters.copy()

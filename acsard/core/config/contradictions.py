@@ -1,6 +1,7 @@
-"""Finds contradictions between the keys of a configuration, and surprising effects.
+"""Checks combinations of settings in a configuration.
 
-A contradiction is an error. A surprising effect is a warning. The rules about motion are in
+`contradictions` returns errors: settings that cannot be used together. `warnings` returns settings
+that are allowed but have an effect that a user may not expect. The rules about motion are in
 `motion_rules.py`, and the rules about simulated faults in `named_faults.py`.
 """
 
@@ -28,27 +29,27 @@ from acsard.core.config.wire_time import (
 from acsard.core.values import ROOT, WHEELS
 
 LEAST_WRAP_PERIODS = 2
-"""Smallest number of control periods in which a wheel at full speed may move its encoder count by
-half of the count's range. After half of the range, a turn in the other direction would give the
-same count, so the direction is ambiguous. With a minimum of two periods, one lost line does no
-harm."""
+"""Smallest number of control periods in which a wheel at full speed may change its encoder count
+by half of the count's range. A larger change between two lines would look like a turn in the other
+direction. The value 2 allows for one lost line."""
 
 FEW_COUNTS, FASTEST_HZ = 200, 100.0
-"""A warning says that the pose may be wrong if the encoders have fewer than `FEW_COUNTS` counts per
-turn and the control rate is above `FASTEST_HZ`. It is for boards that report speeds but no counts.
-Such a board repeats its last speeds if it is asked again too soon, and the daemon cannot always
-tell repeated speeds from new ones. With 16 to 96 counts, the simulated robot measured distances
-that were up to 20 % too short at 200 Hz and up to 29 % too long at 300 Hz."""
+"""Limits for a warning about coarse encoders: encoder counts per wheel turn, and the control rate
+in Hz. The warning appears if there are fewer counts, the control rate is higher, and the board
+reports speeds but no counts. Such a board repeats its last speeds if it is asked again too soon,
+and the daemon cannot always tell repeated speeds from new ones. With 16 to 96 counts, the
+simulated robot measured distances that were up to 20 % too short at 200 Hz and up to 29 % too long
+at 300 Hz."""
 
 LEAST_HZ = 0.001
-"""Lowest rate of publishing above 0, Hz: one message in 17 min."""
+"""Lowest publishing rate that is not 0, Hz. It means one message in 17 min."""
 
 MOST_VOLTS = 99.99
 """Highest voltage that a status line can express, V."""
 
 
 def warnings(config: Config) -> list[str]:
-    """Return a list with a warning for each setting that is allowed but has a surprising effect."""
+    """Return one warning for each setting that is allowed but has a surprising effect."""
     found = []
     count = config.mcu.line_bytes
     use = wire_use(config.rate_hz, config.mcu.baud_rate, count)
@@ -130,7 +131,7 @@ def _count_warnings(config: Config) -> list[str]:
 
 
 def contradictions(config: Config) -> list[str]:
-    """Return an error line for each contradiction between keys of the configuration."""
+    """Return one error line for each contradiction between settings in `config`."""
     return mistakes(RULES, config)
 
 
@@ -152,9 +153,10 @@ def _wire_problems(config: Config) -> list[str]:
 
 
 def _shorter_lines(mcu: McuConfig, rate: float) -> str:
-    """Return advice for the end of an error message: which setting makes the serial lines shorter.
+    """Return advice such as "; or mcu.encoder_counts = 0, which shortens the lines to 41 B".
 
-    The result is "" if no setting makes them short enough for the control rate `rate`, Hz.
+    The advice is the end of an error message. It is "" if no setting makes the serial lines short
+    enough for the control rate `rate`, Hz.
     """
     fixes = ((True, "mcu.encoder_counts = 0"), (False, 'mcu.link_check = "off"'))
     for check, fix in fixes:
@@ -167,8 +169,8 @@ def _shorter_lines(mcu: McuConfig, rate: float) -> str:
 def _count_problems(config: Config) -> list[str]:
     """Return an error line if forward motion of a wheel could look like backward motion.
 
-    To prevent this, `mcu.encoder_counts` must be so low that at full speed a count does not change
-    by half of its range within `LEAST_WRAP_PERIODS` control periods.
+    To prevent this, `mcu.encoder_counts` must be low enough: while a wheel turns at full speed,
+    its count must not change by half of its range within `LEAST_WRAP_PERIODS` control periods.
     """
     counts, fastest = config.mcu.encoder_counts, config.feedback.wheel_speed / math.tau
     lasts = LEAST_WRAP_PERIODS / config.rate_hz
@@ -237,9 +239,9 @@ def _gyro_problems(config: Config) -> list[str]:
 def _battery_problems(config: Config) -> list[str]:
     """Return an error line for each mistake in the battery thresholds.
 
-    A more severe level must have a lower threshold. A level ends when the value rises above its
-    threshold plus the hysteresis, so this sum must not exceed the highest value that a board can
-    report.
+    A more severe level must have a lower threshold. A level ends when the voltage or the charge
+    rises above the threshold plus the hysteresis, so a board must be able to report a value above
+    this sum.
     """
     battery, found = config.battery, []
     rows = [(f"battery.{level}_below", below) for level, below in battery.bounds.items()]
@@ -261,10 +263,11 @@ def _battery_problems(config: Config) -> list[str]:
 def _repeated(
     noun: str, names: dict[str, str], part: Callable[[str], str] = lambda name: name
 ) -> list[str]:
-    """Return an error line for each name that repeats an earlier one.
+    """Return an error line for each value in `names` that repeats an earlier value.
 
-    `noun` says in the error what kind of name it is, such as "motor". `names` maps keys of the
-    configuration to names. Two names count as the same if `part` returns the same text for both.
+    `noun` is the kind of value for the error text, such as "motor". `names` maps dotted keys, such
+    as `mcu.wheels.front_left`, to their values. Two values count as the same if `part` returns the
+    same text for both values.
     """
     first: dict[str, str] = {}
     found = []
@@ -301,9 +304,9 @@ def _bumper_problems(config: Config) -> list[str]:
 
 
 def _reachability_problems(config: Config) -> list[str]:
-    """Return an error line for each setting of `bus` that keeps clients from the daemon.
+    """Return an error line for each setting of `[bus]` with which clients cannot connect.
 
-    It would keep out either all clients, or all clients that connect over TLS.
+    Some of these settings lock out all clients, and others only the clients that use TLS.
     """
     bus, found = config.bus, []
     if bus.mode == "client" and not bus.connect:
@@ -351,14 +354,13 @@ def _endpoint_problems(config: Config, key: str) -> list[str]:
 
 
 def _listen_twice_problems(config: Config) -> list[str]:
-    """Return an error line for each entry of `bus.listen` that repeats a host and port."""
     listen = _endpoints(config.bus).get("listen", ())
     names = {f"bus.listen[{i}]": endpoint for i, endpoint in enumerate(listen)}
     return _repeated("host and port", names, lambda endpoint: endpoint.partition("/")[2])
 
 
 def _page_problems(config: Config) -> list[str]:
-    """Return an error line for each entry of `web.address` at which the page could not start.
+    """Return an error line for each entry of `web.address` that prevents the start of the page.
 
     `acsard/web/listen.py` applies the same rules when the page starts.
     """
@@ -403,7 +405,7 @@ def _ros_problems(config: Config) -> list[str]:
 
 
 def _endpoints(bus: BusConfig) -> dict[str, tuple[str, ...]]:
-    """Return the endpoints in use under "listen" and "connect", as in the table `[bus]`.
+    """Return the endpoints that the daemon uses, by the keys "listen" and "connect" of `[bus]`.
 
     The result has no "listen" if `bus.mode` is "client", because a client listens at no endpoint.
     """
@@ -412,7 +414,10 @@ def _endpoints(bus: BusConfig) -> dict[str, tuple[str, ...]]:
 
 
 def _host(endpoint: str) -> str | None:
-    """Return the host of an endpoint such as "tcp/127.0.0.1:7448", or None if it is not valid."""
+    """Return the host in an endpoint such as "tcp/127.0.0.1:7448".
+
+    Return None if the endpoint is not valid.
+    """
     scheme, _, address = endpoint.partition("/")
     if set(endpoint) & set("#?;= \t"):
         # These characters add options for Zenoh to an endpoint. Such options could switch off the

@@ -25,18 +25,22 @@ WHEN: dict[When, str] = {
     "raised": "may be raised at any time, but lowered only while the robot stands",
     "rest": "only while the robot stands",
 }
-"""Maps each `When` to words that say when such a setting may change.
+"""Texts for users that say when a setting may change, by the value of `Live.when`.
 
 - "always": The change is safe at any time.
-- "raised": The setting is a deceleration. If it were lowered while the robot drives, the robot
-  could not stop in time.
-- "rest": Lowering `limits.wheel_speed` reduces the speed without a ramp. After a change in
-  `commands`, no sender drives the robot until it has sent a zero.
+- "raised": The setting is a deceleration. A lower deceleration makes the stopping distance longer,
+  so it must not be lowered while the robot drives.
+- "rest": The change would disturb a moving robot. A lower `limits.wheel_speed` reduces the speed
+  without a ramp. After a change in `commands`, no sender drives the robot until it has sent a
+  zero.
 """
 
 
 class Live(Struct, frozen=True):
-    """A setting that may change while the daemon runs."""
+    """A setting that may change while the daemon runs.
+
+    `when` is a key of `WHEN`. `what` describes the setting for users.
+    """
 
     when: When
     what: str
@@ -102,7 +106,7 @@ SECTIONS: dict[str, type[Struct]] = {field.name: field.type for field in fields(
 
 
 def live(key: str) -> Live | None:
-    """Return the entry of `LIVE` for a dotted key.
+    """Return the entry of `LIVE` for the setting with the dotted key `key`.
 
     The result is None if the setting takes effect only at the next start of the daemon.
     """
@@ -113,11 +117,11 @@ def live(key: str) -> Live | None:
 
 
 def flat(value: object, name: str = "") -> Iterator[tuple[str, object]]:
-    """Yield the dotted name and the value of each key in nested tables.
+    """Yield the dotted key and the value of each setting in nested tables.
 
-    The dotted name of a table in a list contains the table's own `name`, not its index: the timeout
-    of the source "app" is `commands.sources.app.timeout`. The parameter `name` is the dotted name
-    of `value`, "" for the whole configuration.
+    `name` is the dotted key of `value`, or "" for the whole configuration. A table in a list, such
+    as a command source, appears in a dotted key with its own `name` instead of its index. For
+    example, the key of the timeout of the source "app" is `commands.sources.app.timeout`.
     """
     if isinstance(value, Mapping):
         for key, inner in value.items():
@@ -131,17 +135,17 @@ def flat(value: object, name: str = "") -> Iterator[tuple[str, object]]:
 
 
 class Difference(Struct, frozen=True):
-    """A setting whose value in force differs from its value in the configuration file."""
+    """The two values of a setting that differs between the daemon and the configuration file."""
 
     its: object
-    """Value in force."""
+    """Value in force in the daemon; None if the setting does not exist there."""
     ours: object
-    """Value in the file."""
+    """Value in the configuration file; None if the setting does not exist there."""
 
     def words(self, key: str) -> str:
-        """Return a text with both values of the setting: `log.level = "info", not "debug"`.
+        """Return a text with both values, such as `log.level = "info", not "debug"`.
 
-        `key` is the dotted key of the setting.
+        The value in force comes first. `key` is the dotted key of the setting.
         """
         # A command source may be in only one of the two configurations. Its keys have no value in
         # the other one.
@@ -150,9 +154,9 @@ class Difference(Struct, frozen=True):
 
 
 def differences(runs: Config, file: Config) -> dict[str, Difference]:
-    """Return the settings in which two configurations differ, by dotted key.
+    """Return the settings whose values differ between two configurations, by dotted key.
 
-    `runs` is the configuration in force. `file` is the one in the configuration file.
+    `runs` is the configuration in force. `file` is the configuration in the file.
     """
     its, ours = dict(flat(effective(runs))), dict(flat(effective(file)))
     return {
@@ -163,14 +167,18 @@ def differences(runs: Config, file: Config) -> dict[str, Difference]:
 
 
 def changed(config: Config, wishes: Mapping[str, object], at_rest: bool) -> tuple[Config, str]:
-    """Return a pair: `config` with the requested settings, and a text that lists the changes.
+    """Return a pair: `config` with new values of settings, and a text that lists the changes.
 
-    `wishes` contains the requested values by dotted key. `at_rest` says whether the robot stands,
-    because some settings may change only then. A setting that already has the requested value is
-    left out, even if it may not change. The text is "" if nothing changes.
+    The change is applied completely or not at all. A setting that already has the requested value
+    is skipped, even if it must not change. The text is "" if nothing changes.
+
+    Args:
+        config: the configuration in force.
+        wishes: the requested values, by dotted key.
+        at_rest: True if the robot stands still. Some settings may change only then.
 
     Raises:
-        ConfigError: the change is not allowed, so no setting is changed. The error says why.
+        ConfigError: the change is not allowed. The error says why.
     """
     tables: dict[str, Any] = effective(config)
     before = dict(flat(tables))
@@ -225,7 +233,7 @@ def _put(tables: dict[str, Any], path: list[str], value: object) -> None:
 
 
 def _must_stand(key: str, before: object, after: object) -> str:
-    """Return an error line if a setting may change only while the robot stands, else "".
+    """Return an error line if this change is allowed only while the robot stands still, else "".
 
     `key` is the dotted key of the setting. `before` and `after` are its values.
     """

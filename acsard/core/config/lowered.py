@@ -19,14 +19,18 @@ TABLE = "limits."
 
 
 def stays(key: str) -> bool:
-    """Return whether a lowered value of the dotted key `key` is kept if the daemon restarts."""
+    """Return whether a lowered value of the setting `key` is kept over a restart of the daemon.
+
+    `key` is the dotted key of the setting.
+    """
     return key.startswith(TABLE) and not key.endswith("_deceleration")
 
 
 def lowered(file: LimitsConfig, now: LimitsConfig) -> dict[str, float]:
-    """Return the limits that are lower now than in the configuration file.
+    """Return the limits that are lower in `now` than in `file`, without the decelerations.
 
-    The result contains their values in `now` by dotted key. Decelerations are left out.
+    `now` contains the limits in force, and `file` the limits in the configuration file. The result
+    maps dotted keys to the values in `now`.
     """
     return {
         TABLE + name: getattr(now, name)
@@ -37,12 +41,16 @@ def lowered(file: LimitsConfig, now: LimitsConfig) -> dict[str, float]:
 
 
 def with_lowered(config: Config, kept: Mapping[str, float]) -> tuple[Config, list[Event]]:
-    """Return a pair: `config` with the lowered limits, and events that report what was applied.
+    """Return a pair: `config` with the lowered limits, and events that report the changes.
 
-    `config` is the content of the configuration file. `kept` contains the limits that were lowered
-    before the restart, by dotted key. A limit is applied only if it is below the value in `config`.
-    The file may have changed since, so the limits together may contradict it. They are then applied
-    one at a time: each limit that causes a contradiction is dropped, and an event says so.
+    A lowered limit is applied only if it is below the value in `config`. The configuration file
+    may have changed since the limits were lowered, so they may contradict its other settings. In
+    this case, the limits are applied one after another. A limit that causes a contradiction is
+    dropped, and an event reports this.
+
+    Args:
+        config: the content of the configuration file.
+        kept: the limits that were lowered before the restart, by dotted key.
     """
     limits = config.limits
     wishes: dict[str, object] = {
@@ -80,9 +88,8 @@ def _applied(config: Config, wishes: Mapping[str, object]) -> tuple[Config, list
 
 
 def _rank(name: str, value: float) -> float:
-    """Return a number by which two values of the limit `name` can be compared.
+    """Return a number to compare two values of the limit `name`; a larger one allows more motion.
 
-    The larger number belongs to the value that allows more motion. For a jerk limit of 0, which
-    means "no limit", the number is infinity. Any other value is returned as it is.
+    The result is infinity for a jerk limit of 0, which means "no limit". Otherwise it is `value`.
     """
     return math.inf if name.endswith("_jerk") and value == 0.0 else value

@@ -18,15 +18,15 @@ LEAST_JERK = 0.01
 10 s to reach walking pace."""
 
 LONGEST_STOP_S = 2.0
-"""Longest time, s, that the robot may take to brake from full speed to rest when it is stopped. No
-person should have to wait longer."""
+"""Longest allowed time to brake from full speed to rest after a stop, s. No person should have to
+wait longer."""
 
 LONGEST_RAMP_S = 5.0
-"""Longest time, s, that the robot may take to brake from full speed to rest when commands no longer
-arrive. During this ramp, no sender controls the robot."""
+"""Longest allowed time to brake from full speed to rest after the last command, s. During this
+ramp, no sender controls the robot."""
 
 HEADROOM = 1.1
-"""Ratio of the speed that a sound wheel may reach for a moment to its commanded speed."""
+"""Highest speed that a sound wheel reaches for a moment, divided by its commanded speed."""
 
 MOST_WHEEL_SPEED = 99.99
 """Highest wheel speed that a line to the board can express, rad/s."""
@@ -36,7 +36,7 @@ LINES_OF_EVIDENCE = 2
 
 
 class _Reach(Struct, frozen=True):
-    """The highest speeds that the limits allow."""
+    """The highest speeds that the settings in `[limits]` allow."""
 
     linear: float
     """Linear speed, m/s."""
@@ -95,7 +95,7 @@ def _jerk_problems(config: Config, name: str) -> list[str]:
 
 
 def _feedback_problems(config: Config, asked: float) -> list[str]:
-    """Return an error line if `feedback.wheel_speed` is so low that a sound wheel could exceed it.
+    """Return an error line if a sound wheel could be faster than `feedback.wheel_speed`.
 
     `asked` is the highest wheel speed that a command can request within the limits, rad/s.
     """
@@ -111,10 +111,7 @@ def _feedback_problems(config: Config, asked: float) -> list[str]:
 
 
 def _reply_problems(config: Config) -> list[str]:
-    """Return an error line if `mcu.reply_period` is too long.
-
-    With such a period, one lost line would look like a wheel fault.
-    """
+    """Return an error line if, with `mcu.reply_period`, one lost line looks like a wheel fault."""
     period, fault_s = config.mcu.reply_period, config.feedback.fault_time
     most = longest_reply(fault_s)
     if period <= most:
@@ -127,9 +124,11 @@ def _reply_problems(config: Config) -> list[str]:
 
 
 def longest_reply(fault_s: float) -> float:
-    """Return the longest allowed `mcu.reply_period`, s.
+    """Return the longest allowed interval between two feedback lines (`mcu.reply_period`), s.
 
-    `fault_s` is `feedback.fault_time`, s, or 0 if the daemon does not check for wheel faults.
+    `fault_s` is `feedback.fault_time`, s. Within this time, the board must send
+    `LINES_OF_EVIDENCE` lines. If `fault_s` is 0, the daemon does not check for wheel faults, and
+    the result is `LONGEST_REPLY_S`.
     """
     share = math.floor(round(fault_s / LINES_OF_EVIDENCE * 1000, 6)) / 1000
     return min(LONGEST_REPLY_S, share) if fault_s else LONGEST_REPLY_S
@@ -138,7 +137,7 @@ def longest_reply(fault_s: float) -> float:
 def _rounded_up(value: float) -> float:
     """Return a value rounded up to three decimals.
 
-    Error messages advise to write at least this value, so it must not be rounded down.
+    The value is the least allowed value in an error message, so it must not be rounded down.
     """
     return math.ceil(round(value * 1000, 6)) / 1000
 

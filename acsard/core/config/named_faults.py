@@ -1,4 +1,4 @@
-"""Reads the names of the simulator's faults, such as `mute`, `stuck_encoder=b` or `stalls=5:0.15`.
+"""Parses the names of simulated faults, such as `mute`, `stuck_encoder=b` or `stalls=5:0.15`.
 
 The methods that produce the faults have the same names. They are in `core/simulator/faults.py` and
 `core/simulator/fake_mcu.py`.
@@ -33,16 +33,18 @@ ARGUMENTS = {
     "bumper_pressed": "nnn", "bumpers_silent": "nn", "driver_fault": "nn",
     "battery": "nn",
 }  # fmt: skip
-"""Maps each fault that takes arguments to one letter for each argument: `m` for a motor and `n` for
-a number. A user writes a motor as a to d; it is stored as 0 to 3."""
+"""Maps the name of each fault with arguments to the kinds of its arguments. Each letter stands for
+one argument: `m` for a motor, `n` for a number. A user writes a motor as a to d, and `NamedFault`
+stores it as 0 to 3."""
 
 INPUTS = ("estop_pressed", "estop_silent", "bumper_pressed", "bumpers_silent", "driver_fault")
-"""Faults whose last two arguments are the time from the start of the simulator to the beginning of
-the fault, and the duration of the fault, both in s."""
+"""Names of the faults of the board's inputs. The last two arguments of each fault are a delay and
+a duration, s. The delay is the time from the start of the simulator to the beginning of the fault.
+A duration of 0 means that the fault never ends."""
 
 RESET = "reset"
-"""Fault that restarts the simulated board periodically. Its argument is the period, s. It needs a
-timer, so only `acsard sim --fault` offers it."""
+"""Name of the fault that restarts the simulated board periodically. Its argument is the period, s.
+It needs a timer, so only `acsard sim --fault` offers it."""
 
 MOTORS = "abcd"
 
@@ -51,25 +53,26 @@ MOST = 1e6
 overflow in the simulator."""
 
 SHORTEST_S = 0.001
-"""Shortest duration of the fault `stalls`, s. A shorter one has no visible effect."""
+"""Shortest duration of a stall in the fault `stalls`, s. A shorter stall has no visible effect."""
 
 
 class NamedFault(Struct, frozen=True):
-    """A fault of the simulator with its arguments. A motor is a number from 0 to 3."""
+    """A simulated fault and its arguments. A motor argument is a number from 0 to 3 (a to d)."""
 
     name: str
     values: tuple[int | float, ...] = ()
 
 
 def forms() -> list[str]:
-    """Return the faults with arguments as a user writes them, such as "stuck_encoder=MOTOR"."""
+    """Return each fault with arguments as a user writes it, such as "stuck_encoder=MOTOR"."""
     return [_form(name, kinds) for name, kinds in ARGUMENTS.items()]
 
 
 def named(text: str) -> NamedFault:
-    """Parse a fault such as "stalls=5:0.15".
+    """Parse the text of a simulated fault, such as "stalls=5:0.15".
 
-    Raises `ValueError` with the mistake and the fix. The error does not quote `text`.
+    Raises `ValueError` if the text is not valid. The error gives the mistake and the fix, but does
+    not repeat `text`.
     """
     name, _, given = text.partition("=")
     known = {RESET: "n", **dict.fromkeys(FAULTS, ""), **ARGUMENTS}
@@ -110,7 +113,7 @@ def named(text: str) -> NamedFault:
 
 
 def warnings(config: Config) -> list[str]:
-    """Return a warning if the configuration gives the simulator faults, else an empty list.
+    """Return a list with one warning if `sim.faults` has an effect, else an empty list.
 
     Without the warning, a user could take a simulated fault for a real one.
     """

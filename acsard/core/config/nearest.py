@@ -6,12 +6,12 @@ import difflib
 from collections.abc import Iterable
 
 LONGEST = 80
-"""Number of characters of a mistyped word that `nearest` compares; it ignores the rest. So even a
-very long word takes only a short time."""
+"""Number of characters of a mistyped word that `nearest` compares. It ignores the rest, so that
+even a very long word takes only a short time."""
 
 
 def nearest(word: str, known: Iterable[str]) -> list[str]:
-    """Return a list with the most similar known word, or an empty list if no word is similar."""
+    """Return a list with the known word most similar to `word`. It is empty if none is similar."""
     return difflib.get_close_matches(word[:LONGEST], list(known), n=1, cutoff=0.6)
 
 

@@ -26,10 +26,15 @@ class ConfigError(AcsardError):
 
 
 def parse(text: bytes, overrides: dict[str, dict[str, object]] | None = None) -> Config:
-    """Return the configuration in `text`. Raises `ConfigError` with every mistake.
+    """Decode and check the text of an `acsard.toml`.
 
-    `overrides` contains the values from the command line, by table and key. They replace the values
-    in `text`.
+    Args:
+        text: the content of the file, TOML in UTF-8.
+        overrides: values from the command line, by table and key. They replace the values in
+            `text`.
+
+    Raises:
+        ConfigError: the text is not a valid configuration. The error lists every mistake.
     """
     if len(text) > MAX_BYTES:
         raise ConfigError(
@@ -68,12 +73,12 @@ def parse(text: bytes, overrides: dict[str, dict[str, object]] | None = None) ->
 
 
 def from_builtins(data: object) -> Config:
-    """Return the `Config` for the plain tables that `effective` returned."""
+    """Convert the result of `effective` back to a `Config`."""
     return convert(data, Config)
 
 
 def effective(config: Config) -> dict[str, object]:
-    """Return a configuration as plain tables, with a value for every key."""
+    """Return a configuration as nested dictionaries, with a value for every key."""
     plain = to_builtins(config)
     assert isinstance(plain, dict)
     return plain

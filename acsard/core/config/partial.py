@@ -1,5 +1,7 @@
-"""Runs the rules that relate several keys of `acsard.toml` to each other. A rule is skipped if it
-reads a key that has no valid value."""
+"""Runs the rules that relate several keys of `acsard.toml` to each other.
+
+A rule is skipped if it reads a key that has no valid value.
+"""
 
 from __future__ import annotations
 
@@ -10,20 +12,23 @@ from acsard.core.config.settings import Config
 from acsard.core.values import AcsardError
 
 Rule = Callable[[Config], Iterable[str]]
-"""Function that returns the mistakes in a configuration, one line each."""
+"""Function that checks a configuration and returns one error line for each mistake."""
 
 
 class InvalidKeyError(AcsardError):
-    """Error that a rule causes when it reads a key that has no valid value."""
+    """Error that occurs when a rule reads a key whose value is not valid."""
 
 
 def view_without(config: Config, invalid: Set[str]) -> Config:
-    """Return a view of `config` that raises `InvalidKeyError` for the dotted keys in `invalid`."""
+    """Return a view of `config` in which the keys in `invalid` cannot be read.
+
+    `invalid` contains dotted keys. Reading one of these keys raises `InvalidKeyError`.
+    """
     return cast(Config, _View(config, "", invalid)) if invalid else config
 
 
 def mistakes(rules: Iterable[Rule], config: Config) -> list[str]:
-    """Return the mistakes that all `rules` find in `config`, one line each.
+    """Return the error lines of all `rules` for `config`.
 
     A rule is skipped if it reads a key that has no valid value.
     """
@@ -37,10 +42,10 @@ def mistakes(rules: Iterable[Rule], config: Config) -> list[str]:
 
 
 class _View:
-    """A view of one table, from which an invalid key cannot be read.
+    """A view of one table of the configuration. Reading an invalid key raises `InvalidKeyError`.
 
     `path` is the dotted name of the table plus a dot, or "" for the whole document. `invalid`
-    contains the dotted keys whose reading raises `InvalidKeyError`.
+    contains the dotted keys that are not valid.
     """
 
     def __init__(self, table: object, path: str, invalid: Set[str]) -> None:

@@ -144,12 +144,12 @@ class WheelMap(Struct, frozen=True):
 
 
 SIMULATOR = "sim"
-"""Port name that selects the built-in simulator."""
+"""Value of `mcu.port` that selects the built-in simulator."""
 
 LONGEST_REPLY_S = 0.25
-"""Largest allowed interval between two feedback lines, s. A board that is silent for one second
-counts as restarted. At this interval, even two lost lines in a row make a silence of only 0.75 s.
-"""
+"""Largest allowed interval between two feedback lines of the board, s. A board that is silent for
+one second counts as restarted. With this interval, the loss of two lines in a row causes a silence
+of only 0.75 s."""
 
 
 class McuConfig(Struct, frozen=True):
@@ -165,7 +165,7 @@ class McuConfig(Struct, frozen=True):
 
     @property
     def simulated(self) -> bool:
-        """True if the built-in simulator takes the place of a serial device."""
+        """True if the built-in simulator is used instead of a serial device."""
         return self.port == SIMULATOR
 
     @property
@@ -241,7 +241,7 @@ class BatteryConfig(Struct, frozen=True):
 
     @property
     def bounds(self) -> dict[BatteryLevel, float]:
-        """Threshold, V or %, of each level that has one; the most severe level is the last."""
+        """Threshold of each battery level that has one, V or %, the most severe level last."""
         found: dict[BatteryLevel, float] = {
             "warning": self.warning_below,
             "return": self.return_below,
@@ -343,17 +343,17 @@ class BusConfig(Struct, frozen=True):
 
     @property
     def plain(self) -> tuple[str, ...]:
-        """The endpoints in `listen` without TLS. The daemon listens at them.
+        """The endpoints in `listen` without TLS, at which the daemon listens.
 
-        Empty if `mode` is "client".
+        The tuple is empty if `mode` is "client".
         """
         return tuple(e for e in self.listen if not e.startswith(TLS)) if self._peer else ()
 
     @property
     def outside(self) -> tuple[str, ...]:
-        """The endpoints in `listen` with TLS. The TLS gateway listens at them.
+        """The endpoints in `listen` with TLS, at which the TLS gateway listens.
 
-        Empty if `mode` is "client".
+        The tuple is empty if `mode` is "client".
         """
         return tuple(e for e in self.listen if e.startswith(TLS)) if self._peer else ()
 
@@ -454,8 +454,8 @@ class Config(Struct, frozen=True):
     def rate_hz(self) -> float:
         """Control rate, Hz.
 
-        For `"auto"`, it is the rate at which the lines use 80 % of the capacity of the serial wire,
-        but at most 100 Hz.
+        For `"auto"`, it is the highest whole number of Hz at which the lines use at most 80 % of
+        the capacity of the serial wire, but at most 100 Hz.
         """
         if self.control.rate != "auto":
             return float(self.control.rate)

@@ -13,13 +13,15 @@ from acsard.core.config.validation import write
 
 
 def edited(text: str, keys: Mapping[str, object]) -> str:
-    """Return the text of a configuration file with new values.
+    """Return `text`, the content of an `acsard.toml`, with new values for some settings.
 
-    `keys` maps dotted keys to the new values.
+    Args:
+        text: the content of the file.
+        keys: the new values, by dotted key.
 
     Raises:
-        ConfigError: the old or the new text is not a valid configuration.
-        ValueError: the form of the text does not allow a safe change.
+        ConfigError: the old or the new content is not a valid configuration.
+        ValueError: tables are written in a form that cannot be changed safely.
     """
     from tomlkit.exceptions import TOMLKitError
 
@@ -59,10 +61,9 @@ def _changed(text: str, keys: Mapping[str, object]) -> str:
 
 
 def _adjusted(array: object, value: object) -> bool:
-    """Change the TOML list `array` to `value` without losing its comments, and return True.
+    """Change the TOML list `array` to `value` and keep its comments. Return True if that works.
 
-    Return False if that is not possible. In this case the list may be changed in part, so the
-    caller must replace it.
+    Otherwise return False. The list may then be partly changed, so the caller must replace it.
     """
     from tomlkit.items import Array
 
@@ -81,12 +82,12 @@ def _adjusted(array: object, value: object) -> bool:
 def _dotted(text: str, keys: Mapping[str, object]) -> tuple[str, dict[str, object]]:
     """Insert each new key whose table is written as dotted keys, such as `mcu.port = ...`.
 
-    tomlkit cannot do this: it would insert a table header between the dotted keys. `keys` maps
-    dotted keys to the new values. Return a pair: the new text, and the entries of `keys` that the
-    caller must still put into the text.
+    `keys` maps dotted keys to the new values. Return a pair: the new text, and the entries of
+    `keys` that the caller must still put into the text.
     """
     import tomlkit
 
+    # tomlkit cannot insert such keys: it would put a table header between the dotted keys.
     document = tomlkit.parse(text)
     lines, left = text.splitlines(keepends=True), dict(keys)
     for key, value in keys.items():

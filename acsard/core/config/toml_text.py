@@ -8,9 +8,10 @@ from acsard.core.config.validation import write
 
 
 def document(table: dict[str, object], path: str = "") -> list[str]:
-    """Return the lines of a TOML document for `table`, with its nested tables after its own keys.
+    """Return the lines of a TOML document with all keys and nested tables of `table`.
 
-    `path` is the dotted name of `table`, "" for the whole document.
+    The nested tables come after the keys. `path` is the dotted name of `table`, or "" for the
+    whole document.
     """
     lines: list[str] = []
     tables: list[str] = []
@@ -27,7 +28,7 @@ def document(table: dict[str, object], path: str = "") -> list[str]:
 
 
 def excerpt(keys: Mapping[str, object]) -> list[str]:
-    """Return the TOML lines for some settings, with a header line for each table.
+    """Return the lines of a TOML document with some settings and the headers of their tables.
 
     `keys` maps the dotted keys of the settings to their values.
     """

@@ -1,4 +1,7 @@
-"""Decodes a TOML table to a frozen struct, or to a list of mistakes with key, value and fix."""
+"""Decodes a TOML table to a frozen struct, or to a list of mistakes.
+
+Each mistake is one line with the key, its value and the fix.
+"""
 
 from __future__ import annotations
 
@@ -19,10 +22,13 @@ _BARE_KEY = re.compile(r"[A-Za-z0-9_-]{1,80}")
 
 
 def build(cls: type[T], table: object, path: str, problems: list[str]) -> T | None:
-    """Return `table` as a struct of the type `cls`, or None if it has a mistake.
+    """Convert a TOML table to a struct of the type `cls`. Return None if the table has a mistake.
 
-    `path` is the dotted name of the table, "" for the whole document. The function appends a line
-    to `problems` for each mistake.
+    Args:
+        cls: the type of the struct.
+        table: the decoded TOML table.
+        path: the dotted name of the table, or "" for the whole document.
+        problems: list to which the function appends one line for each mistake.
     """
     before = len(problems)
     made = build_partly(cls, table, path, problems, set())
@@ -32,12 +38,18 @@ def build(cls: type[T], table: object, path: str, problems: list[str]) -> T | No
 def build_partly(
     cls: type[T], table: object, path: str, problems: list[str], invalid: set[str]
 ) -> T | None:
-    """Return `table` as a struct of the type `cls`, with the default in place of an invalid value.
+    """Convert a TOML table to a struct, and use the default for each invalid value.
 
-    Returns None if a required key has no valid value. `path` is the dotted name of the table, ""
-    for the whole document. The function appends a line to `problems` for each mistake. It adds to
-    `invalid` the dotted key of each invalid value, and the known key most similar to each unknown
-    key, because the user may have meant that key.
+    Return None if `table` is not a table, or if a required key has no valid value.
+
+    Args:
+        cls: the type of the struct.
+        table: the decoded TOML table.
+        path: the dotted name of the table, or "" for the whole document.
+        problems: list to which the function appends one line for each mistake.
+        invalid: set to which the function adds the dotted key of each invalid value. For an
+            unknown key, it adds the most similar known key, because the user may have meant that
+            key.
     """
     if not isinstance(table, Mapping):
         header = f"[[{path.partition('[')[0]}]]" if path.endswith("]") else f"[{path}]"
@@ -94,7 +106,7 @@ def _value(
 
 
 def finite(raw: object) -> bool:
-    """Return whether a TOML value, or each item of a list, is neither infinite nor NaN.
+    """Return False if a TOML value, or an item of a TOML list, is infinite or NaN, else True.
 
     This check is necessary because TOML allows inf and nan, and msgspec accepts them.
     """
@@ -111,7 +123,7 @@ def _unknown(key: str, value: object, path: str, near: list[str], known: list[st
 
 
 def expected(kind: inspect.Type) -> str:
-    """Return a description of the valid values of a type, such as "a number from 0 to 10 m/s"."""
+    """Return words for the valid values of a type, such as "a number from 0 to 10 m/s"."""
     unit = ""
     if isinstance(kind, inspect.Metadata):
         unit = str((kind.extra or {}).get("unit", ""))
@@ -138,9 +150,9 @@ def expected(kind: inspect.Type) -> str:
 
 
 def _entries(least: int | None, most: int | None) -> str:
-    """Return words such as " of 1 to 4 entries" for the allowed length of a list.
+    """Return words for the allowed length of a list, such as " of 1 to 4 entries".
 
-    They begin with a space. The result is "" if any length is allowed.
+    The words begin with a space. The result is "" if any length is allowed.
     """
     if most is None:
         return "" if least is None else f" of {least} or more entries"
@@ -160,13 +172,13 @@ def _example(field: FieldInfo) -> str:
 
 
 def show(value: object) -> str:
-    """Return a value as TOML, shortened to 80 characters if it is longer."""
+    """Return a value in TOML syntax, cut to at most 80 characters."""
     text = write(value)
     return text if len(text) <= 80 else text[:77] + "..."
 
 
 def write(value: object) -> str:
-    """Return a value as TOML."""
+    """Return a value in TOML syntax."""
     match value:
         case bool():
             return "true" if value else "false"

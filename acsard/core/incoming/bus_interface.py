@@ -16,20 +16,21 @@ from acsard.core.values import Event, RoutersStatus
 
 
 class BusInput(Struct, frozen=True):
-    """Input from the bus since the last call of `Bus.take`."""
+    """The input from the bus since the previous call of `Bus.take`."""
 
     arrivals: tuple[Arrival, ...] = ()
     queries: tuple[Query, ...] = ()
     overrun: int = 0
     """Number of samples that were dropped because the control loop did not fetch them in time."""
     overrun_sources: tuple[str, ...] = ()
-    """Command sources of the samples that `overrun` counts."""
+    """Names of the command sources of the samples that `overrun` counts."""
     dropped: int = 0
     """Number of published messages that were dropped because the bus did not send them in time."""
     stuck: bool = False
-    """True if a send on the bus has begun to block since the previous `BusInput`."""
+    """True if a send on the bus has begun to block since the previous call of `Bus.take`."""
     routers: RoutersStatus | None = None
-    """State of the connections to the endpoints in `bus.connect`; None if it has not changed."""
+    """State of the connections to the endpoints in `bus.connect`; None if the state has not
+    changed."""
 
 
 NOTHING = BusInput()
@@ -50,27 +51,27 @@ class Bus(Protocol):
 
     @property
     def wanted(self) -> AbstractSet[str]:
-        """Keys that the daemon publishes and that have a subscriber."""
+        """The published keys that have a subscriber at present."""
 
     def take(self, queries: int) -> BusInput:
         """Return the input from the bus since the last call.
 
-        The argument `queries` limits the number of queries in the result. Service calls come first.
-        Then comes one slow query (ROS parameters or a `set`), even if the limit is reached already.
+        `queries` is the largest number of queries in the result. Service calls come first. Then
+        comes one slow query (ROS parameters or a `set`), even if the limit is reached already.
         Other queries follow until the limit is reached. The rest waits for the next call.
         """
 
     def publish(self, key: str, message: Message) -> None:
-        """Queue a message for the subscribers of `key`. `flush` sends it."""
+        """Queue a message for the subscribers of `key`. The next call of `flush` sends it."""
 
     def flush(self) -> None:
-        """Start to send the queued messages, without waiting until they are sent."""
+        """Start to send the queued messages. Do not wait until they are sent."""
 
     def reply(self, reply: Reply) -> None:
-        """Reply to the query that holds the ticket `reply.ticket`."""
+        """Send a reply to the query with the number `reply.ticket`."""
 
     def retire(self, ticket: int) -> None:
-        """End the query that holds this ticket. No more replies to the query are possible."""
+        """End the query with the number `ticket`. No more replies to this query are possible."""
 
 
 GATEWAY_KEY = "gateway"
@@ -79,20 +80,22 @@ _decoder = Decoder(GatewayState)
 
 
 class GatewayFollower:
-    """Counts two facts about the TLS gateway since the start of the daemon, from its reports.
+    """Counts the starts of the TLS gateway, and the checks that found all its connections in use.
 
-    They are the number of its starts, and how often it found all its connections in use. The
-    gateway reports its own count of the latter, which begins at 0 after each start of the gateway.
+    The gateway makes these checks four times a second, and reports their number since its own
+    start. A gateway that already runs when the daemon starts counts as one start, and its earlier
+    checks are counted too.
     """
 
     def __init__(self) -> None:
         self._last = GatewayState(0, 0, 0)
 
     def receive(self, arrival: Arrival, counters: MutableMapping[str, int]) -> int | None:
-        """Decode the gateway's report in a sample, and add what is new in it to `counters`.
+        """Decode a report of the TLS gateway, and add the increase of both numbers to `counters`.
 
-        Returns the time at which the first of the TLS certificates expires, wall-clock ns since
-        1970. Returns None if this time is unknown, or if the report is invalid and thus ignored.
+        `arrival` is the sample with the report. Return the time at which the first of the TLS
+        certificates expires, wall-clock ns since 1970. Return None if this time is unknown, or if
+        the report is invalid. An invalid report is ignored.
         """
         try:
             report = _decoder.decode(arrival.encoding, arrival.payload)
@@ -116,7 +119,7 @@ PEER = (
 
 
 class RouterFollower:
-    """Logs when the connection to an endpoint in `bus.connect` is made or lost."""
+    """Reports in the log when the connection to an endpoint in `bus.connect` is made or lost."""
 
     def __init__(self) -> None:
         self.status = RoutersStatus()
@@ -124,9 +127,10 @@ class RouterFollower:
     def receive(
         self, status: RoutersStatus, counters: MutableMapping[str, int], events: list[Event]
     ) -> None:
-        """Store the present status, and compare it with the previous one.
+        """Store the present status, and compare it with the previous status.
 
-        Each kind of change adds an event to `events`. Each lost connection is also counted in
+        If connections were lost or made, or if connected endpoints are not routers, one event for
+        each of these changes is added to `events`. The lost connections are also counted in
         `counters`.
         """
         before, self.status = self.status, status

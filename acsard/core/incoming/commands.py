@@ -39,21 +39,22 @@ from acsard.core.values import NS_PER_S, REST, Command, Pose, Request, Verb, Whe
 from acsard.core.values import Twist as BodyTwist
 
 BOUND_NS = 60 * NS_PER_S
-"""A sender id may be used with another certificate if no command with the id has arrived for this
-time, ns. For example, a program with a fixed id may move from the robot to a laptop."""
+"""Time without a command after which a sender id may be used with another certificate, ns. For
+example, a program with a fixed id may move from the robot to a laptop."""
 
 MAX_BOUND = 1024
-"""Largest number of sender ids for which the daemon remembers the certificate. It first forgets the
-sender that has sent no command for the longest time."""
+"""Largest number of sender ids for which the daemon remembers the certificate. If there are more,
+the daemon forgets the sender that has sent no command for the longest time."""
 
 
 class Bindings:
-    """Binds each sender id to the certificate with which the daemon first saw it.
+    """The certificates to which the sender ids are bound.
 
-    If one id arrives with two certificates, it was copied by mistake, or its secret was stolen. The
-    daemon then refuses the commands with the second certificate for as long as commands with the
-    first one keep arriving. Senders on ROS keys are not bound, because such keys do not contain the
-    name of a certificate. Such a sender cannot have the public name of a native sender.
+    A sender id is bound to the certificate with which the daemon first received it. If one id
+    arrives with two certificates, it was copied by mistake, or its secret was stolen. The daemon
+    then refuses the commands with the second certificate for as long as commands with the first
+    certificate keep arriving. Senders on ROS keys are not bound, because such keys do not contain
+    the name of a certificate. Such a sender cannot have the public name of a native sender.
     """
 
     def __init__(self) -> None:
@@ -63,11 +64,11 @@ class Bindings:
         robot itself. The oldest command is first."""
 
     def other(self, sender: str, certificate: str, now_ns: int) -> str | None:
-        """Bind a sender id to a certificate and return None.
+        """Bind a sender id to a certificate, and return None.
 
-        If the id is still bound to another certificate, change nothing and return the name of that
-        certificate. `sender` is the public name of the id. `certificate` is a common name, or "".
-        `now_ns` is monotonic.
+        If the id is still bound to another certificate, change nothing and return the name of the
+        other certificate. `sender` is the public name of the id. `certificate` is the common name
+        of the certificate, or "" for a program on the robot itself. `now_ns` is monotonic.
         """
         bound, seen_ns = self._seen.get(sender, (certificate, now_ns))
         if bound != certificate and now_ns - seen_ns <= BOUND_NS:
@@ -92,7 +93,7 @@ name of the ROS transport."""
 
 
 class Arrival(Struct, frozen=True):
-    """A sample as Zenoh delivered it."""
+    """A sample as Zenoh delivered it to the daemon."""
 
     key: str
     """The key below `acsard/<id>/`, or the equivalent native key of a ROS key."""
@@ -112,9 +113,9 @@ class Arrival(Struct, frozen=True):
     via: Via = "native"
     attachment: bytes = b""
     received_ns: int | None = None
-    """Timestamp that the daemon's own Zenoh session set, wall-clock ns since 1970. It does so if
-    the sample has no timestamp, or one that is too far ahead of the daemon's clock. Otherwise
-    None."""
+    """Timestamp that the daemon's own Zenoh session set, wall-clock ns since 1970; otherwise None.
+    The session sets a timestamp if the sample arrives without a timestamp, or with a timestamp that
+    is too far ahead of the daemon's clock."""
 
 
 class _TwistPayload(Struct, frozen=True, forbid_unknown_fields=True):
@@ -151,7 +152,10 @@ class Receiver:
         self._bindings = Bindings()
 
     def command(self, arrival: Arrival) -> Command:
-        """Return the command in a sample on `cmd/…` or `wheel_cmd/…`, or raise `DecodeError`."""
+        """Return the command in a sample on `cmd/…` or `wheel_cmd/…`.
+
+        Raises `DecodeError` if the sample is not a valid command.
+        """
         kind, source, certificate = parts(arrival.key)
         if "*" in arrival.key or "/" in certificate:
             raise DecodeError(
@@ -249,7 +253,7 @@ class Receiver:
     def request(
         verb: Verb, ticket: int, encoding: str, payload: bytes, asked_ns: int | None = None
     ) -> Request:
-        """Return the request in a service query. Raises `DecodeError` if the payload is not valid.
+        """Return the request in a service query. Raise `DecodeError` if the payload is not valid.
 
         `verb` is the called service. `ticket` is the number of the query, which the reply repeats.
         `encoding` is the Zenoh Encoding of `payload`. `asked_ns` is the monotonic time at which the
@@ -275,20 +279,21 @@ class Receiver:
 
 
 class Identity(Struct, frozen=True):
-    """The sender of a sample. The stamp and the sequence number are included if they are known."""
+    """The sender of a sample, with the stamp and the sequence number of the sample if known."""
 
     sender: str
     """The public name of the sender. The secret id is not kept."""
     stamp_ns: int | None = None
-    """Time of sending by the sender's wall clock, ns."""
+    """Time of sending by the wall clock, ns since 1970; None if unknown. It is the stamp in the
+    attachment, or else the timestamp of Zenoh."""
     sequence: int | None = None
     shared: bool = False
     """Whether several programs may share this identity."""
     steady: bool = False
     """Whether the sender states that the clock of its stamps is never adjusted."""
     signed: str = ""
-    """The public name in `sender`, but without the name of the TLS certificate. It is "" if the
-    sample has no sender id, or is not a command on a native key."""
+    """The public name of the sender id, without the name of the TLS certificate. It is "" for a
+    sample without a sender id, and for a sample that is not a command on a native key."""
 
 
 # The results are cached, because each command needs the parts of its key twice, and commands arrive
@@ -297,7 +302,8 @@ class Identity(Struct, frozen=True):
 def parts(key: str) -> tuple[str, str, str]:
     """Return the kind, the source and the certificate name in a command key.
 
-    For `cmd/app` they are "cmd", "app" and "".
+    For `cmd/app` they are "cmd", "app" and "". For `cmd/app/laptop` they are "cmd", "app" and
+    "laptop".
     """
     kind, _, rest = key.partition("/")
     source, _, certificate = rest.partition("/")
@@ -305,7 +311,7 @@ def parts(key: str) -> tuple[str, str, str]:
 
 
 def identify(arrival: Arrival) -> Identity:
-    """Return the identity of a sample's sender. Raises `DecodeError` if it cannot be read.
+    """Return the identity of a sample's sender.
 
     The identity is the first of these that the sample has:
 
@@ -313,10 +319,11 @@ def identify(arrival: Arrival) -> Identity:
     - on a key of rmw_zenoh: the GID
     - on a key of a bridge: the session that stamped the sample, the key
 
-    A sender id or a GID belongs to one program. A session or a key may stand for several programs:
-    a router or a bridge stamps the samples of all programs behind it, and the daemon cannot tell
-    the session of a router from the session of a program. A GID does not prove the identity: ROS
-    discovery publishes the GIDs, so a program that may put on a key of rmw_zenoh can claim any GID.
+    Raises `DecodeError` if a sample on a key of rmw_zenoh has no valid attachment. A sender id or a
+    GID belongs to one program. A session or a key may stand for several programs: a router or a
+    bridge stamps the samples of all programs behind it, and the daemon cannot tell the session of a
+    router from the session of a program. A GID does not prove the identity: ROS discovery publishes
+    the GIDs, so a program that may put on a key of rmw_zenoh can claim any GID.
     """
     if arrival.via == "rmw":
         rmw = unpack(arrival.attachment)
@@ -342,7 +349,7 @@ def identify(arrival: Arrival) -> Identity:
 
 
 def _by_gid(gid: bytes) -> str:
-    """Return the public name of a ROS publisher. No native sender can have the same name."""
+    """Return the public name of a ROS publisher, which differs from those of all native senders."""
     return f"gid {public_name(gid.hex())}"
 
 
@@ -351,9 +358,10 @@ def _by_key(arrival: Arrival) -> str:
 
 
 def claimed_identity(arrival: Arrival) -> Identity:
-    """Return the identity of a sample's sender like `identify`, but without raising an error.
+    """Return the identity of a sample's sender like `identify`, but never raise an error.
 
-    For a sample from rmw_zenoh, only the field `sender` is set. It is "" if the sample has no GID.
+    For a sample on a key of rmw_zenoh, only the field `sender` is set. It is "" if the attachment
+    is too short for a GID.
     """
     if arrival.via == "rmw":
         gid = arrival.attachment[-GID_BYTES:]
@@ -382,12 +390,13 @@ def _twist_payload(arrival: Arrival) -> _TwistPayload:
 
 
 def caller_name(via: Via, attachment: bytes, stamped_by: str = "") -> str:
-    """Return a name for the program that called a service or sent a stop, for the log.
+    """Return a name for the log: that of the program that called a service or sent a stop.
 
     The name depends on the transport `via`, which follows it in brackets:
 
-    - native: the public name of the sender id in `attachment`, or "unnamed". The id of the Zenoh
-      session that stamped the sample follows in the brackets, unless `stamped_by` is "".
+    - native: the public name of the sender id in `attachment`, or "unnamed". The brackets also
+      contain the public name of the Zenoh session `stamped_by`, which stamped the sample, unless
+      `stamped_by` is "".
     - rmw_zenoh: "unnamed" with the GID of the client in brackets.
     - bridge: "unnamed".
 

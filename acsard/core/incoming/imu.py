@@ -3,7 +3,7 @@
 A sample is a sensor_msgs/Imu in any encoding. In JSON and msgpack only `angular_velocity` is
 required. The z axis points up, so a turn to the left is positive.
 
-The daemon uses the samples of one gyro until that gyro is silent. After that, it may use another
+The daemon uses the samples of only one gyro. If this gyro is silent, the daemon may use another
 gyro. The first sample of the new gyro is marked (`GyroSample.anew`), because two gyros have
 different biases.
 """
@@ -52,12 +52,12 @@ _readings = Decoder(_Reading)
 
 
 class GyroFollower:
-    """Decodes the samples of one gyro on the bus, and refuses those of all other gyros."""
+    """Decoder for the samples of one gyro on the bus. It refuses the samples of all other gyros."""
 
     def __init__(self, own: bool = False) -> None:
         """Start without a gyro in use.
 
-        If `own` is true, accept only the simulated gyro of the daemon's own simulator.
+        If `own` is true, accept only the simulated gyro of the built-in simulator of this daemon.
         """
         self._own = own
         self._followed = public_name(OWN) if own else ""
@@ -80,11 +80,11 @@ class GyroFollower:
         return replace(sample, anew=True) if anew else sample
 
     def _follow(self, who: str, now_ns: int) -> bool:
-        """Use the gyro of the sender `who`. Return True if another sender's gyro was used before.
+        """Use the gyro of the sender `who`, and return whether it replaces another sender's gyro.
 
         `now_ns` is the monotonic time of arrival. Raises `DecodeError` if this gyro may not be
-        used, because the gyro of another sender still sends, or because only the gyro of the
-        daemon's own simulator is allowed.
+        used. Either the gyro of another sender still sends, or only the gyro of the built-in
+        simulator is allowed.
         """
         other = who != self._followed
         if other and (self._own or now_ns - self._heard_ns < FOLLOWED_NS):

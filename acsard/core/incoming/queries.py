@@ -73,12 +73,14 @@ class Query(Struct, frozen=True):
     ticket: int
     """Number of the query. Each reply to the query has the same number."""
     topic: str
-    """Key of the row in the topic table that the query matches."""
+    """The daemon's key that the query matches, such as "state" or "srv/stop". For all JSON schemas,
+    it is "schema/<Type>"."""
     asked: str
     """The key expression of the query. If it begins with exactly `acsard/<id>/`, this prefix is
     removed."""
     fmt: str
-    """The `fmt` parameter of the query, "" if it is absent."""
+    """The parameter `fmt` of the query, which names the encoding of the reply; "" if it is
+    absent."""
     payload: bytes
     encoding: str
     arrived_ns: int | None = None
@@ -106,7 +108,8 @@ class _Waiting(Struct, frozen=True):
     form: Format
     """Encoding of the reply."""
     asked: Attachment | None
-    """Attachment of a call over rmw_zenoh; the reply must contain it too. None for other calls."""
+    """Attachment of a call over rmw_zenoh, from which the attachment of the reply is made. None for
+    other calls."""
     ros: bool = False
     wish: bytes = b""
     """Payload of a ROS request to set parameters, from which the reply is built. b"" for other
@@ -114,7 +117,7 @@ class _Waiting(Struct, frozen=True):
 
 
 class Queries:
-    """Answers queries with constants or the newest messages. A service call becomes a `Request`."""
+    """Answers queries with constants or present messages, and turns service calls into requests."""
 
     def __init__(self, config: Config, info: Info) -> None:
         self._config = config
@@ -127,7 +130,7 @@ class Queries:
         self._waiting: dict[int, _Waiting] = {}
 
     def use(self, config: Config) -> None:
-        """Answer with this configuration from now on."""
+        """Answer queries with the configuration `config` from now on."""
         self._config = config
         self._fixed["config"] = effective(config)
         self._parameters = Parameters(effective(config))
@@ -135,12 +138,12 @@ class Queries:
     def serve(
         self, query: Query, current: Current, outputs: Outputs | None
     ) -> list[Reply] | Request:
-        """Return the replies to a query. If the query calls a service, return a `Request` instead.
+        """Return the replies to a query, or a `Request` to the robot if the query calls a service.
 
-        The list is empty if the daemon has no value for the query. `current` is a function that
-        returns the present message of a published key. `outputs` are those of the last step, or
-        None before the first step. Raises `DecodeError` for a ROS request that cannot be served.
-        The caller then sends the reply that `refused` builds.
+        The list of replies is empty if the daemon has no value for the query. `current` is a
+        function that returns the present message of a published key. `outputs` are those of the
+        last step, or None before the first step. Raises `DecodeError` for a ROS request that cannot
+        be served. The caller then sends the reply that `refused` builds.
         """
         if query.via != "native":
             return self._ros(query, 0 if outputs is None else outputs.now.wall_ns)
@@ -160,7 +163,7 @@ class Queries:
         """Return the reply that contains the robot's answer to a service call.
 
         The result is None if no service call waits for this answer. `wall_ns` is the time of the
-        reply.
+        reply by the wall clock, ns since 1970.
         """
         waiting = self._waiting.pop(answer.id, None)
         if waiting is None:
@@ -177,10 +180,10 @@ class Queries:
         return Reply(answer.id, key, payload, encoding_name(form, name), attachment=attachment)
 
     def _ros(self, query: Query, wall_ns: int) -> list[Reply] | Request:
-        """Do the work of `serve` for a query over a ROS transport.
+        """Serve a query over a ROS transport, as `serve` does.
 
         The query calls a std_srvs/Trigger service or a ROS parameter service. `wall_ns` is the time
-        of the reply.
+        of the reply by the wall clock, ns since 1970.
         """
         asked = unpack(query.attachment) if query.via == "rmw" else None
         by = caller_name(query.via, query.attachment)
@@ -243,7 +246,7 @@ class Queries:
         return [] if value is None else [(topic, type(value).__name__, value)]
 
     def _matches(self, query: Query, key: str) -> bool:
-        """Return whether the key expression of a query includes a key below `acsard/<id>/`."""
+        """Return whether a query asks for `key`, a key without the prefix `acsard/<id>/`."""
         if "*" not in query.asked:
             return query.asked == key
         if len(query.asked) > MAX_WILDCARD:
@@ -253,7 +256,7 @@ class Queries:
 
 
 def includes(expression: str, key: str) -> bool:
-    """Return whether a Zenoh key expression includes a key.
+    """Return whether a Zenoh key expression matches a key.
 
     The function does not backtrack, so no expression takes a long time.
     """
@@ -292,10 +295,11 @@ def _fits(pattern: str, chunk: str) -> bool:
 
 
 def refused(query: Query, why: str, wall_ns: int) -> Reply | None:
-    """Return the reply that refuses a query, or None if the client could not read a reply.
+    """Return the reply that refuses a query, or None if the client could not read any reply.
 
-    `why` is the reason, in words. `wall_ns` is the time of the reply. A ROS client does not receive
-    error replies of Zenoh. Therefore it gets a normal response, which says that the call failed.
+    `why` is the reason, in words. `wall_ns` is the time of the reply by the wall clock, ns since
+    1970. A ROS client does not receive error replies of Zenoh. Therefore it gets a normal response,
+    which says that the call failed.
     """
     if query.via == "native":
         return Reply(query.ticket, query.topic, why.encode(), "text/plain", ok=False)
@@ -312,7 +316,7 @@ def refused(query: Query, why: str, wall_ns: int) -> Reply | None:
 
 
 def most_bytes(topic: str) -> int:
-    """Return the largest allowed payload of a query for the key `topic`, bytes."""
+    """Return the largest allowed payload of a query for the key `topic`, in bytes."""
     return MAX_REQUEST_BYTES if topic.startswith(PARAMETERS) else MAX_COMMAND_BYTES
 
 
@@ -320,7 +324,7 @@ def _echo(asked: Attachment | None, wall_ns: int) -> bytes:
     """Return the attachment by which rmw_zenoh matches a reply with its request.
 
     `asked` is the attachment of the request. If it is None, the result is b"". `wall_ns` is the
-    time of the reply.
+    time of the reply by the wall clock, ns since 1970.
     """
     return b"" if asked is None else Attachment(asked.sequence, wall_ns, asked.gid).pack()
 
@@ -348,9 +352,9 @@ def _format(query: Query) -> Format:
 
 
 def topic_table(config: Config) -> Topics:
-    """Return the topic table of this daemon, with full keys.
+    """Return the list of the daemon's keys with this configuration, as full keys on the bus.
 
-    The table leaves out the published keys on which this daemon never sends a message.
+    The list leaves out the published keys on which this daemon never sends a message.
     """
     robot, silent = config.robot.id, left_out(config)
     return Topics(
@@ -363,7 +367,10 @@ def topic_table(config: Config) -> Topics:
 
 
 def note_of(config: Config, topic: Topic) -> str:
-    """Return the meaning of a key. For `tf_static`, list the transforms that `config` enables."""
+    """Return the description of a key.
+
+    The description of `tf_static` lists the transforms that `config` enables.
+    """
     if topic.key != "tf_static":
         return topic.note
     frames = {"lidar": config.lidar.publish_tf, "base_footprint": config.footprint.publish_tf}

@@ -60,9 +60,9 @@ class Limit(Struct, frozen=True):
 
 
 def decode_limit(arrival: Arrival, configured: float) -> Limit:
-    """Return the limit in a sample, or raise `DecodeError`.
+    """Return the speed limit in a sample. Raise `DecodeError` if the sample is not valid.
 
-    A limit in % is a share of `configured`, the configured highest speed, m/s.
+    `configured` is the configured highest speed, m/s. A limit in % is a share of this speed.
     """
     if not arrival.put:
         raise DecodeError("not_a_put", "a DELETE is not a speed limit: send a PUT")
@@ -89,7 +89,7 @@ NONE = Limit(math.inf, "", 0)
 
 
 class SpeedLimiter:
-    """Keeps the speed limit in force, and the settings that will apply when it ends."""
+    """The speed limit in force, and the settings that will apply when this limit ends."""
 
     def __init__(self, config: Config) -> None:
         """Start without a limit. `config` is the robot's present configuration."""
@@ -103,14 +103,14 @@ class SpeedLimiter:
         same object until a setting changes."""
         self._asked: tuple[Request, float] | None = None
         """A pair: the client's `set` request in this step that changes the highest speed, and the
-        speed that it requests, m/s. None if this step has no such request."""
+        speed that it requests, m/s. None if no request in this step changes the highest speed."""
         self._held: list[Request] = []
         """The `set` requests that wait for the next control step. While a limit is in force, a step
         takes only one `set` request."""
 
     @property
     def lowers(self) -> bool:
-        """True while the robot's highest speed is below the setting because of a speed limit.
+        """Whether the robot's highest speed is below the setting because of a speed limit.
 
         After the limit is lifted, this stays True until the robot has the higher value again.
         """
@@ -142,7 +142,7 @@ class SpeedLimiter:
     def requests(
         self, requests: tuple[Request, ...], now_ns: int
     ) -> tuple[tuple[Request, ...], list[Answer]]:
-        """Return a pair: the requests for the robot in this step, and answers to refused requests.
+        """Return the requests for the robot in this step, and the answers to refused requests.
 
         The argument `requests` contains the requests of the clients, and `now_ns` is the monotonic
         time of the step. The caller must call `settle` after the step.
@@ -166,11 +166,11 @@ class SpeedLimiter:
         return tuple(found), refused
 
     def _limited(self, request: Request) -> Request:
-        """Return a client's `set` request. A requested speed above the limit becomes the limit.
+        """Return a client's `set` request, with the requested highest speed lowered to the limit.
 
         Raises `ConfigError` if the requested settings would be invalid when the limit ends.
         """
-        # Whether a change must wait until the robot stands is checked by the robot itself.
+        # The robot itself checks whether a change must wait until the robot stands still.
         made, _ = changed(self.settings, request.settings, at_rest=True)
         if SETTING not in request.settings:
             return request
@@ -181,7 +181,7 @@ class SpeedLimiter:
         return replace(request, settings=request.settings | {SETTING: self._limit.speed})
 
     def _own(self, now_ns: int) -> tuple[Request, ...]:
-        """Put the newest limit in force, and return the `set` request that tells the robot.
+        """Put the newest limit in force, and return the `set` request that sends it to the robot.
 
         The result is () if no new limit waits, if the last change is too recent, or if the robot
         already has the right value. `now_ns` is monotonic.
@@ -199,11 +199,11 @@ class SpeedLimiter:
     def settle(
         self, robot: Config, answers: Iterable[Answer], events: list[Event]
     ) -> tuple[Answer, ...]:
-        """Store the robot's configuration after the step, and return the answers for the clients.
+        """Store the robot's configuration after a step, and return the answers for the clients.
 
-        `robot` is that configuration. `answers` are the robot's answers in the step. If a client
-        has set a speed above the limit, the answer to this client and a new event say that the
-        speed will apply when the limit ends.
+        `robot` is the robot's configuration after the step. `answers` are the robot's answers in
+        the step. If a client has set a speed above the limit, the answer to this client and a new
+        event in `events` say that the speed will apply when the limit ends.
         """
         answers = tuple(answers)
         speed = self.settings.limits.linear_speed

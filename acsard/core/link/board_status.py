@@ -5,16 +5,16 @@ An example of a status line is:
     !status estop=ok bumpers=..X. driver=ok volts=24.31 amps=-1.20 charge=87% temp=41.5*HHHH
 
 Every field is optional. The fields may come in any order, and each at most once. The board sends
-the line in addition to its replies, never instead of one. The line contains no wheel speeds and
-does not count as a reply. One invalid field makes the whole line invalid. The format of the values
-makes damage detectable:
+status lines in addition to its replies, never instead of a reply. A status line contains no wheel
+speeds and does not count as a reply. One invalid field makes the whole line invalid. The format of
+the values makes damage detectable:
 
 - An input has two words, such as `pressed` and `ok`. They differ in many bits, so a few flipped
   bits cannot turn one word into the other.
 - Each number has a fixed number of decimals or ends with `%`, so a truncated number is refused.
 
-After `*` comes the CRC-16/XMODEM of everything before it. It may be omitted, except on a checked
-link, where all lines have a checksum.
+`*` and four hexadecimal digits may end the line: the CRC-16/XMODEM of all characters before `*`. On
+a checked link, the line must have this checksum.
 """
 
 from __future__ import annotations
@@ -64,15 +64,16 @@ class BoardStatus(Struct, frozen=True):
 
 
 def merged(status: BoardStatus, newer: BoardStatus) -> BoardStatus:
-    """Return a copy of `status` with the fields of `newer` that are not None."""
+    """Return a copy of `status`, updated with those fields of `newer` that are not None."""
     pairs = zip(astuple(status), astuple(newer), strict=True)
     return BoardStatus(*[old if new is None else new for old, new in pairs])
 
 
 def shown(status: BoardStatus) -> dict[str, str]:
-    """Return the values of `status` as text, by names that users see, such as `motor_driver`.
+    """Return the fields of `status` as text, under the names that users see.
 
-    Fields of `status` that are None are left out.
+    The result maps names such as "motor_driver" to words or numbers such as "fault" or "24.31". It
+    does not contain the fields that are None.
     """
     bumpers = status.bumpers
     values = {
@@ -90,9 +91,9 @@ def shown(status: BoardStatus) -> dict[str, str]:
 # A board at rest repeats the same line, so the last lines are cached.
 @lru_cache(8)
 def decode_status(line: bytes, check: bool) -> BoardStatus:
-    """Return the fields of a status line. Raises `FrameError` if the line is not valid.
+    """Return the fields of a status line. Raise `FrameError` if the line is not valid.
 
-    `line` begins with `STATUS` and has no line end. If `check` is true, a line without a checksum
+    `line` begins with `!status` and has no line end. If `check` is true, a line without a checksum
     is not valid. A line with a wrong checksum is never valid.
     """
     match = _LINE.fullmatch(line)

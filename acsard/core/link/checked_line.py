@@ -1,12 +1,12 @@
-"""Encodes and decodes the checked line: the plain line with a sequence number and a CRC.
+"""Encodes checked commands and decodes checked replies: lines with a sequence number and a CRC.
 
     command  ap12.50,bn08.75,cp15.00,dn10.25#07S*HHHH
     reply    ap12.50,bn08.75,cp15.00,dn10.25#07@TTTTAAAABBBBCCCCDDDD*HHHH
 
 After `#` come the two digits of the sequence number. In a command, request letters may follow. In a
 reply, `@` and the sample fields (the board's clock and its encoder counts) follow if the command
-asked for them. After `*` comes the CRC-16/XMODEM of everything before it. All digits after `#` are
-upper-case hexadecimal, so there is only one correct way to write them. `codec.py` handles the plain
+asked for them. After `*` comes the CRC-16/XMODEM of all characters before `*`. All digits after `#`
+are upper-case hexadecimal, so a line can be written in only one way. `codec.py` handles the plain
 part, which comes before `#`.
 """
 
@@ -27,8 +27,8 @@ ASK_SAMPLE = b"S"
 """The request letter that asks for the sample fields."""
 
 ASK_NOTHING = b"H"
-"""A request letter that the board ignores. It only marks the daemon's lines: replies contain no
-request letters, so a received line with this letter is an echo of a line of the daemon."""
+"""A request letter that the board ignores. The letter marks a line as a line of the daemon. Replies
+contain no request letters, so a received line with this letter is an echo."""
 
 # The pattern also restricts the characters of the plain part, because the CRC does not detect zero
 # bytes in front of a line.
@@ -38,10 +38,10 @@ _SAMPLE = struct.Struct(">5H")
 
 
 class Reading(Struct, frozen=True):
-    """The sample fields of a reply: the board's clock and encoder counts at the same moment.
+    """The sample fields of a reply: the board's clock and its encoder counts at the same moment.
 
-    `mcu_ms` is the board's clock in ms. `counts` are the encoder counts of the motors a to d. A
-    count rises when its motor turns in the `p` direction. All five numbers are modulo 65536.
+    `mcu_ms` is the board's clock, ms. `counts` are the encoder counts of the motors a to d. A count
+    rises when its motor turns in the `p` direction. All five numbers are modulo 65536.
     """
 
     mcu_ms: int
@@ -51,8 +51,9 @@ class Reading(Struct, frozen=True):
 class Checked(Struct, frozen=True):
     """A reply with a correct CRC, split into its parts.
 
-    `plain` is the part before `#`. `sequence` is the sequence number, which is that of the command
-    that the reply answers. `reading` is None if the reply has no sample fields.
+    `plain` is the part before `#`, which contains the wheel speeds. `sequence` is the sequence
+    number of the command that the board answers with this reply. `reading` is None if the reply has
+    no sample fields.
     """
 
     plain: bytes
@@ -61,19 +62,19 @@ class Checked(Struct, frozen=True):
 
 
 def seal(line: bytes, sequence: int, letters: bytes = b"") -> bytes:
-    """Return the checked form of a plain command, with CR LF at its end.
+    """Return a plain command as a checked line: with sequence number, CRC and CR LF.
 
     `line` is the plain command, with or without CR LF. `sequence` is the sequence number, 0 to 255.
-    `letters` are the request letters, b"" for none.
+    `letters` are the request letters; b"" means none.
     """
     body = b"%b#%02X%b" % (line.removesuffix(b"\r\n"), sequence, letters)
     return b"%b*%04X\r\n" % (body, binascii.crc_hqx(body, 0))
 
 
 def unseal(line: bytes) -> Checked:
-    """Return the parts of the checked reply `line`, which has no line end.
+    """Split a checked reply into its parts. Raise `FrameError` if the reply is not valid.
 
-    Raises `FrameError` if the line is not a valid checked reply.
+    `line` is the reply without its line end.
     """
     match = _REPLY.fullmatch(line)
     if match is None:

@@ -2,10 +2,10 @@
 
 An example is `ap12.50,bn08.75,cp15.00,dn10.25`. Each value consists of a motor letter, `p`
 (positive) or `n` (negative) for the direction, and a speed in rad/s. The encoder writes exactly
-this form, with a trailing comma if the configuration asks for one. The decoder also accepts spaces
-after commas, a trailing comma, one or two integer digits, and one to three decimals. One invalid
-value makes the whole line invalid. In the daemon, only this module maps motor letters and signs to
-wheels. The simulator has its own code for this.
+this form, with a trailing comma if the configuration asks for a trailing comma. The decoder also
+accepts spaces after commas, a trailing comma, one or two integer digits, and one to three decimals.
+One invalid value makes the whole line invalid. In the daemon, only this module maps motor letters
+and signs to wheels. The simulator has its own code for this.
 """
 
 from __future__ import annotations
@@ -23,7 +23,8 @@ LETTERS = "abcd"
 Motors = tuple[float, float, float, float]
 
 MAX_SPEED = 99.99
-"""Largest speed that a line can contain, rad/s: it has two integer digits and two decimals."""
+"""Largest speed that a line can contain, rad/s. A speed in a line has two digits before the decimal
+point and two after it."""
 
 Reason = Literal[
     "malformed", "duplicate_wheel", "over_range", "without_crc", "crc_error", "stale_sequence",
@@ -37,7 +38,10 @@ _LINE = re.compile(TOKENS + rb"(?:, *)?")
 
 
 class FrameError(AcsardError):
-    """The error for an invalid line. `reason` is the kind of error, such as "crc_error"."""
+    """The error for an invalid line from the board.
+
+    `reason` is the kind of error, such as "crc_error".
+    """
 
     def __init__(self, reason: Reason, line: bytes) -> None:
         super().__init__(reason, line)
@@ -50,7 +54,7 @@ class FrameError(AcsardError):
 
 
 class Codec:
-    """An encoder and decoder of plain lines for the wiring (motors to wheels) of one robot."""
+    """An encoder and decoder of plain lines, for one assignment of the motors to the wheels."""
 
     def __init__(self, wheels: WheelMap, trailing_comma: bool = False) -> None:
         motors = (wheels.front_right, wheels.front_left, wheels.rear_left, wheels.rear_right)
@@ -66,13 +70,14 @@ class Codec:
         }
         self._end = b",\r\n" if trailing_comma else b"\r\n"
         self.stop = self._written(STILL)
-        """The line with speed zero for all wheels."""
+        """The line, with its line end, that commands speed zero for all wheels."""
         self._last = (STILL, self.stop)
 
     def encode(self, speeds: WheelSpeeds) -> bytes:
-        """Return the line that commands these speeds, clamped to 99.99 rad/s and rounded to 0.01.
+        """Return the line, with its line end, that commands these wheel speeds.
 
-        Raises ValueError for a speed that is not finite, because that is a bug of the caller.
+        Each speed is clamped to 99.99 rad/s and rounded to 0.01 rad/s. Raises `ValueError` for a
+        speed that is not finite, because that is a bug of the caller.
         """
         last, line = self._last
         if speeds != last:  # a steady command repeats its line in each period
@@ -88,7 +93,8 @@ class Codec:
     def wheels(self, motors: Motors) -> Motors:
         """Convert four values of the motors a to d, such as speeds, to values of the wheels.
 
-        The result is in the order `WHEELS`. Its values are positive if a wheel turns forward.
+        The result is in the order front right, front left, rear left, rear right. A value is
+        positive if its wheel turns forward.
         """
         wheel = [0.0] * 4
         for motor, (_, index, sign) in zip(motors, self._wiring, strict=True):
@@ -97,9 +103,9 @@ class Codec:
         return front_right, front_left, rear_left, rear_right
 
     def decode(self, line: bytes) -> WheelSpeeds:
-        """Return the wheel speeds in `line`, which has no line end.
+        """Return the wheel speeds in a plain line. Raise `FrameError` if the line is not valid.
 
-        Raises `FrameError` if the line is not valid.
+        `line` has no line end.
         """
         words = _words(line)
         if words is None:
@@ -120,7 +126,10 @@ class Codec:
 # A robot at rest repeats the same line, so the last lines are cached.
 @lru_cache(16)
 def _words(line: bytes) -> tuple[tuple[bytes, float], ...] | None:
-    """Return the four values of a line, such as `(b"ap", 12.5)` in rad/s, or None if malformed."""
+    """Return the four values of a plain line, such as `(b"ap", 12.5)`, or None if it is malformed.
+
+    The second item of each value is a speed, rad/s.
+    """
     match = _LINE.fullmatch(line)
     if match is None:
         return None

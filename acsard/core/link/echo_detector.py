@@ -1,4 +1,4 @@
-"""Detects echoes: lines that the daemon wrote to the serial port and then receives from it.
+"""Detects echoes: lines that the daemon writes to the serial port and then receives back.
 
 Lines come back if TX and RX are connected to each other, or if a device at the far end sends all
 bytes back. Behind such a device, there may also be a board that answers. This module detects the
@@ -14,30 +14,29 @@ from msgspec import Struct
 from acsard.core.values import WheelSpeeds
 
 REPORTS = 20
-"""Received lines count as an echo only if they repeat at least this number of successive sent
-lines. 20 lines take 0.2 s at 100 Hz."""
+"""Least number of successive sent lines that must come back to count as an echo. 20 lines take 0.2
+s at 100 Hz."""
 
 OTHERS = 2
-"""An echo is detected even if up to this number of other reports come between two sent lines that
-come back. A board behind an adapter that echoes sends such other reports. If it reports by its own
-clock, it may send two of them in a row."""
+"""Largest number of genuine replies between two lines of an echo. If a board is connected behind an
+adapter that echoes, the daemon receives both the echo and the replies of the board. A board that
+reports by its own clock may send two replies in a row."""
 
 CHANGE = 2.0
-"""A run is a series of successive sent lines that came back. Between each two successive lines of
-the run, only the largest of the four speed changes counts. The run counts as an echo only if the
-sum of these changes reaches `CHANGE`, rad/s. With coarse encoders, a smaller sum may be a
-coincidence."""
+"""Least total change of the wheel speeds in an echo, rad/s. From each line that came back to the
+next, only the largest of the four changes counts, and these changes are added up. With coarse
+encoders, a smaller sum may be a coincidence."""
 
 CORNER = 0.025
-"""A run is a series of successive sent lines that came back. It counts as an echo only if two
-successive speed changes from line to line differ by more than `CORNER`, rad/s, as at the begin or
-the end of a ramp. Speeds in lines are rounded to 0.01 rad/s, so on a straight ramp two speed
-changes differ by up to 0.02 rad/s. Therefore an echo may stay undetected while all ramps are
-gentler than 0.025 rad/s per line, which is 0.125 m/s2 for a wheel radius of 0.05 m at 100 Hz."""
+"""Least difference between two successive speed changes in an echo, rad/s. At least one such
+difference must occur, as at the start or the end of a ramp. Speeds in lines are rounded to 0.01
+rad/s, so on a straight ramp two speed changes differ by up to 0.02 rad/s. Therefore an echo may
+stay undetected while all ramps are gentler than 0.025 rad/s per line, which is 0.125 m/s2 for a
+wheel radius of 0.05 m at 100 Hz."""
 
 LINES = 8
-"""`EchoDetector` compares each report with this number of the last sent lines. At 100 Hz, this
-detects an echo that comes back within 70 ms."""
+"""Number of sent lines, the newest ones, with which `EchoDetector` compares each received reply. At
+100 Hz, an echo that comes back within 70 ms is detected."""
 
 _Wheels = tuple[float, float, float, float]
 STEADY: _Wheels = (0.0, 0.0, 0.0, 0.0)
@@ -48,10 +47,10 @@ class _Run(Struct, gc=False):
     """A series of successive sent lines that came back."""
 
     report: int
-    """The number of the last report that equaled the last line of the run. The reports are numbered
-    from 1 as they come."""
+    """Number of the last received reply that equals the last line of the run. Replies are numbered
+    from 1."""
     wheels: _Wheels
-    """Speeds in the last line, rad/s."""
+    """Wheel speeds in the last line of the run, rad/s."""
     slope: _Wheels | None = None
     """Change of each wheel's speed between the last two lines of the run, rad/s. None if the run
     has only one line."""
@@ -60,18 +59,19 @@ class _Run(Struct, gc=False):
     change: float = 0.0
     """Sum of the speed changes between successive lines, rad/s, as `CHANGE` defines it."""
     corner: float = 0.0
-    """Largest difference between two successive speed changes, rad/s. See `CORNER`."""
+    """Largest difference between two successive speed changes in the run, rad/s. See `CORNER`."""
 
 
 class EchoDetector:
     """Detector of an echo: received lines that only repeat the daemon's own lines.
 
-    A report is a reply without a sample. It has the same form as a command, so an echo looks like a
-    board that reports exactly the commanded speeds. The rule is:
+    A report is a received reply without a sample, which means without encoder counts. A report has
+    the same form as a command, so an echo looks like a board that reports exactly the commanded
+    speeds. The received lines are an echo if all of these conditions hold:
 
     - At least `REPORTS` successive sent lines came back in order, byte for byte.
     - Between two successive lines that came back, at most `OTHERS` other reports came. The speeds
-      of these reports do not lie between the speeds of the two lines. A motor on its way from one
+      in these reports do not lie between the speeds in the two lines. A motor that changes from one
       speed to the other would report speeds between them.
     - The speed changes from line to line add up to at least `CHANGE`, and one of them differs by
       more than `CORNER` from the speed change before it. A motor that lags by a whole number of
@@ -82,9 +82,9 @@ class EchoDetector:
     detected just as quickly as a device that only echoes. While all ramps are gentle (see
     `CORNER`), no echo is detected.
 
-    A board that reports its set points looks exactly like an echo, and so may a simulator whose
-    wheels have no lag. The daemon then does not drive until the port is opened again, and reports
-    the reason.
+    A board that reports its set points instead of measured speeds looks exactly like an echo. A
+    simulator whose wheels have no lag may look like an echo too. The daemon then does not drive
+    until the port is opened again, and reports the reason.
     """
 
     def __init__(self) -> None:
@@ -108,9 +108,9 @@ class EchoDetector:
         self._runs.append(None)
 
     def report(self, line: bytes, speeds: WheelSpeeds) -> bool:
-        """Process a report, and return whether the last reports are an echo.
+        """Process a reply without a sample, and return whether the last such replies are an echo.
 
-        `line` is the report without its line end, and `speeds` are the speeds in it.
+        `line` is the reply without its line end, and `speeds` are the speeds in the reply.
         """
         self._reports += 1
         wheels = speeds.as_tuple()
@@ -138,10 +138,10 @@ class EchoDetector:
         return found
 
     def _continued(self, run: _Run | None, wheels: _Wheels) -> _Run:
-        """Return `run` with one more line, which has the speeds `wheels`.
+        """Return `run` with one more line at its end, or a new run with only this line.
 
-        Return a new run with only this line if `run` is None, or if the reports since the last line
-        of `run` show that this line is not an echo.
+        `wheels` are the speeds in the line, rad/s. A new run begins if `run` is None, or if the
+        reports since the last line of `run` show that the line is not an echo.
         """
         others = OTHERS + 1 if run is None else self._reports - run.report - 1
         if run is None or others > OTHERS:

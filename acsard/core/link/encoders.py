@@ -1,11 +1,11 @@
 """Converts encoder counts into the angle that each motor turned since the previous reading.
 
 The counts are cumulative, so no distance is missing after a lost line. The board sends the time of
-its own clock with the counts, so the time between two readings does not depend on when the host
-read the lines. Counts and milliseconds are modulo 65536. The difference between two counts is used
-only if the counts cannot have wrapped, and if a wheel at its highest speed can make that many
-counts. Otherwise the caller computes the angle as speed times time. The module also detects a
-probable restart of the board.
+its own clock with the counts, so the time between two readings does not depend on the moments at
+which the host read the lines. Counts and milliseconds are modulo 65536. The difference between two
+counts is used only if the counts cannot have wrapped, and if a wheel at its highest speed can make
+that many counts. Otherwise the caller computes the angle as speed times time. The module also
+detects a probable restart of the board.
 """
 
 from __future__ import annotations
@@ -31,20 +31,24 @@ ROUNDING_MS = 2
 it is wrong by up to 1 ms."""
 
 LATEST_MS = 1000.0
-"""Limit on the delay of a line, ms. A line with a longer delay is treated as if it had this delay.
-A larger limit is not needed, because the session restarts after a gap of one second."""
+"""Largest delay of a reading that `Encoders` distinguishes, ms. A longer delay is treated as this
+delay. A larger limit is not needed, because the session restarts after a gap of one second."""
 
 Unknown = Literal["unknown", "leap", "restarted"]
-"""The reason why the difference between two readings of the encoders cannot be used.
+"""The reason why the angles since the previous reading of the encoders are unknown.
 
-- unknown: there is no earlier reading, or it is so old that a count may have wrapped
-- leap: the difference is more than any motor can have turned
+- unknown: there is no previous reading, or it is so old that a count may have wrapped
+- leap: the difference between the counts is more than any motor can have turned
 - restarted: the board has probably restarted
 """
 
 
 class Turned(Struct, frozen=True):
-    """Angles that the motors a to d turned, rad, and the time `dt` by the board's clock, s."""
+    """The motion between two readings of the encoders.
+
+    `motors` are the angles that the motors a to d turned, rad. `dt` is the time between the two
+    readings by the board's clock, s.
+    """
 
     motors: Motors
     dt: float
@@ -56,32 +60,28 @@ class Encoders:
     def __init__(self, counts: int, wheel_speed: float, quiet_ns: int) -> None:
         """Start before the first reading of the encoders.
 
-        The delay of a reading is its arrival time minus the time that it contains, which comes from
-        the board's clock. A restart sets the board's clock to 0. The clock counts modulo 65536 ms,
-        so it then seems to have jumped ahead, and the delay of the next reading seems too small.
-        The board has probably restarted if a delay is more than `quiet_ns` below the least delay so
-        far.
-
         Args:
-            counts: Encoder counts per wheel turn, 0 if unknown.
-            wheel_speed: The highest speed of a wheel, rad/s.
-            quiet_ns: The duration of silence after which the link is stale, ns.
+            counts: encoder counts per wheel turn, 0 if unknown.
+            wheel_speed: highest speed of a wheel, rad/s.
+            quiet_ns: duration of silence after which the link is stale, ns. If a reading seems to
+                arrive too early by more than this, the board has probably restarted.
         """
         self._angle = math.tau / counts if counts else 0.0
         self._fastest = wheel_speed / math.tau * counts / 1000
         self._early_ms = quiet_ns * 1000 / NS_PER_S
         self._last: tuple[Reading, int] | None = None
+        # A restart sets the board's clock to 0. The clock counts modulo 65536 ms, so it then seems
+        # to have jumped ahead, and the delay of the next reading seems too small.
         self._promptest = MinimumDelay(most=LATEST_MS)
-        """Measures by how much the delay of a reading exceeds the least delay so far, ms."""
+        """Measures the delay of each reading in excess of the least delay so far, ms. The delay is
+        the arrival time of the reading minus its time by the board's clock."""
 
     def forget(self) -> None:
-        """Forget the last reading, because a new session begins or a line has no reading."""
+        """Forget the previous reading, because a new session begins or a line has no reading."""
         self._last = None
 
     def turned(self, reading: Reading, at_ns: int) -> Turned | Unknown:
-        """Return the angles by which the motors turned, or the reason why they are unknown.
-
-        The angles are those since the previous reading.
+        """Return the motion since the previous reading, or the reason why the motion is unknown.
 
         `at_ns` is the monotonic time at which the reading arrived, ns. It serves only to detect
         that the board has restarted, or that a count may have wrapped.

@@ -1,11 +1,11 @@
-"""Adds to each good line its sample time and the motion since the last line.
+"""Adds to each good line its sample time and the motion since the previous good line.
 
 The sample time is the time at which the board read its encoders. The time between two samples comes
 from the best of these clocks that is available:
 
-- the board's own clock, if the board sends it with its counts;
+- the board's own clock, if its replies contain the time of this clock and the encoder counts;
 - the times at which the commands were written, if the board answers each line (`PromptedTimes`);
-- the period of the board, if it reports by its own clock (`FreeRunningTimes`);
+- the period of the board, if the board reports by its own clock (`FreeRunningTimes`);
 - otherwise the times at which the host read the lines, spread evenly if one read has several lines.
 
 `ReplyStyle` detects whether the board answers each command or reports by its own clock. The sample
@@ -31,51 +31,53 @@ APART_NS = 1000
 sample times would look like a single line."""
 
 LATER = 0.05
-"""Gain of the filter for the mean difference between the times that `PromptedTimes` and
-`FreeRunningTimes` give to a line."""
+"""Gain of the filter for a mean difference: the time that `PromptedTimes` gives to a line, minus
+the time that `FreeRunningTimes` gives to the same line."""
 
 FULL_READ = 1024
 """If a read of the port contains at least this number of bytes, the kernel may hold more data."""
 
 DIFFERS = 1.5
-"""`ReplyStyle` begins to evaluate the reads of the port when two numbers differ by at least this:
-the number of reply periods since the last read, and the number of commands written since the last
-read. Scheduling alone causes a smaller difference."""
+"""A read of the port helps `ReplyStyle` to decide if two numbers differ by at least `DIFFERS`: the
+reply periods that have passed since the previous read, and the commands that were written since
+then. Scheduling alone causes a smaller difference."""
 
 TELLING = 2.5
-"""Let p be the number of reply periods and c the number of commands, both in the reads of the port
-that `ReplyStyle` evaluates. It decides only if p and c differ by at least this number."""
+"""`ReplyStyle` adds up two numbers over the reads of the port that it evaluates: the reply periods
+that passed, and the commands that were written. It decides only if the two sums differ by at least
+`TELLING`."""
 
 LATEST = 100.0
 """`ReplyStyle` ignores a read of the port if more than this number of reply periods have passed
-since the read before it."""
+since the previous read."""
 
 CLEAR = 0.5
-"""Let p be the number of reply periods, c the number of commands, and n the number of received
-lines, all in the reads of the port that `ReplyStyle` evaluates. It decides only if either p or c is
-clearly nearer to n: |p - n| and |c - n| must differ by at least `CLEAR` times |p - c|."""
+"""`ReplyStyle` decides only if the number n of received lines is clearly nearer to one of two sums
+than to the other: the number p of reply periods, and the number c of commands. Therefore |p - n|
+and |c - n| must differ by at least `CLEAR` times |p - c|. All three numbers are sums over the reads
+of the port that `ReplyStyle` evaluates."""
 
 AFTER = 3
-"""`ReplyStyle` also evaluates this number of reads after each read of the port that reaches
+"""Number of further reads that `ReplyStyle` evaluates after a read of the port that reaches
 `DIFFERS`."""
 
 NEAR = 0.35
-"""Let p be the number of reply periods, c the number of commands, and n the number of received
-lines, all in the reads of the port that `ReplyStyle` evaluates. It decides only if |p - n| or |c -
-n| is at most `NEAR` times n, or at most 1.5 if that is more. The limit is not 0, because some lines
-get lost."""
+"""`ReplyStyle` decides only if the number n of received lines is near to one of two sums: the
+number p of reply periods, or the number c of commands. Therefore |p - n| or |c - n| must be at most
+`NEAR` times n, or at most 1.5 if that is more. The limit is not 0, because some lines get lost. All
+three numbers are sums over the reads of the port that `ReplyStyle` evaluates."""
 
 
 class Feedback(Struct, frozen=True, gc=False):
-    """A good line, with its sample time and the motion since the previous line.
+    """A good line from the board, with its sample time and the motion since the previous good line.
 
     `at` is the time at which the board read its encoders, and `dt` is the time since the previous
     sample, s. If the motion since the previous sample is unknown, `dt` is 0, and `gap` is the time
-    since the previous line, s. Otherwise, and in the first line, `gap` is 0.
+    since the previous line, s. Otherwise `gap` is 0. For the first line of the board, both are 0.
 
     `turned` is the angle by which each wheel turned since the previous line, rad, in `WHEELS`
-    order. It comes from the encoder counts in the lines, is valid even after a gap, and is None if
-    unknown.
+    order. It is computed from the encoder counts in the lines, so it is valid even after a gap. It
+    is None if the angles are unknown.
     """
 
     at: Instant
@@ -84,15 +86,16 @@ class Feedback(Struct, frozen=True, gc=False):
     gap: float = 0.0
     turned: Motors | None = None
     bridged: float = 0.0
-    """Length of the part of `dt` in which lines were lost, s. It is the first part of `dt`. The
-    odometry fills it with the speeds of the line before it and of the line after it."""
+    """Duration of the first part of `dt`, in which lines were lost, s; 0 if no line was lost. The
+    odometry fills this part with the speeds of the last line before it and of the first line after
+    it."""
     asked_ns: int | None = None
     """Monotonic time at which the daemon wrote the command that this line answers, ns. None if
     unknown."""
     since: float = 0.0
-    """Time since the previous line, s, which the plausibility checks use. It comes from the board's
-    clock if the line contains that clock, else from the arrival times. It is 0 after a silence or a
-    gap."""
+    """Time since the previous line for the plausibility checks, s. It comes from the board's clock
+    if the line contains the time of that clock, else from the arrival times. It is 0 after a
+    silence or a gap."""
     heard_ns: int = 0
     """Monotonic time at which the host had received the whole line, ns."""
     counted: Motors | None = None
@@ -104,9 +107,10 @@ class Feedback(Struct, frozen=True, gc=False):
     count: float = 0.0
     """Angle of one encoder count, rad, 0 if the counts per turn are not configured."""
     driven: float = 0.0
-    """Time from the previous line until the motors were commanded to rest, or until the watchdog
-    of the MCU stopped them for want of lines, s. It is negative if the command came before the
-    previous line, and 0 in the first line."""
+    """Time from the previous sample until the motors had no command to move any more, s. The
+    command to move ends with the first line of zeros. It also ends when the watchdog of the board
+    stops the motors because no line has reached the board. The value is negative if the command
+    ended before the previous sample, and 0 in the first line."""
 
 
 class ReplyStyle:
@@ -115,16 +119,15 @@ class ReplyStyle:
     While the daemon sends one line per period, both kinds of boards look alike. Sometimes the
     daemon sends more or fewer lines, because the host did not run or because a new command did not
     wait for the next period. Then a board that reports by its own clock sends as many lines as
-    periods have passed, and a board that answers sends as many lines as it received commands. The
-    class adds up both numbers over the reads of the port in which they differ, and over the next
-    few reads, which deliver the lines that a USB adapter still held. The sum that is nearer to the
-    number of received lines shows the kind of the board.
+    periods have passed. A board that answers sends as many lines as it received commands. The class
+    compares the number of received lines with both numbers.
     """
 
     def __init__(self, speaks: bool) -> None:
-        """Start with the kind of the board unknown, unless `speaks` is true.
+        """Start before the first read of the port.
 
-        `speaks` is true if `mcu.reply_period` is set. Then the board reports by its own clock.
+        `speaks` is true if `mcu.reply_period` is set, so that the board certainly reports by its
+        own clock. If `speaks` is false, the kind of the board is unknown at first.
         """
         self.speaks: bool | None = speaks or None
         """True if the board reports by its own clock, False if it answers each command, None while
@@ -140,7 +143,7 @@ class ReplyStyle:
     def read(self, lines: int, periods: float) -> None:
         """Process a read of the port that completed `lines` lines.
 
-        `periods` is the time since the last such read, in reply periods of the board.
+        `periods` is the time since the previous such read, in reply periods of the board.
         """
         left, self._left = self._left, 0
         if self._known or periods > LATEST:
@@ -196,17 +199,18 @@ class Timeline:
         self._heard_ns = self._end_ns = 0
         self._forgotten = True
         self._rest_ns = 0
-        """Monotonic time, ns, of the first command to rest after the last command that moves a
-        wheel, or of the watchdog's stop if that is earlier."""
+        """Monotonic time at which the motors have no command to move any more, ns: the time of the
+        first line of zeros, or of the stop by the board's watchdog if that is earlier."""
         self._last_placed = Placed("reads", 0)
-        """The time of the last good line, according to the clock that was used for it."""
+        """The time of the last good line, by the clock that was chosen for this line."""
         self._spoilt = False
         """Whether a bad or ignored line came since the last good line."""
         self._later = 0.0
         """Mean difference between two times of the same line, ns: the time that `PromptedTimes`
         gives minus the time that `FreeRunningTimes` gives."""
         self._compared = False
-        """Whether the last difference is part of this mean. The first one of a series starts it."""
+        """Whether the mean in `_later` includes the last difference. If it does not, the next
+        difference becomes the new mean."""
         self.leaps = 0
         """Number of lines with impossible encoder counts. For such a line, the angle that a wheel
         turned is computed as speed times time."""
@@ -214,16 +218,19 @@ class Timeline:
         """Whether the board's clock in the last line shows that the board has restarted."""
 
     def forget(self) -> None:
-        """Start a new session. The motion between the last line and the next one is unknown."""
+        """Forget the previous line, because a new session begins.
+
+        The motion between the previous line and the next one is then unknown.
+        """
         self._encoders.forget()
         self._slots.forget()
         self._prompts.forget()
         self._forgotten = True
 
     def left(self, at_ns: int, moves: bool = True) -> None:
-        """Record that a command was written at `at_ns` on the monotonic clock.
+        """Record that a command was written at the monotonic time `at_ns`, ns.
 
-        `moves` is true if the command gives a speed to a wheel.
+        `moves` is true if the command contains a speed other than zero.
         """
         self._prompts.left(at_ns)
         self._style.left()
@@ -255,7 +262,7 @@ class Timeline:
         self._prompts.read(end_ns, lines, following > 0)
 
     def spoilt(self) -> None:
-        """Skip the next line of the read, because it is bad.
+        """Skip the next line of the read, because this line is bad.
 
         Also skip the command that this line may answer, unless the board reports by its own clock.
         """
@@ -276,12 +283,13 @@ class Timeline:
         """Return the feedback for the next line of the read, which must be a good line.
 
         Args:
-            speeds: The speeds in the line.
-            reading: The sample fields of a checked reply, None if it has none.
-            following: The number of bytes in the read after the end of the line.
-            length: The number of bytes of the line with its line end.
-            silent: Whether the line ends a silence that made the link stale, or begins a session.
-            asked_ns: Monotonic time at which the answered command was written, ns, or None.
+            speeds: wheel speeds in the line.
+            reading: sample fields of a checked reply; None if the line has no sample fields.
+            following: number of bytes in the read after the end of the line.
+            length: number of bytes of the line with its line end.
+            silent: whether the line ends a silence of more than `quiet_ns`, or is the first good
+                line since the port was opened or the board restarted.
+            asked_ns: monotonic time at which the answered command was written, ns; None if unknown.
         """
         self._rest -= 1
         # Bytes that followed in the same read were on the wire after this line was complete.
@@ -344,17 +352,16 @@ class Timeline:
         return Placed("reads", int(self._end_ns - self._share_ns * self._rest))
 
     def _since_last(self, placed: Placed) -> tuple[float, float]:
-        """Return the time since the last good line, and the part of it in which lines were lost, s.
+        """Return the time since the last good line, and its part in which lines were lost.
 
-        The odometry fills this part. It is 0 if no line was lost.
-
-        If the times of this line and of the last good line come from different clocks, the time is
-        the difference of their `due_ns`, corrected by the mean offset between the clocks. Without
-        this correction, the errors of many changes from one clock to another would add up.
+        Both times are in s. The second time is 0 if no line was lost.
         """
         last = self._last_placed
         back = placed.due_ns < last.due_ns
         self._last_placed = replace(placed, due_ns=last.due_ns) if back else placed
+        # If the times of this line and of the last good line come from different clocks, their
+        # difference is corrected by the mean offset between the clocks. Without this correction,
+        # the errors of many changes from one clock to another would add up.
         by_clock = placed.dt if placed.clock == last.clock else None
         if by_clock is not None and not last.early:
             return by_clock, placed.bridged
@@ -380,7 +387,7 @@ class Timeline:
         self._later += LATER * (later_ns - self._later)
 
     def _late_ns(self, clock: str) -> float:
-        """Return the mean time by which `clock` is later than `FreeRunningTimes` for a line, ns.
+        """Return how much later `clock` usually is than `FreeRunningTimes` for the same line, ns.
 
         `clock` is one of the values of `Placed.clock`.
         """
@@ -393,7 +400,7 @@ class Timeline:
         return self._slots.usual or self._period_ns
 
     def _sampled(self, came_ns: int, placed: Placed, length: int) -> Instant:
-        """Return the time at which the board began to send a line, which is its sample time.
+        """Return the sample time of a line: the time at which the board began to send the line.
 
         `came_ns` is the monotonic time at which the whole line had arrived, ns. `placed` is the
         time of the line by the chosen clock. `length` is the number of bytes of the line with its

@@ -13,7 +13,7 @@ status line with all fields about 100."""
 
 
 class LineReader:
-    """A splitter that turns a byte stream, in pieces of any size, into lines."""
+    """A splitter that turns a stream of received bytes, in pieces of any size, into lines."""
 
     def __init__(self) -> None:
         self._held = b""
@@ -21,15 +21,16 @@ class LineReader:
         self.too_long = 0
 
     def clear(self) -> None:
-        """Forget a half-received line, because the port has been reopened."""
+        """Forget the beginning of an incomplete line, because the port has been reopened."""
         self._held = b""
         self._discarding = False
 
     def feed(self, data: bytes) -> list[tuple[bytes, int]]:
-        """Return the lines that `data` completes, in order, as pairs.
+        """Return the lines that `data` completes, in order.
 
-        A pair is a line without its line end, and the number of bytes that follow it in `data`.
-        From this number, the caller computes how long before the read the line was complete.
+        Each line is a pair: its bytes without the line end, and the number of bytes that follow the
+        line in `data`. From this number, the caller computes how long before the read the line was
+        complete.
         """
         lines = []
         ends = data.split(b"\n")

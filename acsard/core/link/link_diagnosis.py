@@ -1,4 +1,4 @@
-"""Explains to the operator why the link is not up or why lines are lost, and what to do.
+"""Explains to the operator why the link is not up or why lines are lost, and how to repair it.
 
 The sentences appear in `state.reason`, in the log and on the web page. `acsard mcu check` uses the
 same diagnosis. The diagnosis does not change the state of the link, which `link_state.py` decides.
@@ -19,10 +19,10 @@ from acsard.core.link.negotiation import MENDS, Negotiation
 from acsard.core.values import NS_PER_S, Event
 
 SHARE = 0.5
-"""The link is stale if no feedback line was read for `Link.quiet_ns`. The daemon reads the lines of
-the board only in its control steps. If the time between two control steps reaches this share of
-`Link.quiet_ns`, the second step is late. Then this computer has caused the silence by not running
-the daemon, and the board is not to blame."""
+"""A control step is late if the time since the previous step reaches this share of `Link.quiet_ns`,
+the duration of silence after which the link is stale. The daemon reads the lines of the board only
+in its control steps. So before a late step, this computer has caused a silence by not running the
+daemon, and the board is not to blame."""
 
 BUSY = (
     "the Linux command `top` shows which other program uses the processor; acsard has priority if "
@@ -76,8 +76,8 @@ BLOCKED = (
 )
 
 WINDOW = 1000
-"""`UnansweredLines` counts the answers each time this number of lines has been sent, which takes 10
-s at 100 Hz."""
+"""Number of sent lines after which `UnansweredLines` counts the answers to these lines. At 100 Hz,
+this takes 10 s."""
 
 LOST = 0.02
 """Share of unanswered lines above which `UnansweredLines` warns. A good link loses no answer."""
@@ -95,8 +95,8 @@ class Lateness:
     """Detector of control steps that come too late.
 
     The daemon reads the lines of the board only in its control steps. If a control step comes late,
-    no line could be read for a while. This computer has then caused the silence on the serial line
-    by not running the daemon in time. The board is not to blame.
+    the daemon could not read any line for a while. This computer has then caused the silence on the
+    serial line, and the board is not to blame.
     """
 
     def __init__(self, simulated: bool, quiet_ns: int) -> None:
@@ -111,14 +111,14 @@ class Lateness:
         """Longest time between two control steps since the last good line, s; 0 if no control step
         was late."""
         self.step_s = 0.0
-        """Time between the last two control steps, s, if the last one was late; otherwise 0."""
+        """Time between the last two control steps, s, if the last step was late; otherwise 0."""
 
     def look(self, now_ns: int, good: bool) -> bool:
-        """Record a control step. Return whether it ends a silence that this computer caused.
+        """Record a control step. Return whether this step ends a silence that this computer caused.
 
         Only a good line from the board ends a silence. The built-in simulator runs on this
-        computer, so this computer counts as the cause of each of its silences. With the simulator,
-        the result is therefore True for every step that receives a good line.
+        computer, so this computer causes each of the simulator's silences. With the simulator, the
+        result is therefore True for every step that receives a good line.
 
         Args:
             now_ns: the monotonic time of the control step, ns.
@@ -148,7 +148,7 @@ class Lateness:
 
 
 class Heard(Struct):
-    """A summary of the bytes and lines that were received in an interval without a link."""
+    """A summary of the bytes and lines that the daemon received in an interval without a link."""
 
     size: int = 0
     """Number of received bytes, without the bytes of status lines."""
@@ -159,7 +159,7 @@ class Heard(Struct):
     statuses: int = 0
     """Number of the board's status lines."""
     last: bytes = b""
-    """The last bad line, or the last received bytes if no line has ended yet."""
+    """The last bad line, or the last received bytes if no line is complete yet."""
     late_s: float = 0.0
     """Longest time in the interval in which this computer did not run the daemon, s."""
 
@@ -170,7 +170,7 @@ class Heard(Struct):
             self.last = (self.last + data)[-SHOWN:]
 
     def line(self, line: bytes, good: bool) -> None:
-        """Add a received line without its line end. `good` says whether it is a valid reply."""
+        """Add a received line without its line end. `good` is true if the line is a valid reply."""
         self.lines += 1
         self.good += good
         if not good:
@@ -230,7 +230,7 @@ class SilenceDiagnosis:
         self._since_ns: int | None = None
 
     def forget(self) -> None:
-        """Discard the diagnosis, and start with a new interval at the next call of `judge`.
+        """Discard the diagnosis. The next call of `judge` begins a new interval.
 
         The caller does this if the link is up, if the output is blocked, or if the port was opened
         or closed.
@@ -238,12 +238,12 @@ class SilenceDiagnosis:
         self.heard, self.now, self._since_ns = None, Heard(), None
 
     def judge(self, now_ns: int, late_s: float = 0.0) -> bool:
-        """Process a control step without a link.
+        """Process a control step without a link, and return whether the diagnosis is new.
 
-        `late_s` is the time since the step before, s, if this step is late; otherwise 0. Steps
-        without a link are divided into intervals of 3 s (`PATIENCE_NS`). Return True if this step
-        ends the first interval, or an interval whose class of received bytes (`Look`) differs from
-        that of the interval before.
+        A new diagnosis is made every 3 s (`PATIENCE_NS`), from the bytes received in these 3 s. The
+        result is True if this step makes the first diagnosis, or a diagnosis whose class of
+        received bytes (`Look`) differs from that of the previous diagnosis. `late_s` is the time
+        since the previous step, s, if this step is late; otherwise 0.
         """
         if self._since_ns is None:
             # The interval begins with this step, so the time before it does not belong to it.
@@ -268,10 +268,10 @@ class UnansweredLines:
     """
 
     def __init__(self, reply_period: float) -> None:
-        """Start before the first line was sent. `reply_period` is `mcu.reply_period`, s.
+        """Start before the first line was sent.
 
-        If `reply_period` is not 0, the board does not answer lines but reports by its own clock, so
-        the class never warns.
+        `reply_period` is the setting `mcu.reply_period`, s. If it is not 0, the board does not
+        answer lines but reports by its own clock, so the class never warns.
         """
         self._own_clock = reply_period > 0.0
         self._since: tuple[int, int] | None = None
@@ -280,8 +280,8 @@ class UnansweredLines:
     def look(self, sent: int, good: int, linked: bool) -> Event | None:
         """Return the warning if it is due, else None.
 
-        `sent` and `good` are the numbers of sent lines and of received good lines, both counted
-        since the daemon started. `linked` says whether the link is up.
+        `sent` is the number of lines sent, and `good` the number of good lines received, both since
+        the daemon started. `linked` is true if the link is up.
         """
         if not linked or self._own_clock:
             self._since, self._told = None, False
@@ -319,8 +319,8 @@ def words(
     """Return a sentence for the operator about the state of the link while the port is open.
 
     `check` is the negotiation of the checksum, `hearing` is the diagnosis of a silence, and
-    `lateness` knows the late control steps. `longest_reply` is the highest value that the setting
-    `mcu.reply_period` may have, s.
+    `lateness` is the detector of late control steps. `longest_reply` is the highest value that the
+    setting `mcu.reply_period` may have, s.
     """
     if link.state in ("booting", "stale"):
         heard = hearing.heard
@@ -355,10 +355,10 @@ def _sparse(sparse_s: float, longest_reply: float) -> str:
 
 
 def check_event(check: Negotiation, wants_samples: bool) -> Event:
-    """Return the event for the log which says that the lines are now plain, or now checked.
+    """Return the log event which says whether the lines on the wire are now plain or checked.
 
-    The event is a warning if the board does not support the check, or if `wants_samples` is true
-    and the board does not send its encoder counts.
+    The event is a warning if the board does not support the check. It is also a warning if
+    `wants_samples` is true and the board does not send its encoder counts.
     """
     fallen = check.state == "plain" or (wants_samples and check.state == "checked")
     text = f"the lines on the serial port are now {check.in_force}"

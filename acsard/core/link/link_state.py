@@ -60,23 +60,26 @@ GOOD_LINES = 3
 board may print anything after a reset."""
 
 BAD_LINES = 5
-"""Number of bad lines in a row on a checked link after which the daemon renegotiates the check."""
+"""Number of bad lines in a row on a checked link after which the daemon negotiates the check
+again."""
 
 SPARSE = 2
-"""The board's lines count as too sparse after this number of silences in a row, if only a single
-good line follows each of them. One silence only means that the link was lost for a moment."""
+"""The lines of the board count as too sparse after this number of silences in a row, with only one
+good line between two of them. A single silence only means that the link was lost for a moment."""
 
 
 class Link:
     """The state of the link and its counts of good and bad lines. Only `sign` changes the state."""
 
     def __init__(self, quiet_ns: int) -> None:
-        """Start with the port closed. A silence of `quiet_ns` ns makes the link stale."""
+        """Start with the port closed.
+
+        `quiet_ns` is the duration of silence after which the link is stale, ns.
+        """
         self.quiet_ns = quiet_ns
         self.state: State = "down"
         self.sparse_s = 0.0
-        """Time between the last two good lines, s, if there were `SPARSE` silences in a row. Else
-        0."""
+        """Time between the last two good lines, s, after `SPARSE` silences in a row; else 0."""
         self._silences = 0
         self._good_in_row = self._bad_in_row = 0
         self._heard_ns: int | None = None
@@ -100,16 +103,18 @@ class Link:
             self.excuse()
 
     def silent(self, now_ns: int) -> bool:
-        """Return whether the last good line is older than `quiet_ns`, or no good line came yet.
+        """Return whether the last good line is older than `quiet_ns`.
 
-        The line is not too old while `wait` lets the board answer.
+        The result is also True if no good line has come since the port was opened or the board
+        restarted. It is False during the additional time that `wait` gives the board. `now_ns` is
+        monotonic.
         """
         if self._heard_ns is None:
             return True
         return now_ns - self._heard_ns > self.quiet_ns and now_ns > self._waits_until_ns
 
     def good(self, at_ns: int) -> int | None:
-        """Count a good line, which came at `at_ns` on the monotonic clock.
+        """Count a good line, which the daemon received at the monotonic time `at_ns`.
 
         Return the time since the previous good line, ns, or None for the first good line after the
         port was opened or the board has restarted.
@@ -128,11 +133,12 @@ class Link:
         return since_ns
 
     def wait(self, now_ns: int) -> None:
-        """Let the board answer for a third of `quiet_ns`, but only once after each good line.
+        """Give the board additional time to answer: a third of `quiet_ns`.
 
-        The caller does this if it sent no line for a while, so that the board may have had nothing
-        to answer. So the link becomes stale at the latest `quiet_ns` plus the duration of the stall
-        plus `quiet_ns` / 3 after the last good line.
+        The caller does this if it sent no line for a while, because the board may have had nothing
+        to answer. The call has an effect only while the link is up, and only once after each good
+        line. With it, the link becomes stale at the latest `quiet_ns` plus the duration of the
+        stall plus `quiet_ns` / 3 after the last good line.
         """
         if self.state == "up" and not self._waited:
             self._waited = True
@@ -141,12 +147,13 @@ class Link:
     def excuse(self) -> None:
         """Reset the count of silences in a row.
 
-        The caller does this if a line came in time, or if the board did not cause the silence.
+        The caller does this if a line came in time, or if the board is not the cause of the
+        silence.
         """
         self._silences, self.sparse_s = 0, 0.0
 
     def missed(self) -> None:
-        """Reset the count of good lines in a row, after a bad line or a silence.
+        """Reset the count of good lines in a row, because of a bad line or a silence.
 
         While the link is up, the count does not change.
         """
@@ -154,9 +161,9 @@ class Link:
             self._good_in_row = 0
 
     def bad(self) -> bool:
-        """Count a bad line. Return True if now exactly `BAD_LINES` bad lines have come in a row.
+        """Count a bad line. Return True if this line completes `BAD_LINES` bad lines in a row.
 
-        On a checked link, the caller must then renegotiate the check.
+        On a checked link, the caller must then negotiate the check again.
         """
         self.missed()
         self._bad_in_row += 1
@@ -170,7 +177,7 @@ class Link:
     def judge(self, now_ns: int, may_rise: bool) -> None:
         """Change the state to "stale" after a silence, or to "up" after `GOOD_LINES` good lines.
 
-        The state changes to "up" only if `may_rise` is true.
+        The state changes to "up" only if `may_rise` is true. `now_ns` is monotonic.
         """
         silent = self.silent(now_ns)
         if self.state == "up":

@@ -20,8 +20,9 @@ class MinimumDelay:
     def __init__(self, drift: float = DRIFT, most: float = math.inf) -> None:
         """Start before the first event.
 
-        `drift` is the largest relative drift between the two clocks. A delay that exceeds the
-        minimum by more than `most` is treated as if it exceeded the minimum by `most`.
+        `drift` is the largest relative drift between the two clocks. `most` is in the caller's unit
+        of time: a delay that exceeds the minimum by more than `most` is remembered as exceeding it
+        by `most`.
         """
         self._drift, self._most = drift, most
         self.late = 0.0
@@ -29,9 +30,9 @@ class MinimumDelay:
     def add(self, ours: float, theirs: float) -> float:
         """Process an event, and return its delay minus the least delay so far.
 
-        If the result is negative, this event sets a new least delay. Unlike `measure`, this method
-        does not subtract the allowed drift from the result. `ours` is the time since the previous
-        event by this computer's clock, and `theirs` is the same time by the other clock.
+        If the result is negative, this event sets a new least delay. `ours` is the time since the
+        previous event by this computer's clock, and `theirs` is the same time by the other clock.
+        Unlike `measure`, this method does not subtract the allowed drift since the previous event.
         """
         later = self.late + ours - theirs
         self.measure(ours, theirs)
@@ -39,9 +40,10 @@ class MinimumDelay:
         return later
 
     def measure(self, ours: float, theirs: float) -> float:
-        """Return the delay of an event, minus the least delay and the allowed drift.
+        """Return the delay of an event, minus the least delay and minus the allowed drift.
 
-        The least delay does not change until `believe` is called. The arguments are those of `add`.
+        The least delay does not change until `believe` is called. `ours` is the time since the
+        previous event by this computer's clock, and `theirs` is the same time by the other clock.
         """
         self.late = self.late + ours - theirs - self._drift * ours
         return self.late

@@ -1,14 +1,14 @@
 """Negotiates with the board whether lines have a check: a sequence number and a CRC.
 
 The negotiation runs when the port is opened, and again after a gap in the lines. The daemon asks
-with a question, which is a stop line with the check (`checked_line.py`). A board that knows the
+with a question, which is a stop line with the check (`checked_line.py`). A board that supports the
 check answers in the same form. The states of the negotiation are:
 
 - off: mcu.link_check is "off". Lines are plain, and the daemon does not ask for the check.
 - waking: the daemon sends only stops. The board has not answered yet, so its silence proves
-  nothing. Every second stop is plain, because the board may know only plain lines.
+  nothing. Every second stop is plain, because the board may support only plain lines.
 - asking: the daemon sends only stops. The board has sent a plain line, so it is awake. If it does
-  not answer a question now, it probably does not know the check.
+  not answer a question now, it probably does not support the check.
 - plain: only with mcu.link_check = "auto". The board answers, but without the check. The daemon
   asks again after the next gap.
 - checked: the board has answered a question correctly. Now the daemon accepts only checked replies.
@@ -19,9 +19,9 @@ Once a board has answered with the check, the daemon accepts no plain replies un
 reopened, because noise must not end the check.
 
 The module also detects echoes, which are lines of the daemon that come back because TX and RX are
-connected or the far end echoes. If a question with request letters comes back, it is recognized
-immediately, because no reply has request letters. `echo_detector.py` detects the echo of plain
-lines, and of checked lines that ask for no sample.
+connected or the far end echoes. If a question with request letters comes back, the echo is detected
+immediately, because replies contain no request letters. `echo_detector.py` detects the echo of
+plain lines, and of checked lines that ask for no sample.
 """
 
 from __future__ import annotations
@@ -76,12 +76,12 @@ IN_FORCE: dict[State, str] = {
 }
 
 Trouble = Literal["", "echo", "forgotten", "unknown"]
-"""The reason why the daemon accepts none of the received replies, so that the robot cannot drive.
-"" means that there is no such reason.
+"""The reason why the daemon accepts no reply at all, so that the robot cannot drive. "" means that
+there is no such reason.
 
 - echo: the lines that the daemon sends come back
 - forgotten: the board has answered with the check since the port was opened, but no longer does
-- unknown: the board does not know the check, and the configuration requires it
+- unknown: the board does not support the check, and the configuration requires it
 """
 
 MENDS: dict[Trouble, str] = {
@@ -99,7 +99,7 @@ MENDS: dict[Trouble, str] = {
 
 TRIES = 3
 """After this number of unanswered questions of one kind, the daemon concludes that the board does
-not know this kind. A question is a stop line with a sequence number and a checksum. Questions of
+not support this kind. A question is a stop line with a sequence number and a checksum. Questions of
 the first kind ask for a sample, and those of the second kind have no request letters. If the daemon
 wants no samples, it sends a single question with `ASK_NOTHING` instead of the first kind."""
 
@@ -108,7 +108,7 @@ WINDOW = 64
 sequence numbers (256), so a reply cannot match the wrong line."""
 
 LATE_NS = round(WATCHDOG_S * NS_PER_S)
-"""An answer is accepted only if it comes within this time after its line was written, ns. If the
+"""Longest time from the writing of a command to its answer, ns. Later answers are rejected. If the
 board receives no line for this time, its watchdog stops the motors."""
 
 BLIND_PERIOD_NS = NS_PER_S // 10
@@ -116,7 +116,8 @@ BLIND_PERIOD_NS = NS_PER_S // 10
 wake the board, and only few lines then accumulate in buffers."""
 
 THINKING_NS = 30_000_000
-"""Time that the board and the drivers may take to answer, in addition to the wire time, ns."""
+"""Time that the board and the drivers may need for an answer in addition to the time on the wire,
+ns."""
 
 FEW_SAMPLES = 5
 """Number of correct replies in a row without a sample after which the daemon no longer asks for
@@ -124,7 +125,7 @@ samples."""
 
 
 class Throttle:
-    """A rate limiter. After an event was allowed, the next one must wait for a given time."""
+    """A rate limiter. After an allowed event, the next event must wait for a given time."""
 
     def __init__(self) -> None:
         self.last_ns: int | None = None
@@ -133,8 +134,7 @@ class Throttle:
     def lets(self, now_ns: int, wait_ns: int) -> bool:
         """Return whether an event is allowed at `now_ns`, and record the event if it is.
 
-        The event is allowed if the last one was at least `wait_ns` ns earlier, or if there was
-        none.
+        An event is allowed if the last one was at least `wait_ns` ns earlier, or if there was none.
         """
         if self.last_ns is not None and now_ns - self.last_ns < wait_ns:
             return False
@@ -144,7 +144,7 @@ class Throttle:
     def undo(self) -> None:
         """Forget the last event, because its line was not written.
 
-        The next event then need not wait.
+        The next event is then allowed immediately.
         """
         self.last_ns = self._before_ns
 
@@ -152,7 +152,7 @@ class Throttle:
 class Negotiation:
     """The negotiation of the check with the board.
 
-    The class also adds the check to lines, and finds the line that a reply answers.
+    The class also adds the check to commands, and finds the command that a reply answers.
     """
 
     def __init__(self, mcu: McuConfig, stop: bytes) -> None:
@@ -168,8 +168,8 @@ class Negotiation:
         first = (ASK_SAMPLE,) * TRIES if mcu.wants_samples else (ASK_NOTHING,)
         self._letters = (*first, *(b"",) * TRIES)
         self._question = b""
-        """The last question without its line end, to detect its echo. It is b"" if the question has
-        no request letters, because a reply may equal such a question."""
+        """The last question without its line end, to detect its echo; b"" if the question has no
+        request letters, because a genuine reply may equal such a question."""
         longest = line_bytes(mcu.trailing_comma, check=True, sample=mcu.wants_samples)
         self._answer_ns = THINKING_NS + 4 * wire_ns(longest, mcu.baud_rate)
         self._sequence = 0
@@ -186,7 +186,7 @@ class Negotiation:
 
     @property
     def asking(self) -> bool:
-        """Whether the daemon sends only questions and plain stops."""
+        """Whether the daemon is still asking for the check, so that it sends nothing but stops."""
         return self.state in ("waking", "asking")
 
     @property
@@ -200,10 +200,10 @@ class Negotiation:
         return IN_FORCE[self.state]
 
     def begin(self, fresh: bool = False) -> None:
-        """Start the negotiation again.
+        """Start the negotiation again, after the port was opened or lines were missing or damaged.
 
-        If `fresh` is true, also forget everything that is known about the board, because another
-        board may be connected now.
+        If `fresh` is true, also forget all facts about the board, because another board may be
+        connected now.
         """
         self._sign("gap")
         self._begin(fresh)
@@ -226,16 +226,16 @@ class Negotiation:
     # Lines to the board.
 
     def seal(self, line: bytes, now_ns: int) -> bytes:
-        """Return the plain line `line` in the form that is in force now, plain or checked.
+        """Return a plain command in the form that is in force now, plain or checked.
 
-        `now_ns` is the monotonic time at which the line is made.
+        `line` is the plain command. `now_ns` is the monotonic time at which the command is made.
         """
         if not self.checked:
             return line
         return self._sealed(line, ASK_SAMPLE if self.state == "sampled" else b"", now_ns)
 
     def question(self, now_ns: int) -> bytes | None:
-        """Return the next question or plain stop to send, or None if it is not due yet.
+        """Return the next question or plain stop to send, or None if none is due yet.
 
         The caller calls this method instead of `seal` while the daemon asks for the check. `now_ns`
         is the monotonic time at which the line is made.
@@ -260,8 +260,8 @@ class Negotiation:
     def settle(self, went: bool, late_ns: int = 0) -> None:
         """Record whether the port wrote the line that `seal` or `question` returned last.
 
-        `went` is true if the port wrote the line. `late_ns` is the time from making the line to
-        writing it, ns.
+        `went` is true if the port wrote this line. `late_ns` is the time from the making to the
+        writing of the line, ns.
         """
         if self._made is not None and went:
             sequence, made_ns = self._made
@@ -280,7 +280,7 @@ class Negotiation:
     # Lines from the board.
 
     def echoed(self, line: bytes) -> bool:
-        """Return whether the received line, or a line before it, is an echo of the daemon's lines.
+        """Test a received line, and return whether this line or an earlier one is an echo.
 
         `line` has no line end. After an echo, the caller rejects every received line until the port
         is reopened.
@@ -291,13 +291,13 @@ class Negotiation:
 
     @property
     def echoes(self) -> bool:
-        """Whether an echo was detected. Then every line is rejected until the port is reopened."""
+        """Whether an echo was detected. Then all lines are rejected until the port is reopened."""
         return self.trouble == "echo"
 
     def repeated(self, line: bytes, speeds: WheelSpeeds) -> bool:
-        """Process a reply without a sample, and return whether the received replies are an echo.
+        """Process a reply without a sample, and return whether the last replies are an echo.
 
-        `line` is the reply without its line end, and `speeds` are the speeds in it.
+        `line` is the reply without its line end, and `speeds` are the speeds in the reply.
         """
         if self._echo.report(line, speeds):
             self.trouble = "echo"
@@ -306,16 +306,17 @@ class Negotiation:
     def heard_plain(self) -> None:
         """Record that a valid plain line came while the daemon was asking for the check.
 
-        The board is awake then, so unanswered questions are counted from now on.
+        This line shows that the board is awake, so unanswered questions are counted from now on.
         """
         self._sign("heard")
 
     def answered(self, reply: Checked, at_ns: int) -> int:
-        """Process a correct checked reply, which was read at `at_ns` on the monotonic clock.
+        """Process a correct checked reply, and return the time at which its command was written.
 
-        Return the monotonic time at which the line that it answers was written, ns. Raises
-        `FrameError` if this line was written more than `LATE_NS` before `at_ns`, or if the sequence
-        number belongs to no line that waits for an answer.
+        This time is monotonic, in ns. Raises `FrameError` if the command was written more than 0.3
+        s (`LATE_NS`) before the reply was read, or if the sequence number of the reply belongs to
+        no command that waits for an answer. `at_ns` is the monotonic time at which the reply was
+        read.
         """
         while self._pending and at_ns - self._pending[0][1] > LATE_NS:
             self._pending.popleft()
@@ -340,7 +341,8 @@ class Negotiation:
         """Count the last question as unanswered if its answer is overdue.
 
         After `TRIES` unanswered questions of each kind, accept plain lines if `mcu.link_check` is
-        "auto" and the board has never answered with the check. Otherwise set `trouble`.
+        "auto" and the board has never answered with the check. Otherwise set `trouble`. `now_ns` is
+        monotonic.
         """
         asked_ns = self._asked.last_ns
         if self.state != "asking" or not self._open or asked_ns is None:

@@ -1,4 +1,4 @@
-"""Adds the counted angles of the wheels, and the quantization steps of their speeds, to good lines.
+"""Adds to each good line the angles in whole encoder counts, and the quantization of its speeds.
 
 A coarse encoder quantizes the reported speed of its wheel. If the counts per turn are configured,
 `whole_counts.py` recovers the counts from the speeds. Otherwise the pose uses speed times time. The
@@ -21,17 +21,17 @@ FLICKER = 0.0105
 """Smallest change of a wheel's reported speed that is more than rounding, rad/s."""
 
 BLOCK = 64
-"""Number of steps (changes of a reported speed) that form a block, from which `Steps.size` is
-learned. Even if counts are rare and the firmware filters the speeds, at least three counts fall
-into a block."""
+"""Number of steps (changes of a reported speed) in a block. At the end of each block, `Steps.size`
+is computed again from the steps of the block. Even if counts are rare and the firmware filters the
+speeds, at least three counts fall into a block."""
 
 FIRST = 24
-"""Number of steps (changes of a reported speed) after which `Steps.size` gets its first value. This
-value may still grow until the end of the block."""
+"""Number of steps (changes of a reported speed) after which `Steps.size` gets its first value.
+Until the end of the block, this value may still grow."""
 
 RECUR = 3
-"""`Steps.size` is the third largest step of a block, because a single damaged line causes two large
-steps."""
+"""`Steps.size` is the third largest step of a block. The largest step would be wrong, because a
+single damaged line causes two large steps."""
 
 ALIKE = 3.0
 """Upper bound on the quantization step of a wheel, as a multiple of the second largest step among
@@ -54,8 +54,8 @@ class Steps:
 
     One count more or less in a period T changes the reported speed by 2 pi / (counts per turn x T).
     This is 31 rad/s at 20 counts per turn and 100 Hz. Such a step is not an acceleration. The size
-    is learned from the reported speeds. So it is right for firmware that divides counts by its
-    nominal period, that divides them by the measured time, or that filters the speeds.
+    is learned from the reported speeds. So it is right whether the firmware divides counts by its
+    nominal period, divides them by the measured time, or filters the speeds.
 
     `size` is in rad/s. It is `math.inf` until `FIRST` steps have occurred.
     """
@@ -105,9 +105,10 @@ class Coarseness:
     def add(self, speeds: Motors, own: float) -> bool:
         """Process the speeds of a line, and return whether the examined encoder is coarse.
 
-        Each call examines the encoder of one wheel, and the wheels take turns. `speeds` are in
-        rad/s. `own` is the time since the previous line, s. Return False without an examination if
-        `own` exceeds `LONGEST_LINE`, or if all speeds of this line and the previous line are 0.
+        Each call examines the encoder of one wheel, and the wheels take turns. `speeds` are the
+        speeds of the four wheels, rad/s. `own` is the time since the previous line, s. Return False
+        without an examination if `own` exceeds `LONGEST_LINE`, or if all speeds of this line and of
+        the previous line are 0.
         """
         (older, before), self._rows = self._rows, (self._rows[1], speeds)
         if speeds == NOTHING == before or own > LONGEST_LINE:
@@ -120,7 +121,7 @@ class Coarseness:
 
 
 class CountRecovery:
-    """Adds the counted angles and the quantization steps to each good line of one port."""
+    """Adds the angles in whole counts and the quantization steps to each good line of a port."""
 
     def __init__(self, counts: int = 0) -> None:
         """Start before the first line.
@@ -146,15 +147,16 @@ class CountRecovery:
     def counts(self) -> tuple[int, ...]:
         """Configured encoder counts per turn of each wheel.
 
-        They are 0 if no counts are configured, or if the reported speeds contradict them.
+        All are 0 if no counts are configured, or if the reported speeds contradict the configured
+        counts.
         """
         return (self._configured if self._whole.believed else 0,) * 4
 
     def look(self, line: Feedback) -> Feedback:
-        """Return the line with the counted angle and the quantization step of each wheel added.
+        """Return a copy of a good line with the fields `counted`, `steps` and `count` set.
 
-        The field `counted` is None if the counted angles are unknown. If they include the angles of
-        a missing line before this one, the field `bridged` becomes 0.
+        `counted` is None if the angles in whole counts are unknown. If these angles include the
+        motion of a missing line before this line, the field `bridged` becomes 0.
         """
         own, speeds, counted = line.dt - line.bridged, line.speeds.as_tuple(), None
         if self._whole.angle:

@@ -1,11 +1,11 @@
 """Estimates when the board read its encoders (the sample time), for two kinds of boards.
 
-The time at which the host reads a line is later than its sample time, because an adapter, the
-scheduler or a stall of the host may have held the line back. `FreeRunningTimes` finds the period of
-a board that reports by its own clock. For a board that answers each command, `PromptedTimes` uses
-the times at which the commands were written. Each class serves as a clock: after every read of the
-port, call `read` on both objects, and then `place` to get the time of each line of the read.
-`feedback.py` chooses the better clock for each line.
+The host reads a line later than its sample time, because an adapter, the scheduler or a stall of
+the host may have delayed the line. `FreeRunningTimes` finds the period of a board that reports by
+its own clock. For a board that answers each command, `PromptedTimes` uses the times at which the
+commands were written. Each class serves as a clock: after every read of the port, call `read` on
+both objects, and then `place` to get the time of each line of the read. `feedback.py` chooses the
+better clock for each line.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ complete, ns, and the number of lines in the read."""
 
 BRIDGED_S = 1.0
 """If no line came for this time, s, the odometry does not fill the gap, because the board may have
-been reset. It fills shorter gaps."""
+been reset. The odometry fills only shorter gaps."""
 
 
 class Placed(Struct, frozen=True, gc=False):
@@ -41,13 +41,14 @@ class Placed(Struct, frozen=True, gc=False):
     clock: Literal["slots", "prompts", "reads"]
     due_ns: int
     dt: float | None = None
-    """Time since the previous line by this clock, s. None for its first line and for "reads"."""
+    """Time since the previous line by this clock, s. None for the first line of the clock and for
+    "reads"."""
     bridged: float = 0.0
     """The part of `dt` in which lines were lost, s."""
     early: bool = False
     """Whether the line came before the clock expected it. If so, `due_ns` is the time at which the
     line arrived, and the clock gives a wrong `dt` for the next line. The caller therefore computes
-    that `dt` as the difference between the `due_ns` of the two lines."""
+    the `dt` of the next line as the difference between the `due_ns` of the two lines."""
 
 
 # A free-running board. A slot is one period of its clock, in which the board sends one line.
@@ -73,21 +74,22 @@ LONE = 0.7
 read one by one. Otherwise they are treated as batches of an adapter."""
 
 LATE_ALONE, LATE_BATCHED = 0.6, 1.3
-"""`FreeRunningTimes` accepts a clock only if each line comes at most this late after its slot, in
+"""`FreeRunningTimes` accepts a clock only if every line comes at most this long after its slot, in
 periods of the board. `LATE_ALONE` is for lines that are read one by one, and `LATE_BATCHED` for
 lines that an adapter batches. `HELD_NS` limits both."""
 
 HELD_NS = 25_000_000
-"""Longest time for which an adapter is assumed to hold a line back, ns. An FTDI chip holds it for
-16 ms. If a line comes later than this, `FreeRunningTimes` finds no clock. Such a line probably
+"""Longest time for which an adapter is assumed to hold a line back, ns. An FTDI chip holds a line
+for 16 ms. If a line comes later than this, `FreeRunningTimes` finds no clock. Such a line probably
 answers a command that was sent between two periods, or comes from a slow board whose lines vary by
 more than this time."""
 
 EARLY_ALONE, ALONE = 0.55, 12
 """A read confirms a clock if it comes at most `EARLY_ALONE` periods after its slot. The earliest
-read always confirms the clock. `FreeRunningTimes` accepts the clock only if, besides that read,
-more than one in `ALONE` reads confirm it. If fewer do, these reads probably contain answers to
-commands that were sent between two periods, and the clock is too early for all other lines."""
+read always confirms the clock. `FreeRunningTimes` accepts the clock only if, in addition to the
+earliest read, more than one in `ALONE` reads confirm it. If fewer reads do, these reads probably
+contain answers to commands that were sent between two periods, and the clock is too early for all
+other lines."""
 
 JUMP = 1.4
 """If two reads with a single line each are less than this number of periods apart, no line is
@@ -124,18 +126,22 @@ class FreeRunningTimes:
       passed since the previous read, a read shows even a single missing line. Any other read shows
       a missing line only if x exceeds the greatest possible lateness.
 
-    The missing slots are spread over the lines of the read. If a line comes before its slot, too
-    many slots were counted as missing, so one of them is taken back. Twice a second, c and T are
-    corrected by the least x since the last correction, in a second-order loop with the gain g:
+    The missing slots are spread over the lines of the read. If a line comes before its slot, the
+    class has counted too many slots as missing, so it takes one of them back. Twice a second, c and
+    T are corrected by the least x since the last correction, in a second-order loop with the gain
+    g:
 
         (2)  c += g x T                 (3)  T += g^2 / 2 x T / slots
 
     In (3), `slots` is the number of slots since the last correction. If lines have no regular
-    period, no clock is found. A clock that the lines contradict is given up.
+    period, the class finds no clock. It gives up a clock that the lines contradict.
     """
 
     def __init__(self, known: tuple[float, ...]) -> None:
-        """Start without a clock. `known` are the periods that the configuration suggests, s."""
+        """Start without a clock.
+
+        `known` are the periods that the configuration suggests, s.
+        """
         self._known = known
         self.usual = 0.0
         """The last measured period T of the board, ns. 0 until a clock has been found."""
@@ -145,8 +151,8 @@ class FreeRunningTimes:
         self._first, self._slot = 0.0, 0
         """The time c of slot 0, ns, and the number k of the slot of the last line."""
         self._given = 0
-        """Number of slots that recent reads counted as slots of missing lines. If that was wrong,
-        they are taken back."""
+        """Number of slots that recent reads counted as slots of missing lines. If later lines show
+        that no line was missing, these slots are taken back."""
         self._lag = self._batch = self._gain = self._share = 0.0
         """`_lag` is the usual lateness x of a read, and `_batch` the usual time between two reads,
         both in slots. `_gain` is the gain g. `_share` is the share of the reads in the last window
@@ -163,14 +169,14 @@ class FreeRunningTimes:
         """Nominal period by which the firmware divides its counts, s. None without a clock."""
         self._reads: list[Read] = []
         self._last: float | None = None
-        """Slot of the last line that the present clock has placed. None before the first one."""
+        """Slot of the last line that the present clock has placed. None before the first line."""
 
     def read(self, at_ns: int, lines: int, drained: bool) -> int:
-        """Process a read of the port, and return how many lines before its last line are missing.
+        """Process a read of the port, and return how many lines are missing before its last line.
 
-        The result is -1 if one slot too many was counted as missing in earlier reads. `at_ns` is
-        the monotonic time at which the last line of the read was complete. `lines` is the number of
-        lines in the read. `drained` says whether the read took all data that the kernel held.
+        The result is -1 if earlier reads counted one line too many as missing. `at_ns` is the
+        monotonic time at which the last line of the read was complete. `lines` is the number of
+        lines in the read. `drained` is true if the read took all data from the kernel.
         """
         self._stretch = 1.0
         since, self._before = at_ns - self._before, at_ns
@@ -229,7 +235,7 @@ class FreeRunningTimes:
         Return -1 if the read shows that the clock is wrong, or that an earlier read counted a slot
         too many as missing. `ahead` is the lateness x of the read's last line, and `since` is the
         time since the last read, both in slots. `lines` is the number of lines in the read.
-        `drained` says whether the read took all data that the kernel held.
+        `drained` is true if the read took all data from the kernel.
         """
         lag = self._lag if self._lag < 0.5 else 0.5
         if ahead < -0.5 + 0.6 * lag:
@@ -278,15 +284,9 @@ class FreeRunningTimes:
 
         A candidate is a triple: the slot of each read's last line, the largest allowed lateness in
         slots, and the period in ns. `gaps` are the times between the reads, ns.
-
-        - Configured periods come before the measured period. For jittery lines, they are more
-          reliable than half a second of data.
-        - Even if the lines are read one by one, each configured period is also tried with the rules
-          for an adapter that batches lines. Such lines may fill the packets of an adapter one by
-          one.
-        - If an adapter batches the lines, a measured period is left out if a configured period is
-          within `DRIFT` of it. Half a second of data cannot distinguish these two periods.
         """
+        # The configured periods come before the measured period, because for jittery lines they are
+        # more reliable than half a second of data.
         plain, known = _slots(reads), [period * NS_PER_S for period in self._known]
         alone = [gap for gap, (_, lines) in zip(gaps, reads[1:], strict=True) if lines == 1]
         own = plain
@@ -295,12 +295,16 @@ class FreeRunningTimes:
         if len(alone) >= LONE * len(gaps) and (usual := median(alone)) > 0:
             own = _slots(reads, usual)
             yield from ((own, LATE_ALONE, period) for period in known)
+        # Lines that are read one by one may also fill the packets of an adapter one by one, so the
+        # rules for an adapter that batches lines are tried in any case.
         yield from ((plain, LATE_BATCHED, period) for period in known)
         slope = _slope(reads, own)
         if slope <= 0:
             return
         if own is not plain:
             yield own, LATE_ALONE, slope
+        # Half a second of batched lines cannot distinguish the measured period from a configured
+        # period that is within `DRIFT` of it.
         elif all(abs(slope / period - 1) > DRIFT for period in known):
             yield own, LATE_BATCHED, slope
 
@@ -316,9 +320,9 @@ class FreeRunningTimes:
         self._lossy: int = 0
 
     def _follow(self, at_ns: int) -> None:
-        """Correct the clock by equations (2) and (3) of the class, or give it up as wrong.
+        """Correct the clock by equations (2) and (3) of the class, or give up a wrong clock.
 
-        The window that shows the error of the clock ended at the monotonic time `at_ns`.
+        `at_ns` is the monotonic time at which the window of reads ended, ns.
         """
         least, slots = self._least, self._passed
         lossy, self._share = self._share, self._lossy / self._count
@@ -350,10 +354,10 @@ class FreeRunningTimes:
 
 
 def _slots(reads: list[Read], period: float = math.inf) -> list[int]:
-    """Return the slot of each read's last line.
+    """Return the slot of the last line of each read. The first read has slot 0.
 
-    The first read has slot 0. Each line of a read has a slot. If `period`, ns, is finite, the time
-    between two reads shows how many lines are missing, and they have slots too.
+    Each line has its own slot. If `period`, ns, is finite, missing lines have slots too: the time
+    between two reads shows their number.
     """
     slots = [0]
     for (before, _), (at, lines) in pairwise(reads):
@@ -372,9 +376,9 @@ def _slope(reads: list[Read], slots: list[int]) -> float:
 
 
 def _latest(reads: list[Read], slots: list[int], period: float) -> tuple[float, list[float]]:
-    """Return a pair: a time of slot 0, ns, and the resulting lateness of each read, in slots.
+    """Return a pair: the time of slot 0, ns, and the resulting lateness of each read, in slots.
 
-    The time is the latest one for which no read comes before its slot. `period` is in ns.
+    The time of slot 0 is the latest one for which no read comes before its slot. `period` is in ns.
     """
     offsets = [at - slot * period for (at, _), slot in zip(reads, slots, strict=True)]
     first = min(offsets)
@@ -394,24 +398,25 @@ SLOW = 0.0125
 """Gain per read of the filter that decides whether the board itself varies the reply delay."""
 
 LEAST = 0.002
-"""Gain per reply with which the long-term least delay rises toward the usual delay. So an outdated
-least delay is forgotten after about 500 replies."""
+"""Gain per reply with which the long-term least delay rises toward the usual delay. With this gain,
+an outdated least delay is forgotten after about 500 replies."""
 
 CREEP, CREEPS_FOR = 0.05, 3
-"""`PromptedTimes` keeps the least delay of the last replies. With each read of the port, this value
-rises by the share `CREEP` of the time since the last read, so that older replies are forgotten.
-That time is first limited to between 1 and `CREEPS_FOR` times the usual time between two commands.
-The upper limit is for a board that stalls and then answers all lines."""
+"""`PromptedTimes` keeps the least delay of the last replies. With each read of the port, this least
+delay rises by `CREEP` times the time since the previous read, so that older replies are forgotten.
+For this purpose, the time since the previous read counts as at least 1 and at most `CREEPS_FOR`
+times the usual time between two commands. The upper limit is for a board that stalls and then
+answers all lines."""
 
 LATE = 1.25
 """Replies were lost if the least delay of the last replies exceeds the long-term least delay by
 more than `LATE` times the usual time between two commands. A factor of 1 is too low, because the
-delay may permanently rise by almost that much."""
+delay may permanently rise by almost the time between two commands."""
 
 RARE = 0.002
 """While the share of lost replies is below this value, a late reply after a host stall does not
 prove that a reply was lost. After a host stall, two commands are written close together, so the
-reply to the first one is late even if no reply was lost."""
+reply to the first command is late even if no reply was lost."""
 
 JITTER_NS = 350_000
 """If the mean deviation of the reply delay is at most this, ns, USB and the scheduler explain the
@@ -419,20 +424,20 @@ deviation."""
 
 THOUGHT_NS = 800_000
 """If the mean deviation of the reply delay exceeds this, ns, the board itself varies the delay. USB
-and the scheduler rarely cause as much."""
+and the scheduler rarely cause such a large deviation."""
 
 RISE_NS = 20_000
-"""On a batched link, the least reply delay rises by this much with each read, ns, so that an
-outdated value is forgotten. A link is batched if an adapter holds replies back, so that one read
-contains several."""
+"""On a batched link, the least reply delay rises by this time with each read, ns, so that an
+outdated value is forgotten. A link is batched if an adapter holds replies back, so that a read
+contains several replies."""
 
 LOSING = 0.005
 """Gain of the filter for the share of lost replies. With a gain of 1/20 instead, two lost replies
 would be enough to reach `LOSSY`."""
 
 LOSSY = 0.03
-"""If more than this share of the replies is lost on a batched link, it counts as lossy. Then the
-reply to any command may be missing."""
+"""If more than this share of the replies is lost on a batched link, the link counts as lossy. Then
+the reply to any command may be missing."""
 
 SEVERAL = 0.15
 """If more than this share of the reads of the port contain several lines, an adapter batches lines.
@@ -444,8 +449,8 @@ delay. An adapter whose packets fill line by line also varies the delay, but onl
 second."""
 
 BATCH_NS = 2_000_000
-"""If the mean deviation of the reply delay exceeds this, ns, an adapter causes the deviation. The
-board does not."""
+"""If the mean deviation of the reply delay exceeds this, ns, an adapter and not the board varies
+the delay."""
 
 
 class PromptedTimes:
@@ -454,8 +459,8 @@ class PromptedTimes:
     In this class, a line is a command that the daemon wrote. A plain reply does not say which line
     it answers. However, a board that answers each line takes its sample when the line arrives. So
     the sample times are the times at which the lines were written, plus a usual delay. The time
-    between two samples is the time between the lines that they answer, even if the host reads the
-    replies late.
+    between two samples is the time between the two lines that the board answered, even if the host
+    reads the replies late.
 
     Replies come in the order of the lines. If a reply seems to be later than usual by more than
     half the time from its line to the next line, it answers the next line, and the reply to the
@@ -480,7 +485,7 @@ class PromptedTimes:
         """Forget which command was answered last, and the usual delay of the replies.
 
         The next reply is then assigned to the newest command that it can answer. The commands are
-        not forgotten, because replies to the last ones may still come.
+        not forgotten, because replies to the last commands may still come.
         """
         self._delay: float | None = None
         self._first = False
@@ -495,18 +500,18 @@ class PromptedTimes:
         """`_apart` is the usual time between two commands, ns. `_missing` is the share of lost
         replies."""
         self._last: int | None = None
-        """Time at which the last answered command was written, ns. If the board itself delayed the
-        reply more or less than usual, the time is shifted by about the difference."""
+        """Time at which the last answered command was written, ns. If the board itself answered
+        later or sooner than usual, about this difference is added."""
         self._passed = self._line = 0
         """Both are times at which the daemon wrote a command, ns. `_line` belongs to the last
-        answered command. `_passed` belongs to the last command whose reply is not awaited any more,
-        because the command was answered, skipped or given up."""
+        answered command. `_passed` belongs to the last command for which no reply is expected any
+        more, because the command was answered, skipped or given up."""
         self._lost = False
         """Whether the last read with a single reply showed that an earlier reply was lost."""
         self._given: list[int] = []
         """The commands that were given up at the last read of a batched link, oldest first. Each is
-        the time at which it was written, ns. An adapter that stalled may still deliver their
-        replies."""
+        the time at which it was written, ns. An adapter that stalled may still deliver the replies
+        to these commands."""
         self._at, self._alone, self._since = 0, False, 0
         self._base, self._batch, self._losses = 0.0, 2e7, 0.0
         """These values describe a batched link. `_base` is the least reply delay, ns. `_batch` is
@@ -521,16 +526,19 @@ class PromptedTimes:
 
     @property
     def thinks(self) -> bool:
-        """Whether the reply delay varies more than this computer or its USB adapter can cause."""
+        """Whether the board itself varies the reply delay.
+
+        The delay then varies more than this computer or its USB adapter can cause.
+        """
         return self._thinking > THINKS and not self._batched
 
     @property
     def lossy(self) -> bool:
-        """Whether an adapter batches the replies, and more of them are lost than `LOSSY` allows."""
+        """Whether an adapter batches the replies, and a share of them above `LOSSY` is lost."""
         return self._batched and self._losses > LOSSY
 
     def left(self, at_ns: int) -> None:
-        """Record that a command was written at `at_ns` on the monotonic clock."""
+        """Record that a command was written at the monotonic time `at_ns`, ns."""
         if self._sent is not None:
             apart, usual = at_ns - self._sent, self._apart
             self._apart = usual + FAST * (min(apart, 2 * usual) - usual) if usual else apart
@@ -560,8 +568,8 @@ class PromptedTimes:
     def place(self, asked_ns: int | None = None) -> Placed | None:
         """Return the time of the next reply, or None if no command waits for a reply.
 
-        `asked_ns` is the monotonic time at which the answered line was written, ns, or None if it
-        is unknown.
+        `asked_ns` is the monotonic time at which the command that this reply answers was written,
+        ns. It is None if the reply does not say which command it answers.
         """
         left = self._left
         if asked_ns is not None:
@@ -621,11 +629,11 @@ class PromptedTimes:
     def _shorten(self, line: int) -> None:
         """Correct the usual delay if it was measured on a first reply that a stall had delayed.
 
-        In that case, the delay of the second reply is much shorter than the usual delay. Without
-        the correction, the usual delay would fall by only 5 % of the difference per reply. Until
-        then the delay would seem to vary much, which would hide lost replies. `line` is the time at
-        which the command that the second reply answers was written, ns.
+        `line` is the time at which the command that the second reply answers was written, ns.
         """
+        # After a stall, the delay of the second reply is much shorter than the usual delay. Without
+        # the correction, the usual delay would fall by only 5 % of the difference per reply. Until
+        # then the delay would seem to vary much, which would hide lost replies.
         own = self._at - line
         self._first = own < (self._delay or 0) - self._apart / 2
         if self._first and self._alone and not self._batched:
@@ -635,17 +643,17 @@ class PromptedTimes:
     def _weigh(self, lines: int, since: int, cut: bool) -> None:
         """Give up the commands whose replies were lost on a batched link.
 
-        The last reply of a batch shows a loss: it comes too late for the command that it would
-        answer if no reply were lost. If many replies are lost, the first reply of the batch decides
-        instead, because the board made it after the previous batch. If the last reply comes too
-        soon for its command, commands that were given up before are taken back.
-
         `lines` is the number of whole replies in the batch. `since` is the time since the previous
         read, ns. `cut` is true if the read also contains the first part of one more reply.
         """
+        # The last reply of a batch shows a loss: it comes too late for the command that it would
+        # answer if no reply were lost. If it comes too soon for its command, commands that were
+        # given up before are taken back.
         left, at, began = self._left, self._at, lines + cut
         judged, soonest = lines - 1, float(self._soonest)
         if self.lossy:
+            # If many replies are lost, the first reply of the batch decides instead, because the
+            # board made it after the previous batch.
             judged, soonest = 0, max(soonest, self._base - JITTER_NS)
         if since < 1.5 * self._batch:
             self._batch += FAST * (since - self._batch)
@@ -676,9 +684,9 @@ class PromptedTimes:
     def _given_up_too_early(self, delay: float) -> bool:
         """Give up the commands whose replies were lost.
 
-        Return True if an earlier read gave up one command too early. In that case, the present
-        reply answers the command that was given up last. The present reply must be the only reply
-        in its read of the port. `delay` is the usual delay, ns.
+        Return True if an earlier read gave up a command too early. The present reply then answers
+        the command that was given up last. The present reply must be the only reply in its read of
+        the port. `delay` is the usual delay, ns.
         """
         left, at, wide = self._left, self._at, 4 * self._spread
         lost, self._lost = self._lost, False
@@ -700,7 +708,7 @@ class PromptedTimes:
             if at - left[0] - delay <= max(apart / 2, wide) or at - left[1] < soonest:
                 break
             # After a host stall, two lines are written in quick succession. The reply to the first
-            # one is late, but not so late that the reply to the second one should have come too.
+            # line is late, but not so late that the reply to the second line should have come too.
             overdue = at - left[1] - delay > max(self._apart / 2, wide)
             close = apart < self._apart / 2 and not overdue
             if close and self._missing < RARE:
@@ -738,7 +746,7 @@ class PromptedTimes:
         error = self._at - line - delay
         size = abs(error)
         if size >= delay and size >= 4 * spread:
-            return 0  # a host stall
+            return 0  # a host stall has probably delayed this reply
         self._delay = delay + FAST * error
         self._least = min(self._least + LEAST * (delay - self._least), delay + error)
         self._spread += FAST * (size - spread)

@@ -13,8 +13,8 @@ from acsard.core.values import Instant, Received
 
 Offered = Literal["sent", "superseded", "down"]
 """The result of `Port.offer`. "sent" means that the whole line was written. "superseded" means that
-the line was dropped, replaced by a stop or only partly written, so a newer line must follow. "down"
-means that the port is closed."""
+the line was dropped, replaced by a stop or only partly written, so that the daemon must send a
+newer line. "down" means that the port is closed."""
 
 
 class Port(Protocol):
@@ -53,8 +53,8 @@ class SerialOutput:
     def __init__(self, baud_rate: int, stop: bytes, period_ns: int) -> None:
         """Start for a port that was just opened.
 
-        `stop` is the plain line that commands speed zero for all wheels. `period_ns` is the age,
-        ns, above which `prepare` drops a line that is not a stop.
+        `stop` is the plain line that commands speed zero for all wheels. `period_ns` is the control
+        period, ns: `prepare` drops a line that is older, unless it is a stop.
         """
         self._baud_rate, self._stop, self._period_ns = baud_rate, stop, period_ns
         self._still = stop.removesuffix(b"\r\n")
@@ -67,17 +67,20 @@ class SerialOutput:
     def prepare(self, line: bytes, made_ns: int, now_ns: int, kernel_bytes: int) -> bytes | None:
         """Return the bytes to pass to the kernel for a line, or None if the line must be dropped.
 
-        A line is dropped if the kernel still has bytes to send, or if the previous line was still
-        on the wire when `line` was made. A line that is not a stop is also dropped if it is older
-        than a period, which happens if the process did not run meanwhile. After the port was
-        opened, a plain stop replaces the first line. If the board may have received a part of a
-        line before, the bytes begin with an additional line end.
+        The first line after the port was opened is replaced by a plain stop. If the board may have
+        received only a part of the previous line, the bytes begin with an additional line end. A
+        line is dropped in these cases:
+
+        - The kernel still has bytes to send.
+        - The previous line was still on the wire when this line was made.
+        - The line is older than a period and is not a stop. This happens if the process did not run
+          meanwhile.
 
         Args:
-            line: The line with its line end.
-            made_ns: The monotonic time at which the step that made the line began, ns.
-            now_ns: The present monotonic time, ns.
-            kernel_bytes: The number of bytes that the kernel has not sent yet.
+            line: the line with its line end.
+            made_ns: monotonic time at which the step that made the line began, ns.
+            now_ns: present monotonic time, ns.
+            kernel_bytes: number of bytes that the kernel has not sent yet.
         """
         if kernel_bytes or made_ns < self._free_ns:
             return None

@@ -2,12 +2,13 @@
 
 The module turns received bytes into feedback, and wheel speeds into lines for the board.
 `negotiation.py` decides whether lines are plain or checked, and `link_state.py` decides whether the
-link may carry motion. The link does not come up while the daemon asks the board for checked lines.
+robot may drive over the link. The link does not come up while the daemon asks the board for checked
+lines.
 
-When the port is opened again, another board may answer. If it does not report a field of the status
-line that the previous board reported, the field is forgotten after `FORGET_NS`. If a board restarts
-while the port stays open, no field is forgotten: the same board has the same inputs, so a field
-that it no longer reports is a fault.
+When the port is opened again, another board may answer. The daemon then forgets, after `FORGET_NS`,
+each field of the status line that only the previous board reported. If a board restarts while the
+port stays open, the daemon forgets no field: the same board has the same inputs, so a field that it
+no longer reports is a fault.
 """
 
 from __future__ import annotations
@@ -36,16 +37,16 @@ NAMES: dict[LinkState, EventName] = {
 }
 
 LONG_GAP_NS = 1 * NS_PER_S
-"""If for at least this time, ns, no line was received or no line was written, the MCU may have been
+"""If the daemon received no line or wrote no line for at least this time, ns, the MCU may have been
 reset meanwhile. After such a gap, every sender must send a zero before it can drive."""
 
 FORGET_NS = 3 * NS_PER_S
-"""When the port was opened, another board may answer. After the link has been up for this time
-without a break, ns, the session forgets the fields of the status line that the board has not
-reported since the opening. The time does not include steps in which this computer was late. It is
-long enough, because a board reports each of its fields at least once a second. Until a field is
-forgotten, it keeps its value. So a pressed emergency stop remains latched while the cable is
-unplugged and plugged in again."""
+"""Time after the opening of the port in which a board must report each field of its status line,
+ns. The session then forgets the fields that the board did not report, because another board may be
+connected now. Only time in which the link is up without a break counts, without steps in which this
+computer was late. The time is long enough, because a board reports each of its fields at least once
+a second. Until a field is forgotten, it keeps its value. So a pressed emergency stop remains
+latched while the cable is unplugged and plugged in again."""
 
 IDENTITY = b"!acsard-mcu "
 """First bytes of the line with which an MCU with acsard's firmware identifies itself after
@@ -76,7 +77,7 @@ class McuSession:
         self._rest = self.codec.stop.rstrip(b",\r\n")
         """The first bytes of every line, plain or checked, with speed zero for all wheels."""
         self._answers = not mcu.reply_period
-        """Whether the board answers lines, so that it may be silent because it got none."""
+        """Whether the board answers lines. Such a board is silent if it received no line."""
         self._lines = LineReader()
         self._needs_check = mcu.link_check == "require"
         self.statuses: list[tuple[int, BoardStatus]] = []
@@ -87,15 +88,16 @@ class McuSession:
         self.status_ns: int | None = None
         """Monotonic time of arrival of the last status line that is not forgotten, ns."""
         self._reported: tuple[BoardStatus, int | None] = (BoardStatus(), None)
-        """The values of `status` and `status_ns` that come only from status lines received since
-        the last opening of the port."""
+        """The values of `status` and `status_ns`, but only from status lines received since the
+        last opening of the port."""
         self._awaiting, self._settled_ns, self._judged_ns = True, 0, 0
-        """`_awaiting` is true while fields from before the last opening of the port are not
-        forgotten yet. `_settled_ns` is the time for which the link has been up, ns, without the
-        late steps. `_judged_ns` is the monotonic time of the last update, ns."""
+        """`_awaiting` is true until the fields that were reported only before the last opening of
+        the port are forgotten. `_settled_ns` is the time for which the link has been up, ns,
+        without the late steps. `_judged_ns` is the monotonic time of the last update, ns."""
         self.reopened = self.forgot = False
         """`reopened` is true if the last `update` found that the port was opened. `forgot` is true
-        if it forgot the fields that the board has not reported since the opening of the port."""
+        if the last `update` forgot the fields that the board has not reported since the opening of
+        the port."""
         self.quiet_ns = int(NS_PER_S * max(0.1, 4 / rate_hz, 3 * mcu.reply_period))
         """Duration of silence after which the link is stale, ns."""
         self.negotiation = Negotiation(mcu, self.codec.stop)
@@ -107,8 +109,8 @@ class McuSession:
         self._wants_samples, self._longest_reply = mcu.wants_samples, longest_reply
         self.rejects: Counter[str] = Counter()
         self._rejected: dict[str, tuple[int, bytes]] = {}
-        """Maps each reason to the number of lines that this `update` has rejected for it, and to
-        the last such line."""
+        """Maps each reason to the number of lines that this `update` has rejected for this reason,
+        and to the last such line."""
         self.good_lines = 0
         self._heard_ns: int | None = None
         self.restarted = False
@@ -133,7 +135,7 @@ class McuSession:
 
     @property
     def link(self) -> LinkState:
-        """The state of the link. The link may carry motion only if it is `up`."""
+        """The state of the link. The robot may drive only while this is `up`."""
         return self._link.state
 
     def update(
@@ -147,9 +149,9 @@ class McuSession:
     ) -> list[Feedback]:
         """Process the state of the port and the received bytes, and return the good lines in order.
 
-        `opened` is how many times the port has been opened. If this number has changed, a new
-        session starts. `unsent` is true if the port did not write the last line that `line()`
-        returned. `late_ns` is the time from making that line to writing it, ns.
+        `opened` is the number of times that the port has been opened. If this number has changed, a
+        new session starts. `unsent` is true if the port did not write the last line that `line()`
+        returned. `late_ns` is the time from the making to the writing of that line, ns.
         """
         self.restarted, self._starting_over, self.events = False, False, []
         self.reopened = self.forgot = False
@@ -184,7 +186,7 @@ class McuSession:
 
         If the MCU does not answer, or if the daemon is asking it for checked lines, every line is a
         stop, whatever `speeds` is. The first of these stops is due immediately, because the MCU may
-        still obey the line before it.
+        still execute the previous line. `now_ns` is monotonic.
         """
         line = self._next_line(now_ns, speeds)
         self._made = None if line is None else (line, now_ns)
@@ -204,7 +206,8 @@ class McuSession:
     def silent(self, now_ns: int) -> bool:
         """Return whether the last good line of this session is older than `quiet_ns`.
 
-        Also return True if this session has no good line yet.
+        The result is also True if this session has no good line yet. After a late control step, the
+        board gets additional time to answer, in which the result is False. `now_ns` is monotonic.
         """
         return self._link.silent(now_ns)
 
@@ -242,8 +245,8 @@ class McuSession:
     def _settle(self, went: bool, port_open: bool, late_ns: int) -> None:
         """Record whether the port wrote the line that `line()` returned last.
 
-        `went` is true if the port wrote it. `port_open` says whether the port is open. `late_ns` is
-        the time from making the line to writing it, ns.
+        `went` is true if the port wrote this line. `port_open` is true if the port is open.
+        `late_ns` is the time from the making to the writing of the line, ns.
         """
         made = self._made
         if made is None:
@@ -321,16 +324,17 @@ class McuSession:
             self.events.append(Event(NAMES[self.link], self.words(), "warning"))
 
     def _reject(self, reason: str, line: bytes = b"", more: int = 1) -> None:
-        """Count `more` lines rejected for `reason`. `line` is the last of them, b"" if unknown."""
+        """Count `more` lines rejected for `reason`.
+
+        `line` is the last of these lines; b"" means that its bytes are unknown.
+        """
         self.rejects[reason] += more
         before, _ = self._rejected.get(reason, (0, b""))
         self._rejected[reason] = (before + more, line)
 
     def _announce_rejects(self) -> None:
-        """Add one event for all lines that this update has rejected for the same reason.
-
-        After noise on the cable, an event for each rejected line would take too much time.
-        """
+        """Add one event to `events` for each reason for which this update has rejected lines."""
+        # After noise on the cable, an event for each rejected line would take too much time.
         for reason, (count, line) in self._rejected.items():
             text = f"{line[:60]!r}" if line else ""
             self.events.append(
@@ -443,7 +447,7 @@ class McuSession:
 
         `read_at` is the time of the read of the port. `size` is the pair of `following` and
         `length`, the arguments of `Timeline.place`. `asked_ns` is the monotonic time at which the
-        answered command was written, ns, None if unknown.
+        answered command was written, ns; None if unknown.
         """
         self.good_lines += 1
         before_ns, self._heard_ns = self._heard_ns, read_at.mono_ns

@@ -19,9 +19,9 @@ is lost or counted twice.
 
 If the previous line is missing, there are two cases. If the board answered and its reply was lost,
 T covers only the time since that reply. If the command was lost, the board did not answer, and T
-covers the whole time since the last good line. Only one of these times makes the speeds whole
-counts. If a line does not show which case it is, the module assumes the case of most earlier lines.
-If more than one line is missing, it assumes the first case.
+covers the whole time since the last good line. The speeds are whole counts for only one of these
+two times. If a line does not show which case applies, the module assumes the case of most earlier
+lines. If more than one line is missing, it assumes the first case.
 
 Some firmware filters its speeds, or measures the time between two encoder edges. Its speeds are not
 whole counts. The module detects this, and the caller then uses speed times time.
@@ -42,14 +42,14 @@ line. This limit bounds the time of a control step."""
 
 BY_CHANCE = 0.05
 """Largest accepted probability that random speeds look like whole counts. The probability grows
-with each number of counts that is tried for a line. If it exceeds the limit, speeds that look like
-whole counts prove nothing."""
+with each number of counts that is tried for a line. If the probability exceeds this limit, speeds
+that look like whole counts prove nothing."""
 
 EXACT = 0.3
 """Largest accepted difference between a whole number of counts and the number of counts that
-follows from the speed and the host's estimate of the time. It applies if the speeds alone prove
-nothing, as with fine encoders. It also helps to decide whether the counts of a line include those
-of the missing line before it."""
+follows from the speed and the host's estimate of the time. This limit applies if the speeds alone
+prove nothing, as with fine encoders. It also helps to decide whether the counts of a line include
+those of the missing line before it."""
 
 WIDE, WIDE_S = 0.6, 0.005
 """Largest assumed error of the host's estimate of the time between two samples: the estimate times
@@ -57,8 +57,8 @@ WIDE, WIDE_S = 0.6, 0.005
 
 KEPT = 0.95
 """Largest share of the error of the host's estimate that is added to the estimate for the next
-line. If the whole error were added and the two clocks differed by 0.5 %, the sum of the errors
-would grow forever."""
+line. The share must be below 1. If the whole error were added and the two clocks differed by 0.5 %,
+the sum of the errors would grow forever."""
 
 REPEATED = 0.65
 """Firmware that is asked again very soon has no new counts, and repeats the speeds of the previous
@@ -98,18 +98,17 @@ class WholeCounts:
     def forget(self) -> None:
         """Forget all earlier lines, because they may be those of another board."""
         self._apart = self._period = 0.0
-        """`_apart` is the time in s that is added to the host's estimate for the next line. It is
+        """`_apart` is the time, s, that is added to the host's estimate for the next line. It is
         positive if the board took the last sample earlier than the host estimated. `_period` is the
-        time in s over which the firmware last counted."""
+        time, s, over which the firmware last counted."""
         self._run = 0
         """Number of lines with recovered counts since the last line without recovered counts."""
         self._before: Motors = (0.0, 0.0, 0.0, 0.0)
         self.covers_gap = False
         """Whether the counts of the last line include those of the missing line before it."""
         self._cover = 0.0
-        """The lines that follow a missing line are of two kinds: their counts include those of the
-        missing line, or not. This is the filtered share of the first kind. Lines whose speeds do
-        not show the kind are left out."""
+        """Filtered share of the lines after a missing line whose counts include those of the
+        missing line. Lines that do not show whether their counts include them are left out."""
         self._doubt = self._unsure = 0.0
         """`_doubt` is the filtered share of the lines whose speeds are not whole counts. `_unsure`
         is the filtered error of the host's estimate of the time, in counts of the fastest wheel."""
@@ -117,7 +116,8 @@ class WholeCounts:
     def pause(self) -> None:
         """Forget the error of the host's estimate, so that it is not added to the next estimate.
 
-        The caller does this if the last line does not show over what time the firmware counted.
+        The caller does this if the last line does not show the time over which the firmware
+        counted.
         """
         self._apart, self._run = 0.0, 0
 
@@ -134,8 +134,8 @@ class WholeCounts:
         the wheels turn, but no speed exceeds its rounding error.
 
         `speeds` are in rad/s. `own` is the host's estimate of the time since the previous line, s,
-        even if that line is missing. In that case, `gap` is the time from the last good line to the
-        missing line, s. Otherwise `gap` is 0.
+        whether or not the host received that line. If that line is missing, `gap` is the time from
+        the last good line to the missing line, s. Otherwise `gap` is 0.
         """
         self.covers_gap = False
         before, self._before = self._before, speeds
@@ -208,9 +208,9 @@ class WholeCounts:
         return abs(number - want * fastest / self.angle) <= EXACT
 
     def _number(self, speeds: Motors, fastest: float, want: float) -> tuple[int, bool | None]:
-        """Return a pair: the number n of counts of the fastest wheel, and whether it is proved.
+        """Return a pair: the number n of counts of the fastest wheel, and whether n is proved.
 
-        n is 0 if the line does not show it. The second value is True if the speeds prove that they
+        n is 0 if the line does not show n. The second value is True if the speeds prove that they
         are whole counts, False if they prove the opposite, and None if they prove neither. `speeds`
         are those of all wheels, and `fastest` is the largest absolute speed, rad/s. `want` is the
         expected time between the two samples, s: the host's estimate plus the addition from the

@@ -1,1 +1,4 @@
-"""The messages on the bus: types, table of keys, encodings, reports and signatures. Does no I/O."""
+"""The messages on the bus: types, table of keys, encodings, reports and signatures.
+
+This package does no I/O.
+"""

@@ -52,7 +52,7 @@ class Cdr(Generic[T]):
         self._parts, self._build = _compiled(of_type)
 
     def encode(self, message: T) -> bytes:
-        """Return the message as CDR with its header, little endian, without trailing padding."""
+        """Encode a message as CDR with its header, little endian, without trailing padding."""
         out = bytearray(HEADER)
         for part in self._parts:
             part.write(out, message)
@@ -62,7 +62,7 @@ class Cdr(Generic[T]):
         return bytes(out)
 
     def decode(self, payload: bytes) -> T:
-        """Return the message in a payload. Trailing bytes are ignored.
+        """Decode the message in a CDR payload. Trailing bytes are ignored.
 
         Raises `CdrError` and no other exception if the payload is not valid.
         """
@@ -108,7 +108,8 @@ class _Source:
     def count(self, least: int) -> int:
         """Read and return the number of items in a sequence.
 
-        Each item takes at least `least` bytes. Raises `CdrError` if the payload is too short.
+        `least` is the smallest size of an item, bytes. Raises `CdrError` if the rest of the
+        payload is too short for that many items.
         """
         (count,) = self.take("I")
         if count * least > len(self.data) - self.at:
@@ -155,7 +156,8 @@ def _layout(order: str, codes: str, start: int) -> struct.Struct:
 def _packs(codes: str) -> tuple[Callable[..., bytes], ...]:
     """Return eight functions that pack neighboring numbers, one for each start position modulo 8.
 
-    `codes` contains the format character of each number in Python's `struct`.
+    `codes` contains the format character of each number in Python's `struct`. The position is
+    counted from the end of the CDR header.
     """
     return tuple(_layout("<", codes, start).pack for start in range(8))
 
@@ -182,7 +184,7 @@ Get = Callable[[Any], Any]
 
 
 class _Numbers:
-    """Codec of a part of a message: neighboring numbers, also of different nested structs."""
+    """Codec of neighboring numbers in a message. They may belong to different nested structs."""
 
     def __init__(self, run: list[tuple[str, inspect.Type]]) -> None:
         self._codes = "".join(number_code(kind) for _, kind in run)
@@ -222,9 +224,10 @@ class _Text:
 
 
 class _List:
-    """Codec of a part of a message: a sequence, or an array if `fixed` is true.
+    """Codec of one list in a message: a CDR sequence, or a CDR array if `fixed` is true.
 
-    A sequence has up to `most` items, or any number if `most` is None. An array has `most` items.
+    An array has exactly `most` items. A sequence has up to `most` items, or any number if `most`
+    is None.
     """
 
     def __init__(self, get: Get, kind: inspect.Type, most: int | None, fixed: bool) -> None:
@@ -289,9 +292,9 @@ _Part = _Numbers | _Text | _List
 
 @cache
 def _compiled(cls: Any) -> tuple[tuple[_Part, ...], Build]:
-    """Return a pair for the struct type `cls`: its parts in order, and a function.
+    """Return a pair for the struct type `cls`: the codecs of its parts in order, and a builder.
 
-    The parts encode and decode the values. The function builds a struct from decoded values.
+    The builder is a function that makes a struct from the decoded values.
     """
     info = struct_info(cls)
     parts: list[_Part] = []

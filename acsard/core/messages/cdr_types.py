@@ -17,8 +17,8 @@ SIZES = {"d": 8, "f": 4, "q": 8, "Q": 8, "i": 4, "I": 4, "B": 1, "?": 1}
 """Size and alignment of a number in CDR, bytes, by its format character in Python's `struct`."""
 
 Build = Callable[[Iterator[object]], object]
-"""Function that builds a struct. Its argument is an iterator over the values of the fields in
-order. A nested struct is not one value: the iterator yields the values of its fields one by one."""
+"""Function that builds a struct from an iterator over the values of its fields, in order. For a
+nested struct, the iterator yields the values of the nested fields one by one."""
 
 Limit = tuple[float, float]
 """Least and greatest value of a number."""
@@ -33,9 +33,10 @@ def struct_info(cls: Any) -> inspect.StructType:
 
 
 def leaves(info: inspect.StructType, path: str = "") -> Iterator[tuple[str, inspect.Type]]:
-    """Yield the dotted path and the type of each leaf. A leaf is a field whose type is no struct.
+    """Yield the dotted path and the type of each field that is not itself a struct.
 
-    `path` is put before each path; it ends with a dot, or is "".
+    Fields of nested structs are included. `path` is a prefix for each path. It ends with a dot, or
+    is "".
     """
     for field in info.fields:
         kind = plain(field.type)
@@ -46,19 +47,22 @@ def leaves(info: inspect.StructType, path: str = "") -> Iterator[tuple[str, insp
 
 
 def builder(info: inspect.StructType) -> Build:
-    """Return the function that builds the struct from the values of its `leaves`, in order."""
+    """Return a function that builds the struct from the values of its `leaves`, in order."""
     kinds = [plain(field.type) for field in info.fields]
     children = [builder(kind) if isinstance(kind, inspect.StructType) else next for kind in kinds]
     return lambda values: info.cls(*[child(values) for child in children])
 
 
 def plain(kind: inspect.Type) -> inspect.Type:
-    """Return the type without its metadata."""
+    """Return the type `kind` without its msgspec metadata."""
     return kind.type if isinstance(kind, inspect.Metadata) else kind
 
 
 def number_code(kind: inspect.Type) -> str:
-    """Return the format character of a number in Python's `struct`, or "" for any other type."""
+    """Return the format character in Python's `struct` for a number type; "" for other types.
+
+    Raises `TypeError` for an int type that does not declare its width.
+    """
     extra = kind.extra if isinstance(kind, inspect.Metadata) else None
     code = str((extra or {}).get("cdr", ""))
     match plain(kind):
@@ -80,12 +84,15 @@ def _is_float(kind: inspect.Type) -> bool:
 
 
 def nullable(kind: inspect.Type) -> bool:
-    """Return whether a number may be None, which CDR encodes as NaN."""
+    """Return whether the type `kind` allows None, which CDR encodes as NaN."""
     return isinstance(plain(kind), inspect.UnionType)
 
 
 def limit(kind: inspect.Type) -> Limit | None:
-    """Return the bounds of an int, or None for an int without bounds and for any other type."""
+    """Return the least and the greatest allowed value of an int type.
+
+    Return None for an int type without bounds, and for any other type.
+    """
     number = plain(kind)
     if not isinstance(number, inspect.IntType):
         return None

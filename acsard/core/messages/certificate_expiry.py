@@ -1,4 +1,7 @@
-"""Says how long the TLS certificates stay valid, for `state`, `diagnostics` and `acsard doctor`."""
+"""Describes in words how long the TLS certificates stay valid.
+
+The messages `state` and `diagnostics` and the command `acsard doctor` show these words.
+"""
 
 from __future__ import annotations
 
@@ -7,17 +10,22 @@ from collections.abc import Mapping
 from acsard.core.values import NS_PER_S
 
 EXPIRY_DAYS = 30
-"""`state` and `diagnostics` show a warning if a certificate expires in fewer days than this."""
+"""Remaining validity of a certificate, days, below which `state` and `diagnostics` show a
+warning."""
 
 DAY_NS = 86400 * NS_PER_S
 
 
 def expiry(ends: Mapping[str, int], now_ns: int) -> tuple[int, str]:
-    """Return a pair: the level (0 ok, 1 warning, 2 error) and a text about the validity.
+    """Return a pair: a level (0 ok, 1 warning, 2 error) and a text about the certificates.
 
-    The text begins with "valid" only at level 0. `ends` maps the owner of each certificate that TLS
-    needs to the time at which it expires. The owner of the robot's own certificate is "". The
-    mapping is empty if no expiry time is known. All times are wall-clock ns since 1970.
+    The text is about the certificate that expires first. It begins with "valid" only at level 0.
+
+    Args:
+        ends: the time at which each certificate that TLS needs expires, wall-clock ns since 1970,
+            by the owner of the certificate. The owner of the robot's own certificate is "". The
+            mapping is empty if no expiry time is known.
+        now_ns: the present wall-clock time, ns since 1970.
     """
     if not ends:
         return (
@@ -36,10 +44,11 @@ def expiry(ends: Mapping[str, int], now_ns: int) -> tuple[int, str]:
 
 
 def first(ends: Mapping[str, int]) -> tuple[str, int]:
-    """Return a pair for the certificate that expires first: its owner, and when it expires.
+    """Return the certificate that expires first, as a pair: its owner and its expiry time.
 
     `ends` maps owners to expiry times, wall-clock ns since 1970. The time of the owner "" may come
-    from the TLS gateway, which reports only the earliest time of all certificates. So if another
-    owner has the same time, the certificate is the other owner's, and the result names that owner.
+    from the TLS gateway, which reports only the earliest expiry of all certificates. If another
+    owner has the same time, that certificate is the one that expires first, so the result names
+    its owner.
     """
     return min(ends.items(), key=lambda one: (one[1], one[0] == ""))

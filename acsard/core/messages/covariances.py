@@ -16,7 +16,7 @@ SMALLEST, LARGEST = 1e-6, 1e6
 rad2/s2 for a twist."""
 
 UNKNOWN = [LARGEST if cell % 7 == 0 else 0.0 for cell in range(36)]
-"""Covariance of a twist that is not measured at all: 6x6, row major, m2/s2 and rad2/s2."""
+"""Covariance of a twist about which nothing is known: 6x6, row major, m2/s2 and rad2/s2."""
 
 
 class Covariances:
@@ -30,10 +30,10 @@ class Covariances:
         self._unmeasured_rates = _bounded(self._twist)
 
     def of_pose(self, p: PoseCovariance) -> list[float]:
-        """Return the 6x6 covariance of the pose in the frame odom, row major, m2, m rad and rad2.
+        """Return the 6x6 covariance of the pose in the frame odom, row major.
 
-        Roll, pitch and yaw are rotations about axes through the robot that are parallel to the axes
-        of odom.
+        The units are m2, m rad and rad2. Roll, pitch and yaw are rotations about axes through the
+        robot that are parallel to the axes of odom.
         """
         if self._constant:
             return _diagonal(*self._pose)
@@ -50,7 +50,10 @@ class Covariances:
         # fmt: on
 
     def of_twist(self, v: TwistVariances) -> list[float]:
-        """Return the 6x6 covariance of the twist in the frame base_link, m2/s2 and rad2/s2."""
+        """Return the 6x6 covariance of the twist in the frame base_link, row major.
+
+        The units are m2/s2 and rad2/s2.
+        """
         if self._constant:
             return _diagonal(*self._twist)
         return _diagonal(v.linear, v.lateral, *self._unmeasured_rates, v.angular)

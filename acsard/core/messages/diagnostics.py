@@ -41,8 +41,7 @@ from acsard.core.values import (
 OK, WARN, ERROR = 0, 1, 2
 
 OF_MODE = {"stopped": WARN, "fault": ERROR}
-"""Diagnostic level of the two modes that last until a person clears a latch. The level of all other
-modes is OK."""
+"""Diagnostic levels of the modes `stopped` and `fault`. All other modes have the level OK."""
 
 BOARD = {
     "": (OK, "no emergency-stop input"),
@@ -50,7 +49,7 @@ BOARD = {
     "pressed": (WARN, PRESSED),
     "silent": (ERROR, SILENT),
 }
-"""Diagnostic level and text of each state of the emergency-stop input."""
+"""Maps each state of the emergency-stop input to the diagnostic level and the text to show."""
 
 OF_LEVEL = {"ok": OK, "warning": WARN, "return": WARN, "stop": ERROR, "unknown": WARN}
 """Maps each battery level, such as "return", to the diagnostic level to show for it."""
@@ -60,14 +59,16 @@ REFUSED_S = 2.0
 for two messages."""
 
 MISSED_SHARE = 0.01
-"""`diagnostics` warns if more than this fraction of the last minute's control periods was
-missed."""
+"""Fraction of missed control periods in the last minute above which `diagnostics` warns."""
 
 NO_ROUTER, NOT_YET = "a peer, not a router", "not connected yet"
 
 
 class Row(Struct, frozen=True):
-    """A row of `diagnostics` about one part of the robot. `values` are details as text, by name."""
+    """A row of `diagnostics` about one part of the robot.
+
+    `values` contains details as text, by name.
+    """
 
     name: str
     level: int
@@ -82,11 +83,15 @@ def diagnostics(
     certificate: tuple[int, str],
     speed_limit: str = "",
 ) -> DiagnosticArray:
-    """Return the message `diagnostics` with all rows.
+    """Return the message `diagnostics` with one row for each part of the robot.
 
-    `certificate` is the pair of level and text that `expiry` returns. Without TLS the text is "",
-    and the message has no row about the certificate. `speed_limit` describes the speed limit that
-    lowers a setting; "" if no limit does.
+    Args:
+        config: the configuration in force.
+        outputs: the outputs of the last step.
+        snapshot: the other values of the robot.
+        certificate: the diagnostic level and the text about the TLS certificates, as `expiry`
+            returns them. If the text is "", the message has no row about certificates.
+        speed_limit: description of the speed limit that lowers a setting, or "".
     """
     mode = {"mode": outputs.mode, "source": outputs.source}
     rows = [
@@ -171,8 +176,8 @@ def _commands(outputs: Outputs, snapshot: Snapshot, speed_limit: str) -> Row:
 def _wheels(doubt: WheelsStatus, counters: dict[str, int]) -> Row:
     """Return the row about wheels that are faulty, slip or turn slower than commanded.
 
-    `doubt` is the result of the checks of the wheels. The row also shows those `counters` that
-    count wheel faults and uncommanded motion.
+    `doubt` is the result of the wheel checks. From `counters`, the row shows the numbers of wheel
+    faults and of uncommanded motions.
     """
     left, right = doubt.differ
     values = {

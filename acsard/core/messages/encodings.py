@@ -1,7 +1,7 @@
 """Encodes and decodes messages in msgpack, JSON and CDR.
 
-The encoding of an incoming payload is the one that its Zenoh Encoding names. If the Zenoh Encoding
-names none of the three, the first bytes of the payload decide:
+The Zenoh Encoding of an incoming payload names its format. If it names none of the three formats,
+the first bytes of the payload decide:
 
 - JSON: `{`, also after white space
 - msgpack: the header of a map
@@ -38,8 +38,8 @@ _text = msgspec.json.Encoder()
 class DecodeError(AcsardError):
     """Error for a payload that cannot be decoded.
 
-    `reason` is the kind of the error. It is also the end of the name of the counter for such
-    errors: the reason "malformed" is counted as `command_malformed`.
+    `reason` is the kind of the error, such as "malformed". The daemon counts these errors by
+    reason: an error with this reason adds 1 to the counter `command_malformed`.
     """
 
     def __init__(self, reason: str, text: str) -> None:
@@ -51,15 +51,15 @@ _AT_BYTE = re.compile(r"JSON is malformed: (.*) \(byte (\d+)\)")
 
 
 def encoding_name(form: Format, type_name: str = "") -> str:
-    """Return the Zenoh Encoding of a payload to send.
+    """Return the Zenoh Encoding for an outgoing payload in the format `form`.
 
-    `type_name` is the type of the message, which the Encoding then contains; "" leaves it out.
+    If `type_name` is not "", the Encoding also contains this type of the message.
     """
     return f"{_MIME[form]};acsard.{type_name}.v1" if type_name else _MIME[form]
 
 
 def encode(message: object, form: Format) -> bytes:
-    """Return the encoded message. Raises `DecodeError` if CDR cannot represent the type."""
+    """Encode a message in the format `form`. Raises `DecodeError` if the type has no CDR form."""
     if form == "cdr":
         return _codec(type(message)).encode(message)
     return _pack.encode(message) if form == "msgpack" else _text.encode(message)
@@ -75,10 +75,10 @@ def _codec(cls: type[T]) -> Cdr[T]:
 
 
 def detect(encoding: str, payload: bytes) -> Format:
-    """Return the format of a received payload: JSON, msgpack or CDR.
+    """Return the format of a received payload: "json", "msgpack" or "cdr".
 
-    Raises `DecodeError` if it is none of them. `encoding` is the Zenoh Encoding of the payload. If
-    it does not name the format, the first bytes of the payload decide.
+    `encoding` is the Zenoh Encoding of the payload. If it does not name the format, the first
+    bytes of the payload decide. Raises `DecodeError` if the payload has none of the formats.
     """
     form = _FORM_OF.get(encoding.partition(";")[0])
     if form is not None:
@@ -97,7 +97,7 @@ def detect(encoding: str, payload: bytes) -> Format:
 
 
 class Decoder(Generic[T]):
-    """Decodes payloads of one type in any of the encodings."""
+    """Decodes payloads of one message type in msgpack, JSON and, for ROS types, CDR."""
 
     def __init__(self, cls: type[T]) -> None:
         self._cls = cls
@@ -105,7 +105,7 @@ class Decoder(Generic[T]):
         self._text = msgspec.json.Decoder(cls)
 
     def decode(self, encoding: str, payload: bytes) -> T:
-        """Return the message in a payload, or raise `DecodeError`.
+        """Decode a payload, or raise `DecodeError`.
 
         `encoding` is the Zenoh Encoding of the payload. If it does not name the format, the first
         bytes of the payload decide.
@@ -113,7 +113,7 @@ class Decoder(Generic[T]):
         return self.decode_as(detect(encoding, payload), payload)
 
     def decode_as(self, form: Format, payload: bytes) -> T:
-        """Return the message in a payload whose format is `form`, or raise `DecodeError`."""
+        """Decode a payload in the format `form`, or raise `DecodeError`."""
         if form == "cdr":
             return decode_cdr(self._cls, payload)
         try:
@@ -126,9 +126,9 @@ class Decoder(Generic[T]):
 
 
 def _where(words: str, payload: bytes) -> str:
-    """Return a JSON error with the line and the column of the mistake in place of its byte offset.
+    """Return the text of a JSON error with a line and a column instead of a byte offset.
 
-    `words` is the text of the error from msgspec, and `payload` is the JSON text.
+    `words` is the text of the error from msgspec. `payload` is the JSON text.
     """
     match = _AT_BYTE.fullmatch(words)
     if match is None:
@@ -141,7 +141,7 @@ def _where(words: str, payload: bytes) -> str:
 
 
 def decode_cdr(cls: type[T], payload: bytes) -> T:
-    """Return the message in a CDR payload. Raises `DecodeError` if the payload is not valid."""
+    """Decode a CDR payload to a message of type `cls`. Raises `DecodeError` if it is not valid."""
     try:
         return _codec(cls).decode(payload)
     except CdrError as error:

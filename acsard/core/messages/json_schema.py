@@ -45,7 +45,7 @@ Schema = dict[str, Any]
 
 
 def going_out(cls: type, name: str) -> Schema:
-    """Return the schema of a type as the daemon publishes it."""
+    """Return the schema `name` of messages of type `cls` that the daemon publishes."""
     schema = _described(cls, name)
     for part in (schema, *schema["$defs"].values()):
         if "properties" in part:
@@ -57,7 +57,7 @@ def going_out(cls: type, name: str) -> Schema:
 
 
 def coming_in(cls: type, name: str) -> Schema:
-    """Return the schema of a type as the daemon accepts it from clients."""
+    """Return the schema `name` of messages of type `cls` that the daemon accepts from clients."""
     schema = _described(cls, name)
     return schema | {"required": ENOUGH[cls]} if cls in ENOUGH else schema
 
@@ -79,4 +79,4 @@ SCHEMAS: dict[str, Schema] = {
     **{f"{cls.__name__}In": coming_in(cls, f"{cls.__name__}In") for cls in BOTH_WAYS},
     "Config": going_out(Config, "Config"),
 }
-"""Every schema by its name, as in the key `schema/<Type>`."""
+"""Maps the name of each schema, as in the key `schema/<Type>`, to the schema."""

@@ -1,8 +1,8 @@
 """The table of all keys below `acsard/<id>/`: direction, type, rate, meaning and required roles.
 
-A key that is not in the table does not exist. The bus declares its keys from this table. `acsard
-topics`, the README and the answer to the query `topics` show the table. `permissions.py` derives
-the permissions of the roles from it.
+A key that is not in the table does not exist. The bus declares its keys from this table, and
+`permissions.py` derives the permissions of the roles from it. `acsard topics`, the README and the
+reply to the query `topics` show the table.
 """
 
 from __future__ import annotations
@@ -37,10 +37,10 @@ class Topic(Struct, frozen=True):
     """The key below the robot's id, with placeholders such as `<source>`."""
     direction: Direction
     type: str
-    """Name of the message type in `MESSAGES`. For a type that is not in `MESSAGES`, a
-    description."""
+    """Name of the message type in `MESSAGES`. If the type is not in `MESSAGES`, this is a
+    description of the type."""
     rate: str
-    """How often the daemon publishes or accepts a message, in words; "" for a query."""
+    """How often messages are published or accepted, in words; "" for a query."""
     note: str
     publish: Role | None = None
     """Lowest role that may put on the key. None means that no client may put on it."""
@@ -116,7 +116,7 @@ SERVICES: dict[Verb, Service] = {
         '{"settings": {"limits.linear_speed": 0.8}}',
     ),
 }
-"""All services by verb. The bus, ROS, the page and the tools take their facts from this table."""
+"""All services, by verb. The bus, ROS, the page and the tools use this table."""
 
 PLAIN_SERVICES = tuple(
     verb for verb, service in SERVICES.items() if service.optional or not service.payload
@@ -138,12 +138,12 @@ client that gets an answer on a key has at least the role of that key."""
 
 
 def whoami_key(role: str) -> str:
-    """Return the key that only clients with at least this role can query."""
+    """Return the key that only clients with the role `role` or a higher role can query."""
     return WHOAMI.replace("<role>", role)
 
 
 def service_key(verb: str) -> str:
-    """Return the key of a service."""
+    """Return the key of the service `verb`, such as `srv/stop`."""
     return f"srv/{verb}"
 
 
@@ -151,7 +151,7 @@ JSON_TREE = "json/"
 
 
 def json_key(key: str) -> str:
-    """Return the key on which the daemon publishes the same messages as on `key`, but in JSON."""
+    """Return the key on which the daemon publishes the messages of `key` in JSON."""
     return JSON_TREE + key
 
 
@@ -169,10 +169,9 @@ def _out(
     simulated: bool = False,
     urdf: bool = False,
 ) -> Topic:
-    """Return the row of a key on which the daemon publishes, and which every client may read.
+    """Return the row of a key on which the daemon publishes and which every client may read.
 
-    `kind` is the type of the messages. The other arguments are the fields of `Topic` with the same
-    names.
+    `kind` is the type of the messages. The other arguments are fields of `Topic`.
     """
     return Topic(
         key, "out", kind, rate, note,
@@ -259,12 +258,13 @@ FOLLOWED: tuple[Topic, ...] = tuple(
     topic for topic in TOPICS if topic.subscribe and topic.query and "<" not in topic.key
 )
 """The rows of `TOPICS` for the keys that clients may both subscribe to and query. These are the
-keys on which the daemon publishes messages, and the key of the gyro. The row of the JSON copies
-(`json/<key>`) is left out."""
+keys on which the daemon publishes messages, and the key of the gyro. The row `json/<key>`, which
+stands for the JSON copies of all keys, is not included."""
 
 PUBLISHED: tuple[Topic, ...] = tuple(topic for topic in FOLLOWED if topic.direction == "out")
 """The rows of `TOPICS` for the keys on which the daemon publishes messages. A query for such a key
-returns the present message. The row of the JSON copies (`json/<key>`) is left out."""
+returns the present message. The row `json/<key>`, which stands for the JSON copies of all keys, is
+not included."""
 
 
 def offered(config: Config) -> tuple[Topic, ...]:
@@ -285,10 +285,11 @@ def offered(config: Config) -> tuple[Topic, ...]:
 
 
 def published(config: Config) -> tuple[Topic, ...]:
-    """Return the rows of `TOPICS` for the keys on which a daemon with this configuration publishes.
+    """Return the rows of `TOPICS` for the keys on which this daemon publishes messages.
 
-    If the configuration selects the built-in simulator and has `odometry.gyro = true`, the result
-    includes the row of the gyro. The daemon then publishes the samples of the simulated gyro.
+    `config` is the configuration of the daemon. With the built-in simulator and `odometry.gyro =
+    true`, the result includes the key of the gyro, because the daemon publishes the samples of the
+    simulated gyro.
     """
     own = config.mcu.simulated
     return tuple(t for t in offered(config) if t in PUBLISHED or (own and t.key == IMU))
@@ -306,25 +307,27 @@ COMMANDS = ("cmd", "wheel_cmd")
 def command_key(kind: str, source: str, certificate: str = "") -> str:
     """Return the key, below the robot's id, on which a sender puts its commands.
 
-    `kind` is one of `COMMANDS`. `source` is the name of the command source. `certificate` is the
-    common name of the certificate of a sender that connects over TLS. Only this sender may put on
-    the key. A program on the robot's own machine uses "".
+    Args:
+        kind: the first part of the key, one of `COMMANDS`.
+        source: the name of the command source.
+        certificate: the common name of the sender's certificate if the sender connects over TLS.
+            Only this sender may put on the key. It is "" for a program on the robot's own machine.
     """
     return f"{kind}/{source}/{certificate}" if certificate else f"{kind}/{source}"
 
 
 def source_keys(sources: Iterable[str], certificate: str = "") -> list[str]:
-    """Return the command keys of all given sources, two for each source.
+    """Return the two command keys of each source in `sources`, without the robot's id.
 
-    `certificate` is the common name of the senders' certificate; "*" stands for any certificate. It
-    is "" for programs on the robot's own machine.
+    `certificate` is the common name of the senders' certificate, or "*" for any certificate. It is
+    "" for programs on the robot's own machine.
     """
     names = list(sources)
     return [command_key(kind, name, certificate) for kind in COMMANDS for name in names]
 
 
 def unknown(key: str) -> bool:
-    """Return True if no row of the table of keys matches a key below the robot's id.
+    """Return True if `key` matches no row of `TOPICS`. `key` does not contain the robot's id.
 
     Keys that begin with `json/`, `cmd/` or `wheel_cmd/` always count as known.
     """
@@ -332,7 +335,7 @@ def unknown(key: str) -> bool:
 
 
 def key_hint(key: str) -> str:
-    """Return a hint for an unknown key: the most similar key, or the advice to list the keys."""
+    """Return a hint for an unknown key: the most similar key, or the advice to list all keys."""
     known = [topic.key for topic in TOPICS if "<" not in topic.key]
     return hint(key, known, "`acsard topics` lists the keys")
 
@@ -343,9 +346,9 @@ def by_key(key: str) -> Topic | None:
 
 
 def row_of(key: str) -> Topic | None:
-    """Return the row of `TOPICS` that a key below the robot's id matches, or None.
+    """Return the row of `TOPICS` that describes a key, or None. `key` has no robot id in front.
 
-    For example, `cmd/app` matches the row of `cmd/<source>`.
+    For example, the result for `cmd/app` is the row of `cmd/<source>`.
     """
     return next((topic for topic in TOPICS if _pattern(topic.key).fullmatch(key)), None)
 

@@ -14,7 +14,7 @@ from acsard.core.messages.keys_and_roles import JSON_TREE, VERBS, Topic, json_ke
 from acsard.core.values import ROLES, Role, Verb
 
 Use = Literal["publish", "subscribe", "query"]
-"""A client's use of a key. A call of a service is a query."""
+"""Action of a client on a key. A call of a service is a query."""
 
 USES: tuple[Use, ...] = get_args(Use)
 
@@ -28,26 +28,28 @@ MAY: dict[Role, str] = {
 
 
 def has(role: str, least: Role) -> bool:
-    """Return whether `role` has the permissions of `least`. The role "" has no permissions."""
+    """Return whether the role `role` includes all permissions of the role `least`.
+
+    If `role` is "" or unknown, the result is False.
+    """
     return role in ROLES and ROLES.index(role) >= ROLES.index(least)
 
 
 def keys_for(role: Role, use: Use, rows: Iterable[Topic]) -> list[str]:
     """Return the keys of `rows` for which `role` is the lowest role with the permission `use`.
 
-    Command keys are left out, because they contain the names of sources, which the configuration
-    defines. `source_keys` returns these keys, and `COMMAND_ROLE` is the lowest role that may use
-    them. Keys that only programs on the robot's own machine may use are left out, too.
+    Two kinds of keys are left out. Command keys contain the names of sources, which only the
+    configuration defines: `source_keys` returns these keys, and `COMMAND_ROLE` is their lowest
+    role. The other kind are keys that only programs on the robot's own machine may use.
     """
     exact = (pair for row in rows if not row.local for pair in _exact(row, use))
     return [key for key, least in exact if least == role and "<" not in key]
 
 
 def _exact(row: Topic, use: Use) -> Iterator[tuple[str, Role]]:
-    """Yield a pair for each key that `row` describes: the key, and a role.
+    """Yield each key that `row` describes, with the lowest role that has the permission `use`.
 
-    The role is the lowest role with the permission `use` for this key. The function yields no pair
-    if no client has this permission.
+    The function yields nothing if no client has this permission.
     """
     least = {"publish": row.publish, "subscribe": row.subscribe, "query": row.query}[use]
     if least == "<role>":

@@ -2,8 +2,8 @@
 
 An event and its repetitions share one row with a count. If each repetition had its own row, a
 computer that misses a control period every second would push a fault out of the twenty rows within
-20 s. An event whose `news` is true always gets its own row. The rows do not affect the lines in the
-log, which `event_throttle.py` limits.
+20 s. An event whose `news` is true always gets its own row. The log has its own limit
+(`event_throttle.py`).
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ LAST = 20
 misses an event."""
 
 PAUSE_NS = 60 * NS_PER_S
-"""An event gets a new row, instead of counting as a repetition, if the previous event of the same
-name is older than this, ns."""
+"""Longest time between two events of the same name that share a row, ns. After a longer pause, an
+event gets a new row."""
 
 
 class _Row(Struct, frozen=True):
@@ -42,7 +42,7 @@ class RecentEvents:
         self._total = 0
 
     def add(self, events: Iterable[Event], now: Instant) -> None:
-        """Add the events of a step, whose time is `now`."""
+        """Add the events of a step. `now` is the time of the step."""
         for event in events:
             self._total += 1
             same = None if event.news else self._same(event, now)
@@ -52,7 +52,7 @@ class RecentEvents:
             self._rows.append(_Row(now, event))
 
     def told(self) -> Events | None:
-        """Return the message with all rows, or None before the first event."""
+        """Return the message `events` with all rows, or None before the first event."""
         if not self._rows:
             return None
         return Events(_time(self._rows[-1]), self._total, [_log_event(row) for row in self._rows])

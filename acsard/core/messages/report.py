@@ -1,7 +1,7 @@
-"""Builds the messages that are due after a step, and the present value of any published key.
+"""Builds the messages that are due after a step, and the present message of any published key.
 
-A message is built only if its key has a subscriber. All messages that come from the same feedback
-line have the stamp of that line.
+A message is built only if its key has a subscriber or was queried. All messages that come from the
+same feedback line have the stamp of that line.
 """
 
 from __future__ import annotations
@@ -64,10 +64,7 @@ UNKNOWN_STATUS, CHARGING, DISCHARGING, NOT_CHARGING = range(4)
 
 
 class _Rate:
-    """Decides when the next message of one key is due, so that a highest rate is kept.
-
-    0 Hz means that the rate is not limited.
-    """
+    """Limits how often messages of one key are published. 0 Hz means that there is no limit."""
 
     def __init__(self, hz: float) -> None:
         self._period_ns = int(NS_PER_S / hz) if hz else 0
@@ -84,9 +81,10 @@ class _Rate:
 
 
 class Report:
-    """Builds the published messages.
+    """Builds the messages that the daemon publishes.
 
-    The only data that it keeps are the last outputs, the last estimate and the last events.
+    It stores the last outputs, the last estimate and the last events, and when the next message of
+    each key with a limited rate is due.
     """
 
     def __init__(
@@ -97,12 +95,12 @@ class Report:
         since 1970. The owner of the robot's own certificate is "". If the daemon may not read this
         certificate, its time comes from a report of the TLS gateway."""
         self.settings_differ = ""
-        """Settings in force that differ from the configuration file, in words; "" if none
-        differs."""
+        """The settings in force that differ from the configuration file, in words; "" if all agree
+        with the file."""
         self.speed_limit = ""
-        """The speed limit that lowers a setting, in words; "" if none does."""
+        """The speed limit that lowers a setting, in words; "" if no speed limit does."""
         self.description = ""
-        """The robot's URDF; "" without a file in `[ros] urdf`."""
+        """The robot's URDF; "" if `[ros] urdf` names no file."""
         self._names = list(config.joints.as_tuple())
         self._start = start
         self._estimate: Estimate | None = None
@@ -111,6 +109,7 @@ class Report:
         self.use(config)
 
     def use(self, config: Config) -> None:
+        """Use the rates, frames and covariances of `config` from the next message on."""
         self._config = config
         rates = asdict(config.rates) | {"battery": BATTERY_HZ}
         self._rates = {key: _Rate(hz) for key, hz in rates.items()}
@@ -121,10 +120,14 @@ class Report:
     ) -> Iterator[tuple[str, Message]]:
         """Return an iterator over the pairs of key and message to publish after this step.
 
-        `outputs` are those of the step. `wanted` contains the keys that have a subscriber. `look`
-        is a function that returns the robot's `Snapshot`; it is called only if a message needs it.
         The messages of the feedback (`odom`, `tf`, `wheel_states`) come first, because `state`
         takes ten times as long to build.
+
+        Args:
+            outputs: the outputs of the step.
+            wanted: the keys that have a subscriber.
+            look: function that returns the robot's `Snapshot`. It is called only if a message
+                needs it.
         """
         self._outputs = outputs
         if outputs.events:
@@ -172,9 +175,10 @@ class Report:
                     yield key, message
 
     def current(self, key: str, look: Look) -> Message | None:
-        """Return the present message of a published key, or None if the key has none.
+        """Return the present message of a published key, or None if there is none.
 
-        `look` is a function that returns the robot's `Snapshot`; it is called only if necessary.
+        `look` is a function that returns the robot's `Snapshot`. It is called only if the message
+        needs it.
         """
         estimate, outputs = self._estimate, self._outputs
         match key:
@@ -218,14 +222,14 @@ class Report:
         return TFMessage(transforms)
 
     def robot_description(self) -> String | None:
-        """Return the message with the URDF, or None if the robot has none."""
+        """Return the message with the robot's URDF, or None if the daemon has no URDF."""
         return String(self.description) if self.description else None
 
     def _odom(self, estimate: Estimate, live: bool = True) -> Odometry:
         """Return the message `odom` for an estimate.
 
-        `live` is false if the board no longer sends feedback. The twist is then zero, and its
-        covariance is `UNKNOWN`.
+        `live` is False if the board no longer sends feedback. The message then has a twist of zero
+        with the covariance `UNKNOWN`.
         """
         frames, pose = self._config.odometry, estimate.pose
         of_pose = self._covariances.of_pose(estimate.covariance)
@@ -304,8 +308,8 @@ class Report:
     def _battery(self, outputs: Outputs, snapshot: Snapshot) -> Battery | None:
         """Return the message `battery`, or None if the board has never reported a battery.
 
-        Its stamp is the time of the board's last report. If the board no longer reports its
-        battery, the stamp is the time of the step.
+        The stamp is the time of the board's last report. If the board has stopped these reports,
+        the stamp is the time of the step.
         """
         battery, now = snapshot.battery, outputs.now
         if battery is None:
@@ -325,7 +329,7 @@ class Report:
         )
 
     def _certificate(self, now: Instant) -> tuple[int, str]:
-        """Return the level and the text of `expiry` for the TLS certificates at the time `now`.
+        """Return the diagnostic level and the text of `expiry` for the TLS certificates.
 
         Without TLS, the result is (0, "").
         """

@@ -1,8 +1,8 @@
 """The types of the messages on the bus, with the unit of each field.
 
-A type has the name and the fields of its ROS 2 counterpart if there is one. A field means the same
-in msgpack, JSON and CDR. Unknown fields are refused, so a command with a misspelled axis is an
-error. If such a field were ignored, the speed on that axis would be zero without an error.
+If ROS 2 has a corresponding type, the struct has the same name and fields. A field means the same
+in msgpack, JSON and CDR. Decoding refuses unknown fields, so a command with a misspelled axis is
+an error. If the field were ignored, the speed on that axis would be zero without an error.
 """
 
 from __future__ import annotations
@@ -39,20 +39,20 @@ LatchNumber = Annotated[int, Meta(ge=0, lt=1 << 53)]
 """Number of a latch. It is below 2^53, so JavaScript represents it exactly."""
 
 FEW = Meta(max_length=64)
-"""Constraint of a list or a map to at most 64 items, so that a huge message is refused quickly. No
-robot has more than 64 joints."""
+"""Limit of a list or a map to 64 items, with which a huge message is refused quickly. No robot has
+more than 64 joints."""
 
 
 def one_of(values: Iterable[object]) -> Meta:
-    """Return the annotation that lists the possible values of a field in its JSON Schema.
+    """Return an annotation that lists the expected values of a field in its JSON Schema.
 
-    Decoding accepts other values too, because a later version may send them.
+    Decoding also accepts other values, because a later version may send them.
     """
     return Meta(extra_json_schema={"enum": list(values)})
 
 
 class Message(Struct, frozen=True, forbid_unknown_fields=True):
-    """Base of every struct on the bus."""
+    """Base class of all messages on the bus and of their parts."""
 
 
 class Time(Message, frozen=True):
@@ -63,7 +63,7 @@ class Time(Message, frozen=True):
 
     @classmethod
     def from_ns(cls, wall_ns: int) -> Time:
-        """Return ns since 1970 as a `Time`, limited to the range of int32 (1901 to 2038)."""
+        """Convert ns since 1970 to a `Time`, limited to the range of int32 (1901 to 2038)."""
         sec, nanosec = divmod(wall_ns, NS_PER_S)
         return cls(max(-(2**31), min(2**31 - 1, sec)), nanosec)
 
@@ -73,7 +73,7 @@ class Time(Message, frozen=True):
 
 
 class Header(Message, frozen=True):
-    """Time at which the data was sampled, and the frame in which it is expressed."""
+    """Time at which the data was measured, and the frame in which it is expressed."""
 
     stamp: Time = Time()
     frame_id: str = ""
@@ -104,7 +104,7 @@ class Twist(Message, frozen=True):
 
 
 class TwistStamped(Message, frozen=True):
-    """A twist with a stamp."""
+    """A velocity at the time `header.stamp`, in the frame `header.frame_id`."""
 
     header: Header
     twist: Twist
@@ -118,7 +118,7 @@ class Pose(Message, frozen=True):
 
 
 class PoseStamped(Message, frozen=True):
-    """A pose in `header.frame_id` at the time `header.stamp`."""
+    """A pose in the frame `header.frame_id` at the time `header.stamp`."""
 
     header: Header
     pose: Pose
@@ -145,7 +145,10 @@ class TwistWithCovariance(Message, frozen=True):
 
 
 class Odometry(Message, frozen=True):
-    """Pose of `child_frame_id` in `header.frame_id`, with the twist in `child_frame_id`."""
+    """Pose of the frame `child_frame_id` in the frame `header.frame_id`, and its velocity.
+
+    The velocity (`twist`) is expressed in the frame `child_frame_id`.
+    """
 
     header: Header
     child_frame_id: str
@@ -161,7 +164,7 @@ class Transform(Message, frozen=True):
 
 
 class TransformStamped(Message, frozen=True):
-    """Pose of `child_frame_id` in `header.frame_id`."""
+    """Pose of the frame `child_frame_id` in the frame `header.frame_id`."""
 
     header: Header
     child_frame_id: str
@@ -175,9 +178,9 @@ class TFMessage(Message, frozen=True):
 
 
 class JointState(Message, frozen=True):
-    """State of the wheel joints, or a command for them.
+    """State of the wheel joints, or a command for the wheels.
 
-    `position` is in rad and not wrapped, `velocity` is in rad/s, and `effort` is not used.
+    `position` is in rad and grows beyond 2 pi. `velocity` is in rad/s. `effort` is not used.
     """
 
     header: Header = Header()
@@ -191,7 +194,8 @@ class Imu(Message, frozen=True):
     """An inertial measurement in the frame `header.frame_id`.
 
     `angular_velocity` is in rad/s and `linear_acceleration` in m/s2. Each quantity has a 3x3
-    covariance, row major. If its first element is -1, the quantity is not measured.
+    covariance, row major. A covariance that begins with -1 means that the quantity is not
+    measured.
     """
 
     header: Header
@@ -204,7 +208,10 @@ class Imu(Message, frozen=True):
 
 
 class SpeedLimit(Message, frozen=True):
-    """A limit on the robot's speed, as in nav2_msgs/SpeedLimit. 0.0 lifts the limit."""
+    """A limit of the robot's speed, as in nav2_msgs/SpeedLimit.
+
+    A `speed_limit` of 0.0 ends the limit.
+    """
 
     header: Header
     percentage: bool
@@ -230,7 +237,7 @@ class Battery(Message, frozen=True):
     capacity: Float32 | None = None
     """Capacity, Ah. The daemon never measures it."""
     design_capacity: Float32 | None = None
-    """Capacity by design, Ah. The daemon does not know it."""
+    """Capacity by design, Ah. It is always null."""
     percentage: Float32 | None = None
     """State of charge, 0 to 1."""
     power_supply_status: Annotated[Byte, one_of(range(5))] = 0
@@ -253,7 +260,7 @@ class Battery(Message, frozen=True):
 
 
 class BatterySummary(Message, frozen=True):
-    """A summary of the battery. A value that the board does not report now is null."""
+    """The main values of the battery. A value that the board does not report now is null."""
 
     volts: float | None
     percent: float | None
@@ -261,15 +268,15 @@ class BatterySummary(Message, frozen=True):
     amps: float | None
     """Current, A. It is negative while the battery discharges."""
     level: Annotated[str, one_of(get_args(BatteryLevel))]
-    """Level according to the thresholds in `[battery]`; `ok` if none is set.
+    """Level according to the thresholds in `[battery]`; `ok` if no threshold is set.
 
-    `unknown` means that the board does not report the quantity (V or %) that the thresholds use, or
-    has reported it only for a few seconds so far.
+    `unknown` means that the board does not report the quantity (V or %) that the thresholds use,
+    or has reported it only for a few seconds so far.
     """
 
 
 class SourceState(Message, frozen=True):
-    """A source of commands."""
+    """A named source of commands, as the list `commands.sources` configures it."""
 
     name: str
     priority: int
@@ -280,8 +287,10 @@ class SourceState(Message, frozen=True):
     event, the age is null until the next command is accepted.
     """
     waits_for: str
-    """Condition that must be met before the source drives the robot, such as "a command"; empty if
-    the source drives it."""
+    """Condition that must be met before the source can drive the robot, such as "a command".
+
+    It is empty while the source drives the robot.
+    """
 
 
 class Spread(Message, frozen=True):
@@ -294,7 +303,7 @@ class Spread(Message, frozen=True):
 
 
 class Latency(Message, frozen=True):
-    """A duration that the daemon measures, such as the time from a command to its serial line."""
+    """Statistics of one latency of the daemon, such as the time from a command to its line."""
 
     since_start: Spread
     last_minute: Spread
@@ -320,26 +329,30 @@ class RobotState(Message, frozen=True):
     source: str
     sources: list[SourceState]
     refused: str
-    """The last refused command and the reason; empty if no command was refused."""
+    """The last command that was refused, and the reason; empty if no command was refused."""
     counters: dict[str, int]
     """Counters since the start of the daemon, by name."""
     certificate_expiry: str = ""
-    """Remaining validity of the bus's TLS certificate, in words; empty without TLS.
+    """Remaining validity of the TLS certificates of the bus, in words; empty without TLS.
 
     The text begins with "valid" while at least 30 days remain.
     """
     latencies: dict[str, Latency] = {}
     """Latencies of the daemon by name (`daemon/latencies.py`). They are up to one second old."""
     gyro: Annotated[str, one_of(get_args(GyroDoes))] = "off"
-    """State of the gyro. The odometry uses the gyro in the states `used` and `disagrees`."""
+    """State of the gyro. The heading comes from the gyro in the states `used` and `disagrees`."""
     encoder_counts: list[int] = []
     """Configured encoder counts per wheel turn, in the order of `wheels`.
 
     All values are 0 if no counts are configured. They are also 0 if the reported speeds do not
-    match the configured counts: each speed should be an integer number of counts divided by a time.
+    match the configured counts: each speed should be an integer number of counts divided by a
+    time.
     """
     wheel_fault: str = ""
-    """A wheel that the odometry leaves out, or a side whose wheels slip, in words; else empty."""
+    """Description of a wheel that the odometry ignores, or of a side whose wheels slip.
+
+    It is empty if there is no such wheel or side.
+    """
     sender: str = ""
     """Public name of the selected sender of `source`; empty while no sender is selected.
 
@@ -349,11 +362,11 @@ class RobotState(Message, frozen=True):
     effective_track: str = ""
     """Ratio of the effective track to the wheel separation, in words.
 
-    The text gives the configured ratio and the ratio that was learned with the gyro, and says which
-    of them is in use. It is empty until a ratio has been learned.
+    The text gives the configured ratio and the ratio that was learned with the gyro. It also says
+    which ratio is in use. It is empty until a ratio has been learned.
     """
     recording_error: str = ""
-    """Why recording fails at present, in words; empty if it works or is switched off."""
+    """Why recording fails at present, in words; empty if recording works or is switched off."""
     latch: LatchNumber = 0
     """Number of the latch that keeps the robot from driving; 0 if no latch is set.
 
@@ -363,26 +376,27 @@ class RobotState(Message, frozen=True):
     latch_file_error: str = ""
     """Why a latched stop would be lost if the daemon restarted now, in words.
 
-    The text is empty if the stop would stay latched. It is also empty if the daemon keeps no latch
-    file, as with the built-in simulator.
+    It is empty if the stop would stay latched. It is also empty if the daemon keeps no latch file,
+    as with the built-in simulator.
     """
     feedback_age: float | None = None
-    """Seconds since the last valid feedback line; null before the first one."""
+    """Seconds since the last valid feedback line of the board; null before the first feedback
+    line."""
     emergency_stop: Annotated[str, one_of(get_args(EstopState))] = ""
-    """State of the emergency-stop input that the board reports; empty if it has never reported it.
+    """State of the emergency-stop input; empty if the board has never reported this input.
 
-    `silent` means that the board no longer reports it, which counts as pressed.
+    `silent` means that the board has stopped reporting the input, which counts as pressed.
     """
     bumpers: list[bool] | None = None
-    """Whether each of the 1 to 4 bumpers counts as pressed, in the order in the board's reports.
+    """Whether each of the 1 to 4 bumpers counts as pressed, in the order of the board's reports.
 
-    Null if the board has never reported its bumpers. If it no longer reports them, all values
-    are true, because all bumpers then count as pressed.
+    Null if the board has never reported its bumpers. If the board has stopped reporting them, all
+    bumpers count as pressed, so all values are true.
     """
     battery: BatterySummary | None = None
     """The battery; null if the board has never reported its voltage or its charge."""
     settings_differ: str = ""
-    """Settings in force that differ from the daemon's configuration file, in words; else empty.
+    """Settings in force that differ from the configuration file, in words; else empty.
 
     If the daemon could not start with the present file, the text gives the reason. A setting that
     only a speed limit has lowered is not listed.
@@ -393,9 +407,9 @@ class RobotState(Message, frozen=True):
     It is empty if no speed limit lowers it.
     """
     certificate_days: float | None = None
-    """Number of days until the earliest expiry of the certificates that TLS needs.
+    """Number of days until the first of the certificates that TLS needs expires.
 
-    It is negative after this expiry, and null without TLS or while the expiry is unknown.
+    It is negative after this time. It is null without TLS, or while the time is unknown.
     """
 
 
@@ -410,9 +424,9 @@ class GatewayState(Message, frozen=True):
     connections: Annotated[int, Meta(ge=0, lt=1 << 16)]
     """Number of connections from the network at present."""
     full: Annotated[int, Meta(ge=0, lt=1 << 31)]
-    """Number of checks since the gateway's start that found all connections in use.
+    """Number of times since its start that the gateway found all its connections in use.
 
-    The gateway checks four times a second.
+    The gateway checks this four times a second.
     """
     certificate_ends: Annotated[int, Meta(ge=0, lt=1 << 62)] = 0
     """Earliest time at which one of the TLS certificates expires, wall-clock ns since 1970. It is 0
@@ -443,25 +457,26 @@ class DiagnosticStatus(Message, frozen=True):
 
 
 class DiagnosticArray(Message, frozen=True):
-    """The state of each part of the robot at one time."""
+    """The diagnostic status of each part of the robot."""
 
     header: Header
     status: list[DiagnosticStatus]
 
 
 class LogEvent(Message, frozen=True):
-    """An event as in the log."""
+    """An event that the daemon has logged."""
 
     stamp: Time
     name: Annotated[str, one_of(get_args(EventName))]
     level: Annotated[str, one_of(get_args(Level))]
     text: str
     by: str
-    """Client that caused the event; empty if no client did."""
+    """Name of the client that caused the event; empty if no client caused it."""
     count: int
     """How often the event has occurred.
 
-    If an event repeats within a minute, its row stays the same and this number grows.
+    If an event only repeats an earlier event of the last minute, both share one row, and this
+    number grows.
     """
 
 
@@ -469,15 +484,16 @@ class Events(Message, frozen=True):
     """The last events, oldest first.
 
     An event and its repetitions share one row, which has the time of the last repetition. Each
-    repetition moves the row to the end.
+    repetition moves the row to the end of the list.
     """
 
     stamp: Time
     """Time of the last event."""
     total: int
-    """Number of events since the start of the daemon. Each repetition counts as an event.
+    """Number of events that the daemon has logged since its start.
 
-    If `total` is larger by N than in the previous message, all new events are in the last N rows.
+    Events that share one line of the log count once. If `total` is larger by N than in the
+    previous message, all new events are in the last N rows.
     """
     events: list[LogEvent]
 
@@ -490,7 +506,7 @@ class ServiceReply(Message, frozen=True):
 
 
 class SetPose(Message, frozen=True):
-    """Pose to set for base_link in the frame odom: `x` and `y` in m, `yaw` in rad."""
+    """Pose of base_link in the frame odom to be set: `x` and `y` in m, `yaw` in rad."""
 
     x: float
     y: float
@@ -503,21 +519,23 @@ class Release(Message, frozen=True):
     latch: LatchNumber | None = None
     """Number of the latch to release, as in `RobotState.latch`.
 
-    If it is null, the call is refused for 2 s after a stop, after a `deactivate` and after the
-    start of the daemon, because the client may not know of the latch yet.
+    For `activate`, 0 means that the robot is off without a latch. If the number is null, the
+    client may not know of the latch yet. Such a call is refused for 2 s after a stop, after a
+    `deactivate` and after the start of the daemon. If a fault is cleared while a stop is latched,
+    a `clear` without a number is also refused for the next 2 s.
     """
 
 
 class Settings(Message, frozen=True):
-    """New values of settings, by their dotted keys in `acsard.toml`."""
+    """New values for settings, by the dotted keys of the settings in `acsard.toml`."""
 
     settings: Annotated[dict[str, Plain], FEW]
     keep: bool = False
-    """Whether the daemon also writes the new values into its configuration file."""
+    """True if the daemon must also write the new values into its configuration file."""
 
 
 class Info(Message, frozen=True):
-    """Identity of the daemon."""
+    """Identity, version and connections of the daemon."""
 
     id: str
     version: str
@@ -548,7 +566,7 @@ class Interfaces(Message, frozen=True):
 
 
 class TopicInfo(Message, frozen=True):
-    """One row of the topic table."""
+    """One row of the table of keys that `acsard topics` shows."""
 
     key: str
     direction: Annotated[str, one_of(get_args(Direction))]
@@ -558,18 +576,19 @@ class TopicInfo(Message, frozen=True):
 
 
 class Topics(Message, frozen=True):
-    """The topic table of this daemon, with full keys."""
+    """The table of all keys of this daemon."""
 
     topics: list[TopicInfo]
 
 
 class WhoAmI(Message, frozen=True):
-    """The client that sent the query, as the daemon sees it."""
+    """The role and the name of the client that sent the query."""
 
     role: Annotated[str, one_of(ROLES)]
-    """The role in the queried key. The access rules show that the caller has at least this role."""
+    """The role in the queried key. The client has at least this role, because otherwise the access
+    rules would have blocked the query."""
     sender: str
-    """The caller's public name and its transport, as in the log."""
+    """The client's public name and its transport, as in the log."""
 
 
 MESSAGES: dict[str, type[Message]] = {
@@ -599,5 +618,5 @@ MESSAGES: dict[str, type[Message]] = {
         WhoAmI,
     )
 }
-"""The types of complete messages, by name, without the types that are only parts of a message. A
-query of the key `schema/<Type>` returns the JSON Schema of a type."""
+"""Maps the name of each complete message type to the type. Types that are only parts of messages
+are not included. A query of the key `schema/<Type>` returns the JSON Schema of a type."""

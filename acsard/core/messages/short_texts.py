@@ -21,9 +21,9 @@ from acsard.core.messages.state_warnings import brief, charge, warnings
 
 
 def place(x: float, y: float, yaw: float) -> list[str]:
-    """Return three texts with units for a pose, such as "yaw +90.0°".
+    """Return texts for the x, y and yaw of a pose, with units, such as "yaw +90.0°".
 
-    The arguments `x` and `y` are in m, and `yaw` is in rad.
+    `x` and `y` are in m, and `yaw` is in rad.
     """
     return [
         f"x {signed(x, 3, 8)} m",
@@ -33,7 +33,7 @@ def place(x: float, y: float, yaw: float) -> list[str]:
 
 
 def speeds(linear: float | None, angular: float | None) -> list[str]:
-    """Return two texts with units for a twist, such as "forward +0.50 m/s".
+    """Return texts for the forward speed and the turn rate, such as "forward +0.50 m/s".
 
     `linear` is in m/s and `angular` in rad/s. None means that the speed is unknown.
     """
@@ -41,7 +41,7 @@ def speeds(linear: float | None, angular: float | None) -> list[str]:
 
 
 def short(message: object) -> str:
-    """Return a message in one line. Its type must be in `SHORT`."""
+    """Format a message as one line. The type of the message must be in `SHORT`."""
     return "  ".join(SHORT[type(message)](message))
 
 
@@ -58,7 +58,7 @@ def _state(state: RobotState) -> list[str]:
 
 
 def power(battery: BatterySummary) -> list[str]:
-    """Return the voltage, the current and the charge of a battery as three texts with units.
+    """Return texts for the voltage, the current and the charge of a battery, with units.
 
     An unknown value is shown as "-".
     """
@@ -90,5 +90,5 @@ SHORT: dict[type, Callable[[Any], list[str]]] = {
     PoseStamped: lambda message: _pose(message.pose),
     TwistStamped: lambda message: _twist(message.twist),
 }
-"""Maps each message type that has a one-line form to a function. The function returns the parts of
-this line for a message."""
+"""Maps each message type that has a one-line form to a function that returns the parts of the
+line."""

@@ -24,7 +24,8 @@ MAX_SENDER = 64
 """Largest number of characters in a sender id."""
 
 MAX_NAME = 40
-"""A public name contains at most this number of characters of NAME in a sender id `NAME/SECRET`."""
+"""Largest number of characters that a public name takes from NAME in the sender id
+`NAME/SECRET`."""
 
 DIGITS = 16
 """Number of hexadecimal digits of the hash in a public name. 16 digits encode 64 bits, so nobody
@@ -37,22 +38,24 @@ and commas between the names of senders."""
 
 
 class Signature(Struct, frozen=True, omit_defaults=True):
-    """The attachment of one command or call."""
+    """The attachment of one command or service call. It names the sending program."""
 
     sender: Annotated[str, Meta(min_length=1, max_length=MAX_SENDER)]
-    """The sender id."""
+    """The sender id, such as "joystick/8Xg2kq0vRw-1yEJc7hPzUA"."""
     stamp: Annotated[int, Meta(gt=0, le=MOST)] | None = None
-    """Time at which the command was sent, by the sender's clock, ns since 1970."""
+    """Time at which the command was sent, by the sender's clock, ns since 1970. None if the sender
+    sends no time."""
     sequence: Annotated[int, Meta(ge=0, le=MOST)] | None = None
-    """Number of the command. It grows by 1 with each command of this sender."""
+    """Number of the command, which grows by 1 with each command of this sender. None if the sender
+    does not number its commands."""
     steady: bool = False
-    """True if the clock of `stamp` is never adjusted while the sender runs.
+    """True if the clock that gives `stamp` is never adjusted while the sender runs.
 
-    An old stamp then proves that the command itself is late.
+    An old stamp then proves that the command was delayed.
     """
 
     def pack(self) -> bytes:
-        """Encode the attachment as acsard's own client sends it."""
+        """Encode the attachment in msgpack."""
         return msgspec.msgpack.encode(self)
 
 
@@ -61,7 +64,7 @@ _msgpack = msgspec.msgpack.Decoder(Signature)
 
 
 def unpack(attachment: bytes) -> Signature | None:
-    """Return the decoded attachment, or None if it is not a valid signature."""
+    """Decode an attachment in JSON or msgpack. Return None if it is not a valid signature."""
     if not attachment:
         return None
     try:

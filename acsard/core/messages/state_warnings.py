@@ -25,7 +25,7 @@ WHATS: tuple[What, ...] = get_args(What)
 """All values of `StateWarning.what`, from the most to the least urgent."""
 
 WARNING = "WARNING"
-"""The word before a list of warnings in a line of text."""
+"""Word that begins a text with a list of warnings."""
 
 ESTOP = {"pressed": "emergency stop pressed", "silent": "emergency stop not reported"}
 
@@ -52,18 +52,22 @@ class StateWarning(Struct, frozen=True):
 
 
 def warnings(state: RobotState) -> list[StateWarning]:
-    """Return the warnings about this robot, in the order of `WHATS`."""
+    """Return the warnings about the robot with this `state`, the most urgent first."""
     return list(_warnings(state))
 
 
 def brief(found: Sequence[StateWarning]) -> str:
-    """Return the warnings as text, such as "WARNING: recording fails", or "" without any."""
+    """Return the warnings as one text, such as "WARNING: recording fails"; "" for no warnings."""
     words = ", ".join(printable(one.brief) for one in found)
     return f"{WARNING}: {words}" if words else ""
 
 
 def charge(battery: BatterySummary | None) -> str:
-    """Return the charge of a battery as text, or its voltage if the charge is unknown, or ""."""
+    """Return the charge of a battery as text, such as "80 %".
+
+    If the charge is unknown, return the voltage, such as "24.1 V". If that is unknown too, return
+    "".
+    """
     if battery is None:
         return ""
     if battery.percent is not None:

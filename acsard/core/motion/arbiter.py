@@ -1,19 +1,19 @@
-"""Chooses the one command that the robot follows: first the source, then the sender of that source.
+"""Chooses the command that the robot follows: first the source, then a sender of this source.
 
 A sender is live while its last accepted command is not older than the timeout of its source. A
-source is live while one of its senders is live. If the stamps of a sender come into doubt, its
-commands are not accepted, so it is soon not live any more. It then still takes part in the choice
-for a short time (`Sender.present`). If the arbiter chooses such a sender, the robot stands still.
+source is live while one of its senders is live. A sender is armed if it has sent a zero command
+(`neutral.py`).
 
 - The robot follows the live source of the highest priority. Among sources of equal priority, the
-  robot follows the one that began to send first, until that source falls silent. The same rule
+  robot follows the source that began to send first, until this source falls silent. The same rule
   applies to the senders of one source.
-- A live source without an armed sender (`neutral.py`) keeps its priority, and the robot stands
-  still. Otherwise a source of lower priority would drive the robot instead.
-- A source that sends zeros holds the robot still for any length of time. The arbiter cannot tell
-  whether an operator wants that or a controller has failed, so `state` and the log report it.
-
-`values.Command` explains source, sender and clock.
+- A live source without an armed sender keeps its priority, and the robot stands still. Otherwise a
+  source of lower priority would drive the robot instead.
+- A source that sends only zero commands keeps the robot at rest for any length of time. The arbiter
+  cannot tell whether an operator wants that or a controller has failed, so `state` and the log
+  report it.
+- A sender whose commands have doubtful stamps still takes part in the choice for a short time
+  (`Sender.present`). If the arbiter chooses such a sender, the robot stands still.
 """
 
 from __future__ import annotations
@@ -30,25 +30,26 @@ from acsard.core.motion.neutral import Sender, is_zero
 from acsard.core.values import NS_PER_S, REST, Command, SourceStatus, Twist, Wait
 
 MAX_SENDERS = 16
-"""Largest number of senders that one source remembers. Beyond this number, a new sender replaces
-another one, but never a sender that may keep control of the robot (`Sender.holds`), such as a live,
-armed sender."""
+"""Largest number of senders that one source remembers. If the source is full, a new sender replaces
+a known sender, but never a sender that may keep control of the robot (`Sender.holds`), such as a
+live, armed sender."""
 
 Objection = Literal["", "unknown_source", "not_finite", "too_many_senders", "unproven", "stale"]
-"""The reason to refuse a command, or "" if the arbiter accepts it."""
+"""The reason for which the arbiter refuses a command; "" if the command is accepted."""
 
 LASTING_S = (3.0, 10.0, 60.0, 600.0, 3600.0)
-"""`state` reports for how long a sender has sent only zeros, or only speeds although it is not
-armed. That duration is rounded down to one of these values, s."""
+"""Durations, s, that `state` can report for a sender that sends only zero commands, or only speeds
+without being armed. The true duration is rounded down to one of these values."""
 
 NOTHING, COMMAND = Wait("nothing"), Wait("command")
 
 
 class Choice(Struct, frozen=True):
-    """The choice of the arbiter in one step.
+    """The decision of the arbiter in one control step: the twist to follow, or None.
 
-    `arrived_ns` is the monotonic time at which `twist` arrived. If no sender may drive, `twist` is
-    None and `wait` is the reason.
+    If `twist` is None, `wait` is the reason why the robot follows no command. `source` and `sender`
+    are the names of the chosen source and sender. `arrived_ns` is the monotonic time at which the
+    command with `twist` arrived, ns.
     """
 
     source: str = ""
@@ -59,8 +60,8 @@ class Choice(Struct, frozen=True):
 
 
 IDLE = Choice()
-"""The choice if no command has arrived within the timeout of its source. A command that was refused
-because of its stamp also counts as arrived, and then the choice is not `IDLE`."""
+"""The choice if no source has sent a command within its timeout. If a known sender has sent a
+command that was not accepted because of its stamp, the choice has this reason and is not `IDLE`."""
 
 
 class _Source:
@@ -71,7 +72,7 @@ class _Source:
         self.use(settings, pause)
 
     def use(self, settings: Source, pause: float) -> None:
-        """Apply new settings, also to the known senders. `pause` is `neutral_pause`, s."""
+        """Apply new settings to the source and its senders. `pause` is `neutral_pause`, s."""
         self.pause_ns = int(pause * NS_PER_S)
         self.timeout_ns = int(settings.timeout * NS_PER_S)
         self.proof = Wait("proof", settings.name, min(self.timeout_ns, LONGEST_PROOF_NS) / NS_PER_S)
@@ -81,9 +82,11 @@ class _Source:
             sender.use(self.timeout_ns, self.pause_ns)
 
     def add(self, name: str, now_ns: int) -> Sender | None:
-        """Add a sender and return it, or return None if the source already has too many senders.
+        """Add a sender and return it, or return None if there are too many senders.
 
-        It has too many if `MAX_SENDERS` senders may keep the robot (`Sender.holds`).
+        If the source is full, the new sender replaces another sender. Return None if all
+        `MAX_SENDERS` senders may keep control of the robot (`Sender.holds`). `name` is the public
+        name of the new sender.
         """
         if len(self.senders) >= MAX_SENDERS:
             least = min(self.senders, key=lambda other: self._account(other, now_ns))
@@ -94,34 +97,33 @@ class _Source:
         return added
 
     def _account(self, name: str, now_ns: int) -> tuple[bool, bool, int]:
-        """Return the rank of a sender. `add` replaces the sender with the lowest rank."""
+        """Return the rank of the sender `name`. `add` replaces the sender with the lowest rank."""
         sender = self.senders[name]
         holds = sender.holds(now_ns)
         return holds, holds or sender.armed(now_ns), sender.noticed_ns
 
     def cancel_zeros(self, at_ns: int) -> None:
-        """Record that any sender with a shared identity may have sent a speed.
+        """Record that a sender with a shared identity may have sent a speed.
 
-        A zero from such a sender does not arm the sender any more, unless its
-        `commands.neutral_pause` was already over. `at_ns` is the monotonic time at which the
-        message that may be a speed arrived.
+        Any sender with a shared identity may be this sender. Therefore a zero command of such a
+        sender does not arm it any more, unless its `commands.neutral_pause` was already over.
+        `at_ns` is the monotonic time at which the message that may be a speed arrived.
         """
         for sender in self.senders.values():
             sender.cancel_zero(at_ns)
 
     def doubt(self, command: Command, was_set: bool) -> None:
-        """Undo the effect that zeros of a sender had on this source, because its clock is in doubt.
+        """Undo the effect of a sender's zero commands, because the sender's clock is in doubt.
 
-        The sender and its clock are those of `command`, which may have come to another source. If
-        the clock was set (`was_set`), the sender must send a zero again. Otherwise the clock is
-        unproven, and a zero arms the sender only if it was accepted before the doubt or arrives
-        later.
-
-        Behind a bridge, several programs with clocks of their own share one identity. Therefore a
-        command to another source has an effect here only if the same clock stamped the last command
-        of this sender to this source.
+        Only the effect on this source is undone. `command` raised the doubt; it may have been sent
+        to another source. If `was_set` is true, the sender's clock was set, and the sender must
+        send a zero command again. If `was_set` is false, the clock is unproven. A zero command then
+        arms the sender only if it was accepted before the doubt or arrives later.
         """
         sender = self.senders.get(command.sender)
+        # Behind a bridge, several programs with clocks of their own share one identity. Therefore a
+        # command to another source counts here only if the same clock stamped the last command of
+        # this sender to this source.
         if sender is None or (command.source != self.name and command.clock != sender.clock):
             return
         if was_set:
@@ -133,8 +135,8 @@ class _Source:
         """Return the senders that take part in the choice, the preferred sender first.
 
         These are the senders for which `Sender.present` is true. Armed senders come before unarmed
-        senders. In each of these two groups, live senders come before senders that are not live,
-        and otherwise the sender that began to send earlier comes first.
+        senders. In each of these two groups, live senders come before senders that are not live.
+        Otherwise the sender that began to send earlier comes first.
         """
         present = []
         for sender in self.senders.values():
@@ -148,10 +150,9 @@ class _Source:
         )
 
     def latest_ns(self) -> int | None:
-        """Return the monotonic time at which the last accepted command arrived, ns.
+        """Return the monotonic time at which the last accepted command of this source arrived, ns.
 
-        Commands from before the last `require_neutral` do not count. Return None if there is no
-        command.
+        Return None if no command was accepted since the last `require_neutral`.
         """
         times = [s.arrived_ns for s in self.senders.values() if s.arrived_ns is not None]
         return max(times, default=None)
@@ -161,7 +162,7 @@ class _Source:
             sender.require_neutral()
 
     def neutral(self, sender: Sender, lasts: float = 0.0) -> Wait:
-        """Return the `Wait` of a sender that must send a zero before it may drive.
+        """Return the `Wait` for a sender that must send a zero command before it may drive.
 
         `lasts` is the time for which the sender has already sent speeds instead, s.
         """
@@ -169,10 +170,10 @@ class _Source:
         return Wait("neutral", self.name, pause, lasts=lasts, ros=sender.ros, shared=sender.shared)
 
     def doubted(self, now_ns: int) -> Wait | None:
-        """Return why the stamp of a recent command kept the command from being accepted.
+        """Return why recent commands of this source were not accepted because of their stamps.
 
         If several senders sent such commands, the result is for the sender of the newest message.
-        Return None if there is no such command.
+        Return None if no sender sent such a command.
         """
         doubtful = [sender for sender in self.senders.values() if sender.doubtful(now_ns)]
         if not doubtful:
@@ -180,7 +181,7 @@ class _Source:
         return self.why(max(doubtful, key=lambda sender: sender.noticed_ns), now_ns)
 
     def why(self, sender: Sender, now_ns: int) -> Wait:
-        """Return why the robot does not follow this sender, which is not live."""
+        """Return why the robot does not follow `sender`. Call this only if `sender` is not live."""
         if not sender.doubtful(now_ns):
             return self.stalled
         if sender.doubt == "stale":
@@ -188,10 +189,10 @@ class _Source:
         return self.proof if sender.armed(now_ns) else self.neutral(sender)
 
     def obstacle(self, sender: Sender, now_ns: int, lasting: bool = True) -> Wait:
-        """Return why this sender cannot drive the robot, although it takes part in the choice.
+        """Return why `sender` cannot drive the robot, although it takes part in the choice.
 
-        If the reason is that the sender must send a zero, and `lasting` is true, the result
-        contains the time for which it has sent speeds instead.
+        If the sender must first send a zero command, and `lasting` is true, the result also has the
+        time for which the sender has sent speeds instead.
         """
         if not sender.live(now_ns):
             return self.why(sender, now_ns)
@@ -200,7 +201,7 @@ class _Source:
 
 
 class Arbiter:
-    """Holds the latest command of each sender and chooses the one that the robot follows."""
+    """Stores the latest command of each sender, and chooses the command that the robot follows."""
 
     def __init__(self, commands: CommandsConfig) -> None:
         self._sources = {
@@ -215,7 +216,7 @@ class Arbiter:
         self._freshness = Freshness()
 
     def use(self, commands: CommandsConfig) -> None:
-        """Apply the timeouts and `neutral_pause` of `commands` from now on.
+        """Use the timeouts and the `neutral_pause` of `commands` from now on.
 
         Armed senders stay armed. The names and priorities of the sources must not change.
         """
@@ -223,11 +224,12 @@ class Arbiter:
             self._sources[settings.name].use(settings, commands.neutral_pause)
 
     def require_neutral(self, since_ns: int = 0) -> None:
-        """Forget all commands. Each sender must then send a zero before it drives again.
+        """Forget all commands. Each sender must send a zero command before it drives again.
 
-        Only a zero that arrives at the monotonic time `since_ns` or later arms a sender. An older
-        zero, for example from before a stop was cleared, does not show that the sender wants the
-        robot to rest now. After several calls, the latest `since_ns` of all calls counts.
+        Only a zero command that arrives at the monotonic time `since_ns` or later arms a sender. An
+        older zero command, for example from before a stop was cleared, does not show that the
+        sender wants the robot to rest now. After several calls, the latest `since_ns` counts. If
+        `commands.neutral_first` is false, senders need not send a zero command.
         """
         self._since_ns = max(self._since_ns, since_ns)
         for source in self._ranking:
@@ -235,11 +237,12 @@ class Arbiter:
         self._holder = self._followed = None
 
     def begin(self, now_ns: int) -> None:
-        """Begin a step at the monotonic time `now_ns`. Call this before `accept` in each step.
+        """Begin a control step at the monotonic time `now_ns`, ns. Call this before `accept`.
 
-        If the daemon stood still since the last step, the bus may not have delivered the commands
-        of that time yet. Therefore each sender takes part in the choice for a short time more, and
-        a running `commands.neutral_pause` takes longer (see `Sender.resume`).
+        If the previous step was more than `LATE_NS` ago, the daemon stood still, and the bus may
+        not have delivered the commands of that time yet. Each sender then takes part in the choice
+        for a short time more, and a running `commands.neutral_pause` takes longer (see
+        `Sender.resume`).
         """
         before_ns, self._begun_ns = self._begun_ns, now_ns
         if now_ns - before_ns > LATE_NS:
@@ -249,7 +252,7 @@ class Arbiter:
                     sender.resume(before_ns, now_ns)
 
     def accept(self, command: Command) -> Objection:
-        """Accept a command and return "", or return the reason to refuse it."""
+        """Process a command. Return "" if it is accepted, otherwise the reason to refuse it."""
         source = self._sources.get(command.source)
         if source is None:
             return "unknown_source"
@@ -275,13 +278,13 @@ class Arbiter:
         return "" if verdict in ("fresh", "set") else "unproven"
 
     def notice(self, source: str, sender: str, arrived_ns: int, shared: bool = False) -> None:
-        """Record a lost or unusable message to `source`, which may have commanded motion.
+        """Record that a message to `source` was lost or unusable. It may have been a speed.
 
-        If `sender` is unknown ("") or has a `shared` identity, any sender with a shared identity
-        may have sent the message. If `commands.neutral_pause` after a zero of such a sender was not
-        over at the monotonic time `arrived_ns`, the zero does not arm its sender any more. The time
-        of a lost message is unknown: `sender` is "" and `arrived_ns` is 0, and no zero arms its
-        sender any more unless it has already done so.
+        If `shared` is true or `sender` is "" (unknown), any sender with a shared identity may have
+        sent the message. The zero command of such a sender does not arm it any more, unless
+        `commands.neutral_pause` was already over at the monotonic time `arrived_ns`. The time of a
+        lost message is unknown: pass "" as `sender` and 0 as `arrived_ns`. Then no zero command
+        arms such a sender, unless it has already done so.
         """
         known = self._sources.get(source)
         if known is None:
@@ -333,8 +336,8 @@ class Arbiter:
     def _kept(self, holder: _Source, now_ns: int) -> str:
         """Return the name of a source whose speeds have no effect, because `holder` sends zeros.
 
-        If the speeds come from another sender of `holder` itself, the result is "another sender of
-        NAME". It is "" if nobody sends speeds.
+        If another sender of `holder` itself sends the speeds, the result is "another sender of
+        NAME". Return "" if no other sender sends speeds.
         """
         for source in self._ranking:
             senders = (each for each in source.present(now_ns) if each is not self._followed)
@@ -344,11 +347,10 @@ class Arbiter:
 
     @property
     def forgiven_ns(self) -> int:
-        """Sum of the rises of command delays that the daemon took for adjusted clocks, ns.
+        """Total increase of command delays that was attributed to adjusted clocks, ns.
 
-        The daemon does so without evidence up to a budget, and after a pause of the sender
-        (`freshness.py`). If the stamps of a sender show that its clock was adjusted, they are
-        evidence, and the rise does not count here.
+        An increase does not count if the stamps of the sender show the adjustment. `freshness.py`
+        limits the total by a budget, except for an increase after a pause of the sender.
         """
         return self._freshness.forgiven_ns
 
@@ -374,7 +376,7 @@ class Arbiter:
 
 
 def _lasts(ns: int) -> float:
-    """Return the duration `ns` in s, rounded down to a value of `LASTING_S`, or to 0.0."""
+    """Return the duration `ns` in s, rounded down to a value of `LASTING_S` or to 0."""
     if ns < LASTING_S[0] * NS_PER_S:
         return 0.0  # Nearly every step ends here.
     return max(seconds for seconds in LASTING_S if ns >= seconds * NS_PER_S)

@@ -22,9 +22,9 @@ REFUSED = {
 }
 
 MAX_SENDER = 124
-"""Largest number of characters of a sender's name in an event. The public name of a program has at
-most 57 characters, and the name from its certificate adds at most 67. A name that is made from a
-Zenoh key can be longer. It is cut to this length."""
+"""Largest number of characters of a sender's name in a log event. The public name of a program has
+at most 57 characters, and the name from its certificate adds at most 67. A name that is made from a
+Zenoh key can be longer, and is then cut to this length."""
 
 ROS_NEVER = (
     ' (`ros2 topic pub` with a speed never sends a zero; the section "After a clear" of '
@@ -33,14 +33,14 @@ ROS_NEVER = (
 
 
 def chosen(choice: Choice) -> str:
-    """Return words that name the source that drives the robot, or the reason why none does."""
+    """Return a text that names the source that drives the robot, or says why no source does."""
     if choice.wait.what == "command":
         return "waiting for a command: no source has sent one within its timeout"
     return waiting(choice.wait) or f"commanded by {choice.source}"
 
 
 def waiting(wait: Wait) -> str:
-    """Return the condition that a source waits for, in words; "" if it need not wait."""
+    """Return the condition that a source waits for, as text; "" if it need not wait."""
     match wait.what:
         case "nothing":
             return ""
@@ -82,13 +82,17 @@ def waiting(wait: Wait) -> str:
 
 
 def missed(periods: int) -> Event:
-    """Return the event for `periods` control periods in which the robot made no step."""
+    """Return the log event for `periods` successive control periods without a step of the robot."""
     text = f"{periods} control periods in a row"
     return Event("missed_periods", text, "warning", kind="missed", count=periods, news=False)
 
 
 def refused(refusal: Refusal) -> Event:
-    """Return the event `command_refused`, or `new_sender` if the sender's clock is unproven."""
+    """Return the log event for a refused command.
+
+    The event is `new_sender` if the clock of the sender is not proven yet, otherwise
+    `command_refused`.
+    """
     by, kind = refusal.sender[:MAX_SENDER], refusal.reason
     if kind == "unproven":
         return Event("new_sender", refusal.text, by=by, news=False)
@@ -96,19 +100,20 @@ def refused(refusal: Refusal) -> Event:
 
 
 class CommandEvents:
-    """Creates the events for a new mode, or a new source or sender that drives the robot."""
+    """Creates log events for a new mode, and for a new source or sender that drives the robot."""
 
     def __init__(self, mode: Mode) -> None:
         self._mode, self._commander = mode, ("", "")
         self._kept = ""
-        """The source whose speeds have no effect, as last reported in the log; "" without one."""
+        """The source whose speeds have no effect, according to the last log event about such
+        speeds; "" if this is over."""
 
     def changes(self, mode: Mode, choice: Choice, why: str) -> list[Event]:
-        """Return the events for changes since the last call.
+        """Return the log events for the changes since the last call.
 
-        The events report a new mode, a new commander (the source and sender that drive the robot),
-        and a source whose speeds have no effect. A commander that drives again after a pause is not
-        new. `why` is the reason of the mode, in words.
+        There is an event for a new mode, for a new commander (the source and the sender that drive
+        the robot), and for a source whose speeds have no effect. A commander that drives again
+        after a pause is not new. `why` is the reason of the mode, as text.
         """
         drives, before, last = mode is Mode.DRIVING, self._mode, self._commander
         if drives:
@@ -125,7 +130,7 @@ class CommandEvents:
     def _kept_waiting(self, mode: Mode, choice: Choice) -> list[Event]:
         """Return a list with one event if a source's speeds have had no effect for a while.
 
-        The event is not repeated while this goes on.
+        While this goes on, later calls return an empty list.
         """
         wait, kept = choice.wait, ""
         if mode not in (Mode.READY, Mode.DRIVING) or wait.what not in ("neutral", "zeros"):

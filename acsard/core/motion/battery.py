@@ -1,4 +1,4 @@
-"""Follows the battery that the board reports, and decides when an empty battery stops the robot.
+"""Monitors the battery that the board reports, and decides when an empty battery stops the robot.
 
 The thresholds in `[battery]` apply to a running mean of the voltage or of the charge. They do not
 apply to single values, because starting motors make the voltage drop for some tenths of a second.
@@ -25,22 +25,22 @@ reacts soon enough."""
 
 SETTLE_S = 3.0
 """Time that the reports of the battery must cover before their running mean decides the level, s.
-This time is the sum of the intervals between the reports. Each interval counts as at most
-`LONGEST_NS`, and a silence of the board resets the sum to 0. A motor start in this time lowers the
-mean by up to a tenth of the voltage drop."""
+The covered time is the sum of the intervals between the reports, each limited to `LONGEST_NS`. A
+silence of the board resets it to 0. A motor start in this time lowers the mean by up to a tenth of
+the voltage drop."""
 
 SILENT_S = 5.0
-"""A value of the battery is dropped when it is older than this, s. If the board sends one report a
-second, four consecutive reports may be lost without an effect."""
+"""Largest age of a reported value of the battery, s. An older value is dropped. If the board sends
+one report a second, four consecutive reports may be lost without an effect."""
 
 LONGEST_NS = 300_000_000
 """Largest weight of one report in the running mean, ns. The weight of a report is the time since
 the previous report, but at most this limit, which is the duration of a motor start. Without the
-limit, a report during a motor start would weigh too much after a gap. The limit has a price: if the
-board sends one report a second, the mean follows the voltage at only a third of the speed."""
+limit, a report during a motor start would weigh too much after a gap. If the board sends only one
+report a second, the limit slows the mean down to a third of its speed."""
 
 EMPTY = "battery below "
-"""The first words of the reason for a stop by an empty battery (`Battery.why`)."""
+"""First words of the text `Battery.why`, the reason for a stop by an empty battery."""
 
 ORDER: tuple[BatteryLevel, ...] = get_args(BatteryLevel)[:4]
 """The battery levels from the best to the worst, except "unknown"."""
@@ -53,7 +53,7 @@ SILENT = f"the board has not reported its battery for {SILENT_S:g} s"
 
 
 def words(config: BatteryConfig, status: BatteryStatus) -> str:
-    """Return the values and the level of a battery as text."""
+    """Return a text with the battery's values and with the reason if its level is not "ok"."""
     forms = ((status.volts, "{:.2f} V"), (status.percent, "{:g} %"), (status.amps, "{:.2f} A"))
     values = [form.format(value) for value, form in forms if value is not None]
     if status.volts is None and status.percent is None:
@@ -80,63 +80,65 @@ def _with_unit(config: BatteryConfig, value: float) -> str:
 
 
 class Battery:
-    """The values of the battery that the board reports, and the level that follows from them."""
+    """The battery values that the board reports, and the battery level computed from them."""
 
     def __init__(self, config: BatteryConfig, stopped: bool = False) -> None:
         """Start without a report.
 
-        `stopped` says whether an empty battery stopped the robot before this daemon started.
+        `stopped` is true if an empty battery had stopped the robot before this daemon started.
         """
         self._config = config
         self._bounds = config.bounds
         self.status: BatteryStatus | None = None
-        """The values and the level; None if the board has never reported its voltage or charge."""
+        """Reported values and battery level; None if the board has never reported its voltage or
+        charge."""
         self.stopped_now = False
-        """Whether the level fell to "stop" in the last `look`."""
+        """Whether the level fell to "stop" in the last call of `look`."""
         self._values: dict[str, tuple[float, int]] = {}
-        """The last values by name, each with its monotonic time of arrival, ns."""
+        """Last value of each quantity by its name ("volts", "percent", "amps"), with its monotonic
+        time of arrival, ns."""
         self._awaited = True
         """True from the opening of the port until the board reports the value that
         `battery.measure` names."""
         self._known: BatteryLevel = "stop" if stopped and "stop" in self._bounds else "ok"
-        """The last level other than "unknown". It stays if the board falls silent, because silence
-        must not end a stop."""
+        """The last level other than "unknown". A silence of the board does not change it, because
+        silence must not end a stop."""
         self._told: BatteryLevel | None = None
-        """The level in the last event, None before the first event."""
+        """The level in the last log event; None before the first event."""
         self._mean: float | None = None
         self._since_ns = self._mean_ns = 0
-        """Monotonic times, ns. `_since_ns` is that of the first report since the last silence, and
-        `_mean_ns` is that of the newest report in `_mean`."""
+        """Monotonic times, ns. `_since_ns` is the arrival of the first report since the last
+        silence, and `_mean_ns` is the arrival of the newest report in `_mean`."""
         self._stood_ns = 0
         """Sum of the weights of all reports in `_mean`, ns (see `LONGEST_NS`)."""
 
     @property
     def held(self) -> bool:
-        """Whether the call `clear` is refused, because the last known level is "stop"."""
+        """Whether the call `clear` is refused, because the last known battery level is "stop"."""
         return self._known == "stop"
 
     @property
     def why(self) -> str:
-        """The reason for the stop at the level "stop", in words without measured values."""
+        """Reason of a stop by an empty battery, as text without measured values."""
         return f"{EMPTY}{_threshold(self._config, 'stop')}"
 
     @property
     def mend(self) -> str:
-        """What the operator must do to end the level "stop", in words without measured values."""
+        """Advice on how to end the level "stop", as text without measured values."""
         if self.held and self._told is None:
             return "wait until the board has reported its battery for some seconds"
         config = self._config
         return f"charge the battery to {_with_unit(config, config.stop_below + config.hysteresis)}"
 
     def reopen(self) -> None:
-        """Record that the port was opened, so that another board may answer from now on."""
+        """Record that the serial port was opened. Another board may answer from now on."""
         self._awaited = True
 
     def forget(self) -> None:
-        """Forget the level, unless the board that is connected now has reported it.
+        """Forget the battery level, unless the board on the newly opened port has reported it.
 
         The board has reported it if the value that `battery.measure` names has arrived since the
-        port was opened.
+        serial port was opened.
         """
         if self._awaited:
             self._known, self._told, self._mean = "ok", None, None
@@ -145,9 +147,10 @@ class Battery:
                 self.status = None
 
     def look(self, reports: Iterable[tuple[int, BoardStatus]], now_ns: int) -> list[Event]:
-        """Process the status lines since the last step, and return an event if the level changed.
+        """Process the status lines since the last control step.
 
-        Each item of `reports` is a pair: the monotonic time of arrival, ns, and the status line.
+        Return a list with one log event if the level changed, otherwise an empty list. Each item of
+        `reports` is a pair: the monotonic time of arrival, ns, and the status line.
         """
         self.stopped_now = False
         news = False
@@ -193,9 +196,9 @@ class Battery:
             self._mean_ns = at_ns
 
     def _level(self, now_ns: int) -> BatteryLevel | None:
-        """Update the level from the mean, and return the level; None until it can be decided.
+        """Update the battery level from the running mean and return it; None if it is undecided.
 
-        It can be decided when the reports cover `SETTLE_S`.
+        It is undecided until the reports cover `SETTLE_S`.
         """
         measure, values = self._config.measure, self._values
         if measure not in values:

@@ -1,4 +1,4 @@
-"""Follows the bumpers that the board reports, and decides which motion they allow.
+"""Monitors the bumpers that the board reports, and decides which motion they allow.
 
 A press of a bumper sets the command to zero without a ramp. With `safety.bumper = "stop"`, the
 press also latches a stop. With `safety.bumper = "away"`, each sender must send a zero before the
@@ -25,8 +25,8 @@ AWAY_SPEED = 0.1
 """Highest speed away from a pressed bumper, m/s."""
 
 DIRECTIONS: dict[Place, int] = {"front": -1, "rear": 1, "left": 0, "right": 0}
-"""Maps the place of a bumper to the sign of the linear speed that drives the robot away from this
-bumper. The sign is 0 if no straight motion leads away from it."""
+"""Sign of the linear speed that drives the robot away from a bumper at this place. The sign is 0 if
+no straight motion leads away from the bumper."""
 
 ALLOWED = {-1: "backwards", 1: "forwards"}
 
@@ -34,7 +34,7 @@ SILENT = f"the board has not reported its bumpers for {SILENT_S:g} s, so they co
 
 
 def missing(safety: SafetyConfig) -> str:
-    """Return why the robot is not ready: its board has not reported the configured bumpers."""
+    """Return the text which says that the board has not reported the configured bumpers."""
     count = len(safety.bumpers)
     return (
         f"safety.bumpers has {many(count, 'place')}, but the microcontroller has not reported "
@@ -44,7 +44,11 @@ def missing(safety: SafetyConfig) -> str:
 
 
 def pressed_words(places: Sequence[Place], pressed: Sequence[bool]) -> str:
-    """Return words that list the pressed bumpers, by place, or by number if `places` is empty."""
+    """Return a text that lists the pressed bumpers, such as "front bumper pressed".
+
+    `pressed` says for each bumper whether it is pressed, and `places` gives the place of each
+    bumper. If `places` is empty, the text gives the numbers of the pressed bumpers, counted from 1.
+    """
     numbers = [i for i, on in enumerate(pressed) if on]
     if not places:
         joined = " and ".join(str(i + 1) for i in numbers)
@@ -71,28 +75,28 @@ class Bumpers(BoardInput):
 
     @property
     def limiting(self) -> bool:
-        """Whether a bumper is pressed and limits the motion instead of latching a stop."""
+        """Whether a pressed bumper limits the motion now and does not latch a stop."""
         return self._away and self.state == "pressed"
 
     @property
     def latching(self) -> bool:
-        """Whether bumpers that count as pressed latch a stop.
+        """Whether the bumpers latch a stop when they count as pressed.
 
-        If the robot may drive away from bumpers, they latch a stop only when the board does not
-        report them any more.
+        If the robot may drive away from its bumpers, they latch a stop only when the board has
+        stopped reporting them.
         """
         return not self._away or self.state == "silent"
 
     @property
     def held(self) -> str:
-        """Why the bumpers do not allow `clear` to release a stop now, in words; "" if they do."""
+        """Reason, as text, why `clear` must not release a stop now; "" if the bumpers allow it."""
         return self.why if self.latching else ""
 
     def away(self, twist: Twist) -> Twist | None:
         """Return the part of `twist` that the pressed bumpers allow; None if they allow no part.
 
         The pressed bumpers allow rest, and straight motion away from all of them at `AWAY_SPEED` or
-        less.
+        less. The turn in `twist` is dropped.
         """
         if twist == REST:
             return REST
@@ -100,7 +104,7 @@ class Bumpers(BoardInput):
         return Twist(self._direction() * min(speed, AWAY_SPEED)) if speed > 0.0 else None
 
     def note(self) -> str:
-        """Return a sentence with the pressed bumpers and the motion that they still allow."""
+        """Return a sentence that names the pressed bumpers and the allowed motion."""
         allowed = ALLOWED.get(self._direction())
         if allowed is None:
             return (
@@ -110,12 +114,12 @@ class Bumpers(BoardInput):
         return f"{self.why}: the robot drives only straight {allowed}, at most {AWAY_SPEED:g} m/s"
 
     def read(self, status: BoardStatus) -> tuple[bool, ...] | None:
-        """Return whether each bumper is pressed according to a status line.
+        """Return whether each bumper is pressed; None if this status line cannot be used.
 
-        Return None if the line reports no bumpers or an unexpected number of bumpers, because a
-        pressed bumper may be missing from the line. If `safety.bumpers` has places, the expected
-        number is the number of places. Otherwise, it is the number in the previous report, but a
-        line that reports a press is accepted with any number of bumpers.
+        A line is not used if it reports no bumpers, or an unexpected number of bumpers, because a
+        pressed bumper may then be missing from the line. The expected number is the number of
+        places in `safety.bumpers`. Without places, it is the number in the previous report, but a
+        line that reports a press is used with any number of bumpers.
         """
         bumpers = status.bumpers
         if bumpers is None:
@@ -127,11 +131,11 @@ class Bumpers(BoardInput):
         return None
 
     def words(self) -> str:
-        """Return words that list the pressed bumpers."""
+        """Return a text that lists the pressed bumpers."""
         return pressed_words(self._places, self.pressed or ())
 
     def advice(self) -> str:
-        """Return words for the log: how the robot may move, or what the operator must do."""
+        """Return the instruction for the log: how the robot may move, or how to end the stop."""
         return self.note().partition(": ")[2] if self.limiting else super().advice()
 
     def released(self, before: EstopState) -> str:

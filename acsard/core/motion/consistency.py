@@ -9,7 +9,7 @@
 - `learned_track.py` chooses the effective track (the distance between the wheels that makes turns
   come out right): the configured track, or a track learned from the comparison with a gyro.
 
-Each check uses the results of another check, and only this module knows the order of the checks.
+Some checks use the results of others. Only this module determines their order.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class ConsistencyChecks:
     ) -> None:
         """Start with no faulty wheel, and with an unproven gyro if the robot has one.
 
-        `encoder_counts` is the number of counts per revolution of a wheel, 0 if it is unknown.
+        `encoder_counts` is the number of counts per revolution of a wheel; 0 if it is unknown.
         """
         self._kinematics = kinematics
         self.wheels = WheelFaults(kinematics, encoder_counts, feedback)
@@ -53,23 +53,23 @@ class ConsistencyChecks:
         self.turn: Turn | None = None
         """Turn of the robot in the last feedback line according to the gyro.
 
-        None if the odometry must use the turn according to the wheels.
+        If it is None, the odometry must use the turn according to the wheels.
         """
         self.on_trial = False
         """Whether the wheels provided the turn of the last line because the gyro is not proven."""
         self.slips = False
-        """Whether the wheels slip: they contradict each other or the gyro."""
+        """Whether the wheels slip, which means that they contradict each other or the gyro."""
         self.events: list[Event] = []
         """Log events of the last feedback line."""
 
     @property
     def gyro_status(self) -> GyroStatus:
-        """The state of the gyro, and whether the odometry uses the track learned from the gyro."""
+        """Status of the gyro, and whether the odometry uses the effective track learned from it."""
         status = GyroStatus() if self.gyro is None else self.gyro.status
         return status if self._track is None else replace(status, track_use=self._track.use)
 
     def hear(self, samples: tuple[GyroSample, ...]) -> None:
-        """Store `samples`, which arrived since the last step and are in the order of arrival."""
+        """Store the gyro `samples` since the last control step, in the order of arrival."""
         if self.gyro is not None:
             self.gyro.hear(samples)
 
@@ -82,7 +82,8 @@ class ConsistencyChecks:
         """Check a feedback line, and return whether it has proved a wheel faulty.
 
         If it has, the caller must recompute the pose from the earlier lines without this wheel.
-        `rolled` contains the angles that the wheels rolled since the line before.
+        `rolled` contains the angles that the wheels rolled since the previous plausible feedback
+        line.
         """
         wheels, gyro, turn, by_gyro = self.wheels, self.gyro, None, None
         if gyro is not None:
@@ -100,19 +101,21 @@ class ConsistencyChecks:
         return found
 
     def taken_back(self, turn: float) -> float:
-        """Record changes of earlier turns, after the pose was recomputed without a faulty wheel.
+        """Return the angle that the caller must subtract from the heading, rad.
 
-        `turn` is the sum of the changes, rad, over the lines for which `on_trial` was true. Return
-        the angle that the caller must subtract from the heading, rad: `turn` if the gyro is proven
-        by now, otherwise 0.
+        Call this after the pose was recomputed over earlier feedback lines without a faulty wheel.
+        `turn` is the sum of the changes of the turns, rad, in the lines for which `on_trial` was
+        true. If the gyro is proven by now, the result is `turn`, because the heading was already
+        corrected to the gyro's turn. Otherwise the result is 0.
         """
         return 0.0 if self.gyro is None else self.gyro.taken_back(turn)
 
     def learn(self, turned: float) -> Track | None:
-        """Finish the checks of the last feedback line, which turned the pose by `turned` rad.
+        """Finish the checks of the last feedback line, and return the effective track to use next.
 
-        Set `events` to the log events of this line, and return the effective track for the next
-        lines. Return None without a gyro, or if `[odometry] learned_track` is false.
+        `turned` is the angle by which this line turned the pose, rad. The method sets `events` to
+        the log events of the line. Return None without a gyro, or if `[odometry] learned_track` is
+        false.
         """
         gyro, track, self.events = self.gyro, self._track, self.wheels.events
         if gyro is None:

@@ -1,4 +1,4 @@
-"""Follows the safety inputs that the board reports, and decides when one of them counts as pressed.
+"""Monitors the safety inputs that the board reports, and decides when an input counts as pressed.
 
 `BoardInput` is the common base class of `EmergencyStop` and of the bumpers (`bumpers.py`). A board
 that has reported an input once must continue to report this input. After `SILENT_S` without a
@@ -36,22 +36,22 @@ TABLE: dict[tuple[EstopState, Sign], EstopState] = {
     ("silent", "ok"): "released",
     ("silent", "pressed"): "pressed",
 }
-"""Maps (state, sign) of a safety input to its next state. The sign is `ok` or `pressed` if a status
-line reports the input. It is `silence` if no line has reported the input for `SILENT_S`. A pair
-without an entry does not change the state."""
+"""Maps the state of a safety input and a sign to the next state. The sign is `ok` or `pressed` if a
+status line reports the input, and `silence` if no line has reported the input for `SILENT_S`. A
+pair without an entry does not change the state."""
 
 SILENT_S = 0.5
 """Time without a report after which an input counts as pressed, s: five status lines at 10 Hz."""
 
 LATE_NS = 150_000_000
-"""If more than this time passes between two control steps, ns, the second step counts as late. The
-longest control period that can be configured is 100 ms."""
+"""Time between two control steps above which the second step counts as late, ns. The longest
+control period that can be configured is 100 ms."""
 
 EXCUSE_NS = 100_000_000
-"""Extra time after a late control step, ns, before the board counts as silent. In this time, the
-daemon reads the lines and commands that arrived while no control step ran. The daemon grants the
-extra time only once between two reports of the board, so that a control loop that is always late
-does not delay the stop forever."""
+"""Extra time that a late control step gives the board before it counts as silent, ns. In this time,
+the daemon reads the lines and commands that arrived while no control step ran. The daemon grants
+the extra time only once between two reports of the board, so that a control loop that is always
+late does not delay the stop forever."""
 
 PRESSED = "emergency stop pressed at the robot"
 SILENT = (
@@ -74,9 +74,9 @@ class BoardInput(ABC):
 
     table = TABLE
     silent: str
-    """The reason of a stop that is latched because the board does not report the inputs."""
+    """Reason, as text, of a stop that is latched because the board does not report the inputs."""
     events: tuple[EventName, EventName]
-    """Names of two log events: the one for a press, and the one for a release."""
+    """Names of the two log events for a press and for a release."""
 
     def __init__(self, use: EstopUse) -> None:
         self.use = use
@@ -87,33 +87,33 @@ class BoardInput(ABC):
         self._awaited = True
         """True from the opening of the port until the board reports the inputs."""
         self.pressed_now = ""
-        """Why an input began to count as pressed in the last call of `look`, in words; "" if no
-        input began to count as pressed in that call."""
+        """Reason, as text, if an input began to count as pressed in the last call of `look`;
+        otherwise an empty text."""
         self._reported_ns = self._looked_ns = 0
         self._excused = False
 
     @property
     def why(self) -> str:
-        """Why an input counts as pressed, in words; "" while no input counts as pressed."""
+        """Reason, as text, why an input counts as pressed; "" while no input counts as pressed."""
         if self.state == "silent":
             return self.silent
         return self.words() if self.state == "pressed" else ""
 
     @property
     def mend(self) -> str:
-        """Advice to the operator about an input that counts as pressed, in words."""
+        """Advice to the operator about an input that counts as pressed, as text."""
         return CHECK if self.state == "silent" else RELEASE
 
     @property
     def missing(self) -> bool:
         """Whether the robot needs the inputs, but the board has not reported them.
 
-        Only reports since the port was last opened count.
+        Only reports since the serial port was last opened count.
         """
         return self.use == "required" and self._awaited
 
     def reopen(self) -> None:
-        """Record that the port was opened, so that another board may answer from now on."""
+        """Record that the serial port was opened. Another board may answer from now on."""
         self._awaited = True
 
     def forget(self) -> None:
@@ -122,7 +122,7 @@ class BoardInput(ABC):
             self.state, self.pressed = "", None
 
     def look(self, reports: Sequence[tuple[int, BoardStatus]], now_ns: int) -> list[Event]:
-        """Process the status lines since the last step, and return the events of the changes.
+        """Process the status lines since the last control step; return the log events of changes.
 
         Each item of `reports` is a pair: the monotonic time of arrival, ns, and the status line.
         """
@@ -145,11 +145,11 @@ class BoardInput(ABC):
 
     @abstractmethod
     def read(self, status: BoardStatus) -> tuple[bool, ...] | None:
-        """Return whether each input is pressed, or None if the line does not report the inputs."""
+        """Return whether each input is pressed; None if `status` does not report the inputs."""
 
     @abstractmethod
     def words(self) -> str:
-        """Return words that say which inputs are pressed, for use as the reason of a stop."""
+        """Return the reason of a stop as text: it says which inputs are pressed."""
 
     @abstractmethod
     def released(self, before: EstopState) -> str:
@@ -183,23 +183,24 @@ class EmergencyStop(BoardInput):
     def __init__(self, use: EstopUse, unpowered: bool = False) -> None:
         super().__init__(use)
         self.driver_fault = False
-        """Whether the status lines in the last `look` reported a motor-driver fault that counts.
+        """Whether the status lines in the last call of `look` reported a motor-driver fault that
+        counts.
 
         A fault does not count while the drivers may have no power (`_unpowered`).
         """
         self._unpowered = unpowered
-        """Whether the emergency stop has been pressed, and a stop has been latched ever since.
+        """Whether the emergency stop was pressed and its stop is still latched.
 
         The emergency stop cuts the power of the motor drivers, and a driver without power reports a
         fault. The power may come back some time after the button is released. Therefore no driver
-        fault counts until `clear` has released the stop. The call `clear` is refused while a driver
-        reports a fault.
+        fault counts until `clear` has released the stop.
         """
 
     def look(self, reports: Sequence[tuple[int, BoardStatus]], now_ns: int) -> list[Event]:
-        """Process the status lines since the last step, and return the events of the changes.
+        """Process the status lines since the last control step; return the log events of changes.
 
         Each item of `reports` is a pair: the monotonic time of arrival, ns, and the status line.
+        The method also updates `driver_fault`.
         """
         self.driver_fault, pressed = False, bool(self.why)
         self._unpowered |= self.state == "pressed"
@@ -222,7 +223,7 @@ class EmergencyStop(BoardInput):
         return None if status.estop is None else (status.estop,)
 
     def words(self) -> str:
-        """Return words for a pressed emergency stop, for use as the reason of a stop."""
+        """Return the reason of a stop by a pressed emergency stop, as text."""
         return PRESSED
 
     def released(self, before: EstopState) -> str:

@@ -3,22 +3,17 @@
 A step is the motion from one feedback line to the next. In a step, the left and the right side of
 the robot roll the distances dl and dr, m. The errors of these distances are independent and have
 the variances k |dl| and k |dr|, where k is in m (Siegwart, Nourbakhsh & Scaramuzza, Introduction to
-Autonomous Mobile Robots, 5.2.4). Let L be the effective track, m. The step has the distance
-d = (dl + dr) / 2 and the turn dyaw = (dr - dl) / L. The errors of d and dyaw therefore have
+Autonomous Mobile Robots, 5.2.4). Let L be the effective track, m. The step has the distance d = (dl
++ dr) / 2 and the turn dyaw = (dr - dl) / L. The errors of d and dyaw therefore have
 
     var(d) = k (|dl| + |dr|) / 4
     var(dyaw) = k (|dl| + |dr|) / L^2
     cov(d, dyaw) = k (|dr| - |dl|) / (2 L)
 
-The settings can describe more errors than those of the two sides. If the sides were the only cause
-of errors, `distance_variance_per_metre` D would be k / 2, and `yaw_variance_per_metre` Y would be
-2 k / L^2. The model uses k = min(2 D, Y L^2 / 2) for the sides. The remaining part of D or Y is an
-error of the robot as a whole. In addition, skidding gives each turn the variance
-`yaw_variance_per_radian` for each radian.
-
-The errors of parameters, such as a wheel radius, do not average out, so they are not noise
-(Borenstein & Feng, Measurement and Correction of Systematic Odometry Errors in Mobile Robots,
-1996). `columns` returns one `Column` for each parameter.
+In addition, skidding gives each turn the variance `yaw_variance_per_radian` for each radian. The
+errors of parameters, such as a wheel radius, do not average out, so they are not noise (Borenstein
+& Feng, Measurement and Correction of Systematic Odometry Errors in Mobile Robots, 1996). `columns`
+returns one `Column` for each parameter.
 """
 
 from __future__ import annotations
@@ -31,18 +26,18 @@ from acsard.core.motion.learned_track import CONFIGURED, Track
 from acsard.core.values import Twist, TwistVariances
 
 Column = tuple[float, float, float, float]
-"""The error of a step if one parameter, such as a wheel radius, is off by one standard deviation.
+"""Error of the distance and the turn of a step if one parameter is off by one standard deviation.
 
 The first two numbers are the error of the distance per m of distance and per rad of turn (m/m,
 m/rad). The last two numbers are the error of the turn per m of distance and per rad of turn (rad/m,
-rad/rad).
+rad/rad). A parameter is, for example, a wheel radius.
 """
 
 SLIPPING = 100.0
 """Factor by which slip of the wheels increases the variances of a step and of the twist."""
 
 DECIMAL = 0.01
-"""Resolution of the wheel speeds in a feedback line, which have two decimals, rad/s."""
+"""Resolution of the wheel speeds in a feedback line, rad/s. The line has two decimals."""
 
 MOST = 1e9
 """Largest variance of a twist, m2/s2 and rad2/s2. It means "unknown"."""
@@ -52,18 +47,22 @@ LEAST = 1e-8
 smaller variance as an error."""
 
 PERIOD = 0.01
-"""Period of the feedback lines that is assumed until it is measured, s."""
+"""Assumed period of the feedback lines before it is measured, s."""
 
 SMOOTHED = 0.05
-"""Weight of the newest period in the mean period of the feedback lines. The weight is small,
-because periods vary: several lines may be read at the same time."""
+"""Weight of the newest period in the running mean of the time between feedback lines. The weight is
+small, because periods vary: several lines may be read at the same time."""
 
 
 class Noise:
-    """Computes the noise of a step: the variances and the covariance of its distance and turn."""
+    """Computes the variances and the covariance of the errors of distance and turn in one step."""
 
     def __init__(self, odometry: OdometryConfig, track: float) -> None:
-        """Use the variances in `odometry`. `track` is the effective track, m."""
+        """Take the variances from `odometry`. `track` is the effective track, m."""
+        # The settings can describe more errors than those of the two sides. If the sides were the
+        # only cause of errors, `distance_variance_per_metre` D would be k / 2, and
+        # `yaw_variance_per_metre` Y would be 2 k / L^2. Therefore the sides get k = min(2 D,
+        # Y L^2 / 2). The remaining part of D or Y is an error of the robot as a whole.
         wheels = min(
             2 * odometry.distance_variance_per_metre,
             odometry.yaw_variance_per_metre * track * track / 2,
@@ -82,8 +81,8 @@ class Noise:
         Args:
             distance: the distance d of the step, m.
             turn: the turn dyaw of the step, rad.
-            turned: the part of |turn| that is not encoder noise, rad. The wheels skid only in this
-                part.
+            turned: the part of |turn| that is a real turn and not encoder noise, rad. Only this
+                part has the variance for skidding.
         """
         left, right = abs(distance - self._half * turn), abs(distance + self._half * turn)
         path, sides = abs(distance), left + right
@@ -95,10 +94,13 @@ class Noise:
 
 
 class ErrorModel:
-    """The noise of a step and the effects of parameter errors, for the effective track in use."""
+    """The noise of an odometry step and the effects of parameter errors on it.
+
+    The results are for the effective track in use, which may change (`turn_by`).
+    """
 
     def __init__(self, odometry: OdometryConfig, kinematics: Kinematics) -> None:
-        """Start with the configured track."""
+        """Start with the configured effective track."""
         self._declared, self._kinematics = odometry, kinematics
         self.radius = kinematics.radius
         """Mean radius of the wheels, m."""
@@ -106,12 +108,12 @@ class ErrorModel:
         self.turn_by(CONFIGURED if odometry.learned_track else None)
 
     def use(self, odometry: OdometryConfig) -> None:
-        """Use the noise of these settings from now on. The errors of parameters do not change."""
+        """Use the noise in `odometry` from now on. The errors of parameters do not change."""
         self.settings = odometry
         self.noise = Noise(odometry, self.track)
 
     def turn_by(self, learned: Track | None) -> None:
-        """Use the effective track `learned` from now on, or the configured one if it is None."""
+        """Use the effective track `learned` from now on. None means the configured track."""
         self.track = self._kinematics.track * (learned or CONFIGURED).share
         """Effective track in use, m."""
         self.columns = columns(self._declared, self._kinematics, learned)
@@ -121,7 +123,7 @@ class ErrorModel:
 def columns(
     odometry: OdometryConfig, kinematics: Kinematics, learned: Track | None = None
 ) -> tuple[Column, ...]:
-    """Return a column (see `Column`) for each uncertain parameter.
+    """Return the effects of all uncertain parameters on a step: one `Column` for each parameter.
 
     The equations of a step are
 
@@ -135,8 +137,9 @@ def columns(
     scale and the slip share one column. The standard deviations of these parameters come from
     `odometry`. A parameter with a standard deviation of 0 has no column.
 
-    If `learned` is not None, the last column is for the error of the learned track. The numbers in
-    this column are 0 while the configured track is in use.
+    If `learned` is not None, the last column is for the error of the learned track. While a learned
+    track is in use, the numbers in the column of m_L are 0. While the configured track is in use,
+    the numbers in the last column are 0.
     """
     used = learned or CONFIGURED
     track = kinematics.track * used.share
@@ -179,14 +182,14 @@ class TwistUncertainty:
       uncertain as the pose.
     - The sums are over the uncertain parameters of the kinematics (c_1 to c_4: see `columns`).
 
-    If the wheels slip, the variances are multiplied by `SLIPPING`. If the robot rests, only a
-    motion that is too small for the encoders remains uncertain.
+    If the wheels slip, `slipping` multiplies the variances by `SLIPPING`. For a robot at rest,
+    `at_rest` allows only a motion that is too small for the encoders.
     """
 
     def __init__(self, model: ErrorModel, counts: int) -> None:
         """Start with a feedback period of `PERIOD`.
 
-        `counts` is the number of encoder counts per revolution of a wheel, 0 if unknown.
+        `counts` is the number of encoder counts per revolution of a wheel; 0 if it is unknown.
         """
         self._model = model
         self._count = math.tau / counts if counts else 0.0
@@ -196,7 +199,10 @@ class TwistUncertainty:
         self.bend()
 
     def bend(self) -> None:
-        """Use the present effective track of the error model from now on."""
+        """Use the present effective track of the error model from now on.
+
+        Call this after each change of the track.
+        """
         self._to_angular = self._model.radius**2 / self._model.track**2 / 12
 
     def of(self, twist: Twist, dt: float, step: float = 0.0) -> TwistVariances:
@@ -204,12 +210,12 @@ class TwistUncertainty:
 
         Args:
             twist: the twist that the line reports, m/s and rad/s.
-            dt: the time since the line before, s; 0 if it is unknown.
-            step: the quantization step of the wheel speeds in the feedback lines, rad/s; 0 if it
-                is unknown.
+            dt: the time since the previous feedback line, s; 0 if it is unknown.
+            step: the quantization step of the wheel speeds in the feedback lines, rad/s; 0 if it is
+                unknown.
         """
         if dt > 0.0:
-            # A late line, or one after lost lines, does not mean a longer period.
+            # A single late line, or a line after lost lines, does not mean a longer period.
             self._period += SMOOTHED * (min(dt, 2 * self._period) - self._period)
         model, period, linear, angular = self._model, self._period, twist.linear, twist.angular
         quantum = max(DECIMAL, self._count / period, step) ** 2
@@ -229,9 +235,10 @@ class TwistUncertainty:
         )
 
     def at_rest(self, seconds: float, step: float = 0.0) -> TwistVariances:
-        """Return the variances of a robot whose wheels have reported zero speed for `seconds` s.
+        """Return the variances of the twist of a robot at rest.
 
-        `step` is the quantization step of the wheel speeds, rad/s; 0 if unknown.
+        `seconds` is the time for which all wheels have reported zero speed, s. `step` is the
+        quantization step of the wheel speeds, rad/s; 0 if it is unknown.
         """
         quantum = (max(self._count, step * self._period) / seconds) ** 2
         return TwistVariances(
@@ -241,7 +248,7 @@ class TwistUncertainty:
         )
 
     def slipping(self, variances: TwistVariances) -> TwistVariances:
-        """Return all variances times `SLIPPING`, but at most `MOST`, because the wheels slip.
+        """Return `variances` times `SLIPPING`, but at most `MOST`. Use this while the wheels slip.
 
         The lateral variance grows too, because the wheels may slip in any direction.
         """
@@ -252,8 +259,8 @@ class TwistUncertainty:
         )
 
     def with_gyro(self, variances: TwistVariances, angular: float) -> TwistVariances:
-        """Return `variances`, but with `angular` as the variance of the turn rate.
+        """Return `variances`, but with the variance of the turn rate replaced by `angular`.
 
-        `angular` is the variance of a gyro's rate, rad2/s2.
+        `angular` is the variance of the turn rate that a gyro measured, rad2/s2.
         """
         return TwistVariances(variances.linear, variances.lateral, min(max(LEAST, angular), MOST))

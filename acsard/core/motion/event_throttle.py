@@ -18,14 +18,14 @@ BURST = 5
 presses buttons does not need more."""
 
 MOST = 8
-"""Largest number of event kinds that one log line lists, and also the largest number of client
-names. All further kinds or names appear as "others"."""
+"""Largest number of event kinds that one log line lists, and largest number of client names in it.
+All further kinds or names appear as "others"."""
 
 LEVELS: tuple[Level, ...] = get_args(Level)
 
 
 class _Held:
-    """Events of one name that wait for their common log line."""
+    """The events of one name that wait for their common log line."""
 
     def __init__(self) -> None:
         self.count, self.news, self._level = 0, False, 0
@@ -52,20 +52,22 @@ class _Held:
 
 
 class EventThrottle:
-    """Decides which events become log lines now, and holds the events that must wait."""
+    """Decides which events are logged now, and keeps the events that must wait."""
 
     def __init__(self) -> None:
         self._held: dict[EventName, _Held] = {}
         self._number = 0
         """Number of events of all names so far."""
         self._free_ns: dict[EventName, int] = {}
-        """For each event name, the monotonic time at which the next line would be on schedule, ns.
-        Each written line moves this time on by one second, so a burst moves it into the future."""
+        """For each event name, the monotonic time at which the schedule has the next line, ns. Each
+        written line moves this time on by one second, so a burst moves it into the future."""
 
     def lines(self, events: list[Event], now_ns: int) -> tuple[Event, ...]:
-        """Add `events`, and return the events to log now. One returned event may stand for several.
+        """Return the events to log now.
 
-        All other events are held, and a later call returns them.
+        One returned event may stand for several events of the same name. `events` are the new
+        events, and `now_ns` is the monotonic time, ns. A later call returns the events that must
+        wait.
         """
         if not (events or self._held):
             return ()
@@ -83,12 +85,12 @@ class EventThrottle:
         return tuple([self._held.pop(name).line() for name in told])
 
     def _may(self, name: EventName, news: bool, now_ns: int) -> bool:
-        """Return whether a line of this name may be written now; if so, count it as written.
+        """Return whether a line of this name may be written now. If so, count it as written.
 
         The schedule has one line of each name per second. If `news` is true (the line does more
-        than repeat earlier events), up to `BURST` lines may be written at once, ahead of the
-        schedule. So may the lines of a stop even if the robot is already stopped, because the time
-        of each stop matters.
+        than repeat earlier events), up to `BURST` lines may be written ahead of the schedule. The
+        lines of a stop may too, even if the robot is already stopped, because the time of each stop
+        matters.
         """
         free_ns, at_once = self._free_ns.get(name, now_ns), news or name == "stop"
         if free_ns > now_ns + (BURST - 1 if at_once else 0) * NS_PER_S:
@@ -98,13 +100,14 @@ class EventThrottle:
 
 
 NUMBERED = re.compile(r"\A\d+ (?:x [^:;]*|times)(?:; the last)?: ")
-"""Matches the start of the text of a log line that combines several events."""
+"""Pattern for the start of the text of a log line that combines several events."""
 
 
 def together(before: Event, line: Event) -> Event:
-    """Return one log line for two lines of the same event name, `before` and the later `line`.
+    """Return one log line that replaces two lines of the same event name.
 
-    The result has the total number of events, and the text of `line`.
+    `line` is later than `before`. The result has the total number of events, the higher level, the
+    names of all clients, and the text of `line`.
     """
     count, last = before.count + line.count, NUMBERED.sub("", line.text, count=1)
     level = max(before.level, line.level, key=LEVELS.index)
@@ -121,7 +124,10 @@ def _count(counts: Counter[str], what: str, times: int) -> None:
 
 
 def _numbered(counts: Counter[str]) -> str:
-    """Return a text like `12 x stale, 1 x not_finite`; a single event has no number."""
+    """Return the kinds with their numbers of events, like `12 x stale, 1 x not_finite`.
+
+    If there is only one event, return its kind without a number.
+    """
     if counts.total() == 1:
         return next(iter(counts))
     return ", ".join(f"{times} x {what}" for what, times in counts.most_common())

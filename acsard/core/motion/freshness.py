@@ -1,33 +1,13 @@
 """Decides whether a stamped command is fresh, although the sender's clock is not synchronized.
 
-The stamp is the time of sending by the sender's clock. This module subtracts the stamp from the
-time of arrival by our clock, and calls the difference the delay. It is the true delay plus the
-unknown offset of the two clocks. The offset cancels out in a comparison with the minimum of all
-delays. A command is stale if its delay exceeds the minimum by more than the timeout of its source,
-or if its stamp is earlier than that of an accepted command. The clock of a sender is in one of two
-states:
+The delay of a command is its time of arrival by the daemon's clock minus its stamp. This is the
+true delay plus the unknown offset of the two clocks. The offset cancels out if a delay is compared
+with the minimum of all delays. A command is stale if its delay exceeds the minimum by more than the
+timeout of its source, or if its stamp is earlier than that of an accepted command.
 
-    new      The minimum is not known. Delays fall while a backlog arrives. Therefore a test of
-             several commands (the proof) must first show that the delays no longer fall.
-    known    The minimum is trusted until a proof shows another minimum.
-
-There are two kinds of clocks. A *steady* clock is never adjusted. Our client, tools and web page
-declare a steady clock with `"steady": true`. If a command with such a stamp looks late, the command
-is really late, and it stays refused.
-
-A *foreign* clock may be set or slewed, which looks like a change of the delay. If the new delay
-proves constant, it is trusted, and the sender must send a zero again. A congested network can look
-the same. Therefore the sum of the rises of the delay that are trusted in this way is bounded by a
-budget: `FORGIVE_NS`, refilled by 1 s a minute. If the stamps of more than one command go back or
-stand still, the adjustment of the clock is visible and costs no budget, because no network can
-cause that. After a pause of the sender, a rise is trusted even beyond the budget, because the clock
-may have been set by any amount. A pause is longer than 2 s, and longer than the timeout of the
-source.
-
-Sequence numbers show which commands the network lost, repeated or delivered in another order. Lost
-commands do not count as a pause, and a repeated command changes nothing.
-
-Times of arrival are measured by the monotonic clock, because our own wall clock may be set.
+The delays of a new sender must first prove constant. A later change of the delay is trusted only
+within limits, because a congested network looks like a clock that was set. The comment below gives
+the rules.
 """
 
 from __future__ import annotations
@@ -36,9 +16,33 @@ from typing import Literal
 
 from acsard.core.values import NS_PER_S, Command
 
+# The clock of a sender is in one of two states:
+#
+#     new      The minimum is not known. Delays fall while a backlog arrives. Therefore a test of
+#              several commands (the proof) must first show that the delays no longer fall.
+#     known    The minimum is trusted until a proof shows another minimum.
+#
+# There are two kinds of clocks. A *steady* clock is never adjusted. The client, the tools and the
+# web page of acsard declare a steady clock with `"steady": true`. If a command with such a stamp
+# looks late, the command is really late, and it stays refused.
+#
+# A *foreign* clock may be set or slewed, which looks like a change of the delay. If the new delay
+# proves constant, it is trusted, and the sender must send a zero again. A congested network can
+# look the same. Therefore the sum of the rises of the delay that are trusted in this way is bounded
+# by a budget: `FORGIVE_NS`, refilled by 1 s a minute. If the stamps of more than one command go
+# back or stand still, the adjustment of the clock is visible and costs no budget, because no
+# network can cause that. After a pause of the sender (`GAP_NS`), a rise is trusted even beyond the
+# budget, because the clock may have been set by any amount.
+#
+# Sequence numbers show which commands the network lost, repeated or delivered in another order.
+# Lost commands do not count as a pause, and a repeated command changes nothing.
+#
+# Times of arrival are measured by the monotonic clock, because the daemon's own wall clock may be
+# set.
+
 DRIFT = 5000
-"""Number of seconds in which two clocks may drift apart by 1 s. This is twice the drift of a bad
-crystal."""
+"""Number of seconds in which two clocks may drift apart by 1 s. A bad crystal takes twice as
+long."""
 
 FORGET_NS = 250 * NS_PER_S
 """Pause of a sender, ns, after which its clock counts as new, because the clock may have drifted by
@@ -49,43 +53,44 @@ KEEP_NS = 3600 * NS_PER_S
 """Silence of a sender, ns, after which its clock is forgotten to save memory."""
 
 EARLY_NS = NS_PER_S // 20
-"""Largest fall of the delay that can be jitter, ns. A larger fall means that a backlog has ended or
-that a clock was set."""
+"""Largest decrease of the delay that can be jitter, ns. After a larger decrease, a backlog has
+ended or a clock was set."""
 
 WAVER_NS = NS_PER_S
-"""Largest rise of the delay that can be jitter, ns. A larger rise means that the network held
-commands back."""
+"""Largest increase of the delay that can be jitter, ns. After a larger increase, the network has
+held commands back."""
 
 EVEN, CREPT = 200, 20
-"""Divisors. A proof (a test whether the delay is constant) compares the minimum delays of its two
-halves. The minima may differ by the duration of the proof divided by `EVEN`, or divided by `CREPT`
-if the delay creeps (see `CREEP`). The centers of the halves are half the duration apart, so the
-delay may change by 10 ms per second, or by 100 ms per second if it creeps. NTP slews a clock by up
-to 83 ms per second."""
+"""Divisors for a proof (a test whether the delay is constant), which compares the minimum delays of
+its two halves. The two minima may differ by the duration of the proof divided by `EVEN`, or divided
+by `CREPT` if the delay creeps (see `CREEP`). The centers of the halves are half the duration apart,
+so the delay may change by 10 ms per second, or by 100 ms per second if it creeps. NTP slews a clock
+by up to 83 ms per second."""
 
 CREEP, JITTER_NS = 10, NS_PER_S // 200
-"""A delay creeps if its change between two commands is at most the time between them divided by
-`CREEP`, plus `JITTER_NS`. Otherwise the delay jumps."""
+"""A delay creeps if it changes little between two commands: by at most the time between the two
+commands divided by `CREEP`, plus `JITTER_NS`. Otherwise the delay jumps."""
 
 LONGEST_PROOF_NS = 2 * NS_PER_S
 """Nominal duration of a proof (a test whether the delay is constant), ns. The timeout of the source
 applies instead if it is shorter."""
 
 JUMP_PROOF_NS = 3 * NS_PER_S // 2
-"""Shortest time for which the delay must be constant after it has jumped, ns, before it is trusted.
-The cause of the jump is more likely a backlog that arrives in bursts than a clock that was set."""
+"""Shortest time for which the delay must be constant after a jump before it is trusted, ns. The
+cause of a jump is more likely a backlog that arrives in bursts than a clock that was set."""
 
 GAP_NS = 2 * NS_PER_S
-"""A silence of a sender that is longer than this, ns, is a pause. If the timeout of the source is
-longer, only a silence longer than the timeout is a pause, because the sender need not send more
-often. A pause ends a test of the delay. If both stamps and arrival times show the pause, a foreign
-clock (one that may be adjusted) may have been set by any amount meanwhile."""
+"""Longest silence of a sender that is not a pause, ns. If the timeout of the source is longer, the
+timeout applies instead, because the sender need not send more often. A pause ends a test of the
+delay. If both stamps and arrival times show the pause, a foreign clock (one that may be adjusted)
+may have been set by any amount during the pause."""
 
 STANDS_NS = 10_000
-"""A clock was set back if two commands arrive more than `APART_NS` apart, but the second stamp is
-later than the first by at most this, ns. Zenoh's own clock never goes back. If the wall clock was
-set back, Zenoh's clock advances by a fraction of a microsecond for each message until the wall
-clock has caught up."""
+"""Largest step of the stamps, ns, at which a clock seems to have been set back: the stamp of a
+command is later than that of the previous command by at most this, although the commands arrived
+more than `APART_NS` apart. Zenoh's own clock never goes back. If the wall clock was set back,
+Zenoh's clock advances by a fraction of a microsecond for each message until the wall clock has
+caught up."""
 
 APART_NS = NS_PER_S // 500
 """Commands that arrive within this time of each other, ns, may have been sent together."""
@@ -96,9 +101,10 @@ waits for the last command of the queue, which has the smallest delay. No sender
 1000 commands a second."""
 
 FORGIVE_NS, FORGIVE_RATE = NS_PER_S, 60
-"""Budget, ns, for delay rises of a foreign clock (one that may be adjusted) that are trusted
-without a visible adjustment. It is refilled by one second in `FORGIVE_RATE` seconds. While commands
-are late, the budget may rise above `FORGIVE_NS`, so that no sender is refused forever."""
+"""Budget for increases of the delay that are trusted without a visible adjustment of the clock, ns.
+The budget applies to foreign clocks (clocks that may be adjusted). It is refilled by one second in
+`FORGIVE_RATE` seconds. While commands are late, the budget may rise above `FORGIVE_NS`, so that no
+sender is refused forever."""
 
 MAX_CLOCKS = 1024
 """Largest number of clocks that are kept. If there are more, the daemon usually forgets the clock
@@ -110,7 +116,8 @@ Verdict = Literal["fresh", "first", "unproven", "stale", "set"]
 """The verdict on a command.
 
 - `fresh`: the command is accepted.
-- `stale`: the command is refused, because it is late or superseded by a newer one.
+- `stale`: the command is refused, because it is late or repeated, or because a newer command was
+  accepted before it.
 - `first`: the command begins the test of a new clock, and does not drive the robot.
 - `unproven`: the test of a new clock is not over, so the command does not drive the robot.
 - `set`: the command is accepted, but the clock seems to have been set. The sender must send a zero
@@ -119,16 +126,11 @@ Verdict = Literal["fresh", "first", "unproven", "stale", "set"]
 
 
 class _Proof:
-    """A test whether the delays have become constant, starting with one command.
+    """A test whether the delays of a clock have become constant. It starts with one command.
 
     The test compares the minimum delays of successive intervals. An interval is called a half,
     because it lasts half of the nominal duration of the test. The delays are constant if the minima
-    of the first two halves differ by little enough (`EVEN`, `CREPT`). Otherwise the test goes on:
-
-    - For a known clock (`again`), it restarts, and the second half becomes the first one.
-    - For a new clock, it compares the last eight halves in four pairs. The minima of the pairs must
-      agree within the same limit, or differ by at most `EARLY_NS` without a trend. A trend means
-      that the minima only fall, as while a backlog arrives, or only rise, as while a queue grows.
+    of the first two halves differ by little enough (`EVEN`, `CREPT`). Otherwise the test goes on.
     """
 
     def __init__(
@@ -140,13 +142,13 @@ class _Proof:
         self._length_ns, self._share, self._again = needed_ns // 2, share, again
         self._begun_ns = self.last_ns = at_ns
         self._halves: list[tuple[int, int]] = []
-        """Start (monotonic) and minimum delay of the latest halves, ns."""
+        """Monotonic start, ns, and minimum delay, ns, of each of the latest halves."""
 
     def add(self, delay: int, at_ns: int, timeout_ns: int) -> Literal["proven", "open", "failed"]:
-        """Add a command, and return whether the delays are proven constant.
+        """Add a command to the test, and return whether the delays are proven constant.
 
         "open" means that the test goes on. "failed" means that a new test must begin with this
-        command. A command whose delay exceeds the lowest delay by more than the timeout cannot
+        command. A command whose delay exceeds the lowest delay by more than `timeout_ns` cannot
         complete the test.
         """
         if not -EARLY_NS <= delay - self._first <= WAVER_NS:
@@ -168,11 +170,16 @@ class _Proof:
         lasted = at_ns - self._halves[0][0]
         if count == 2:
             even = abs(minima[1] - minima[0]) <= lasted // self._share
+            # The test of a known clock restarts, and its second half becomes the first one.
             if self._again:
                 del self._halves[0]
                 if not even:
                     self.least = self._first = minima[1]
             return even
+        # The test of a new clock compares the last eight halves in four pairs. The minima of the
+        # pairs must agree within the same limit, or differ by at most `EARLY_NS` without a trend. A
+        # trend means that the minima only fall, as while a backlog arrives, or only rise, as while
+        # a queue grows.
         if count < 8:
             return False
         del self._halves[0]
@@ -183,17 +190,18 @@ class _Proof:
 
 
 class _Clock:
-    """One clock of a sender, and the estimated minimum delay of the commands that it stamped."""
+    """One clock of a sender, with the estimated minimum delay of the commands that it stamped."""
 
     def __init__(self, at_ns: int) -> None:
         self.state: State = "new"
         self.at_ns = at_ns
-        """Arrival of the last command, monotonic ns. Repeated commands do not count."""
+        """Monotonic time at which the last command of this clock arrived, ns. Repeated commands do
+        not count."""
         self.gap_ns = GAP_NS
         """Longest silence that is not a pause, ns: `GAP_NS`, or the longest timeout of the sources
         to which the sender has sent commands, if that is longer."""
         self.forgiven_ns = 0
-        """Part of the last trusted rise of the delay for which no adjustment of the clock was
+        """Part of the last trusted increase of the delay for which no adjustment of the clock was
         visible, ns."""
         self._stamp_ns = 0
         self._delay = 0
@@ -202,21 +210,22 @@ class _Clock:
         self._least = 0
         """Minimum of the trusted delays, ns. It rises with time by the largest possible drift."""
         self._early = 0
-        """Sum of the recent falls of `_least`, ns. It decreases by 1 ns for each 10 ns that
+        """Sum of the recent decreases of `_least`, ns. It falls by 1 ns for each 10 ns that
         pass."""
         self._floor: int | None = None
         """Lowest delay of a steady clock (one that is never adjusted), ns. It rises with time by
-        the largest possible drift. It is None before the first command, and for a clock that may be
-        adjusted."""
+        the largest possible drift. It is None before the first command, and always None for a clock
+        that may be adjusted."""
         self._before: int | None = None
-        """Delay before the first visible adjustment since the last command that was on time, ns;
-        None if there was no visible adjustment."""
+        """Delay before the first visible adjustment of the clock, ns; None if no adjustment is
+        visible. Adjustments before the last command that was on time do not count."""
         self._shown = 0
-        """Sum of the visible adjustments since the last command that was on time, ns."""
+        """Sum of the visible adjustments of the clock since the last command that was on time,
+        ns."""
         self._doubted: tuple[int, int, int] | None = None
-        """An adjustment that the next command must confirm, because the network may have swapped or
-        repeated a command. The tuple has the delay before the adjustment, the size of the
-        adjustment, and the stamp before the adjustment, all in ns."""
+        """An adjustment of the clock that the next command must confirm, because the network may
+        have swapped or repeated a command. The tuple has the delay before the adjustment, the size
+        of the adjustment, and the stamp before the adjustment, all in ns."""
         self._paused = False
         """Whether the sender has paused since its last command that was on time, so that its clock
         may have been set."""
@@ -228,11 +237,14 @@ class _Clock:
 
     @property
     def was_known(self) -> bool:
-        """Whether a command of this clock has been accepted since its last pause of `FORGET_NS`."""
+        """Whether a command of this clock was accepted since its last pause of `FORGET_NS`."""
         return self._accepted is not None
 
     def judge(self, command: Command, stamp_ns: int, timeout_ns: int) -> Verdict:
-        """Return the verdict on the next command of this clock, and update the minimum delay."""
+        """Return the verdict on the next command of this clock, and update the minimum delay.
+
+        `stamp_ns` is the stamp of the command, and `timeout_ns` the timeout of its source, ns.
+        """
         at_ns, delay = command.arrived_ns, command.arrived_ns - stamp_ns
         silence, departed = at_ns - self.at_ns, stamp_ns - self._stamp_ns
         number = -1 if command.sequence is None else command.sequence
@@ -381,12 +393,11 @@ class _Clock:
         return "stale"
 
     def _forgive(self, proof: _Proof, at_ns: int) -> bool:
-        """Trust the delay that `proof` found constant, if the rules below allow that.
+        """Return whether the constant delay that `proof` found may be trusted. If so, trust it.
 
-        Return whether the rules allow it. A fall of the delay is always allowed. A rise is allowed
-        if the sender has paused, if the budget covers the rise, or if a visible adjustment of the
-        clock accounts for the rise. A visible adjustment and the budget may each account for a part
-        of the rise.
+        A decrease of the delay is always trusted. An increase is trusted if the sender has paused,
+        if the budget covers the increase, or if a visible adjustment of the clock accounts for it.
+        A visible adjustment and the budget may each account for a part of the increase.
         """
         self._accrue(at_ns, FORGET_NS)
         hidden = proof.least - self._least
@@ -400,7 +411,7 @@ class _Clock:
         return True
 
     def _accrue(self, at_ns: int, most_ns: int) -> None:
-        """Add to the budget for the time since the last call, up to a budget of `most_ns`."""
+        """Refill the budget for the time since the last call, but to at most `most_ns`."""
         grown = (at_ns - self._budget_at_ns) // FORGIVE_RATE
         self._budget, self._budget_at_ns = min(self._budget + grown, most_ns), at_ns
 
@@ -414,26 +425,28 @@ class _Clock:
 
 
 class Freshness:
-    """Judges commands. The state is one `_Clock` for each clock that stamps commands."""
+    """Judges whether commands are fresh. It keeps the state of each clock that stamps commands."""
 
     def __init__(self) -> None:
         self._clocks: dict[str, _Clock] = {}
         self._newcomers: dict[str, _Clock] = {}
-        """Clocks that may be adjusted and have stamped no accepted command yet. They are forgotten
-        after a pause."""
+        """Clocks that may be adjusted and have not stamped an accepted command yet. They are
+        forgotten after a pause."""
         self._unproved: dict[str, _Clock] = {}
-        """Clocks that are never adjusted and have stamped no accepted command yet. They are kept
-        for `KEEP_NS` of silence, because their lowest delay is valid from the first command on."""
+        """Clocks that are never adjusted and have not stamped an accepted command yet. They are
+        kept for `KEEP_NS` of silence, because their lowest delay is valid from the first command
+        on."""
         self._numbers: dict[str, tuple[int, int]] = {}
-        """For each sender with sequence numbers but without stamps, the last number and its
-        monotonic time of arrival, ns."""
+        """Last sequence number of each sender that numbers its commands but does not stamp them,
+        with its monotonic time of arrival, ns."""
         self.forgiven_ns = 0
-        """Sum of the delay rises, ns, that were trusted without a visible adjustment."""
+        """Total increase of delays that was trusted without a visible adjustment of a clock, ns."""
 
     def judge(self, command: Command, timeout_ns: int) -> Verdict:
         """Return the verdict on a command, and remember its stamp and sequence number.
 
-        A command without a stamp is stale only if its sequence number is out of order.
+        `timeout_ns` is the timeout of the command's source, ns. A command without a stamp is stale
+        only if its sequence number is out of order.
         """
         if command.stamp_ns is None:
             return self._in_order(command, max(GAP_NS, timeout_ns))
@@ -453,7 +466,7 @@ class Freshness:
         return verdict
 
     def _in_order(self, command: Command, gap_ns: int) -> Verdict:
-        """Judge a command without a stamp by its sequence number.
+        """Return the verdict on a command without a stamp, according to its sequence number.
 
         After a silence of more than `gap_ns` ns, the numbers of a sender may restart.
         """
@@ -470,11 +483,9 @@ class Freshness:
         return "fresh"
 
     def _forget(self, now_ns: int) -> None:
-        """Forget clocks that were silent for long, and one more if more than `MAX_CLOCKS` remain.
-
-        The number is limited, because a recording begins with all clocks, and the control loop
-        writes them in one step.
-        """
+        """Forget clocks that were silent for long, and one more if `MAX_CLOCKS` is exceeded."""
+        # The number of clocks is limited, because a recording begins with all clocks, and the
+        # control loop writes all of them in one step.
         limits = (self._newcomers, GAP_NS), (self._unproved, KEEP_NS), (self._clocks, KEEP_NS)
         for held, silent_ns in limits:
             while held and now_ns - _oldest(held).at_ns > max(silent_ns, _oldest(held).gap_ns):
@@ -488,8 +499,6 @@ class Freshness:
 
 
 def _oldest(held: dict[str, _Clock]) -> _Clock:
-    """Return the clock that has been silent longest.
-
-    It is the first one, because each command moves its clock to the end.
-    """
+    """Return the clock that has been silent longest."""
+    # Each command moves its clock to the end of the dictionary.
     return next(iter(held.values()))

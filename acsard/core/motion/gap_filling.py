@@ -1,16 +1,13 @@
 """Fills gaps in the feedback: estimates the motion of the wheels in a gap, and its uncertainty.
 
-`Rolling` computes the angles that the wheels rolled since the last plausible feedback line. (An
-implausible line is a line that `sanity.py` or `Confirmation` rejects.) `Rolling` uses the first of
-these sources that exists: the encoder counts in the line, whole counts that are recovered from the
-speeds in the line, or these speeds times the time. It uses no time and no count twice, and leaves
-none out. In a gap that no line covers, `Rolling` assumes the speed before the gap for the first
-half of the gap, and the speed after the gap for the second half. If the motors were commanded to
-rest in the gap, the speed before the gap is assumed only until that command. The motion during
-implausible lines, and in the gaps before them, is computed with the next plausible line.
+`Rolling` computes the angles that the wheels rolled since the last plausible feedback line. A line
+is implausible if `sanity.py` or `Confirmation` rejects it. `Rolling` uses the first of these
+sources that exists: the encoder counts in the line, whole counts that are recovered from the speeds
+in the line, or these speeds times the time. It uses each time and each count exactly once.
 
-A damaged line after a gap would falsify the motion of the whole gap. `Confirmation` therefore holds
-a line with a doubtful speed until other lines confirm this speed or refute it.
+In a gap that no line covers, `Rolling` assumes the speed before the gap for the first half of the
+gap, and the speed after the gap for the second half. If the motors were commanded to rest in the
+gap, the speed before the gap is assumed only until that command.
 """
 
 from __future__ import annotations
@@ -30,10 +27,10 @@ from acsard.core.motion.sanity import SLACK
 from acsard.core.values import REST, Twist, WheelSpeeds
 
 MAX_LOST_S, MAX_LOST = 0.05, 1
-"""Limits for consecutive implausible lines without encoder counts: `MAX_LOST_S` for their total
-duration, s, and `MAX_LOST` for their number. If the lines exceed both limits, the motion of the
-robot during them is unknown. Otherwise, the robot is assumed to have moved at the speed of the next
-plausible line."""
+"""Limits for consecutive implausible feedback lines without encoder counts: `MAX_LOST_S` for their
+total duration, s, and `MAX_LOST` for their number. If the lines exceed both limits, the motion of
+the robot during these lines is unknown. Otherwise, the robot is assumed to have moved at the speed
+of the next plausible line."""
 
 NOWHERE = (0.0, 0.0, 0.0, 0.0)
 
@@ -45,11 +42,12 @@ SPAN = 0.2
 """Time over which the deviation from constant acceleration is measured, s."""
 
 FIRST, MOST = 4.0, 300.0
-"""Weights in the mean of the squared deviations. Each measured span of `SPAN` s has the weight 1,
-and `GUESS` has the weight `FIRST`. The total weight is limited to `MOST` (a minute of driving)."""
+"""Weights in the mean of the squared deviations from constant acceleration. Each measured span of
+`SPAN` s has the weight 1, and `GUESS` has the weight `FIRST`. The total weight is limited to `MOST`
+(a minute of driving)."""
 
 GROWTH = 5
-"""The variance of the motion in a gap grows with this power of the gap's duration (`Gaps`)."""
+"""Exponent: the variance of the motion in a gap grows with this power of the gap's duration."""
 
 
 class Rolled(Struct, frozen=True, gc=False):
@@ -63,30 +61,30 @@ class Rolled(Struct, frozen=True, gc=False):
     least one angle that is not zero. The items are in the order of time."""
     turned: Motors
     """Angles that are computed from encoder counts, rad. The odometry adds this motion to the pose
-    before that in `pieces`."""
+    before the motion in `pieces`."""
     seen: Motors
-    """Angles in the last `seconds` s, rad. If they come from speeds, they have the rounding errors
-    of these speeds."""
+    """Angles that the wheels rolled in the last `seconds` s, rad. Angles that were computed from
+    speeds have the rounding errors of these speeds."""
     seconds: float
     """Duration of the motion `seen`, s."""
     bridged: float
-    """Part of `seconds`, s, that no feedback line covers. The speeds in this part were assumed."""
+    """Part of `seconds` that no feedback line covers, s. The speeds in this part are assumed."""
     unknown: float
-    """Time in addition to `seconds` in which the motion of the robot is unknown, s."""
+    """Time in addition to `seconds` in which the motion of the wheels is unknown, s."""
     known: float
     """Total duration of the motion in `pieces` and `turned`, s; 0 if a part of the motion is
     unknown."""
     doubtful: float = 0.0
-    """Time in the gap from the command to rest until the MCU's watchdog stops the motors, s. The
-    wheels moved on in this time if the MCU did not receive the command."""
+    """Time in the gap from the command to rest until the MCU's watchdog stops the motors, s. If the
+    MCU did not receive the command, the wheels moved on in this time."""
 
 
 class Rolling:
     """Computes the angles that the wheels rolled from one plausible feedback line to the next.
 
     A feedback line is a line from the board with the speeds of the wheels. It is plausible unless
-    `sanity.py` or `Confirmation` rejects it. The motion during rejected lines is computed with the
-    next plausible line.
+    `sanity.py` or `Confirmation` rejects it. The motion during rejected lines, and in the gaps
+    before these lines, is computed with the next plausible line.
     """
 
     def __init__(self, quiet: float = math.inf) -> None:
@@ -98,7 +96,7 @@ class Rolling:
         self.forget()
 
     def forget(self) -> None:
-        """Forget the implausible feedback lines that came after the last plausible one."""
+        """Forget the implausible feedback lines since the last plausible line."""
         self._lost = self._gap = self._bridged = self._counted = self._driven = 0.0
         """Durations, s.
 
@@ -114,16 +112,16 @@ class Rolling:
     def skipped(self) -> float:
         """Total time of the implausible feedback lines without encoder counts, s.
 
-        Only the lines after the last plausible line count. The gaps before these lines are
-        included.
+        Only the lines after the last plausible line count. The total includes the gaps before these
+        lines.
         """
         return self._lost + self._gap + self._bridged
 
     def skip(self, line: Feedback) -> None:
-        """Record an implausible feedback line.
+        """Record an implausible feedback line, so that the next call of `take` includes its motion.
 
-        If the line has encoder counts, they are added to the motion. Otherwise, the time that the
-        line covers is recorded.
+        If the line has encoder counts, the motion comes from these counts. Otherwise only the time
+        that the line covers is recorded.
         """
         self._skipped += 1
         if line.turned is None:
@@ -142,6 +140,8 @@ class Rolling:
     def take(self, line: Feedback, before: WheelSpeeds) -> Rolled:
         """Return the angles that the wheels rolled since the last plausible feedback line.
 
+        The result includes the motion during the implausible lines since then.
+
         Args:
             line: the present feedback line, which is plausible.
             before: the wheel speeds in the last plausible feedback line, rad/s.
@@ -153,8 +153,8 @@ class Rolling:
             moved = seen if line.counted is None else line.counted
             arcs = () if moved == NOWHERE else (moved,)
             return Rolled(arcs, NOWHERE, seen, dt, 0.0, 0.0, dt)
-        # For implausible lines without counts, assume the speed of this line, unless they last too
-        # long.
+        # For implausible lines without counts, assume the speed of this line, unless those lines
+        # last too long.
         guessed = self._lost <= MAX_LOST_S or self._skipped <= MAX_LOST
         lost, unknown = (self._lost, 0.0) if guessed else (0.0, self._lost)
         turned, filled, unknown = self._turned, self._bridged, unknown + self._gap
@@ -192,13 +192,14 @@ def _some(*pieces: Motors) -> tuple[Motors, ...]:
 
 
 def _until_rest(before: Motors, driven: float, after: Motors, bridged: float) -> Motors:
-    """Return the angles of the wheels in a gap in which rest was commanded after `driven` s, rad.
+    """Return the wheel angles, rad, in a gap in which the motors were commanded to rest.
 
-    `before` and `after` are the speeds around the gap, rad/s, and `bridged` is its duration, s. A
-    board that computes its speeds since its last reply reports the means over the gap. These means
-    are large enough for the motion until the command to rest. If a speed is smaller, it is the
-    speed at the end of the gap.
+    `before` and `after` are the wheel speeds before and after the gap, rad/s. `driven` is the time
+    from the start of the gap to the command, s, and `bridged` is the duration of the gap, s.
     """
+    # A board that computes its speeds since its last reply reports the means over the gap. These
+    # means are large enough for the motion until the command to rest. A smaller speed is the speed
+    # at the end of the gap.
     angles = []
     for old, new in zip(before, after, strict=True):
         until, whole = old * driven, new * bridged
@@ -209,23 +210,22 @@ def _until_rest(before: Motors, driven: float, after: Motors, bridged: float) ->
 
 
 def plus(a: Motors, b: Motors) -> Motors:
-    """Return the sums, wheel by wheel, of two sets of angles."""
+    """Return the sums of two sets of wheel angles, wheel by wheel."""
     return a[0] + b[0], a[1] + b[1], a[2] + b[2], a[3] + b[3]
 
 
 def times(a: Motors, factor: float) -> Motors:
-    """Return the angles or speeds of all wheels times a factor."""
+    """Return the angles or speeds of all wheels, multiplied by `factor`."""
     return a[0] * factor, a[1] * factor, a[2] * factor, a[3] * factor
 
 
 class Confirmation:
-    """Holds back a feedback line that reports a doubtful speed and covers more time than usual.
+    """Holds back a feedback line that follows a gap and reports a doubtful speed.
 
-    After a gap, one damaged line would falsify the motion of the whole gap. Damage can be detected,
-    because it changes one wheel alone, while motion changes the speeds of both wheels of a side
-    alike. Let A be the largest angle by which a damaged line of the usual duration can falsify the
-    motion of a wheel. Two lines agree if no wheel alone has changed its speed so much that this
-    change could falsify the motion by more than A.
+    After a gap, one damaged line would falsify the motion of the whole gap. Damage changes the
+    speed of one wheel alone, while motion changes the speeds of both wheels of a side alike. Two
+    lines agree if no wheel alone has changed its speed by more than a limit, which is smaller after
+    a longer gap.
 
     A line of the usual duration is used immediately. A line that covers more time is used
     immediately if it agrees with the last line that was used. Otherwise it is held, and the next
@@ -234,8 +234,8 @@ class Confirmation:
     - If the next line agrees with the held line, both are used, because one wheel really changed
       its speed alone.
     - If the next line agrees with the last line that was used, the held line is dropped.
-    - If the next line agrees with neither, both are held, and the third line decides: a line that
-      differs much more from the other two than they do from each other is dropped.
+    - If the next line agrees with neither, both are held, and the third line decides: a line is
+      dropped if it differs from the other two much more than these differ from each other.
 
     The time of a dropped line counts as a gap.
     """
@@ -261,7 +261,7 @@ class Confirmation:
     ) -> tuple[list[Feedback], list[Feedback]]:
         """Return a pair: the feedback lines to use now, and the feedback lines to drop.
 
-        The lines to use are in the order of time.
+        The lines to use are in the order of time. If `line` is held back, both lists are empty.
 
         Args:
             line: The next plausible feedback line.
@@ -277,6 +277,8 @@ class Confirmation:
         if not held and (seconds <= 2 * period or not period or line.turned is not None):
             return [line], []
         self._seconds = seconds = seconds + (self._seconds if held else 0.0)
+        # This change of one wheel's speed falsifies the motion of the whole time by as much as a
+        # damaged line of the usual duration can.
         most = (self._acceleration * period + SLACK) * period / seconds
         used, now = believed(before.as_tuple()), believed(line.speeds.as_tuple())
         lines, three = [*held, line], [*[believed(one.speeds.as_tuple()) for one in held], now]
@@ -320,12 +322,10 @@ class Gaps:
     the motion is s^2 t^4 / 4. The robot may change its acceleration at any time. Therefore s^2
     itself grows with t, and the variance grows with t^5 (`GROWTH`).
 
-    `follow` measures s while lines arrive without gaps. In each span of a fifth of a second, it
-    compares the motion with the motion at the mean of the first and the last speed. The configured
-    acceleration limits are not used, because robots seldom accelerate that much.
-
-    The deviation is limited to the motion at the higher of the two speeds before and after the gap.
-    Therefore a robot that stood still before and after a gap is assumed not to have moved in it.
+    `follow` measures s while lines arrive without gaps. The configured acceleration limits are not
+    used, because robots seldom accelerate that much. The deviation is limited to the motion at the
+    higher of the two speeds before and after the gap. Therefore a robot that stood still before and
+    after a gap is assumed not to have moved in it.
     """
 
     def __init__(self) -> None:
@@ -335,12 +335,12 @@ class Gaps:
         self.interrupt(REST)
 
     def interrupt(self, twist: Twist) -> None:
-        """Discard the unfinished measurement of the acceleration; start a new one at `twist`."""
+        """Discard the unfinished measurement of the acceleration. Start a new one at `twist`."""
         self._first, self._seconds, self._distance, self._turn = twist, 0.0, 0.0, 0.0
         self._bridged, self._given = 0.0, (0.0, 0.0)
 
     def follow(self, twist: Twist, dt: float) -> None:
-        """Measure the acceleration with a new feedback line.
+        """Measure the acceleration with a feedback line. There must be no gap before this line.
 
         The line reports that the robot moved with `twist` in the last `dt` s.
         """
@@ -352,6 +352,7 @@ class Gaps:
         span = self._seconds - dt  # the time between the first and the last line of the span
         if span < SPAN:
             return
+        # Compare the motion in the span with the motion at the mean of the first and last speeds.
         first = self._first
         if self._distance or self._turn or linear or angular:
             off = self._distance - linear * dt - span * (first.linear + linear) / 2
@@ -367,11 +368,15 @@ class Gaps:
     ) -> tuple[float, float]:
         """Return a pair: the variances of distance (m2) and turn (rad2) that a filled gap adds.
 
-        The gap lasts `seconds` s. If it directly follows another gap, both count as one longer gap,
-        and the result is the increase of the variances since the earlier gap. `before` and `after`
-        are the twists before and after this gap. During `doubtful` s of the gap, the robot is
-        assumed to have had the twist `after`, but it had the twist `before` with the probability
-        1/2.
+        If the gap directly follows another gap, both count as one longer gap. The result is then
+        the increase of the variances since the earlier gap.
+
+        Args:
+            seconds: the duration of the gap, s.
+            before: the twist before the gap.
+            after: the twist after the gap.
+            doubtful: the part of the gap, s, in which the robot is assumed to have had the twist
+                `after`, but had the twist `before` with the probability 1/2.
         """
         bridged, given = self._bridged + seconds, self._given
         along, yaw = self.unseen(bridged, before, after)

@@ -28,30 +28,30 @@ from acsard.core.motion.learned_track import LEAST, Track
 from acsard.core.values import NS_PER_S, Event, GyroDoes, GyroSample, GyroStatus, Level
 
 REST_S = 0.2
-"""Time for which all four wheels must report zero speed before the robot counts as standing, s."""
+"""Time for which all four wheels must report zero speed before the robot counts as standing still,
+s."""
 
 SILENT_NS = NS_PER_S // 5
-"""Age of the last sample, ns, from which the gyro counts as silent. Up to this age, the robot is
-assumed to continue turning at the rate of this sample."""
+"""Age of the gyro's last sample from which the gyro counts as silent, ns. Up to this age, the robot
+is assumed to continue turning at the rate of this sample."""
 
 LATEST_NS = NS_PER_S // 4
-"""If the delay of a sample exceeds the smallest delay of earlier samples by more than this, ns, the
-clock of the sender is assumed to have been set."""
+"""Difference of a sample's delay from the smallest delay of earlier samples, ns. If it is larger
+than this, the clock of the sender is assumed to have been set."""
 
 SET_BACK_NS = NS_PER_S // 50
-"""If a stamp is earlier than the previous one by more than this, ns, the clock of the sender is
-assumed to have been set. A smaller step back may have another cause: a driver may swap two samples
-or measure their times with some jitter."""
+"""Largest step back of the stamps that is not taken for a clock that was set, ns. A small step may
+have another cause: a driver may swap two samples or measure their times with some jitter."""
 
 DELAYS_NS = (-NS_PER_S // 10, 3 * NS_PER_S // 10)
 """Range of the gyro's delay relative to the wheels, ns. The delay is negative if the gyro reports a
 turn earlier than the wheels do."""
 
 LEAST_DELAY_S = 0.002
-"""A measured error of the gyro's delay is corrected only if it is at least this large, s."""
+"""Smallest measured error of the gyro's delay that is corrected, s."""
 
 SLIP_S = 0.5
-"""Seconds for which the wheels count as slipping after they last contradicted the gyro."""
+"""Time for which the wheels count as slipping after they last contradicted the gyro, s."""
 
 MOST_SLIP_S = 5.0
 """Longest plausible slip, s. If gyro and wheels contradict each other for longer, the gyro is not
@@ -59,7 +59,7 @@ used until they agree again."""
 
 ENOUGH_BLOCKS = 20.0
 """Number of blocks of 0.1 s in which the robot must turn before the measured ratio of the gyro's
-turn to the wheels' turn is trusted."""
+turn to the wheels' turn is used."""
 
 WORDS: dict[GyroDoes, str] = {
     "off": "",
@@ -80,50 +80,55 @@ WORDS: dict[GyroDoes, str] = {
 
 
 class Turn(Struct, frozen=True, gc=False):
-    """The turn of the robot since the previous feedback line: `angle` in rad, `variance` in rad2.
+    """Turn of the robot since the previous feedback line, measured by a gyro.
 
-    The variance does not include the error of the gyro's scale, which does not average out
-    (`uncertainty.py`).
+    `angle` is in rad, and `variance` is its variance, rad2. The variance does not include the error
+    of the gyro's scale, which does not average out (`uncertainty.py`).
     """
 
     angle: float
     variance: float
     rate: float
-    """Turn rate according to the last sample of the gyro, rad/s. In contrast to this rate, `angle`
-    may include samples that arrived late."""
+    """Turn rate according to the last sample of the gyro, rad/s. Unlike this rate, `angle` may
+    include samples that arrived late."""
     rate_variance: float
     wheels: float | None = None
     """Turn that wheels without a fault would report, rad. It is `angle` divided by the learned
     ratio of the gyro's turn to the wheels' turn."""
     slips: bool = False
-    """Whether the turns of wheels and gyro have contradicted each other in the last `SLIP_S` s."""
+    """Whether the turns according to wheels and gyro contradicted each other in the last `SLIP_S`
+    s."""
 
 
 class Gyro:
-    """One gyro. The caller passes samples to `hear`, and calls `turn` for each feedback line."""
+    """Computes the turns of the robot from the samples of one gyro.
+
+    The caller passes samples to `hear`, and calls `turn` for each feedback line.
+    """
 
     def __init__(self) -> None:
         self._rest_s = self._since_rest_s = 0.0
         self._learned: Track | None = None
-        """The effective track that was learned with an earlier gyro; None if there is none."""
+        """The effective track that was learned with an earlier gyro, or None."""
         self.owes = False
         """Whether the wheels provided the turn of the last line because the gyro is not proven. If
-        the gyro is proven later, the heading is corrected by the difference to the gyro's turn."""
+        the gyro is proven later, the heading is corrected by the gyro's turn minus the wheels'
+        turn."""
         self._does: GyroDoes = "silent"
         self.events: list[Event] = []
-        """Events of the last `turn`, for the log."""
+        """Log events of the last call of `turn`."""
         self._begin()
 
     def _begin(self) -> None:
         """Start over with a gyro whose bias, delay and direction are unknown."""
         self._bias, self._match, self._trial = Bias(), Match(), Trial()
         self._heard: deque[tuple[int, GyroSample]] = deque(maxlen=256)
-        """Samples that no `turn` has used yet, each with its monotonic time, ns (`_time_of`)."""
+        """Samples that `turn` has not used yet, each with its monotonic time, ns (`_time_of`)."""
         self._promptest = MinimumDelay()
         self._last: GyroSample | None = None
         self._delay_ns = 0
         self._told_ns: int | None = None
-        """Monotonic time of the last sample in `_angle`, ns; None before the first one."""
+        """Monotonic time of the last sample in `_angle`, ns; None before the first sample."""
         self._rate = 0.0
         self._angle = self._given = 0.0
         """`_angle` is the turn according to all samples that were used, rad. `_given` is the turn
@@ -132,9 +137,10 @@ class Gyro:
         """Variance of the part of `_angle` that `turn` has not returned yet, rad2."""
         self._slip_s = self._slipped_s = 0.0
         self._noise = 0.0
-        """Variance of the present rate, rad2/s2."""
+        """Variance of the present turn rate, rad2/s2."""
         self._hole = False
-        """Whether samples are missing since the last line, or the gyro was silent at that line."""
+        """Whether samples are missing since the last feedback line, or the gyro was silent at that
+        line."""
         self.forgive()
 
     @property
@@ -146,14 +152,18 @@ class Gyro:
 
     @property
     def learned(self) -> Track | None:
-        """The effective track learned from this gyro or an earlier one; None if there is none."""
+        """Effective track learned from this gyro or an earlier one; None before enough turns."""
         match = self._match
         if match.blocks < ENOUGH_BLOCKS or match.ratio <= 0.0:
             return self._learned
         return Track(1.0 / match.ratio, max(LEAST, match.spread / match.ratio))
 
     def hear(self, samples: tuple[GyroSample, ...]) -> None:
-        """Store `samples`, which arrived since the last step and are in the order of arrival."""
+        """Store the `samples` that arrived since the last control step, in the order of arrival.
+
+        A sample with `anew` begins the data of another gyro. Everything except the learned
+        effective track is then forgotten.
+        """
         for sample in samples:
             if sample.anew:
                 # The track is a property of wheels and floor, so it stays valid with another gyro.
@@ -163,11 +173,14 @@ class Gyro:
             self._heard.append((self._time_of(sample), sample))
 
     def turn(self, at_ns: int, dt: float, wheels: float, still: bool) -> Turn | None:
-        """Return the robot's turn since the line before; None if the wheels must provide the turn.
+        """Return the turn of the robot since the previous feedback line, measured by the gyro.
+
+        Return None if the wheels must provide the turn, for example because the gyro is silent or
+        not proven.
 
         Args:
             at_ns: Monotonic time of this line, ns.
-            dt: Time since the line before, s. It is 0 after a gap, but the result covers the gap.
+            dt: Time since the previous line, s. It is 0 after a gap, but the result covers the gap.
             wheels: The turn in `dt` according to the wheels, rad.
             still: Whether all wheels that are not ignored report zero speed.
         """
@@ -180,8 +193,8 @@ class Gyro:
         held = 0.0 if resting or silent else self._rate * max(0, ahead) / NS_PER_S
         angle, variance = self._angle + held - self._given, self._variance
         self._given, self._variance = self._angle + held, 0.0
-        # During a silence of the gyro the wheels provide the turn. The samples that end the silence
-        # cover that turn again, so the wheels also provide the turn of the line after it.
+        # During a silence of the gyro, the wheels provide the turn. The samples that end the
+        # silence cover the same turn again, so the wheels also provide the turn of the next line.
         lost, self._hole = silent or self._hole, silent
         self._since_rest_s = 0.0 if resting else self._since_rest_s + dt
         # The error of the bias is the same in each line, so it does not average out.
@@ -209,12 +222,13 @@ class Gyro:
         `_owed_variance` is its variance, rad2."""
 
     def taken_back(self, turn: float) -> float:
-        """Record that the pose was recomputed over one or more lines for which `owes` was true.
+        """Return the angle that the caller must subtract from the heading, rad.
 
-        `turn` is the sum of the changes of the turns in these lines, rad. Return the angle that the
-        caller must subtract from the heading, rad. If the gyro is proven by now, the heading has
-        already been corrected to the gyro's turn of these lines. The changes must then be undone,
-        so the result is `turn`. Otherwise the result is 0.
+        Call this after the pose was recomputed over feedback lines for which `owes` was true.
+        `turn` is the sum of the changes of the turns in these lines, rad. If the gyro is proven by
+        now, the heading has already been corrected to the gyro's turn, so the changes must be
+        undone: the result is `turn`. Otherwise the result is 0, and a pending correction of the
+        heading changes by -`turn`.
         """
         verdict = self._trial.verdict
         if verdict == "none yet":
@@ -240,7 +254,8 @@ class Gyro:
     def _take(self, until_ns: int, resting: bool) -> None:
         """Process the samples until the monotonic time `until_ns`.
 
-        If `resting` is true, learn the bias from them. Otherwise, add their turn to `_angle`.
+        If `resting` is true, the robot is at rest, and the bias is learned from the samples.
+        Otherwise, the turn according to the samples is added to `_angle`.
         """
         bias, heard = self._bias, self._heard
         until_ns += self._delay_ns
@@ -266,8 +281,8 @@ class Gyro:
         """Test a gyro that is not proven yet, and return whether the wheels must provide this turn.
 
         `wheels` and `angle` are the turns in the last `dt` s according to the wheels and to the
-        gyro, rad, and `variance` is the variance of `angle`, rad2. If the wheels rest (`resting`),
-        the gyro provides the turn, because a person may turn the robot.
+        gyro, rad, and `variance` is the variance of `angle`, rad2. If `resting` is true, the wheels
+        rest and the gyro provides the turn, because a person may turn the robot.
         """
         trial, known = self._trial, self._bias.known
         if not trial.open or resting:
@@ -296,7 +311,7 @@ class Gyro:
     def _shift(self) -> None:
         """Correct the assumed delay of the gyro.
 
-        The caller must call this only while the robot rests. Otherwise the heading would jump.
+        Call this only while the robot is at rest. Otherwise the heading would jump.
         """
         delay = self._match.delay()
         if delay is not None and abs(delay) >= LEAST_DELAY_S:

@@ -1,4 +1,4 @@
-"""Learns the bias of a gyro, which is its reading while the robot stands (zero-velocity update).
+"""Learns the bias of a gyro: its reading while the robot stands still (zero-velocity update).
 
 The first estimate is the mean of the samples in `KNOWN_S`. The bias drifts between rests. Therefore
 a scalar Kalman filter models it as a random walk, and a rest has more weight if the previous rest
@@ -19,21 +19,22 @@ WALK = 1e-4
 """Random walk of a cheap gyro's bias with temperature, rad/s per square root of a second."""
 
 UNLIKELY = 5.0
-"""A sample at rest counts as noise if it differs from the bias by at most this number of standard
-deviations plus `SLACK`. A sample that differs by more contradicts the bias."""
+"""Number of standard deviations. A sample at rest counts as noise if it differs from the bias by at
+most this number of standard deviations plus `SLACK`. A sample that differs by more contradicts the
+bias."""
 
 SLACK = 0.01
 """Difference of a sample from the bias, rad/s, that is allowed in addition to `UNLIKELY` standard
-deviations. A robot that stands may vibrate."""
+deviations, because a robot that stands still may vibrate."""
 
 LEAST_NOISE = 1e-5
 """Smallest assumed standard deviation of a sample, rad/s. A coarse gyro may repeat one value, so
 its measured standard deviation may be 0."""
 
 ANEW_S = 1.0
-"""If the reading at rest differs from the bias but stays constant for this time, s, this reading
-becomes the new bias. The gyro may have restarted or warmed up, or the robot may have turned while
-the first bias was learned."""
+"""Time for which the reading at rest must stay constant before it becomes the new bias, s, if it
+differs from the known bias. The gyro may have restarted or warmed up, or the robot may have turned
+while the first bias was learned."""
 
 LEARNING = 0.02
 """Weight of a new sample in the estimate of the noise. About the last fifty samples count."""
@@ -46,7 +47,7 @@ class Bias:
         self.value = 0.0
         """The bias, rad/s."""
         self.variance = MAX_BIAS**2
-        """Variance of the bias, rad2/s2."""
+        """Variance of the estimated bias, rad2/s2."""
         self.noise = 0.0
         """Variance of one sample, rad2/s2."""
         self._rested_s, self._samples = 0.0, 0
@@ -55,18 +56,19 @@ class Bias:
 
     @property
     def known(self) -> bool:
-        """Whether the robot has stood long enough to know the bias."""
+        """Whether the robot has stood still long enough to determine the bias."""
         return self._rested_s >= KNOWN_S
 
     def drift(self, dt: float) -> None:
-        """Increase the variance by the drift that the bias may have in `dt` s."""
+        """Increase the variance of the bias by the drift that may occur in `dt` s."""
         self.variance += WALK * WALK * dt
 
     def rest(self, rate: float, variance: float, dt: float) -> bool:
-        """Learn from a sample while the wheels stand; return False if it shows a turning robot.
+        """Update the bias with a sample that was measured while the wheels stood still.
 
-        `rate` is in rad/s, and `dt` is the time since the sample before, s. `variance` is the
-        variance of `rate` according to the gyro, rad2/s2; 0 if the gyro declares no variance.
+        Return False if the sample shows that the robot turns, for example by hand. `rate` is in
+        rad/s, and `dt` is the time since the previous sample, s. `variance` is the variance of
+        `rate` according to the gyro, rad2/s2; 0 if the gyro declares no variance.
         """
         if not self.known:
             return self._average(rate, variance, dt)
@@ -98,7 +100,7 @@ class Bias:
         return True
 
     def _average(self, rate: float, variance: float, dt: float) -> bool:
-        """Update bias and noise by Welford's method; return False if the sample shows a turn."""
+        """Update bias and noise by Welford's method. Return False if the sample shows a turn."""
         if abs(rate) > MAX_BIAS:
             return False
         self._rested_s += dt

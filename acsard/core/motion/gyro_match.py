@@ -21,19 +21,19 @@ from collections import deque
 from msgspec import Struct
 
 BLOCK_S = 0.1
-"""Duration of a block of mean rates, s. A single line has too few encoder counts for a precise
-rate."""
+"""Duration of a block, over which the turn rates are averaged, s. A single feedback line has too
+few encoder counts for a precise rate."""
 
 LEAST_RATE = 0.05
 """Smallest turn rate according to the wheels, rad/s, at which the robot counts as turning."""
 
 LEAST_CHANGE = 0.3
-"""Smallest change of the turn rate, rad/s2, from which the delay is learned. If the gyro's rate
-changes more slowly, the change of the wheels' rate counts as 0."""
+"""Smallest change of the turn rate, rad/s2, from which the delay of the gyro is learned. If the
+gyro's rate changes more slowly, the change of the wheels' rate counts as 0."""
 
 MEMORY = 0.995
-"""Factor by which each block of turning reduces the weight of all earlier blocks, so that the fit
-remembers 200 blocks (20 s of turning)."""
+"""Factor by which the weight of all earlier blocks is multiplied in each block of turning, so that
+the fit remembers 200 blocks (20 s of turning)."""
 
 ROUGH, FINE = 0.5, 0.1
 """Standard deviations of the ratio of the gyro's turn to the wheels' turn. `ROUGH` is the value
@@ -42,12 +42,13 @@ turn rate change the ratio."""
 
 STRETCH = 1.0
 """Size of a stretch, which is a turn of the robot to the left or to the right, rad. Each stretch
-yields one measurement of the error of the ratio. The delay of the gyro hardly matters over such a
-turn."""
+yields one measurement of the error of the ratio (gyro's turn divided by wheels' turn). The delay of
+the gyro hardly matters over such a turn."""
 
 KEPT, PRIOR = 0.9, 0.1
-"""`KEPT` is the factor by which each new stretch (a turn of `STRETCH`) reduces the weight of the
-earlier stretches. `PRIOR` is the initial weight of `ROUGH`, as a number of stretches."""
+"""`KEPT` is the factor by which the weight of the earlier stretches is multiplied in each new
+stretch (a turn of `STRETCH`). `PRIOR` is the initial weight of `ROUGH`, as a number of
+stretches."""
 
 DELAY_S = 0.2
 """Standard deviation of the gyro's delay before any data, s."""
@@ -56,8 +57,9 @@ NO_DELAY = 0.0, 0.0, 1.0 / DELAY_S**2
 """Initial values of the three least-squares sums from which the delay is computed."""
 
 BEFORE, BEHIND = 2, 3
-"""If the wheels' rate changes in a block, the gyro may show that change up to `BEFORE` blocks
-earlier and up to `BEHIND` blocks later. This covers every delay in `gyro.DELAYS_NS`."""
+"""Numbers of blocks. If the wheels' rate changes in a block, the gyro may show that change up to
+`BEFORE` blocks earlier and up to `BEHIND` blocks later. This covers every delay in
+`gyro.DELAYS_NS`."""
 
 BLOCK_NOISE, BLOCK_SHARE = 0.01, 0.03
 """The standard deviation of a block's mean rate is `BLOCK_NOISE` rad/s plus `BLOCK_SHARE` times the
@@ -83,8 +85,10 @@ deviations, gyro and wheels contradict each other."""
 
 
 class Block(Struct, frozen=True, gc=False):
-    """One block: the turns according to the wheels and to the gyro, rad, and the change of the turn
-    rate according to the wheels, rad/s2."""
+    """Turns of the robot in one block, rad: according to the wheels, and according to the gyro.
+
+    `change` is the change of the turn rate according to the wheels, rad/s2.
+    """
 
     wheels: float
     gyro: float
@@ -96,7 +100,7 @@ class Block(Struct, frozen=True, gc=False):
 
 
 class Match:
-    """Learns how the gyro's turns relate to the wheels' turns, feedback line by feedback line."""
+    """Learns the ratio of the gyro's turns to the wheels' turns, and the delay of the gyro."""
 
     def __init__(self) -> None:
         self._ww, self._wg = 1.0 / ROUGH**2, 1.0 / ROUGH**2
@@ -104,19 +108,20 @@ class Match:
         standard deviation `ROUGH`."""
         self._wd, self._dg, self._dd = NO_DELAY
         self._off = self._way = 0.0
-        """Sums over the present stretch, rad. `_way` is the turn of the wheels. `_off` is the
-        gyro's turn minus the turn that the fit predicts for the gyro."""
+        """Sums over the present stretch (a turn of `STRETCH`), rad. `_way` is the turn of the
+        wheels. `_off` is the gyro's turn minus the turn that the fit predicts for the gyro."""
         self._ways = PRIOR * STRETCH**2
         """Weighted sum of `_way` squared over the completed stretches, rad2."""
         self._offs = ROUGH**2 * self._ways
         """Weighted sum of `_off` squared over the completed stretches, rad2."""
         self._lag = LAG_S
         self.blocks = 0.0
-        """Number of blocks in which the robot turned; older blocks count less (`MEMORY`)."""
+        """Number of blocks in which the robot turned. Older blocks count less (`MEMORY`)."""
         self._solve()
         self._wheels = self._gyro = self._time = 0.0
         self._rate = self._began = 0.0
-        """The turn rate according to the wheels now, and at the start of the block, rad/s."""
+        """Turn rates according to the wheels, rad/s: now (`_rate`), and at the start of the block
+        (`_began`)."""
         self._blocks: deque[Block] = deque(maxlen=BEFORE + 1 + BEHIND)
         self._window: deque[tuple[float, float, float]] = deque()
         self._sums = [0.0, 0.0, 0.0]
@@ -130,10 +135,10 @@ class Match:
         return math.sqrt(self._offs / self._ways)
 
     def delay(self) -> float | None:
-        """Return the delay of the gyro minus the assumed delay, s, or None if it is uncertain.
+        """Return the correction of the gyro's assumed delay, s, or None if it is uncertain.
 
-        If it is certain, the measurement starts over, so the caller must add the result to the
-        assumed delay.
+        The caller must add the result to the assumed delay, because the measurement then starts
+        over.
         """
         ratio, slope = self.ratio, self._slope
         spread = self._dd - self._wd * self._wd / self._ww
@@ -148,8 +153,9 @@ class Match:
     def add(self, wheels: float, gyro: float, dt: float, slips: bool) -> None:
         """Add a feedback line. When a block is complete, learn from the blocks so far.
 
-        `wheels` and `gyro` are the turns in the last `dt` s according to wheels and gyro, rad. If
-        `slips` is true in the last line of a block, nothing is learned from this block.
+        `wheels` and `gyro` are the turns of the robot in the last `dt` s according to wheels and
+        gyro, rad. If `slips` is true in the last line of a block, the wheels slip, and nothing is
+        learned from this block.
         """
         self._slide(wheels, gyro, dt)
         rate = wheels / dt
@@ -167,7 +173,7 @@ class Match:
             self._began = smooth
 
     def contradiction(self, variance: float) -> bool:
-        """Return whether gyro and wheels have contradicted each other over the last `WINDOW_S` s.
+        """Return whether the turns of gyro and wheels in the last `WINDOW_S` s are contradictory.
 
         `variance` is the variance of the gyro's turn over this time, rad2.
         """
@@ -192,7 +198,10 @@ class Match:
             sums[2] -= old[2]
 
     def _learn(self) -> None:
-        """Learn from the block that was completed `BEHIND` blocks ago."""
+        """Learn from the block that was completed `BEHIND` blocks ago.
+
+        The blocks before and after it show whether the gyro's rate changes, too.
+        """
         block = self._blocks[BEFORE]
         wheels, gyro, change = block.wheels / block.time, block.gyro / block.time, block.change
         rates = [one.gyro / one.time for one in self._blocks]
@@ -217,10 +226,9 @@ class Match:
         self._solve()
 
     def _solve(self) -> None:
-        """Solve the least-squares equations for the coefficients of w and dw/dt."""
         det = self._ww * self._dd - self._wd * self._wd
         self.ratio = (self._wg * self._dd - self._dg * self._wd) / det
-        """The ratio a: the turn of the gyro divided by the turn of the wheels."""
+        """The turn of the gyro divided by the turn of the wheels; a in the module's docstring."""
         self._slope = (self._dg * self._ww - self._wg * self._wd) / det
         self.deviation = max(FINE, ROUGH / math.sqrt(1.0 + self.blocks))
         """Assumed standard deviation of `ratio`. It falls from `ROUGH` to `FINE`."""

@@ -1,9 +1,9 @@
 """Tests in the first turn whether a gyro measures rad/s about an axis that points up.
 
 A gyro that is mounted upside down, reads degrees or is disconnected reports a turn that differs
-from that of the wheels. If the wheels slip, a sound gyro also reports a different turn. Therefore a
+from that of the wheels. If the wheels slip, a good gyro also reports a different turn. Therefore a
 gyro is not used until it has agreed with the wheels in a turn once. The bounds for this agreement
-are wide, because wheels that skid turn the robot by less than they roll.
+are wide, because skidding wheels roll further than the robot turns.
 """
 
 from __future__ import annotations
@@ -13,40 +13,44 @@ from typing import Literal
 LEAST_RATE = 0.1
 """Smallest turn rate according to the wheels, rad/s, at which a feedback line in the opposite
 direction begins a new turn. A lower rate may come from a single encoder count. It is also the
-smallest rate at which a gyro that reads zero is called dead. Wheels with unequal tires report a
-lower rate while the robot drives straight."""
+smallest rate at which a gyro that reads zero is called dead, because wheels with unequal tires
+report a lower rate while the robot drives straight."""
 
 SLOWEST, STRETCH_S = 0.05, 0.5
 """`SLOWEST` is the smallest mean turn rate according to the wheels that counts as a turn, rad/s.
 `STRETCH_S` is the duration of the intervals over which the mean is taken, s."""
 
 PROPORTIONS = (0.25, 2.5)
-"""Range of a ratio: the robot's true turn divided by its turn according to the wheels. The ratio is
-within this range on any floor."""
+"""Range of the ratio of the robot's true turn to its turn according to the wheels. On any floor,
+the ratio is within this range."""
 
 PROVED, REFUTED = 0.1, 0.4
-"""Smallest turn to the left or to the right according to the wheels, rad, that proves a gyro
-(`PROVED`) or refutes it (`REFUTED`). Refuting takes a larger turn, because the gyro may be late."""
+"""Smallest turns to one side according to the wheels, rad. A turn of `PROVED` can prove that the
+gyro is good, and a turn of `REFUTED` can show that it is not. The second one is larger, because the
+gyro may be late."""
 
 REFUTED_S = 0.3
-"""Shortest time for which the robot must turn before a gyro is refuted, s. No gyro has a delay as
-long as this."""
+"""Shortest time for which the robot must turn before the gyro can be refuted, s. No gyro has a
+delay as long as this."""
 
 DEGREES = (15.0, 150.0)
-"""Range of a ratio: the gyro's turn divided by the wheels' turn, if the gyro reads degrees. Without
-slip and errors, the ratio is 57."""
+"""Range of the ratio of the gyro's turn to the wheels' turn if the gyro reads degrees. Without slip
+and errors, the ratio is 57."""
 
 Verdict = Literal["none yet", "good", "reversed", "in degrees", "dead", "not believed"]
 
 
 class Trial:
-    """Compares a gyro with the wheels until the gyro is proven, even after it was refuted."""
+    """Compares a gyro with the wheels until the gyro is proven, even after it was refuted.
+
+    `verdict` is the result of the comparison, which may change until the gyro is proven.
+    """
 
     def __init__(self) -> None:
         self.verdict: Verdict = "none yet"
         self._wheels = self._gyro = self._seconds = 0.0
         self._stretch = self._stretch_s = self._stretch_gyro = 0.0
-        """Values of the present interval of `STRETCH_S`: the turn according to the wheels, rad; the
+        """Sums over the present interval of `STRETCH_S`: the turn according to the wheels, rad; the
         duration, s; and the turn according to the gyro, rad."""
         self._fast = self._fast_gyro = 0.0
         """Turns according to wheels and gyro, rad, over all intervals in which the mean turn rate
@@ -54,14 +58,14 @@ class Trial:
 
     @property
     def open(self) -> bool:
-        """Whether the trial goes on, because the gyro is not proven yet."""
+        """Whether the trial goes on. It ends when the gyro is proven."""
         return self.verdict != "good"
 
     def add(self, wheels: float, gyro: float, dt: float, certain: bool = True) -> None:
-        """Add a feedback line of `dt` s, and update the verdict.
+        """Compare the turns of gyro and wheels in a feedback line of `dt` s, and update `verdict`.
 
         `wheels` and `gyro` are the turns of the robot in this line according to wheels and gyro,
-        rad. If the bias of the gyro is unknown, `certain` is false, and the verdict can only change
+        rad. `certain` is false if the bias of the gyro is unknown. The verdict can then only change
         to "in degrees".
         """
         self._stretch += wheels

@@ -34,7 +34,8 @@ class Kinematics:
         self._left_radius = drive.wheel_radius * drive.left_wheel_radius_multiplier
         self._right_radius = drive.wheel_radius * drive.right_wheel_radius_multiplier
         self.track = drive.wheel_separation * drive.wheel_separation_multiplier
-        """The effective track L, m."""
+        """The effective track L, m: the distance between the wheels that makes turns come out
+        right."""
 
     @property
     def radius(self) -> float:
@@ -42,22 +43,22 @@ class Kinematics:
         return (self._left_radius + self._right_radius) / 2
 
     def wheel_speeds(self, twist: Twist) -> WheelSpeeds:
-        """Return the wheel speeds that cause this twist, according to equations (1) to (3)."""
+        """Return the wheel speeds, rad/s, that move the base with this twist."""
         half = twist.angular * self.track / 2
         left = (twist.linear - half) / self._left_radius
         right = (twist.linear + half) / self._right_radius
         return WheelSpeeds(right, left, left, right)
 
     def twist(self, speeds: WheelSpeeds) -> Twist:
-        """Return the twist that these wheel speeds cause, according to equations (1) to (3)."""
+        """Return the twist, m/s and rad/s, that these wheel speeds cause."""
         linear, angular = self.moved(speeds.as_tuple())
         return Twist(linear, angular)
 
     def moved(self, wheels: tuple[float, float, float, float]) -> tuple[float, float]:
         """Return the distance (m) and the turn (rad) of the base after the wheels have rolled.
 
-        `wheels` are the angles that the wheels rolled (rad), in `WHEELS` order. If they are wheel
-        speeds (rad/s) instead, the result is in m/s and rad/s.
+        `wheels` contains the angles that the wheels rolled (rad), in `WHEELS` order. If `wheels`
+        contains wheel speeds (rad/s) instead, the result is in m/s and rad/s.
         """
         front_right, front_left, rear_left, rear_right = wheels
         left = self._left_radius * (front_left + rear_left) / 2
@@ -67,9 +68,9 @@ class Kinematics:
     def opposite(self, left: float, right: float, turn: float) -> tuple[float, float]:
         """Return the angles of the left and the right wheels, each computed from the other side.
 
-        `left` and `right` are the measured angles, rad: the means of the two wheels of each side.
-        `turn` is the turn of the base, rad. By equation (3), the returned left angle follows from
-        `right` and `turn`, and the returned right angle from `left` and `turn`.
+        The left angle follows from `right` and `turn`, and the right angle from `left` and `turn`
+        (equation 3). All angles are in rad. `left` and `right` are the measured angles: the means
+        of the two wheels of each side. `turn` is the turn of the base.
         """
         across = turn * self.track
         return (
@@ -78,7 +79,7 @@ class Kinematics:
         )
 
     def saturate(self, twist: Twist, wheel_speed: float) -> Twist:
-        """Return the twist scaled down until no wheel exceeds `wheel_speed` rad/s."""
+        """Return `twist`, scaled down so that no wheel turns faster than `wheel_speed` rad/s."""
         speeds = self.wheel_speeds(twist)
         fastest = max(abs(speeds.front_right), abs(speeds.front_left))
         if fastest <= wheel_speed:
@@ -87,9 +88,10 @@ class Kinematics:
         return Twist(twist.linear * scale, twist.angular * scale)
 
     def room(self, kept: Twist, added: Twist, wheel_speed: float) -> float:
-        """Return the largest share of `added`, 0 to 1, that can be added to `kept`.
+        """Return the largest fraction of `added`, 0 to 1, that can be added to the twist `kept`.
 
-        No wheel may exceed `wheel_speed` rad/s. The share is 0 if `kept` alone exceeds it.
+        With the sum of these twists, no wheel may turn faster than `wheel_speed` rad/s. The
+        fraction is 0 if `kept` alone exceeds this speed.
         """
         first, second, share = self.wheel_speeds(kept), self.wheel_speeds(added), 1.0
         sides = (first.front_right, second.front_right), (first.front_left, second.front_left)

@@ -1,5 +1,6 @@
 """Chooses the effective track for turns that only the wheels measure: configured or learned.
 
+The effective track is the distance between left and right wheels that makes computed turns right.
 While a gyro measures the heading, each turn shows the true effective track (`gyro_match.py`). When
 the gyro is silent, this learned track is better than the configured one, which may come from
 another floor. The learned track is used if `[odometry] learned_track` is true, and if the learned
@@ -13,23 +14,23 @@ from msgspec import Struct
 from acsard.core.values import Event, GyroStatus, Level, TrackUse
 
 LEAST = 0.05
-"""A learned track never has a smaller relative standard deviation than this, because floor and turn
-rate may change. The value is half of `gyro_match.FINE`, because the mean error over a whole drive
-is smaller than the error at one moment."""
+"""Smallest relative standard deviation of a learned track. Floor and turn rate may change, so the
+track is never more certain. The value is half of `gyro_match.FINE`, because the mean error over a
+whole drive is smaller than the error at one moment."""
 
 CERTAIN, UNCERTAIN = 0.1, 0.2
 """Limits of the learned track's relative standard deviation. An uncertain track becomes certain
 below `CERTAIN`, and a certain track becomes uncertain above `UNCERTAIN`."""
 
 BOUNDS = (0.5, 2.5)
-"""Range of a ratio: the learned track divided by the configured one. Outside this range, the
-learned track is not used. The effective track is 1.4 to 1.9 times the wheel separation on most
-floors, and 2.5 times on slippery ones."""
+"""Range of the ratio of the learned track to the configured track. Outside this range, the learned
+track is not used. The effective track is 1.4 to 1.9 times the wheel separation on most floors, and
+2.5 times on slippery ones."""
 
 INWARDS = 1.05
 """Factor that narrows `BOUNDS` for a learned track that is not in use: such a track comes into use
 only above the lower bound times this factor and below the upper bound divided by this factor.
-Without this margin, a track near a bound could go in and out of use again and again."""
+Without this margin, a track near a bound could alternate between use and non-use."""
 
 NOTES: dict[TrackUse, str] = {
     "shown": "(only reported)",
@@ -52,7 +53,7 @@ CONFIGURED = Track()
 
 
 class LearnedTrack:
-    """Decides between the configured and the learned effective track."""
+    """Decides whether the odometry uses the configured or the learned effective track."""
 
     def __init__(self, multiplier: float) -> None:
         """Start with the configured track, which is `multiplier` times the wheel separation."""
@@ -62,10 +63,13 @@ class LearnedTrack:
         self.used = CONFIGURED
         """The effective track in use, configured or learned."""
         self.event: Event | None = None
-        """The event if the last `look` changed `use`, otherwise None."""
+        """Log event if the last call of `look` changed `use`, otherwise None."""
 
     def look(self, learned: Track | None) -> None:
-        """Choose the track to use. `learned` is the track learned so far, or None."""
+        """Choose the effective track to use. `learned` is the track learned so far, or None.
+
+        This updates `use`, `used` and `event`.
+        """
         before, self.event = self.use, None
         self.use = _use(learned, before)
         self.used = learned if learned is not None and self.use == "used" else CONFIGURED
@@ -88,7 +92,7 @@ def _use(learned: Track | None, before: TrackUse) -> TrackUse:
 
 
 def beside(learned: Track, multiplier: float, use: TrackUse) -> str:
-    """Return words that state the learned track, the configured track, and which of them is used.
+    """Return a text with the learned and the configured track, and which of the two is in use.
 
     The text gives both tracks as multiples of the wheel separation. `multiplier` is the multiple
     for the configured track.
@@ -102,7 +106,10 @@ def beside(learned: Track, multiplier: float, use: TrackUse) -> str:
 
 
 def tracks(gyro: GyroStatus, multiplier: float) -> str:
-    """Return words that state both tracks (see `beside`); "" if no track is learned yet."""
+    """Return a text with the learned and the configured track; "" before a track is learned.
+
+    `multiplier` is the configured track divided by the wheel separation.
+    """
     if gyro.track is None:
         return ""
     return beside(Track(gyro.track, gyro.track_deviation), multiplier, gyro.track_use)

@@ -1,4 +1,4 @@
-"""Holds the latches and the other facts that determine the mode, and derives the mode from them.
+"""Keeps the latches and the other facts that determine the mode, and derives the mode from them.
 
 A latch is set by a stop, a fault or `deactivate`. Only `clear` releases a stop or a fault, one at a
 time, and only `activate` releases the latch of a `deactivate`. Neither request may release a stop
@@ -29,9 +29,9 @@ from acsard.core.motion.modes import GOING_DOWN, Mode, RefusedError, mode_of, re
 from acsard.core.values import NS_PER_S, Instant, Latch, Latches
 
 LOOK_FIRST_S = 2.0
-"""For this time after a stop, a `deactivate` or the start of the daemon, s, a call `clear` or
-`activate` must name the number of the latch, unless it can only release a fault. The network seldom
-takes longer to deliver a packet."""
+"""Time after a stop, a `deactivate` or the start of the daemon in which a call `clear` or
+`activate` must name the number of the latch, s. A `clear` that can only release a fault need not
+name it. The network seldom takes longer to deliver a packet."""
 
 MAX_CLIENTS = 4
 """Largest number of clients among the earlier causes of a stop. If more clients stop the robot, the
@@ -39,7 +39,7 @@ first ones are kept, so that a flood of stops neither fills the reason in `state
 first client. The causes from the board need no limit, because there are only a few."""
 
 LONG_AGO_NS = -(2**62)
-"""A monotonic time that is earlier than every real one, ns. It stands for "never"."""
+"""Monotonic time that stands for "never", ns. It is earlier than every real time."""
 
 _DAYS_TO_1970 = 719_468
 """Days from 0000-03-01 to 1970-01-01. `utc` counts years from March, so that the leap day is the
@@ -49,10 +49,10 @@ _DAYS_PER_400_YEARS = 146_097
 
 
 class Lifecycle:
-    """The latches and the mode of one robot. A request that is refused raises `RefusedError`."""
+    """The latches and the mode of one robot. Requests that are not allowed raise `RefusedError`."""
 
     def __init__(self, active: bool, latches: Latches = Latches()) -> None:  # noqa: B008
-        """Start with these latches. If `active` is false, the robot waits for a call `activate`."""
+        """Start with `latches`. If `active` is false, the robot is off until `activate`."""
         self.latches = latches
         self.mode = Mode.WAITING
         self._shutting_down = self._linked = self._commanded = False
@@ -104,33 +104,37 @@ class Lifecycle:
             self._derive()
 
     def press(self, why: str, now: Instant) -> None:
-        """Latch a stop, with a new number, because of `why`, a cause that the board reports."""
+        """Latch a stop with a new number. `why` is the cause that the board reports, as text."""
         self._stopped_ns = now.mono_ns
         self._latch(stop=self._stop(now, "", why))
 
     def hold(self, why: str, mend: str, now_ns: int) -> None:
-        """Record why the board's reports forbid the call `clear` now, and the advice `mend`.
+        """Record whether the board's reports forbid the call `clear` now.
 
-        `mend` tells the operator what to do about `why`. Both are "" if the call is allowed.
+        `why` is the reason as text, and `mend` is the advice to the operator about it. Both are ""
+        if the call is allowed. `now_ns` is the monotonic time, ns.
         """
         if self._held and not why:
             self._freed_ns = now_ns
         self._held, self._mend = why, mend
 
     def caused_again(self, now_ns: int) -> None:
-        """Record that the cause of the fault came again, so that earlier calls `clear` are refused.
+        """Record that the cause of the fault came again at the monotonic time `now_ns`, ns.
 
-        These are the calls that arrived at the monotonic time `now_ns` or before.
+        Calls `clear` that arrived at this time or before are refused.
         """
         self._freed_ns = now_ns
 
     def leave(self) -> None:
-        """Record that the daemon is going down."""
+        """Record that the daemon is shutting down."""
         self._shutting_down = True
         self._derive()
 
     def fault(self, why: str, now: Instant) -> bool:
-        """Latch a fault and return True. If a fault is already latched, only return False."""
+        """Latch a fault and return True. If a fault is already latched, only return False.
+
+        `why` is the cause of the fault, as text.
+        """
         if self.latches.fault is not None:
             return False
         self._faulted_ns = now.mono_ns
@@ -142,9 +146,14 @@ class Lifecycle:
     def stop(self, by: str, asked_ns: int, now: Instant) -> str:
         """Latch a stop with a new number, and return a text for the client.
 
-        The latch does not change if it already names this client, and if the daemon has already
-        processed a request for a stop with the same or a later time of arrival. `asked_ns` is the
-        monotonic time of arrival of this request. `by` is "" if the client is unknown.
+        A repeated request does not change the latch. A request counts as repeated if the latch
+        already names this client, and if the daemon has already processed a request for a stop with
+        the same or a later time of arrival.
+
+        Args:
+            by: the name of the client; "" if it is unknown.
+            asked_ns: the monotonic time at which the request arrived, ns.
+            now: the time of this control step.
         """
         latch, why = self.latches.stop, f"stopped by {by or 'request'}"
         named = latch is not None and any(cause.why == why for cause in latch.causes)
@@ -164,9 +173,17 @@ class Lifecycle:
     def clear(self, number: int | None, asked_ns: int, now: Instant) -> str:
         """Release the fault if one is latched, otherwise the stop; return a text for the client.
 
-        The text is "" if neither a fault nor a stop is latched. `number` is the number of the latch
-        that the client has seen; None if the request names no number. `asked_ns` is the monotonic
-        time at which the request arrived. Raises `RefusedError`.
+        The text is "" if neither a fault nor a stop is latched.
+
+        Args:
+            number: the number of the latch that the client has seen; None if the request names no
+                number.
+            asked_ns: the monotonic time at which the request arrived, ns.
+            now: the time of this control step.
+
+        Raises:
+            RefusedError: the mode or a lasting cause forbids the call, the call arrived too early,
+                or the client may not know the latch.
         """
         require_allowed(self.mode, "clear")
         if self._held:
@@ -204,12 +221,18 @@ class Lifecycle:
         return f"fault cleared, but the robot is still {_still(latches.stop)}: call srv/clear again"
 
     def activate(self, number: int | None, asked_ns: int, now: Instant) -> bool:
-        """Switch the robot on; return True if it was off.
+        """Switch the robot on. Return True if it was off, and False if it was already on.
 
-        `number` is the number of the latch that the client has seen; None if the request names no
-        number. The number 0 means that the client has seen no latch: the robot is off only because
-        `auto_activate` is False. Raises `RefusedError` if the mode refuses the request, or if the
-        client may not know the latch.
+        Args:
+            number: the number of the latch that the client has seen; None if the request names no
+                number. 0 means that the client has seen no latch: the robot is off only because
+                `auto_activate` is False.
+            asked_ns: the monotonic time at which the request arrived, ns.
+            now: the time of this control step.
+
+        Raises:
+            RefusedError: the mode forbids the request, the request arrived too early, or the client
+                may not know the latch.
         """
         require_allowed(self.mode, "activate")
         if not self._off:
@@ -241,7 +264,7 @@ class Lifecycle:
         return "inactive: the robot ramps to zero; srv/activate switches it on"
 
     def lower(self, limits: dict[str, float]) -> None:
-        """Store the settings of `[limits]` that `set` has lowered. A restart must keep them."""
+        """Store the settings of `[limits]` that `set` has lowered, so that a restart keeps them."""
         if limits != self.latches.lowered:
             self.latches = replace(self.latches, lowered=limits)
 
@@ -300,8 +323,8 @@ class Lifecycle:
     def _require_seen_stop(self, asked_ns: int) -> None:
         """Raise `RefusedError` if the sender of a call `clear` may not know the latched stop.
 
-        `asked_ns` is the monotonic time at which the call arrived. Do nothing if no stop is
-        latched.
+        Do nothing if no stop is latched. `asked_ns` is the monotonic time at which the call
+        arrived.
         """
         stop = self.latches.stop
         if stop is None:
@@ -315,11 +338,14 @@ class Lifecycle:
         self._require_seen(stop, self._stopped_ns, asked_ns, "srv/clear")
 
     def _require_seen(self, latch: Latch, set_ns: int, asked_ns: int, call: str) -> None:
-        """Raise `RefusedError` if the latch is so new that the sender may not know it.
+        """Raise `RefusedError` if `latch` is so new that the sender of the request may not know it.
 
-        `set_ns` is the monotonic time at which the latch was set, `LONG_AGO_NS` if an earlier run
-        set it. `asked_ns` is the monotonic time at which the request arrived. `call` is the service
-        that the text of the error names.
+        Args:
+            latch: the latch that the request would release.
+            set_ns: the monotonic time at which the latch was set; `LONG_AGO_NS` if an earlier run
+                set it.
+            asked_ns: the monotonic time at which the request arrived.
+            call: the service that the text of the error names.
         """
         began_ns = LONG_AGO_NS if self._began_ns is None else self._began_ns
         since = asked_ns - max(set_ns, began_ns)
@@ -338,11 +364,11 @@ class Lifecycle:
 
 
 def with_causes(latch: Latch, before: Latch | None) -> Latch:
-    """Return `latch`, the new latch of a stop, with the causes of the latch `before` added to it.
+    """Return `latch`, the new latch of a stop, with the earlier causes of the stop added to it.
 
-    `before` is the latch that `latch` replaces. Its causes become earlier causes of `latch`. If
-    the cause of `latch` is one of them, it is not an earlier cause as well. Of the earlier causes
-    that came from clients, at most `MAX_CLIENTS` are kept.
+    `before` is the latch that `latch` replaces, or None. Its causes become the earlier causes,
+    except a cause that equals the new one. Of the earlier causes that came from clients, at most
+    `MAX_CLIENTS` are kept.
     """
     causes = () if before is None else before.causes
     earlier = [replace(cause, earlier=()) for cause in causes if cause.why != latch.why]
@@ -355,9 +381,10 @@ def number_after_restart(kept: int, now: Instant) -> int:
 
     `kept` is the largest number in the latch file. The result is the wall-clock time in ms if that
     is above `kept`. Otherwise the wall clock was set back, and the result is `kept` + 1 plus the
-    time since the computer started, ms. `kept` + 1 alone is not safe: an earlier latch, which is
-    not in the file any more, may have had that number, and a late `clear` may still name it.
+    time since the computer started, ms.
     """
+    # `kept` + 1 alone is not safe: an earlier latch, which is not in the file any more, may have
+    # had that number, and a late `clear` may still name it.
     number = now.wall_ns // 1_000_000
     return number if number > kept else kept + 1 + now.mono_ns // 1_000_000
 
@@ -385,7 +412,7 @@ def _when(latch: Latch) -> str:
 
 
 def _asked_for(latch: Latch) -> bool:
-    """Return whether a client asked for the latch. Otherwise, it has a cause such as a fault."""
+    """Return whether a client requested the latch. Otherwise, a cause such as a fault set it."""
     return latch.why.endswith(f" by {latch.by or 'request'}")
 
 
@@ -398,7 +425,7 @@ def _said(latch: Latch) -> str:
 # The daemon publishes the time of a latch in every step, so the text is cached.
 @lru_cache(8)
 def utc(wall_ns: int) -> str:
-    """Return a time given in ns since 1970 as `2026-11-22 13:05:07 UTC` (Gregorian calendar)."""
+    """Return a time, ns since 1970, in the form `2026-11-22 13:05:07 UTC` (Gregorian calendar)."""
     days, seconds = divmod(wall_ns // NS_PER_S, 86_400)
     era, day = divmod(days + _DAYS_TO_1970, _DAYS_PER_400_YEARS)
     year = (day - day // 1_460 + day // 36_524 - day // 146_096) // 365

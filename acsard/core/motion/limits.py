@@ -1,9 +1,9 @@
 """Limits a requested twist: speed, wheel saturation, acceleration, deceleration and jerk.
 
-`follow` moves towards a command and limits the linear and the angular axis separately. `coast`
-brings the robot to rest without a command. It reduces both axes in the same proportion, because
-otherwise a wheel could speed up meanwhile (rule 2 of `acsard/README.md`). The jerk limit applies
-only to speeding up, because comfort must not delay braking.
+`Limiter.follow` moves towards a command and limits the linear and the angular axis separately.
+`Limiter.coast` brings the robot to rest without a command. It reduces both axes in the same
+proportion, because otherwise a wheel could speed up meanwhile (rule 2 of `acsard/README.md`). The
+jerk limit applies only to speeding up, because comfort must not delay braking.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ class _State(Struct, frozen=True):
 
 
 class Limiter:
-    """Moves the allowed twist step by step towards a requested twist, within the `[limits]`."""
+    """Moves the allowed twist step by step towards a requested twist, within the limits."""
 
     def __init__(self, limits: LimitsConfig, kinematics: Kinematics) -> None:
         self._kinematics = kinematics
         self.state = _State(REST, 0.0, 0.0)
         """The allowed twist and the accelerations of the last step.
 
-        If the command line of a step was not written to the port, `Robot` sets `state` back to its
+        If a line with wheel speeds could not be written to the port, `Robot` resets `state` to its
         value at the last line that was written.
         """
         self.use(limits)
@@ -48,8 +48,8 @@ class Limiter:
         """Use these limits from now on.
 
         If the robot moves faster than the new speed limits allow, it slows down at the configured
-        deceleration. The wheel-speed limit is an exception: a lower one takes effect without a
-        ramp, so the caller may lower it only at rest.
+        deceleration. A lower wheel-speed limit, however, takes effect without a ramp, so the caller
+        may lower this limit only at rest.
         """
         self._linear = _Axis(
             limits.linear_speed,
@@ -70,7 +70,8 @@ class Limiter:
         """`_wished` is the last requested twist. `_goal` is the same twist, scaled down to the
         speed limits."""
         self._arrived: _State | None = None
-        """The state in which the robot has reached `_goal` and keeps this speed; None before."""
+        """The state in which the robot has reached `_goal` and keeps this speed; None before
+        that."""
 
     @property
     def twist(self) -> Twist:
@@ -80,7 +81,7 @@ class Limiter:
     def follow(self, wished: Twist, dt: float) -> Twist:
         """Move the allowed twist towards `wished` for `dt` s, and return the new allowed twist.
 
-        `wished` must be finite.
+        `wished` is the requested twist, m/s and rad/s. It must be finite.
         """
         if wished is not self._wished:  # most steps have the same command as the step before
             self._wished, self._arrived = wished, None
@@ -101,13 +102,11 @@ class Limiter:
         return twist
 
     def _fitted(self, twist: Twist) -> Twist:
-        """Return the next twist, reduced so that no wheel exceeds its limit.
-
-        Each axis changes at its own rate. In between, both axes together may need a faster wheel
-        than at the start or at the goal. If one axis speeds up while the other one slows down, only
-        the former is reduced, because the latter would exceed its deceleration. If the radii of the
-        wheels differ, both axes may be reduced although both slow down.
-        """
+        """Return the next twist, reduced so that no wheel exceeds its speed limit."""
+        # Each axis changes at its own rate. In between, both axes together may need a faster wheel
+        # than at the start or at the goal. If one axis speeds up while the other one slows down,
+        # only the axis that speeds up is reduced. The other axis would exceed its deceleration. If
+        # the radii of the wheels differ, both axes may be reduced although both slow down.
         kinematics, most, now = self._kinematics, self._wheel_speed, self.twist
         fitted = kinematics.saturate(twist, most)
         if fitted is twist:
@@ -127,8 +126,8 @@ class Limiter:
         """Slow down towards rest for `dt` s, and return the allowed twist.
 
         Linear and angular speed fall in the same proportion. If `stop` is true, the limits
-        `*_stop_deceleration` apply. A negative `dt` counts as 0, so that it cannot speed up the
-        robot.
+        `*_stop_deceleration` apply, otherwise `*_deceleration`. A negative `dt` counts as 0, so
+        that it cannot speed up the robot.
         """
         dt, twist = max(0.0, dt), self.twist
         seconds = max(
@@ -164,10 +163,10 @@ def _braking(axis: _Axis, stop: bool) -> float:
 def _approach(
     speed: float, goal: float, slope: float, dt: float, axis: _Axis
 ) -> tuple[float, float]:
-    """Move `speed` towards `goal` for `dt` s. Return a pair: the new speed, and the acceleration.
+    """Move the speed of one axis towards `goal` for `dt` s, within the limits of `axis`.
 
-    `slope` is the acceleration in the step before. The units are m/s and m/s2 for the linear axis,
-    and rad/s and rad/s2 for the angular axis.
+    Return a pair: the new speed, and the acceleration. `slope` is the acceleration in the previous
+    step. The units are m/s and m/s2 for the linear axis, and rad/s and rad/s2 for the angular axis.
     """
     if dt <= 0.0:
         return speed, slope
@@ -177,7 +176,8 @@ def _approach(
     most = axis.acceleration if abs(target) > abs(speed) else axis.deceleration
     wanted = (target - speed) / dt
     if axis.jerk and abs(target) > abs(speed):
-        slope = slope if slope * wanted > 0 else 0.0  # otherwise it is left over from braking
+        # A slope in the other direction is left over from braking.
+        slope = slope if slope * wanted > 0 else 0.0
         step = axis.jerk * dt
         most = min(most, abs(slope) + step, _flattenable(abs(target - speed), step, dt))
         # The slope may fall faster than the jerk limit allows only if the speed would pass the goal
@@ -191,8 +191,9 @@ def _approach(
 def _flattenable(away: float, step: float, dt: float) -> float:
     """Return the largest acceleration that can fall to zero while the speed changes by `away`.
 
-    The acceleration falls by `step` in each period of `dt` s. If it starts at s and falls for n
-    more periods, the speed changes by dt ((n + 1) s - step n (n + 1) / 2).
+    The acceleration falls by `step` in each period of `dt` s.
     """
+    # If the acceleration starts at s and falls for n more periods, the speed changes by
+    # dt ((n + 1) s - step n (n + 1) / 2).
     n = math.floor((math.sqrt(1.0 + 8.0 * away / (step * dt)) - 1.0) / 2.0)
     return (away / dt + step * n * (n + 1) / 2.0) / (n + 1)

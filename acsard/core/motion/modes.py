@@ -46,10 +46,11 @@ def mode_of(
     linked: bool,
     commanded: bool,
 ) -> Mode:
-    """Return the first mode of the list in this module's docstring whose condition holds.
+    """Return the first mode of the ordered list in `modes.py` whose condition holds.
 
     `linked` is true if the board is ready to drive the robot, and `commanded` is true if the robot
-    has a fresh command to follow.
+    has a fresh command to follow. The other arguments say whether the daemon is shutting down, or
+    whether the robot is in fault, stopped or inactive.
     """
     if shutting_down:
         return Mode.SHUTDOWN
@@ -75,11 +76,11 @@ REFUSALS: dict[tuple[Mode, Verb], str] = {
     (Mode.STOPPED, "activate"): "the robot is stopped: call srv/clear first",
     (Mode.STOPPED, "deactivate"): "the robot is stopped and cannot move: call srv/clear first",
 }
-"""The requests that each mode refuses, with the reason that the client gets."""
+"""Reason for the client, for each request (verb) that a mode refuses."""
 
 
 def require_allowed(mode: Mode, verb: Verb) -> None:
-    """Raise `RefusedError` if this mode refuses the request."""
+    """Raise `RefusedError` if the robot refuses the request `verb` in this mode."""
     why = REFUSALS.get((mode, verb))
     if why is not None:
         raise RefusedError(why)

@@ -50,25 +50,29 @@ from acsard.core.values import (
 )
 
 TAKEN_BACK = 128
-"""Largest number of lines that are recomputed when a wheel proves faulty."""
+"""Largest number of feedback lines that are recomputed when a wheel proves faulty."""
 
 
 class Step(Struct, frozen=True, gc=False):
-    """The motion that one feedback line added to the pose. It is kept to recompute the pose."""
+    """The motion that one feedback line added to the pose.
+
+    The odometry keeps it to recompute the pose if a wheel proves faulty.
+    """
 
     pose: Pose
-    """The pose before the line."""
+    """The pose before the feedback line."""
     pieces: tuple[Motors, ...]
-    """Angles that the wheels rolled since the line before, rad, one item for each arc."""
+    """Angles that the wheels rolled since the previous feedback line, rad, one item for each
+    arc."""
     gyro: Turn | None
-    """The turn that a gyro measured, None if the wheels provided the turn."""
+    """The turn that a gyro measured; None if the wheels provided the turn."""
     speeds: WheelSpeeds
     turn: float
     """Change of the heading that this line caused, rad."""
     on_trial: bool
     """Whether the turn came from the wheels because the gyro was not proven yet."""
     share: float = 1.0
-    """The effective track that was used for this line, divided by the configured track."""
+    """Effective track that was used for this feedback line, divided by the configured track."""
 
 
 class Odometry:
@@ -84,19 +88,19 @@ class Odometry:
     ) -> None:
         """Start at the origin.
 
-        `encoder_counts` is the number of counts per revolution of a wheel, 0 if unknown. `quiet` is
-        the time without feedback after which the daemon commands rest, s.
+        `encoder_counts` is the number of counts per revolution of a wheel; 0 if it is unknown.
+        `quiet` is the time without feedback after which the daemon commands rest, s.
         """
         self._kinematics, self._track = kinematics, CONFIGURED
         self._positions = NOWHERE
         self._rolling = Rolling(quiet)
         self._confirmation = Confirmation(feedback)
         self._held = NOWHERE
-        """Angles that the wheels have rolled at rest, rad. They are not added to the pose until
-        they exceed two encoder counts (`_unsettled`) or the robot drives."""
+        """Angles that the wheels have rolled at rest, rad. The odometry adds these angles to the
+        pose when they exceed two encoder counts (`_unsettled`) or when the robot drives."""
         self._steps_of, self._coarsest = NOWHERE, 0.0
-        """`_steps_of` are the quantization steps of the speeds in the last line, rad/s. `_coarsest`
-        is the largest known step among them, rad/s."""
+        """`_steps_of` contains the quantization step of each wheel's speed in the last line, rad/s.
+        `_coarsest` is the largest known step of these, rad/s."""
         self._path = Path()
         self._errors = ErrorModel(odometry, kinematics)
         self._uncertainty = PoseUncertainty(self._errors, encoder_counts)
@@ -105,8 +109,8 @@ class Odometry:
         self.checks = ConsistencyChecks(odometry, kinematics, encoder_counts, feedback)
         self._steps: deque[Step] = deque(maxlen=TAKEN_BACK)
         self._unsettled = 2 * math.tau / (encoder_counts or COARSE_COUNTS)
-        """Angle of two encoder counts, rad. A wheel at rest that rocks between the edges of one
-        count reports no larger angle."""
+        """Angle of two encoder counts, rad. If a wheel at rest rocks between the edges of one
+        count, the reported angle is not larger than this."""
         self._still = 0.0
         """Time for which all wheel speeds have been zero, s."""
         self.twist = REST
@@ -114,16 +118,16 @@ class Odometry:
         self.speeds = STILL
         """Wheel speeds in the last feedback line, rad/s."""
         self.gaps, self.unseen, self.bridged = 0, 0.0, 0.0
-        """`gaps` and `unseen` are the number and the total duration, s, of the gaps in the feedback
-        in which the robot moved but the pose could not follow. `bridged` is the total duration of
-        the gaps that were filled, s."""
+        """Statistics of the gaps in the feedback. `gaps` and `unseen` are the number and the total
+        duration, s, of the gaps in which the robot moved but the pose could not follow. `bridged`
+        is the total duration of the gaps that were filled, s."""
         self.travelled = 0.0
         """Distance driven since the start of the daemon, forwards plus backwards, m."""
 
     def use(self, odometry: OdometryConfig) -> None:
-        """Use these variances from now on.
+        """Use the variances in `odometry` from now on.
 
-        The variances of the initial pose apply from the next `set_pose` on.
+        The variances of the initial pose apply from the next call of `set_pose` on.
         """
         self._errors.use(odometry)
 
@@ -138,8 +142,8 @@ class Odometry:
     def set_pose(self, pose: Pose) -> None:
         """Set the pose of base_link in odom, with the uncertainty of an initial pose.
 
-        The angles of the wheels do not change. The motion in held and in implausible lines, which
-        is not in the pose yet, is dropped, because it happened before this call.
+        The angles of the wheels do not change. Motion in feedback lines that are held back or
+        implausible is not in the pose yet. It is dropped, because it happened before this call.
         """
         self._confirmation.forget()
         self._rolling.forget()
@@ -154,10 +158,11 @@ class Odometry:
         return self._path.pose
 
     def missed(self) -> dict[str, int]:
-        """Return counters of the gaps in the feedback, without counters that are 0.
+        """Return counters of the gaps in the feedback by name, without counters that are 0.
 
         `gaps` is the number of gaps in which the robot moved but the pose could not follow, and
-        `gap_ms` is their total duration. `gaps_filled_ms` is the total duration of filled gaps.
+        `gap_ms` is their total duration, ms. `gaps_filled_ms` is the total duration of filled gaps,
+        ms.
         """
         ms = {"gap_ms": round(1e3 * self.unseen), "gaps_filled_ms": round(1e3 * self.bridged)}
         return {name: count for name, count in ({"gaps": self.gaps} | ms).items() if count}
@@ -165,16 +170,17 @@ class Odometry:
     def skip(self, feedback: Feedback) -> None:
         """Ignore the speeds of an implausible feedback line (see `sanity.py`).
 
-        The next plausible line adds the motion of both lines to the pose. If the implausible line
-        has encoder counts, its motion comes from these counts.
+        The next plausible line adds the motion of both lines to the pose. If `feedback` has encoder
+        counts, its motion comes from these counts.
         """
         self._rolling.skip(feedback)
 
     def confirmed(self, feedback: Feedback) -> tuple[list[Feedback], int]:
-        """Return a pair: the lines for `fold`, the oldest first, and the number of dropped lines.
+        """Return the feedback lines to pass to `fold`, and the number of lines that were dropped.
 
-        `feedback` is the next plausible line. It is held if it covers a long time with a speed that
-        no other wheel and no other line confirms yet.
+        `feedback` is the next plausible line. It is held back for a later call if it covers a long
+        time with a speed that no other wheel and no other line confirms yet. The returned lines are
+        in the order of time. The time of a dropped line counts as a gap.
         """
         rolling, believed = self._rolling, self.checks.wheels.believed
         lines, dropped = self._confirmation.look(feedback, rolling.skipped, self.speeds, believed)
@@ -185,10 +191,12 @@ class Odometry:
     def fold(self, feedback: Feedback) -> Estimate:
         """Advance the pose by one feedback line, and return the new estimate.
 
-        - The angles that the wheels rolled come from the encoder counts of the line. Without counts
-          they are the speeds times dt. After a gap without counts, only the uncertainty grows.
-        - While the robot rests, a motion of up to two encoder counts does not change the pose yet.
-        - If a gyro provides the turn since the line before, the wheels provide only the distance.
+        - The angles that the wheels rolled come from the encoder counts of the line. A line without
+          counts gives the speeds times dt. After a gap that cannot be filled, only the uncertainty
+          grows.
+        - While the robot is at rest, a motion of up to two encoder counts does not change the pose
+          yet.
+        - If a gyro provides the turn since the previous line, the wheels provide only the distance.
         - If a wheel proves faulty, the other wheel of its side replaces it, also in the earlier
           lines in which the faulty wheel was wrong.
         """
@@ -232,13 +240,14 @@ class Odometry:
     def _settled(self, rolled: Rolled, at_rest: bool) -> tuple[Motors, ...]:
         """Return the wheel angles by which to advance the pose, rad, one item for each arc.
 
-        Small motions at rest are held back in `_held`.
+        Small motions at rest are not returned yet. They are kept in `_held`.
         """
         turned = rolled.turned
         if self._held != NOWHERE:
             turned = plus(self._held, turned)
         if turned == NOWHERE:
-            self._held = NOWHERE  # the held motion has turned back
+            # The wheels have turned back by the held motion.
+            self._held = NOWHERE
             return rolled.pieces
         if at_rest and max(map(abs, turned)) <= self._unsettled:
             self._held = turned
@@ -270,10 +279,11 @@ class Odometry:
     def _arcs(
         self, pieces: tuple[Motors, ...], gyro: Turn | None, share: float
     ) -> list[tuple[float, float]]:
-        """Return the arcs for these wheel angles. An arc is a pair of distance (m) and turn (rad).
+        """Return the arcs that the robot drove, as pairs of distance (m) and turn (rad).
 
-        If a gyro provides the turn, the result is one arc for all pieces. Otherwise it is one arc
-        for each piece, with an effective track of `share` times the configured one.
+        `pieces` contains the wheel angles, rad. If a gyro provides the turn, the result is one arc
+        for all pieces. Otherwise it is one arc for each piece, with an effective track of `share`
+        times the configured track.
         """
         believed, kinematics = self.checks.wheels.believed, self._kinematics
         arcs = []
@@ -291,10 +301,10 @@ class Odometry:
         speeds: WheelSpeeds,
         slips: bool,
     ) -> float:
-        """Advance the pose by the angles of the wheels; return the turn of the pose, rad.
+        """Advance the pose by the angles of the wheels, and return the turn of the pose, rad.
 
         `pieces` contains the angles, rad, one item for each arc. `turn` is the turn according to a
-        gyro, or None if the wheels must provide the turn. `slips` is true if the wheels slip.
+        gyro; None if the wheels must provide the turn. `slips` is true if the wheels slip.
         """
         path, turned = self._path, 0.0
         pose, variance = path.pose, None if turn is None else turn.variance
@@ -310,10 +320,10 @@ class Odometry:
         return turned
 
     def _go_on(self, rolled: Rolled, feedback: Feedback, before: Twist, twist: Twist) -> None:
-        """Add the uncertainty of a filled gap; without a gap, measure how the twist changes.
+        """Add the uncertainty of a filled gap; without a gap, measure the robot's acceleration.
 
-        `before` and `twist` are the twists of the line before and of this line. A gap that was not
-        filled restarts the measurement.
+        `before` and `twist` are the twists of the previous line and of this line. A gap that was
+        not filled restarts the measurement.
         """
         bridged, doubtful = rolled.bridged, rolled.doubtful
         if bridged > 0.0:
@@ -339,7 +349,7 @@ class Odometry:
         return variances
 
     def _stand(self, seconds: float, before: Twist, after: Twist) -> None:
-        """Add the uncertainty of `seconds` s of unknown motion, without moving the pose.
+        """Add the uncertainty of `seconds` s of unknown motion, but do not move the pose.
 
         `before` and `after` are the twists before and after this time. If both are zero, the time
         does not count as a gap in which the robot moved.

@@ -24,7 +24,7 @@ class Path:
         self.set(Pose())
 
     def set(self, pose: Pose) -> None:
-        """Continue the path from `pose`."""
+        """Set the pose to `pose`, from which the path continues."""
         self._x, self._x_rest = pose.x, 0.0
         self._y, self._y_rest = pose.y, 0.0
         self._yaw, self._yaw_rest = math.remainder(pose.yaw, math.tau), 0.0
@@ -58,14 +58,17 @@ class Path:
 
 
 def plus(a: float, b: float) -> tuple[float, float]:
-    """Return a pair: the double nearest to a + b, and its exact rounding error (Knuth's TwoSum)."""
+    """Return a pair: the double nearest to a + b, and its exact rounding error.
+
+    This is Knuth's TwoSum.
+    """
     total = a + b
     of_b = total - a
     return total, (a - (total - of_b)) + (b - of_b)
 
 
 def arc(pose: Pose, distance: float, turn: float) -> Pose:
-    """Return `pose` after an arc of length `distance` m through `turn` rad."""
+    """Return the pose after an arc from `pose` with the length `distance` m and `turn` rad."""
     half, yaw = turn / 2, math.remainder(pose.yaw, math.tau)
     chord = distance * (math.sin(half) / half if half else 1.0)
     heading = yaw + half

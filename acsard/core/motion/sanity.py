@@ -1,8 +1,8 @@
 """Checks whether feedback is physically possible.
 
-`Sanity` rejects a line in which a wheel turns, or changes its speed, faster than any wheel can. The
-daemon does not use such a line, and several in a row are a fault. If more than one line in a
-hundred is impossible, the daemon logs a warning: either the wire damages lines, or a bound is too
+`Sanity` rejects a feedback line in which a wheel turns, or changes its speed, faster than any wheel
+can. The daemon does not use such a line, and several in a row are a fault. If more than one line in
+a hundred is impossible, the daemon logs a warning: either the wire damages lines, or a bound is too
 low and true lines are rejected. `wheel_faults.py` checks whether the wheels follow their commands.
 
 A plain line has no checksum, so a damaged line may look possible, and then the true lines after it
@@ -21,32 +21,35 @@ from acsard.core.link.feedback import Feedback
 from acsard.core.values import WHEELS, Event, WheelSpeeds
 
 REPEATED = 3
-"""Number of impossible lines in a row that latch a fault: 30 ms at 100 Hz."""
+"""Number of impossible feedback lines in a row that latch a fault: 30 ms at 100 Hz."""
 
 WINDOW = 1000
-"""Number of lines in a window. The daemon counts the impossible lines of each window. A window
-lasts 10 s at 100 Hz."""
+"""Number of feedback lines in a window (10 s at 100 Hz). The daemon counts the impossible lines of
+each window."""
 
 SHARE = 0.01
-"""If more than this fraction of the lines in a window is impossible, one warning is logged."""
+"""If more than this fraction of the feedback lines in a window is impossible, one warning is
+logged."""
 
 SLACK = 2.0
-"""Change of a speed, rad/s, that is allowed in addition to `feedback.wheel_acceleration`. Coarse
-encoders and a robot at rest can cause changes of this size."""
+"""Change of a wheel speed that is allowed in addition to `feedback.wheel_acceleration`, rad/s.
+Coarse encoders and a robot at rest can cause changes of this size."""
 
 STEPS = 2
 """Encoder counts by which two reports of a wheel at constant speed may differ, because each report
 may be wrong by one count."""
 
 SHORTEST_S = 0.004
-"""Shortest time between two lines, s. Lines follow each other this quickly while this computer
-catches up after a stall. A single encoder count in so short a time looks like a high speed."""
+"""Shortest time between two feedback lines, s. Lines follow each other this quickly while this
+computer catches up after a stall. A single encoder count in so short a time looks like a high
+speed."""
 
 
 class Sanity:
-    """Compares each feedback line with the reference: the last line that was possible.
+    """Checks whether the wheel speeds in each feedback line are physically possible.
 
-    A line that contradicts the reference still counts as possible if the reference is not trusted,
+    The changes of the speeds are measured from the reference: the last line that was possible. A
+    line that contradicts the reference still counts as possible if the reference is not trusted,
     and if the line agrees with one of the impossible lines since the reference.
     """
 
@@ -54,39 +57,42 @@ class Sanity:
         self._settings = feedback
         self._last: WheelSpeeds | None = None
         self._trusted = False
-        """Whether the line `_last` is trusted. It is if it differs so little from the possible line
-        before it that the next line may have the speeds of that earlier line again."""
+        """Whether the line `_last` is trusted. It is trusted if it differs so little from the
+        possible line before it that the next line may have the speeds of that earlier line
+        again."""
         self._rejected: list[tuple[WheelSpeeds, float]] = []
         """The newest impossible lines since `_last`: pairs of the speeds and the time since
         `_last`, s. Lines with a speed over `feedback.wheel_speed` are not included."""
         self._since = 0.0
         self._longest = 0.0
-        """Longest time that a recent line covers, s. The speeds in a line are means over the time
-        that the line covers. A line that covers t s counts as recent for t s."""
+        """Longest time that a recent feedback line covers, s. The speeds in a line are means over
+        the time that the line covers. A line that covers t s counts as recent for t s."""
         self._impossible = 0
         self._lines = self._dropped = 0
-        """Numbers of all lines and of impossible lines in the present window."""
+        """Numbers of feedback lines in the present window: all lines (`_lines`), and impossible
+        lines (`_dropped`)."""
         self.warning: Event | None = None
-        """The warning that too many lines are impossible; None unless the last line caused it."""
+        """Log event with the warning that too many lines are impossible; None unless the last line
+        caused it."""
 
     def forget(self) -> None:
-        """Start over, because the link was lost or a fault has been cleared.
+        """Start over, because the link was lost or a fault was cleared.
 
-        The next line is still compared with the last possible line, which is not trusted any more.
+        The next feedback line is still compared with the last possible line, which is not trusted
+        any more.
         """
         self._trusted, self._impossible = False, 0
 
     @property
     def doubtful(self) -> bool:
-        """Whether the last `REPEATED` lines or more were impossible, which latches a fault."""
+        """Whether at least the last `REPEATED` lines were impossible. This latches a fault."""
         return self._impossible >= REPEATED
 
     def impossible(self, feedback: Feedback) -> str:
         """Return why no wheel can have the speeds in this line; "" if the line is possible.
 
         The allowed change of each speed grows with the time since the last possible line, so a real
-        jump is accepted after enough time. Each speed is a mean over the time that its line covers,
-        so the change may have lasted from the middle of one such time to the middle of the next.
+        jump is accepted after enough time. The method also updates `doubtful` and `warning`.
         """
         dt, since = feedback.dt, feedback.since
         since = dt if dt > since else since
@@ -127,11 +133,13 @@ class Sanity:
 
         `longest` is the longest time that one of the recent lines covers, s (see `_longest`).
         """
+        # Each speed is a mean over the time that its line covers. Therefore the change may have
+        # lasted from the middle of one such time to the middle of the next.
         mean = (since + longest) / 2
         return self._settings.wheel_acceleration * (mean if mean > since else since) + SLACK
 
     def _agrees(self, line: Feedback, longest: float) -> bool:
-        """Return whether a line agrees with one of the impossible lines in `_rejected`.
+        """Return whether a feedback line agrees with one of the impossible lines in `_rejected`.
 
         `longest` is the longest time that one of the recent lines covers, s (see `_longest`).
         """
@@ -141,9 +149,9 @@ class Sanity:
         )
 
     def _count(self, why: str) -> None:
-        """Count a line in the window, and set `warning` if too many lines are impossible now.
+        """Count a feedback line, and set `warning` if too many lines of the window are impossible.
 
-        `why` is the reason why the line is impossible, "" for a possible line.
+        `why` is the reason why the line is impossible; "" for a possible line.
         """
         self._lines += 1
         self.warning = None
@@ -163,7 +171,7 @@ class Sanity:
         )
 
     def _too_fast(self, line: Feedback) -> str:
-        """Return why a speed in this line is too high; "" if no speed is."""
+        """Return why a wheel speed in this line is too high; "" if no speed is too high."""
         wheels, fastest = line.speeds.as_tuple(), self._settings.wheel_speed
         turned = _proven(line)
         for name, now, step, angle in zip(
@@ -182,10 +190,9 @@ class Sanity:
         return ""
 
     def _jump(self, line: Feedback, before: WheelSpeeds, most: float) -> str:
-        """Return why a speed in this line differs from `before` by more than `most` allows.
+        """Return why a wheel speed in this line differs too much from `before`; "" if none does.
 
-        Return "" if no speed does. `most` is in rad/s. The quantization of the speeds allows a
-        further difference.
+        The allowed difference is `most`, rad/s, plus the quantization of the speeds.
         """
         least = line.count / SHORTEST_S if _proven(line) is not None else 0.0
         rows = zip(WHEELS, line.speeds.as_tuple(), before.as_tuple(), line.steps, strict=True)
@@ -197,5 +204,5 @@ class Sanity:
 
 
 def _proven(line: Feedback) -> Motors | None:
-    """Return the wheel angles that encoder counts prove, rad; None if the line has no counts."""
+    """Return the wheel angles that encoder counts prove, rad, or None for a line without counts."""
     return line.counted if line.turned is None else line.turned

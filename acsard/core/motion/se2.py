@@ -1,4 +1,4 @@
-"""Computes with the errors of a planar pose, which are elements of the Lie algebra of SE(2).
+"""Calculates with the errors of a planar pose, which are elements of the Lie algebra of SE(2).
 
 SE(2) is the group of planar poses (x, y, yaw). The error of an estimate is log(estimate^-1 truth):
 the constant twist that leads from the estimated pose to the true pose in one unit of time. It is a
@@ -49,9 +49,9 @@ def brackets(a: Vector, p: PoseCovariance, times: float) -> tuple[Vector, Vector
 
 
 def bracket_covariance(p: PoseCovariance, q: PoseCovariance) -> Vector:
-    """Return xx, xy and yy of the covariance of the Lie bracket [a, b].
+    """Return the covariance (xx, xy, yy) of the Lie bracket [a, b] of two pose errors.
 
-    a and b are independent pose errors with the covariances `p` and `q`.
+    The errors a and b are independent and have the covariances `p` and `q`.
     """
     return (
         p.yy * q.yawyaw - 2 * p.yyaw * q.yyaw + p.yawyaw * q.yy,
@@ -78,19 +78,18 @@ def twice_bracketed(p: PoseCovariance, a: Vector) -> PoseCovariance:
 
 
 def seen_from(error: Vector, dx: float, dy: float) -> Vector:
-    """Return the value of a pose `error` after the robot has moved by `dx`, `dy` m in odom.
+    """Return the pose error that `error` becomes when the robot moves by `dx`, `dy` m in odom.
 
-    The given and the returned error are both in axes parallel to odom, with the origin at the
-    robot.
+    Both errors are in axes parallel to odom, with the origin at the robot. Yaw does not change.
     """
     x, y, yaw = error
     return x - dy * yaw, y + dx * yaw, yaw
 
 
 def carried(p: PoseCovariance, dx: float, dy: float) -> PoseCovariance:
-    """Return the covariance of a pose error after the robot has moved by `dx`, `dy` m in odom.
+    """Return the covariance that `p` becomes when the robot moves by `dx`, `dy` m in odom.
 
-    `p` is the covariance before that motion.
+    Both are covariances of the pose error in axes parallel to odom, with the origin at the robot.
     """
     return PoseCovariance(
         p.xx - 2 * dy * p.xyaw + dy * dy * p.yawyaw,
@@ -105,11 +104,15 @@ def carried(p: PoseCovariance, dx: float, dy: float) -> PoseCovariance:
 def added(
     p: PoseCovariance, along: float, yaw: float, both: float, c: float, s: float
 ) -> PoseCovariance:
-    """Return the covariance of the pose, `p`, plus the covariance of the noise of a step.
+    """Return the covariance `p` of the pose plus the covariance of the noise of a step.
 
-    The noise of the step has the variance `along` of the distance, m2, the variance `yaw` of the
-    turn, rad2, and the covariance `both` of distance and turn, m rad. `c` and `s` are the cosine
-    and the sine of the direction of the step in odom.
+    Args:
+        p: the covariance of the pose error.
+        along: the variance of the step's distance, m2.
+        yaw: the variance of the step's turn, rad2.
+        both: the covariance of the step's distance and turn, m rad.
+        c: the cosine of the direction of the step in odom.
+        s: the sine of the direction of the step in odom.
     """
     cc, cs = along * c, along * s
     return PoseCovariance(
@@ -134,9 +137,9 @@ def stepped(
 ) -> PoseCovariance:
     """Return the covariance of the pose after a step by `dx`, `dy` m, with the noise of the step.
 
-    The result is that of `added(carried(p, dx, dy), along, yaw, both, c, s)`. This single function
-    is faster than the two calls, and it runs for each feedback line.
+    The result equals `added(carried(p, dx, dy), along, yaw, both, c, s)`.
     """
+    # This function runs for each feedback line, and is faster than the two calls.
     xyaw, yyaw, yawyaw = p.xyaw, p.yyaw, p.yawyaw
     cc, cs = along * c, along * s
     return PoseCovariance(

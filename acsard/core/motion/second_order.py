@@ -1,8 +1,8 @@
 """Adds the effects of second order to the covariance of the pose.
 
-If the true heading deviates from the estimated one and returns, the robot ends short of the
-estimated position, and never beyond it. This is an effect of second order. On a straight drive, it
-causes nearly the whole error along the path: after 60 m with k = 1e-5 (`error_model.py`) the
+If the true heading deviates from the estimated one and returns, the robot does not get as far as
+the estimated position, and never farther. This is an effect of second order. On a straight drive,
+it causes nearly the whole error along the path: after 60 m with k = 1e-5 (`error_model.py`) the
 first-order error is 17 mm, but the true error is 0.12 m.
 
 The path is divided into stretches. Each stretch composes the error e of the path before it with its
@@ -11,8 +11,8 @@ the Lie bracket (`se2.py`):
 
     log(exp(e) exp(w)) = e + w + [e, w] / 2 + [e, [e, w]] / 12 + [w, [w, e]] / 12 + ...
 
-Each of the two errors has a part from noise and a part from the parameters, e = x + J p and
-w = n + W p, with these symbols:
+Each of the two errors has a part from noise and a part from the parameters, e = x + J p and w = n +
+W p, with these symbols:
 
 - x and n: the errors from noise on the path before and on the stretch, with covariances P and Q.
 - p: the errors of the parameters in standard deviations, independent and normal. p_i is one of
@@ -50,14 +50,15 @@ from acsard.core.motion.se2 import (
 from acsard.core.values import PoseCovariance
 
 MAX_HEADING_VARIANCE = 1.0
-"""Largest variance of the heading for which the terms are computed, rad2. With a larger variance
-the series does not converge, and a stretch adds nothing to the terms."""
+"""Largest variance of the heading for which the second-order terms are computed, rad2. With a
+larger variance, the series does not converge, and a stretch of the path adds nothing to the
+terms."""
 
 NOTHING = PoseCovariance(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 class SecondOrder:
-    """Computes the terms of second order in the covariance of x and y.
+    """Computes the second-order terms in the covariance of x and y.
 
     The symbols such as [x, n], M_i and C_ik are those of the module's docstring.
     """
@@ -71,21 +72,22 @@ class SecondOrder:
         row is for the component of M_i along the x axis, and the second row for that along the y
         axis."""
         self._bent: dict[tuple[int, int], Planar] = {}
-        """C_ik (see the module) for each pair of parameters, m. The larger index comes first."""
+        """C_ik (see the module) for each pair of parameters, m. In the key, the larger index comes
+        first."""
         for _ in range(columns):
             self.widen()
         self.xx = self.xy = self.yy = 0.0
-        """Terms of second order in the covariance of x and y, m2, in the axes of odom. A motion
-        does not change them, because they have no yaw (`se2.seen_from`)."""
+        """Second-order terms in the covariance of x and y, m2, in the axes of odom. A motion of the
+        robot does not change these terms, because they have no yaw (`se2.seen_from`)."""
 
     def widen(self) -> None:
-        """Add one more parameter, which has not affected the pose so far."""
+        """Add one more parameter, which must not have affected the pose yet."""
         self._with_x.append((ORIGIN, ORIGIN))
         i = len(self._with_x) - 1
         self._bent |= {(i, k): (0.0, 0.0) for k in range(i + 1)}
 
     def carry(self, dx: float, dy: float) -> None:
-        """Transform the stored covariances after the robot has moved by `dx`, `dy` m in odom."""
+        """Transform the stored covariances when the robot has moved by `dx`, `dy` m in odom."""
         self._with_x = [(seen_from(a, dx, dy), seen_from(b, dx, dy)) for a, b in self._with_x]
 
     def compose(
@@ -93,13 +95,15 @@ class SecondOrder:
     ) -> PoseCovariance:
         """Add a stretch of the path, and return the covariance that the caller must add to p + q.
 
-        The result is the contribution of the last two terms of the series in the module's
-        docstring. All arguments must be expressed at the robot's position at the end of the stretch
-        (`se2.seen_from`). The caller must first call `carry` with the displacement of the stretch.
+        The method also updates `xx`, `xy` and `yy`. The caller must first call `carry` with the
+        displacement of the stretch. All arguments must be expressed at the robot's position at the
+        end of the stretch (`se2.seen_from`).
 
-        `p` and `q` are the covariances of the noise on the path before the stretch and on the
-        stretch itself. `j` and `w` have a column for each parameter: its effects on the path before
-        and on the stretch.
+        Args:
+            p: the covariance of the noise on the path before the stretch.
+            q: the covariance of the noise on the stretch itself.
+            j: the effect of each parameter on the path before the stretch.
+            w: the effect of each parameter on the stretch itself.
         """
         xyaw, yyaw, yawyaw = p.xyaw, p.yyaw, p.yawyaw
         for x, y, yaw in j:

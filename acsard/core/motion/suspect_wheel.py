@@ -3,10 +3,8 @@
 A faulty encoder shows one of three signs. It is dead (reports no turn), reversed (reports the
 opposite of the other wheel) or stuck (repeats one speed). A wheel with such a sign is faulty if an
 independent reference differs more from this wheel than from the other wheel of its side. The
-reference is the turn according to a gyro or, without a gyro, the command: the speed of a healthy
-wheel lies between its command and the speed that a wheel with `feedback.response_time` has reached
-by now. Without a reference, only a stuck wheel is found, because a person who pushes the robot may
-turn one wheel and not the other.
+reference is the turn according to a gyro or, without a gyro, the command. Without a reference, only
+a stuck wheel is found, because a person who pushes the robot may turn one wheel and not the other.
 
 `Suspect` tests a wheel that contradicts the other wheel of its side. `Stuck` tests every wheel,
 because a stuck encoder agrees with the other wheel until the command changes.
@@ -20,12 +18,12 @@ from typing import Literal
 from acsard.core.motion.wheel_witness import Expected
 
 FAULT_S, FAULT_LINES = 0.025, 2
-"""A sign of a fault must last for at least `FAULT_S` s and for at least `FAULT_LINES` lines. At
-100 Hz, `FAULT_S` takes three lines, so one bad reading is not enough."""
+"""A sign of a faulty encoder must last for at least `FAULT_S` s and for at least `FAULT_LINES`
+feedback lines. At 100 Hz, `FAULT_S` takes three lines, so one bad reading is not enough."""
 
 FAULT_COUNTS, FAULT_ANGLE = 3.5, 0.05
-"""Smallest difference of the angles of two wheels at which one of them can be called faulty:
-`FAULT_COUNTS` encoder counts plus `FAULT_ANGLE` rad."""
+"""Smallest difference between the angles of the two wheels of a side at which one wheel can be
+called faulty: `FAULT_COUNTS` encoder counts plus `FAULT_ANGLE` rad."""
 
 FOLLOWED_COUNTS, FOLLOWED_ANGLE = 2.5, 0.01
 """After a new command, a wheel that repeats its old speed is called stuck only when a healthy wheel
@@ -37,22 +35,22 @@ LEAVES = 0.05
 speed."""
 
 VOTE = 1 / 3
-"""A reference (a gyro or the command) decides which of two wheels is faulty only if the reference
-is clearly nearer to one of them. The two distances from the reference must differ by at least this
-fraction of the difference between the wheels."""
+"""A reference (a gyro or the command) decides which of two wheels is faulty only if it is clearly
+nearer to one wheel. Its distances from the two wheels must differ by at least this fraction of the
+difference between the wheels."""
 
 HAND_S = 0.3
-"""If neither a command nor a gyro shows which wheel is right, a wheel must repeat one speed for
-this time, s, before it is called stuck. A person cannot turn a wheel so evenly by hand."""
+"""Time for which a wheel must repeat one speed before it is called stuck, s, if neither a command
+nor a gyro shows which wheel is right. A person cannot turn a wheel so evenly by hand."""
 
 DEAD, REVERSED = 0.1, 0.3
-"""Fractions of the angle that the other wheel of the side rolled. A wheel is dead if it rolled by
+"""Fractions of the angle that the other wheel of the side rolled. A wheel is dead if its angle is
 at most the fraction `DEAD`. It is reversed if it rolled in the opposite direction, and if the
 magnitudes of the two angles differ by at most the fraction `REVERSED`."""
 
 STUCK = 0.3
-"""Smallest difference between the two wheels of a side at which one of them can be called stuck, as
-a fraction of the faster wheel's angle. If the difference is smaller, the wheel with the constant
+"""Smallest difference between the two wheels of a side at which one wheel can be called stuck, as a
+fraction of the faster wheel's angle. If the difference is smaller, the wheel with the constant
 speed may be healthy while the other wheel slips."""
 
 WheelFault = Literal["dead", "reversed", "stuck"]
@@ -65,8 +63,11 @@ WORDS: dict[WheelFault, str] = {
 
 
 class _Ballot:
-    """Sums of angles over feedback lines, rad: the angles that two wheels rolled, and the lowest
-    and the highest angle that a healthy wheel can have rolled according to a reference."""
+    """Sums of angles over feedback lines, rad, to decide which of two wheels is wrong.
+
+    The sums are the angles that the suspect wheel and the other wheel rolled, and the lowest and
+    the highest angle that a healthy wheel can have rolled according to a reference.
+    """
 
     def __init__(self) -> None:
         self._own = self._other = self._low = self._high = 0.0
@@ -84,7 +85,7 @@ class _Ballot:
 
     @property
     def vote(self) -> float:
-        """A number from 1 (only the suspect wheel is wrong) to -1 (only the other wheel is)."""
+        """Vote from 1 (only the suspect wheel is wrong) to -1 (only the other wheel is wrong)."""
         return (self._off(self._own) - self._off(self._other)) / (self.apart or 1.0)
 
     @property
@@ -111,14 +112,17 @@ class Suspect:
         self._begun: float | None = None
         """Magnitude of the angle that the wheel rolled in the first line of the test, rad."""
         self._known = False
-        """Whether the command could serve as a reference in at least one line of the test."""
+        """Whether the command served as a reference in at least one line of the test."""
 
     def looks(self, own: float, other: float, same: bool, dt: float, count: float) -> bool:
-        """Add a feedback line of `dt` s, and return whether the wheel now shows a sign of a fault.
+        """Add a feedback line, and return whether the wheel now shows a sign of a faulty encoder.
 
-        `own` and `other` are the angles that this wheel and the other wheel of its side rolled, and
-        `count` is the angle of an encoder count, rad. `same` is true if this wheel repeats the
-        speed of the line before.
+        Args:
+            own: the angle that this wheel rolled in the line, rad.
+            other: the angle that the other wheel of its side rolled, rad.
+            same: whether this wheel repeats the speed of the previous line.
+            dt: the time that the line covers, s.
+            count: the angle of an encoder count, rad.
         """
         sign = self._sign(own, other, same, count)
         if sign != self.sign:
@@ -148,18 +152,24 @@ class Suspect:
         expected: Expected,
         gyro: float | None,
     ) -> None:
-        """Compare both wheels with the references in this line.
+        """Compare both wheels of the side with the references in a feedback line.
 
-        `own`, `other` and `gyro` are the angles that this wheel, the other wheel of its side, and
-        the side according to a gyro rolled in `dt` s, rad. `gyro` is None without a trusted gyro.
-        `count` is the angle of an encoder count, rad. `expected` gives the speed of a healthy
-        wheel.
+        Args:
+            own: the angle that this wheel rolled in the line, rad.
+            other: the angle that the other wheel of its side rolled, rad.
+            dt: the time that the line covers, s.
+            count: the angle of an encoder count, rad.
+            expected: the speed of a healthy wheel.
+            gyro: the angle that this side rolled according to a gyro, rad; None without a trusted
+                gyro.
         """
+        # The speed of a healthy wheel lies between its command and the speed that a wheel with
+        # `feedback.response_time` has reached by now.
         slow, command = expected.speed, expected.commanded
         self._begun = abs(own) if self._begun is None else self._begun
-        # After a command to the other direction, a sound wheel of a slow robot turns against the
-        # command for a while. It obeys if it does not turn faster than in the first line of the
-        # test.
+        # After a command to the other direction, a healthy wheel of a slow robot turns against the
+        # command for a while. Such a wheel obeys its command if it does not turn faster than in the
+        # first line of the test.
         obeys = not expected.settled and own * command < 0.0 and abs(own) <= self._begun + count
         if expected.clear and not obeys:
             self._command.add(own, other, min(slow, command) * dt, max(slow, command) * dt)
@@ -168,7 +178,7 @@ class Suspect:
             self._gyro.add(own, other, gyro, gyro)
 
     def is_faulty(self, count: float) -> bool:
-        """Return whether this wheel, and not the other one, is faulty.
+        """Return whether the references show that this wheel is faulty and the other one is not.
 
         `count` is the angle of an encoder count, rad.
         """
@@ -182,7 +192,7 @@ class Suspect:
         return self.sign == "stuck" and not self._known and self._seconds >= HAND_S
 
     def _plain(self, ballot: _Ballot) -> bool:
-        """Return whether the two wheels differ by more than slip of the other wheel explains.
+        """Return whether the two wheels differ by more than slip of the other wheel can cause.
 
         Only the sign "stuck" needs this test. For the other signs, the result is True.
         """
@@ -190,12 +200,12 @@ class Suspect:
 
 
 class Stuck:
-    """The test of one wheel for a speed that stays the same although it must change.
+    """The test of one wheel for an encoder that repeats one speed although the command has changed.
 
-    While the robot drives at a constant speed, no test can detect a stuck encoder, but then it does
-    not harm the pose either. After a new command, a healthy wheel must report another speed as soon
-    as its expected angle differs by a few counts from the angle at the old speed. If only the other
-    wheel of the side reports another speed, this encoder is stuck.
+    After a new command, a healthy wheel must report another speed as soon as its expected angle
+    differs by a few counts from the angle at the old speed. If only the other wheel of the side
+    reports another speed, this encoder is stuck. While the robot drives at a constant speed, no
+    test can detect a stuck encoder, but then it does not harm the pose either.
     """
 
     def __init__(self) -> None:
@@ -206,22 +216,28 @@ class Stuck:
         self._seconds = self._followed = self._other = 0.0
 
     def left_by(self, command: float) -> bool:
-        """Return whether the command has changed since the wheel began to repeat its present speed.
+        """Return whether the command has changed since the wheel began to repeat its speed.
 
-        `command` is the present command, rad/s. A change below `LEAVES` does not count.
+        `command` is the present command for the wheel, rad/s. A change below `LEAVES` does not
+        count.
         """
         return abs(command - self._command) >= LEAVES
 
     def says(self, same: bool, apart: float, dt: float, count: float, expected: Expected) -> bool:
-        """Add a feedback line of `dt` s, and return whether the encoder is stuck.
+        """Add a feedback line, and return whether the encoder of this wheel is stuck.
 
-        `same` is true if the wheel turns and repeats the speed of the line before. `apart` is the
-        angle by which the other wheel of the side turned further than this wheel, rad. `count` is
-        the angle of an encoder count, rad. `expected` gives the speed of a healthy wheel.
+        Args:
+            same: whether the wheel turns and repeats the speed of the previous line.
+            apart: the angle by which the other wheel of the side turned further than this wheel,
+                rad.
+            dt: the time that the line covers, s.
+            count: the angle of an encoder count, rad.
+            expected: the speed of a healthy wheel.
         """
         slow, command = expected.speed, expected.commanded
         leaves = command - self._command
-        if not (same and abs(leaves) >= LEAVES):  # also true in the first line, because of the NaN
+        # In the first line, the NaN makes this condition true.
+        if not (same and abs(leaves) >= LEAVES):
             self._begin(slow, command)
             return False
         self._seconds += dt
@@ -237,7 +253,7 @@ class Stuck:
 
 
 def stands(own: float, other: float) -> bool:
-    """Return whether a wheel seems to stand.
+    """Return whether a wheel seems to stand still.
 
     The wheel turned `own` rad, and the other wheel of its side turned `other` rad.
     """
@@ -254,10 +270,10 @@ def reverses(own: float, other: float, count: float) -> bool:
 
 
 def was_faulty(fault: WheelFault, own: float, other: float, now: float) -> bool:
-    """Return whether the fault may already have been present in an earlier line.
+    """Return whether the fault of a wheel may already have been present in an earlier line.
 
-    `own` and `other` are the speeds of the faulty wheel and of the other one in that line. `now` is
-    the present speed of the faulty wheel. All are in rad/s.
+    `own` and `other` are the speeds of the faulty wheel and of the other wheel of its side in that
+    line. `now` is the present speed of the faulty wheel. All are in rad/s.
     """
     if fault == "reversed":
         return own * other <= 0.0

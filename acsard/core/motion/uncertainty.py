@@ -10,7 +10,7 @@ deviation. Each step updates both parts, and their sum is published (' means tra
     J <- F J + G_p
     P_total = P + J J' + terms of second order (`second_order.py`)
 
-- F (3x3) transforms an error at the robot's place before the step to its place after the step
+- F (3x3) transforms an error at the robot's position before the step to its position after the step
   (`se2.seen_from`).
 - Q (2x2) is the covariance of the noise in the distance and the turn of the step
   (`error_model.Noise`).
@@ -23,12 +23,6 @@ The covariance in nav_msgs/Odometry is defined for x and y in the axes of odom, 
 first order it equals the covariance of e in these axes, so P_total is published. Rotated by -yaw,
 P_total is the covariance of e in the axes of base_link. This rotated covariance is right even if
 the heading is so uncertain that the possible positions form an arc and not an ellipse.
-
-The noise of a turn depends on |dyaw|. On a straight drive, the encoder counts of both sides arrive
-at different times, so the heading turns back and forth by one count. The sum of |dyaw| over all
-feedback lines would count this as turning, and make the variance of yaw 2 to 4 times too large. The
-heading therefore has a dead band of one count, like the backlash of a gear: only turns beyond it
-add to the noise.
 """
 
 from __future__ import annotations
@@ -51,17 +45,18 @@ from acsard.core.motion.second_order import SecondOrder
 from acsard.core.values import PoseCovariance
 
 MAX_VARIANCE = 1e9
-"""Largest variance of the pose, m2 or rad2. A variance of this size means "unknown"."""
+"""Largest variance of the pose, m2 or rad2. A variance of this size means that it is unknown."""
 
 COARSE_COUNTS = 400
-"""Number of encoder counts per revolution of a wheel that is assumed if the configuration has no
-number. Few encoders have a smaller number."""
+"""Number of encoder counts per revolution of a wheel that is assumed if this number is not
+configured. Few encoders have fewer counts."""
 
 NOWHERE = PoseCovariance(MAX_VARIANCE, 0.0, 0.0, MAX_VARIANCE, 0.0, MAX_VARIANCE)
 
 GYRO_SCALE = 0.004
-"""Relative standard deviation of a gyro's scale. An error of this size changes the heading by 1.4
-degrees in one revolution. After equal turns to the left and to the right, its effects cancel."""
+"""Relative standard deviation of the scale factor of a gyro. An error of this size changes the
+heading by 1.4 degrees in one revolution. After equal turns to the left and to the right, its
+effects cancel."""
 
 NO_EFFECT: Column = (0.0, 0.0, 0.0, 0.0)
 
@@ -75,7 +70,7 @@ class PoseUncertainty:
     def __init__(self, model: ErrorModel, counts: int) -> None:
         """Start at the origin.
 
-        `counts` is the number of encoder counts per revolution of a wheel, 0 if unknown.
+        `counts` is the number of encoder counts per revolution of a wheel; 0 if it is unknown.
         """
         self._model = model
         self._parameters = self._effects = model.columns
@@ -88,7 +83,7 @@ class PoseUncertainty:
         self.set(0.0)
 
     def bend(self) -> None:
-        """Use the present track and columns of the error model from now on.
+        """Use the present effective track and columns of the error model from now on.
 
         The error model must have as many columns as before.
         """
@@ -101,14 +96,14 @@ class PoseUncertainty:
         """Set the `angle` of one encoder count, rad, and compute two effects of this angle.
 
         The first effect is the dead band of the heading. The second effect is an uncertainty of the
-        pose, because each wheel may stand anywhere between two counts.
+        pose, because the position of each wheel between two counts is unknown.
         """
         self._count, count, track = angle, self._model.radius * angle, self._model.track
         self._play = count / track
         self._phase = (count**2 / 24 / 2, count**2 / 24 * 2 / track**2, 0.0)
 
     def set(self, yaw: float) -> None:
-        """Reset the covariance to the initial one, for a pose with the heading `yaw`, rad."""
+        """Reset the covariance to that of an initial pose with the heading `yaw`, rad."""
         xx, yy, _, _, _, yawyaw = self._model.settings.pose_covariance_diagonal
         self._p = PoseCovariance(xx, 0.0, 0.0, yy, 0.0, yawyaw)
         self._cos, self._sin = math.cos(yaw), math.sin(yaw)
@@ -119,8 +114,8 @@ class PoseUncertainty:
         """The columns of the matrix J (see the module). The columns for the gyro's scale and for
         gaps are added when needed."""
         self._of_gyro = self._of_gaps = -1
-        """Indices in `_columns` of the column for the gyro's scale and of the column for gaps. An
-        index is -1 if there is no such column yet."""
+        """Indices in `_columns`: of the column for the gyro's scale (`_of_gyro`), and of the column
+        for gaps (`_of_gaps`). An index is -1 before the column is added."""
         self._columns_before = self._columns
         self._turned = self._middle = 0.0
         self._second = SecondOrder(len(self._effects))
@@ -136,11 +131,18 @@ class PoseUncertainty:
     ) -> None:  # fmt: skip
         """Update the covariance after a step, which is an arc of `distance` m through `turn` rad.
 
-        `dx` and `dy` are the displacement in odom, m, and `heading` is the direction of the chord,
-        rad. If a gyro measured the turn, `variance` is the turn's variance, rad2, and `scale` is
-        the relative standard deviation of the gyro's scale. The errors of the parameters then
-        affect only the distance. If `slips` is true, the noise of the wheels is larger by the
-        factor `SLIPPING`.
+        Args:
+            distance: the length of the arc, m.
+            turn: the turn of the step, rad.
+            dx: the displacement along the x axis of odom, m.
+            dy: the displacement along the y axis of odom, m.
+            heading: the direction of the chord of the arc in odom, rad.
+            variance: the variance of the turn, rad2, if a gyro measured the turn; None if the
+                wheels measured it. With a gyro, the errors of the parameters affect only the
+                distance.
+            slips: whether the wheels slip. The noise of the wheels is then larger by the factor
+                `SLIPPING`.
+            scale: the relative standard deviation of the gyro's scale.
         """
         if self._lost:
             self._forget_where(distance, turn)
@@ -170,12 +172,16 @@ class PoseUncertainty:
             self._publish()
 
     def stand(self, distance: float, turn: float, along: float, yaw: float) -> None:
-        """Add the uncertainty of a gap in the feedback, during which the pose was not updated.
+        """Add the uncertainty of a gap in the feedback during which the pose was not updated.
 
-        `distance`, m, and `turn`, rad, are the probable motion in the gap, and `along`, m2, and
-        `yaw`, rad2, are the variances of distance and turn. The motions that the pose missed in
-        several gaps add up and do not average out, so they are treated like the error of a
-        parameter.
+        The motions that the pose missed in several gaps add up and do not average out. Therefore
+        they are treated like the error of a parameter.
+
+        Args:
+            distance: the probable distance driven in the gap, m.
+            turn: the probable turn in the gap, rad.
+            along: the variance of the distance, m2.
+            yaw: the variance of the turn, rad2.
         """
         if self._lost:
             self._forget_where(distance, turn)
@@ -203,15 +209,20 @@ class PoseUncertainty:
         return len(self._columns) - 1
 
     def _forget_where(self, distance: float, turn: float) -> None:
-        """Make the whole pose unknown if the robot moves while its position or heading is unknown.
+        """Make the whole pose unknown if the robot moves by `distance` m or turns by `turn` rad.
 
-        `distance`, m, and `turn`, rad, are the motion. If both are 0, nothing changes.
+        Call this only if the position or the heading is already unknown.
         """
         if distance or turn:
             self.covariance = NOWHERE
 
     def _beyond_play(self, turn: float) -> float:
         """Return the part of `turn` that leaves the heading's dead band of one count, rad."""
+        # On a straight drive, the encoder counts of both sides arrive at different times, so the
+        # heading turns back and forth by one count. The sum of |dyaw| over all feedback lines would
+        # count this as turning, and make the variance of yaw 2 to 4 times too large. The heading
+        # therefore has a dead band of one count, like the backlash of a gear: only turns beyond it
+        # add to the noise.
         self._turned += turn
         off = self._turned - self._middle
         if abs(off) <= self._play:
@@ -226,9 +237,8 @@ class PoseUncertainty:
         """Update the matrix J of the parameters' effects after a step: J <- F J + G_p.
 
         The step is an arc of `distance` m through `turn` rad, with the displacement `dx`, `dy` m in
-        odom. Half of the heading error of the step acts on this displacement, because the direction
-        of the chord is the old heading plus half of the turn. If a gyro measured the turn, `scale`
-        is the relative standard deviation of the gyro's scale. Otherwise it is None.
+        odom. If a gyro measured the turn, `scale` is the relative standard deviation of the gyro's
+        scale. Otherwise it is None.
         """
         c, s, more = self._cos, self._sin, 0.0
         columns: list[Vector] = []
@@ -240,6 +250,8 @@ class PoseUncertainty:
                 more = turn_of_distance * distance + turn_of_turn * turn
             else:
                 more = scale * turn if len(columns) == self._of_gyro else 0.0
+            # Half of the heading error of the step acts on its displacement, because the direction
+            # of the chord is the old heading plus half of the turn.
             lever = yaw + more / 2
             columns.append((x + c * along - dy * lever, y + s * along + dx * lever, yaw + more))
         self._columns = columns
@@ -284,7 +296,7 @@ class PoseUncertainty:
 
 
 def _capped(p: PoseCovariance) -> PoseCovariance:
-    """Return `p` with its variances limited to `MAX_VARIANCE` and its correlations unchanged."""
+    """Return `p` with each variance limited to `MAX_VARIANCE`. Correlations do not change."""
     x, y, yaw = (
         min(1.0, math.sqrt(MAX_VARIANCE / max(v, MAX_VARIANCE))) for v in (p.xx, p.yy, p.yawyaw)
     )

@@ -35,17 +35,17 @@ from acsard.core.motion.wheel_witness import FAULTS, SLACK, Expected, Witness
 from acsard.core.values import STILL, WHEELS, Event, WheelSpeeds, WheelsStatus
 
 COARSEST, FINEST = math.tau / 16, math.tau / 2000
-"""Largest and smallest angle of one encoder count, rad, that is learned if the number of counts is
-not configured."""
+"""Largest and smallest angle of one encoder count that the daemon learns if the number of counts is
+not configured, rad."""
 
 RECUR, SOUGHT = 3, 1000
 """If the number of counts is not configured, the daemon learns the angle of one encoder count. This
-is the `RECUR`-th smallest angle that a front wheel rolled in a line, within `SOUGHT` lines. The
-smallest angle alone may come from a damaged line."""
+is the `RECUR`-th smallest angle that a front wheel rolled in a feedback line, within `SOUGHT`
+lines. The smallest angle alone may come from a damaged line."""
 
 LEAST = 0.005
-"""A commanded wheel speed below this, rad/s, counts as zero, because the line to the board has two
-decimals and shows the speed as 0.00."""
+"""Smallest commanded wheel speed that does not count as zero, rad/s. The line to the board has two
+decimals and shows a lower speed as 0.00."""
 
 ROLLED_S, REPEATED_S = 0.2, 1.0
 """`ROLLED_S` is the time for which wheels must turn without a command before the daemon logs this
@@ -53,17 +53,17 @@ motion, s. A shorter motion may be the rocking of a robot that comes to rest. `R
 shortest time between two such log lines, s."""
 
 SLIP_S = 0.5
-"""Time after the last contradiction for which a side still counts as slipping, s."""
+"""Time for which a side still counts as slipping after the last contradiction of its wheels, s."""
 
 SLIP_REPORTED_S = 0.1
-"""If the two wheels of a side contradict each other for this time, s, the daemon logs slip."""
+"""Time for which the two wheels of a side must contradict each other before slip is logged, s."""
 
 BACK_S = 0.5
-"""If an ignored wheel and the other wheel of its side agree while they roll for this time, s, the
-pose uses the ignored wheel again."""
+"""Time for which an ignored wheel must agree with the other wheel of its side while both roll, s.
+After this time, the pose uses the ignored wheel again."""
 
 Same = tuple[bool, bool, bool, bool]
-"""Whether each wheel reports the same speed as in the line before, in `WHEELS` order."""
+"""Whether each wheel reports the same speed as in the previous feedback line, in `WHEELS` order."""
 
 NONE: Same = (False, False, False, False)
 
@@ -72,7 +72,7 @@ LEFT, RIGHT = (1, 2), (0, 3)
 
 
 class _Side:
-    """The two wheels of one side: the evidence of faults and slip, and the ignored wheel."""
+    """The two wheels of one side: the ignored wheel, and the evidence of faults and slip."""
 
     def __init__(self, name: str, wheels: tuple[int, int]) -> None:
         self.name, self.wheels = name, wheels
@@ -82,7 +82,8 @@ class _Side:
         self._suspects = (Suspect(), Suspect())
         self._stuck = (Stuck(), Stuck())
         self.out: int | None = None
-        """The wheel that the pose ignores: 0 is the front one, 1 the rear one, None means none."""
+        """The wheel that the pose ignores: 0 is the front wheel, 1 is the rear wheel. None if the
+        pose uses both wheels."""
         self._fault: WheelFault = "dead"
         self.late = False
         """Whether a wheel that is not ignored turns too slowly."""
@@ -94,12 +95,12 @@ class _Side:
 
     @property
     def left_out(self) -> str:
-        """The name of the wheel that the pose ignores; "" if it uses both wheels."""
+        """The name of the wheel that the pose ignores; "" if the pose uses both wheels."""
         return "" if self.out is None else WHEELS[self.wheels[self.out]]
 
     @property
     def text(self) -> str:
-        """A text about the ignored wheel or about slip on this side; "" without either."""
+        """A text about the ignored wheel or about slip on this side; "" if both wheels are fine."""
         if self.out is not None:
             return (
                 f"{self.left_out} wheel is left out of the pose: it {WORDS[self._fault]}; check "
@@ -111,7 +112,7 @@ class _Side:
 
     @property
     def slow(self) -> list[str]:
-        """Words for each wheel that turns too slowly: its name and its speed in percent.
+        """A text for each wheel that turns too slowly: its name and its speed in percent.
 
         100 % is the expected speed. An ignored wheel is not included.
         """
@@ -130,7 +131,7 @@ class _Side:
     def watch(self, seen: Motors, dt: float, most: float, count: float, still: bool) -> bool:
         """Compare both wheels with their command, and return whether one of them may be faulty.
 
-        `seen` contains the speeds of all wheels, rad/s. For the other arguments, see
+        `seen` contains the speeds of all wheels, rad/s. The other arguments are as in
         `Witness.look`.
         """
         i, j = self.wheels
@@ -141,7 +142,7 @@ class _Side:
         return bad or self._out_s > 0.0
 
     def fault(self, seen: Motors, limit: float) -> str:
-        """Return words for a wheel fault that has lasted longer than `limit` s, otherwise "".
+        """Return a text about a wheel fault that has lasted longer than `limit` s, otherwise "".
 
         `seen` contains the speeds of all wheels, rad/s.
         """
@@ -159,7 +160,7 @@ class _Side:
         return ""
 
     def agree(self, dt: float) -> None:
-        """Process a line in which the two wheels agree. It covers `dt` s."""
+        """Process a feedback line of `dt` s in which the two wheels of this side agree."""
         if self.suspected:
             self.suspected = False
             for suspect in self._suspects:
@@ -179,9 +180,13 @@ class _Side:
     def stands_still(self, turned: Motors, same: Same, dt: float, count: float) -> bool:
         """Test both wheels for a stuck encoder, and return whether this line proves one stuck.
 
-        The pose then ignores this wheel. `turned` contains the angles that all wheels rolled in the
-        line, and `same` says which wheels repeat the speed of the line before. `count` is the angle
-        of an encoder count, rad.
+        The pose then ignores the wheel with this encoder.
+
+        Args:
+            turned: the angles that all wheels rolled in the line, rad.
+            same: whether each wheel repeats the speed of the previous line.
+            dt: the time that the line covers, s.
+            count: the angle of an encoder count, rad.
         """
         if self.out is not None:
             return False
@@ -203,11 +208,17 @@ class _Side:
         count: float,
         by_gyro: float | None,
     ) -> bool:
-        """Process a line in which the two wheels contradict each other.
+        """Process a feedback line in which the two wheels of this side contradict each other.
 
         Return whether this line has proved a wheel faulty, so that the pose now ignores this wheel.
-        `same` says whether the front and the rear wheel of this side repeat their speeds. `by_gyro`
-        is the angle that this side rolled according to a trusted gyro, rad.
+
+        Args:
+            turned: the angles that all wheels rolled in the line, rad.
+            same: whether the front and the rear wheel of this side repeat their speeds.
+            dt: the time that the line covers, s.
+            count: the angle of an encoder count, rad.
+            by_gyro: the angle that this side rolled according to a gyro, rad; None without a
+                trusted gyro.
         """
         self._agreed_s, fault = 0.0, None if self.out is None else self._fault
         if self.out is not None and self.expected.clear:
@@ -242,7 +253,7 @@ class _Side:
     def was_faulty(self, before: WheelSpeeds, now: WheelSpeeds) -> bool:
         """Return whether the ignored wheel may already have been wrong in an earlier line.
 
-        `before` are the speeds in that line, and `now` are the speeds in the last line.
+        `before` contains the wheel speeds in that line, and `now` those in the last line.
         """
         if self.out is None:
             return False
@@ -264,32 +275,34 @@ class _Side:
 
 
 class WheelFaults:
-    """Checks all wheels, and decides which wheels the pose ignores and which sides slip."""
+    """Checks all wheels. Decides which wheels the pose ignores, and which sides slip."""
 
     def __init__(self, kinematics: Kinematics, counts: int, feedback: FeedbackConfig) -> None:
         """Start without evidence of a fault.
 
-        `counts` is the number of encoder counts per revolution of a wheel, 0 if unknown.
+        `counts` is the number of encoder counts per revolution of a wheel; 0 if it is unknown.
         """
         self._kinematics, self._settings = kinematics, feedback
         self._count = math.tau / counts if counts else COARSEST
         self._seeking, self._period = not counts, PERIOD
         self._least, self._looked = [COARSEST] * RECUR, 0
-        """`_least` are the `RECUR` smallest angles that a front wheel rolled in one of the last
-        `_looked` lines, rad."""
+        """`_least` contains the `RECUR` smallest angles that a front wheel rolled in one of the
+        last `_looked` feedback lines, rad."""
         self._sides = self._left, self._right = _Side("left", LEFT), _Side("right", RIGHT)
         self._last = STILL
         self._busy = self._leaves_out = self._stands = False
         self.slips = False
-        """Whether a side slips: its wheels have contradicted each other in the last `SLIP_S`."""
+        """Whether a side slips, which means that its wheels contradicted each other in the last
+        `SLIP_S`."""
         self._rolled, self._unreported = 0.0, REPEATED_S
         self.pushed = ""
-        """The message that a hand or a slope turns wheels; "" unless the last line causes it."""
+        """Message that wheels turn without a command, for example by hand; "" unless the last line
+        causes this message."""
         self._late = False
         self._found: _Side | None = None
-        """The side on which the last line proved a wheel faulty, or None."""
+        """The side on which the last feedback line proved a wheel faulty, or None."""
         self.events: list[Event] = []
-        """Log events of the last line."""
+        """Log events of the last feedback line."""
 
     @property
     def status(self) -> WheelsStatus:
@@ -304,11 +317,10 @@ class WheelFaults:
         )
 
     def believed(self, wheels: Motors) -> Motors:
-        """Return the values of all wheels, with the values of faulty wheels replaced.
+        """Return `wheels`, with the value of each faulty wheel replaced.
 
-        The value of a faulty wheel becomes the value of the other wheel of its side, times the
-        learned ratio of these wheels. The values are angles (rad) or speeds (rad/s) in `WHEELS`
-        order.
+        The new value is that of the other wheel of its side, times the learned ratio of these two
+        wheels. The values are angles (rad) or speeds (rad/s) in `WHEELS` order.
         """
         if not self._leaves_out:
             return wheels
@@ -326,11 +338,11 @@ class WheelFaults:
             side.forget()
 
     def skip(self, seen: WheelSpeeds) -> None:
-        """Process a line without checking it, because the board may have stopped the motors.
+        """Process a feedback line that waited while this computer did not run the daemon.
 
-        The line waited while this computer did not run the daemon. From now on, the checks expect
-        the wheels to start again from at most the speeds `seen`, rad/s. On a side with a wheel that
-        is already suspected, the expected speeds do not change.
+        The line is not checked, because the board may have stopped the motors meanwhile. From now
+        on, the checks expect the wheels to start again from at most the speeds `seen`, rad/s. On a
+        side with a wheel that is already suspected, the expected speeds do not change.
         """
         self.pushed, speeds = "", seen.as_tuple()
         for side in self._sides:
@@ -339,12 +351,16 @@ class WheelFaults:
                 side.expected.slow_down(speeds[front], speeds[rear])
 
     def watch(self, commanded: WheelSpeeds | None, seen: WheelSpeeds, dt: float) -> str:
-        """Compare the wheel speeds in a line with their commands. The caller must then call `look`.
+        """Compare the wheel speeds in a feedback line with their commands.
 
-        If a wheel has contradicted its command for `feedback.fault_time`, return the reason of the
-        fault, which names the wheel. Otherwise return "". `commanded` is None if the motors may
-        have no power, because the emergency stop counts as pressed. `seen` are the reported speeds,
-        and `dt` is the time since the line before, s.
+        Return the reason of a fault, which names the wheel, if a wheel has contradicted its command
+        for `feedback.fault_time`. Otherwise return "". The caller must then call `look`.
+
+        Args:
+            commanded: the commanded wheel speeds, rad/s. None means that the motors may have no
+                power, because the emergency stop counts as pressed.
+            seen: the reported wheel speeds, rad/s.
+            dt: the time since the previous line, s.
         """
         self.pushed, speeds = "", seen.as_tuple()
         if commanded is None:
@@ -370,7 +386,7 @@ class WheelFaults:
         return right.fault(speeds, limit) or left.fault(speeds, limit)
 
     def _notice(self, speeds: Motors, dt: float, still: bool) -> None:
-        """Set `pushed` if wheels that rested turn without a command.
+        """Set `pushed` if wheels that were at rest turn without a command.
 
         Set it at most once per `REPEATED_S`.
         """
@@ -396,9 +412,14 @@ class WheelFaults:
         """Compare the wheels of each side, and return whether this line proves a wheel faulty.
 
         If it does, the pose ignores the faulty wheel from now on. The caller must find the earlier
-        lines in which this wheel was wrong (`was_faulty`). `turned` contains the angles that the
-        wheels rolled in the last `dt` s, rad, and `speeds` are the reported speeds. `turn` is the
-        turn that the wheels should show according to a gyro, rad; None without a trusted gyro.
+        lines in which this wheel was wrong (`was_faulty`).
+
+        Args:
+            turned: the angles that the wheels rolled in the last `dt` s, rad.
+            speeds: the reported wheel speeds, rad/s.
+            dt: the time in which the wheels rolled these angles, s.
+            turn: the turn of the robot that the wheels should show according to a gyro, rad; None
+                without a trusted gyro.
         """
         slow = self._left.late or self._right.late
         if self.events or slow != self._late:
@@ -440,7 +461,7 @@ class WheelFaults:
         return self._found is not None
 
     def _standing(self, turned: Motors, same: Same, dt: float) -> _Side | None:
-        """Return the side on which this line proves an encoder stuck, or None."""
+        """Return the side on which this feedback line proves an encoder stuck, or None."""
         left = self._left.stands_still(turned, same, dt, self._count)
         right = self._right.stands_still(turned, same, dt, self._count)
         return self._right if right else self._left if left else None
@@ -458,14 +479,15 @@ class WheelFaults:
     def was_faulty(self, before: WheelSpeeds) -> bool:
         """Return whether the newly faulty wheel may already have been wrong in an earlier line.
 
-        `before` are the speeds in that line.
+        `before` contains the wheel speeds in that line, rad/s.
         """
         return self._found is not None and self._found.was_faulty(before, self._last)
 
     def _seek(self, speeds: WheelSpeeds, dt: float) -> None:
         """Learn the angle of an encoder count: the smallest wheel angle that occurs repeatedly.
 
-        `speeds` are the speeds in a line that covers `dt` s. See `RECUR` and `SOUGHT`.
+        `speeds` contains the wheel speeds in a feedback line that covers `dt` s. See `RECUR` and
+        `SOUGHT`.
         """
         self._period += SMOOTHED * (dt - self._period)
         self._looked += 1
@@ -479,10 +501,10 @@ class WheelFaults:
                 self._seeking = self._count > FINEST
 
     def _by_gyro(self, i: int, turned: Motors, turn: float) -> float:
-        """Return the angle that side `i` rolled, computed from the gyro and the other side, rad.
+        """Return the angle that a side rolled, computed from the gyro and from the other side, rad.
 
-        `i` is 0 for the left side and 1 for the right one. The wheels of the other side must agree
-        with each other.
+        `i` is 0 for the left side and 1 for the right side. The wheels of the other side must agree
+        with each other. `turn` is the turn according to the gyro, rad.
         """
         front_right, front_left, rear_left, rear_right = turned
         return self._kinematics.opposite(

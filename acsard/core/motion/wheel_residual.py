@@ -18,64 +18,63 @@ weight (`MEMORY_S`). The wheels contradict each other if
 where D is the sum of the front wheel's angles minus the sum of the rear wheel's angles, rad, A is
 the sum over the lines of the mean angle of both wheels, rad, r is the learned fraction, and c is
 the angle of an encoder count, rad. The wheels slip if |D - r A| exceeds this limit by more than
-LAG_S |v - mean of v|, where v is the speed of the side, rad/s. This term is the effect of a motor
-that reacts later.
-
-Without slip, the angles of two wheels can differ by two counts. Therefore a slip by the fraction s
-at v rad/s is certain only after 2 c / (s v) seconds. With 96 counts per revolution, a slip of a
-tenth at 10 rad/s is certain after 0.13 s, or after 0.26 s if unequal tires may cause the difference
-SHARE. With the limit COUNTS, and with sums that forget old angles, a slip of a tenth is found
-within 0.2 s at speeds above 22 rad/s, and is never found at speeds below 11.5 rad/s.
+LAG_S |v - mean of v|, where v is the speed of the side, rad/s.
 """
 
 from __future__ import annotations
 
 import math
 
+# Without slip, the angles of two wheels can differ by two counts. Therefore a slip by the fraction
+# s at v rad/s is certain only after 2 c / (s v) seconds. With 96 counts per revolution, a slip of a
+# tenth at 10 rad/s is certain after 0.13 s, or after 0.26 s if unequal tires may cause the
+# difference SHARE. With the limit COUNTS, and with sums that forget old angles, a slip of a tenth
+# is found within 0.2 s at speeds above 22 rad/s, and is never found at speeds below 11.5 rad/s.
+
 MEMORY_S = 0.14
 """Time after which the weight of an angle in the sums has fallen to 1 / e, s."""
 
 SHARE = 0.05
-"""Allowed difference of the angles of two wheels, as a fraction of their mean angle. It is half of
-the slip of 10 % that must be found."""
+"""Allowed difference of the angles of the two wheels, as a fraction of their mean angle. It is half
+of the slip of 10 % that must be found."""
 
 COUNTS = 1.2
-"""Allowed difference of the angles of two wheels, in encoder counts. Wheels without slip rarely
+"""Allowed difference of the angles of the two wheels, in encoder counts. Wheels without slip rarely
 differ by more."""
 
 LAG_S = 0.03
-"""Allowed delay of one motor relative to the other, s."""
+"""Allowed delay of one motor of a side relative to the other motor, s."""
 
 LEAST = 0.002
-"""Allowed difference of the angles of two wheels, rad, in addition to `SHARE` and `COUNTS`.
+"""Allowed difference of the angles of the two wheels, rad, in addition to `SHARE` and `COUNTS`.
 Backlash and the rounding of speeds to two decimals cause it."""
 
 UNEQUAL = 0.05
 """Largest fraction by which two healthy wheels of a side may differ permanently."""
 
 LEARNING_S, DOUBTED_S = 5.0, 20.0
-"""While the wheels agree, the fraction by which they differ is learned with the time constant
-`LEARNING_S`, s. While they contradict each other, the learned fraction changes by `WILD` in
-`DOUBTED_S`, s."""
+"""Times that determine how fast the difference of the two wheels is learned, s. While the wheels
+agree, the fraction by which they differ is learned with the time constant `LEARNING_S`. While the
+wheels contradict each other, the learned fraction changes by `WILD` in `DOUBTED_S`."""
 
 SLOWEST = 1.0
-"""Wheel speed, rad/s, below which the difference of the wheels is not learned."""
+"""Wheel speed below which the difference of the two wheels is not learned, rad/s."""
 
 WILD = 0.1
-"""Change of the learned fraction while the wheels contradict each other for `DOUBTED_S`. Slip ends
+"""Change of the learned fraction if the wheels contradict each other for `DOUBTED_S`. Slip ends
 sooner, but a flat tire stays flat, so its effect is learned."""
 
 
 class Residual:
-    """Compares the two wheels of one side, and learns the fraction by which they differ."""
+    """Compares the two wheels of one side, and learns the fraction by which their angles differ."""
 
     def __init__(self) -> None:
         self.ratio = 0.0
         """Learned fraction by which the front wheel turns further than the rear one."""
         self.learns = True
         self.slips = False
-        """Whether the wheels differ by more than a late motor can cause. The value is valid only if
-        the last call of `add` returned False."""
+        """Whether the wheels differ by more than a motor that reacts late can cause. The value is
+        valid only if the last call of `add` returned False."""
         self._off = self._way = self._net = 0.0
 
     def add(self, front: float, rear: float, keep: float, dt: float, count: float) -> bool:
@@ -109,7 +108,7 @@ class Residual:
         return True
 
     def stand_in(self, front: bool) -> float:
-        """Return the factor that computes the angle of one wheel from the angle of the other wheel.
+        """Return the factor for replacing the angle of one wheel by the angle of the other wheel.
 
         If `front` is true, the front wheel's angle is the rear wheel's angle times the result.
         Otherwise, the rear wheel's angle is the front wheel's angle times the result.

@@ -6,9 +6,9 @@ decide whether a wheel follows its command. The bounds around the expected speed
 load, slip and coarse encoders. Behavior is evidence only if no healthy wheel shows it, and evidence
 proves a fault only if it lasts.
 
-If a wheel stands, turns against its command or turns too fast, it is not evidence of a fault while
-the wheel's speed approaches the command. If a wheel turns in the right direction but too slowly,
-the daemon logs a warning with the ratio of the speeds: the load, the battery or
+A wheel that stands still, turns against its command or turns too fast is not evidence of a fault
+while its speed approaches the command. If a wheel turns in the right direction but too slowly, the
+daemon logs a warning with the ratio of the speeds: the load, the battery or
 `feedback.response_time` may be the cause.
 """
 
@@ -18,30 +18,30 @@ import math
 from typing import Literal
 
 SLACK = 2.0
-"""Smallest speed at which a fault can be recognized, rad/s. At lower speeds, coarse encoders and a
-robot at rest can look like any fault."""
+"""Smallest wheel speed at which a fault can be recognized, rad/s. At lower speeds, coarse encoders
+and a robot at rest can look like any fault."""
 
 COMMANDED = 0.3
-"""A command can show which of two wheels is right only if its speed is at least this, rad/s."""
+"""Smallest commanded speed at which the command can show which of two wheels is right, rad/s."""
 
 SLOWEST = 3.0
-"""Response time of a slow robot's wheels, as a multiple of `feedback.response_time`."""
+"""Response time of the wheels of a slow robot, as a multiple of `feedback.response_time`."""
 
 CLEAR = 1.0
 """Wheel speed that determines the smoothing of the measured speed, rad/s. The time constant of the
-smoothing is the time in which a wheel at this speed turns by one encoder count."""
+smoothing is the time in which a wheel with this speed turns by one encoder count."""
 
 NEARER = 1.0
-"""If a wheel is too fast, stands or turns against its command, but its speed comes closer to the
-command by more than this, rad/s, its behavior is not evidence of a fault."""
+"""If a wheel is too fast, stands still or turns against its command, but its speed comes closer to
+the command by more than this, rad/s, its behavior is not evidence of a fault."""
 
 RATIO_S = 2.0
-"""Time of driving, s, after which the angle that a wheel rolled is compared with the angle that it
-should have rolled."""
+"""Time of driving, s, after which the angle that a wheel rolled is compared with the expected
+angle."""
 
 TOO_SLOW, FAST_ENOUGH = 0.7, 0.8
-"""Ratios of the measured to the expected speed. A wheel becomes too slow below `TOO_SLOW`, and is
-not too slow any more from `FAST_ENOUGH` on."""
+"""Ratios of the measured speed of a wheel to its expected speed. A wheel becomes too slow below
+`TOO_SLOW`, and is not too slow any more from `FAST_ENOUGH` on."""
 
 FaultKind = Literal["dead", "reversed", "runaway", "stuck"]
 
@@ -56,25 +56,26 @@ FAULTS: dict[FaultKind, str] = {
 
 
 def faster(front: float, rear: float) -> float:
-    """Return the speed with the larger magnitude."""
+    """Return the one of two wheel speeds that has the larger magnitude."""
     return front if abs(front) > abs(rear) else rear
 
 
 class Expected:
-    """The speed, rad/s, that the wheels of one side should have by now if they are healthy."""
+    """The speed, rad/s, that the wheels of one side should have now if they are healthy."""
 
     def __init__(self) -> None:
         self.commanded = self.speed = self._slow = 0.0
         self._begins = self.settled = self.clear = False
 
     def forget(self) -> None:
-        """Start over from the next reported speed, because the wheels may still coast."""
+        """Start over from the next reported speed, because the wheels may still be turning."""
         self.commanded, self._begins, self.clear = 0.0, True, False
 
     def slow_down(self, front: float, rear: float) -> None:
         """Limit the expected speed to the larger one of two reported speeds, rad/s.
 
-        The caller must call this if the board may have stopped the motors.
+        Call this if the board may have stopped the motors. `front` and `rear` are the reported
+        speeds of the two wheels.
         """
         most = faster(front, rear)
         self.speed, self._slow = (
@@ -82,10 +83,14 @@ class Expected:
         )
 
     def follow(self, commanded: float, front: float, rear: float, dt: float, lag: float) -> None:
-        """Update the expected speed for a line that arrives `dt` s after the line before.
+        """Update the expected speed with a feedback line.
 
-        `commanded` is the command for this side, and `front` and `rear` are the reported speeds,
-        rad/s. `lag` is the response time of a healthy wheel, s.
+        Args:
+            commanded: the commanded speed of this side, rad/s.
+            front: the reported speed of the front wheel, rad/s.
+            rear: the reported speed of the rear wheel, rad/s.
+            dt: the time since the previous line, s.
+            lag: the response time of a healthy wheel, s.
         """
         if self._begins:
             self._begins = False
@@ -95,9 +100,10 @@ class Expected:
         self.commanded = commanded
         follows = speed * commanded > 0.0
         self.clear = follows and abs(speed) >= COMMANDED and abs(commanded) >= COMMANDED
-        """Whether a healthy wheel must turn clearly in the direction of the command by now."""
+        """Whether a healthy wheel must already turn clearly in the direction of the command."""
         self.settled = follows and slow * commanded > 0.0
-        """Whether even a slow wheel must turn in the direction of the command by now."""
+        """Whether even the wheel of a slow robot must already turn in the direction of the
+        command."""
 
 
 class Witness:
@@ -107,60 +113,67 @@ class Witness:
         self.driven = False
         """True while any wheel is commanded to turn, and then until this wheel has come to rest."""
         self.ratio = 1.0
-        """Angle that the wheel rolled in `RATIO_S` of driving, divided by the expected angle."""
+        """Angle that the wheel rolled in the last full `RATIO_S` of driving, divided by the
+        expected angle."""
         self.slow = False
-        """Whether the wheel turns in the right direction, but too slowly."""
+        """Whether the wheel turns in the commanded direction, but too slowly."""
         self._due = 0.0
         """Expected magnitude of `speed`, rad/s. It is smoothed like `speed` itself: an encoder with
         few counts needs much smoothing, and then a healthy wheel seems to brake too late."""
         self._rested_s = 0.0
-        """Time since the last line with a speed above `SLACK`, s."""
+        """Time since the last feedback line with a speed above `SLACK`, s."""
         self.forget()
 
     def forget(self) -> None:
-        """Drop the evidence of faults, but keep what is known about the motion of the wheel."""
+        """Drop the evidence of faults, but keep the facts about the motion of the wheel."""
         self.speed = 0.0
         """Measured speed, smoothed, rad/s."""
         self._seen, self._begins = 0.0, True
         self.evidence: dict[FaultKind, float] = dict.fromkeys(FAULTS, 0.0)
-        """Seconds for which the wheel has shown each fault."""
+        """Time for which the wheel has shown each fault, s."""
         self.suspected = False
         # Because of the infinity, the first line counts as approaching the command. With 0, a wheel
         # that was already too fast would never count as slowing down, and slow motors would latch
         # "runaway".
         self._nearest = math.inf
         """Deviation from the command when the wheel last approached its command, rad/s. For a wheel
-        that is too fast, the deviation is its speed. Otherwise it is the speed of the wheel in the
-        direction opposite to the command."""
+        that is too fast, the deviation is the magnitude of its speed. Otherwise it is the speed of
+        the wheel in the direction opposite to the command."""
         self._wrong = False
-        """Whether the wheel was too fast, stood or turned the wrong way in the last line."""
+        """Whether the wheel was too fast, stood still or turned in the wrong direction in the last
+        line."""
         self._seconds = self._went = self._way = 0.0
 
     def coast(self, seen: float, dt: float, count: float) -> None:
-        """Process the speed `seen`, rad/s, of a wheel whose motor may have no power.
+        """Process a feedback line with the speed `seen`, rad/s, while the motor may have no power.
 
         When the wheel comes to rest, `driven` becomes false: until the next command, only a push
-        can turn the wheel. For `dt` and `count`, see `look`.
+        can turn the wheel. The arguments `dt` and `count` are as in `look`.
         """
         self.driven = self.driven and not self._rests(seen, dt, count)
 
     def _rests(self, seen: float, dt: float, count: float) -> bool:
         """Return whether the wheel is certainly not faster than `SLACK`.
 
-        An encoder with few counts often reports 0 although the wheel turns. Therefore the reported
-        speed must stay low for the time of one count at the speed `SLACK`.
+        The arguments are as in `look`.
         """
+        # An encoder with few counts often reports 0 although the wheel turns. Therefore the
+        # reported speed must stay low for the time of one count at the speed `SLACK`.
         self._rested_s = 0.0 if abs(seen) > SLACK else self._rested_s + dt
         return self._rested_s >= count / SLACK and abs(seen) <= SLACK
 
     def look(
         self, seen: float, expected: Expected, dt: float, most: float, count: float, still: bool
     ) -> bool:
-        """Check a line that reports `seen` rad/s, and return whether it is evidence of a fault.
+        """Check the wheel speed in a feedback line, and return whether it is evidence of a fault.
 
-        `dt` is the time since the line before, and `most` is the longest time that one line can add
-        to the evidence, s. `count` is the angle of an encoder count, rad. `still` is true if all
-        wheels are commanded to stand.
+        Args:
+            seen: the reported speed of the wheel, rad/s.
+            expected: the speed of a healthy wheel.
+            dt: the time since the previous line, s.
+            most: the longest time that one line can add to the evidence, s.
+            count: the angle of an encoder count, rad.
+            still: whether all wheels are commanded to stand still.
         """
         goal, command = expected.speed, expected.commanded
         if self._begins:

@@ -1,7 +1,7 @@
-"""Encodes and decodes the attachment of rmw_zenoh_cpp: sequence number, time and GID in 33 bytes.
+"""Encodes and decodes the attachment that rmw_zenoh_cpp adds to every sample and request.
 
-rmw_zenoh_cpp adds this attachment to every sample and request. Both rmw_zenoh_cpp and acsard drop
-samples and requests without it.
+The attachment contains a sequence number, a time and a GID in 33 bytes. Both rmw_zenoh_cpp and
+acsard drop samples and requests without it.
 """
 
 from __future__ import annotations
@@ -17,22 +17,21 @@ _LAYOUT = Layout(f"<qqB{GID_BYTES}s")
 
 
 class Attachment(Struct, frozen=True):
-    """Attachment of a sample or a request."""
+    """Attachment of a sample or a request that rmw_zenoh_cpp has sent."""
 
     sequence: int
-    """Number of the sample or request. Each publisher and each client counts its own samples or
-    requests from 1."""
+    """Number of the sample or request. Each publisher and each service client counts from 1."""
     stamp_ns: int
     """Time of sending by the wall clock, ns since 1970."""
     gid: bytes
-    """The 16 bytes that identify the publisher or client."""
+    """GID of the publisher or the service client, 16 bytes."""
 
     def pack(self) -> bytes:
         return _LAYOUT.pack(self.sequence, self.stamp_ns, GID_BYTES, self.gid)
 
 
 def unpack(data: bytes) -> Attachment:
-    """Decode an attachment. Raises `DecodeError` if `data` is empty or not a valid attachment."""
+    """Decode an attachment of rmw_zenoh_cpp. Raises `DecodeError` if it is empty or not valid."""
     if not data:
         raise DecodeError(
             "no_attachment",

@@ -121,14 +121,14 @@ RULE = "=" * 80
 
 
 def schema_text(name: str) -> str:
-    """Return the definition of a type and of all nested types in MCAP's `ros2msg` format."""
+    """Return the definitions of a type and of its nested types in MCAP's `ros2msg` format."""
     parts = [_fields(name)]
     parts += [f"{RULE}\nMSG: {_short(other)}\n{_fields(other)}" for other in nested(name)]
     return "".join(parts)
 
 
 def nested(name: str) -> tuple[str, ...]:
-    """Return all types nested in the type `name` at any depth, in the order of their first use."""
+    """Return all types nested in the type `name`, at any depth, in the order of first use."""
     return tuple(dict.fromkeys(_nested(name)))
 
 
@@ -145,7 +145,7 @@ def _fields(name: str) -> str:
 
 
 def _short(kind: str) -> str:
-    """Return the short form of a type in message definitions: `pkg/Type` for `pkg/msg/Type`."""
+    """Return the form of a type name in message definitions: `pkg/Type` for `pkg/msg/Type`."""
     return re.sub("/msg/", "/", kind)
 
 
@@ -156,34 +156,37 @@ SOURCE = "<source>"
 
 
 class Channel(Struct, frozen=True):
-    """A topic in MCAP files and viewers. `<source>` in its name stands for each command source."""
+    """A topic in MCAP files and live viewers.
+
+    `<source>` in the name stands for the name of a command source.
+    """
 
     name: str
     """Topic name relative to the namespace."""
     native: str
-    """Native Zenoh key of the same messages, without its beginning `acsard/<robot.id>/`."""
+    """Native Zenoh key of the same messages, without the prefix `acsard/<robot.id>/`."""
     schema_name: str
     """ROS type as `pkg/msg/Name`."""
     message: type[Struct]
-    """Type of the messages that are encoded as CDR. For the key `state` it is `State` in
+    """Struct type of the messages as CDR encodes them. For the key `state`, it is `State` in
     `shapes.py`."""
     qos: Qos = Qos()
 
     def topic(self, namespace: str, source: str = "") -> str:
         """Return the fully qualified name of the topic, with its leading slash.
 
-        `namespace` is the ROS namespace of the robot. `source` is the command source that replaces
-        `<source>` in the name.
+        `namespace` is the ROS namespace of the robot. `source` is the name of the command source
+        that replaces `<source>`.
         """
         return full_name(namespace, self.name.replace(SOURCE, source))
 
     @property
     def schema(self) -> str:
-        """The message definition and those of all nested types, in MCAP's `ros2msg` format."""
+        """The definitions of the message type and its nested types, in MCAP's `ros2msg` format."""
         return schema_text(self.schema_name)
 
     def encode(self, message: Any) -> bytes:
-        """Return a message as CDR. A `RobotState` is converted to `State` of `shapes.py` first."""
+        """Encode a message as CDR. A `RobotState` is first converted to `State` of `shapes.py`."""
         return encode(state(message) if isinstance(message, RobotState) else message, "cdr")
 
 
@@ -201,11 +204,11 @@ TWIST_STAMPED = "geometry_msgs/msg/TwistStamped"
 STATE = Channel("state", "state", OURS + "RobotState", State)
 
 LOG = Channel("log", "events", "rcl_interfaces/msg/Log", Log, Qos(1000))
-"""The topic of the robot's events. Each event is one log message."""
+"""The topic of the daemon's events. Each event is one log message."""
 
 CMD_VEL_IN = Channel(f"cmd_vel_in/{SOURCE}", f"cmd/{SOURCE}", TWIST_STAMPED, TwistStamped)
-"""The topics of the commands that arrived, one topic for each source. The stamp of a message is the
-time at which the command arrived."""
+"""The topics of the received commands, one topic for each command source. The stamp of a message
+is the time at which the command arrived."""
 
 BY_KEY: dict[str, Channel] = {**_published(), STATE.native: STATE}
 """Maps each native Zenoh key to its channel, for all messages that `Report` (`messages/report.py`)
@@ -215,8 +218,8 @@ CHANNELS: tuple[Channel, ...] = (*BY_KEY.values(), CMD_VEL_IN, LOG)
 
 
 def published_channels(silent: Container[str]) -> tuple[Channel, ...]:
-    """Return all channels, except those with a native key in `silent`.
+    """Return all channels except those whose native key is in `silent`.
 
-    `silent` are the native keys that the robot does not use, as `left_out` returns them.
+    `silent` contains the native keys that the robot does not use, as `left_out` returns them.
     """
     return tuple(channel for channel in CHANNELS if channel.native not in silent)

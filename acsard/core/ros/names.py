@@ -4,9 +4,10 @@ zenoh-bridge-ros2dds uses the name of a topic as its Zenoh key. The key of rmw_z
 contains the domain, the type and the hash of the type, so no message arrives if the hash is wrong.
 The robot's own topics are in `core/ros/transports.py`.
 
-A token announces an endpoint to ROS. Without its token, messages arrive, but `ros2 topic list` and
-`wait_for_service` do not find the endpoint. The formats of tokens, QoS strings and GIDs are those
-of rmw_zenoh_cpp (Jazzy 0.2.4 and later) and zenoh-plugin-ros2dds 1.10.
+A liveliness token announces an endpoint to ROS: a publisher, a subscription or a service server.
+Without the token, messages arrive, but `ros2 topic list` and `wait_for_service` do not find the
+endpoint. The formats of tokens, QoS strings and GIDs are those of rmw_zenoh_cpp (Jazzy 0.2.4 and
+later) and zenoh-plugin-ros2dds 1.10.
 """
 
 from __future__ import annotations
@@ -68,7 +69,7 @@ def full_name(namespace: str, name: str) -> str:
 def bridge_key(name: str) -> str:
     """Return the Zenoh key that zenoh-bridge-ros2dds uses for a topic or service.
 
-    `name` is the fully qualified name.
+    `name` is the fully qualified name, with its leading slash.
     """
     return name.removeprefix("/")
 
@@ -76,8 +77,10 @@ def bridge_key(name: str) -> str:
 def rmw_key(domain: int, name: str, type_name: str) -> str:
     """Return the Zenoh key that rmw_zenoh_cpp uses for a topic or service.
 
-    `domain` is the ROS domain id. `name` is the fully qualified name. `type_name` is the type in
-    the form `pkg/msg/Name`.
+    Args:
+        domain: the ROS domain id.
+        name: the fully qualified name, with its leading slash.
+        type_name: the type in the form `pkg/msg/Name`.
     """
     return f"{domain}/{name.removeprefix('/')}/{dds_type(type_name)}/{TYPE_HASHES[type_name]}"
 
@@ -89,7 +92,7 @@ def dds_type(type_name: str) -> str:
 
 
 Kind = Literal["MP", "MS", "SS"]
-"""Kind of an endpoint in a token: publisher (MP), subscription (MS) or service server (SS)."""
+"""Kind of a ROS endpoint: publisher (MP), subscription (MS) or service server (SS)."""
 
 RMW_DEFAULT_DEPTH = 42
 
@@ -100,11 +103,11 @@ class Qos(Struct, frozen=True):
     depth: int = 10
     """Number of samples that the publisher or the subscription keeps."""
     transient: bool = False
-    """Durability: True is transient local, so that a subscriber that joins later also receives the
-    kept samples. False is volatile."""
+    """Durability. True means transient local: a subscriber that joins later also receives the
+    samples that the publisher keeps. False means volatile."""
     best_effort: bool = False
-    """Reliability: True is best effort, False is reliable. A best-effort subscription accepts every
-    publisher. A reliable subscription accepts only reliable publishers."""
+    """Reliability. True means best effort, and False means reliable. A best-effort subscription
+    accepts every publisher. A reliable subscription accepts only reliable publishers."""
 
 
 class Node(Struct, frozen=True):
@@ -119,14 +122,18 @@ class Node(Struct, frozen=True):
 
     @property
     def token(self) -> str:
-        """Liveliness token of the node itself. The node has the number 0 in its session."""
+        """Liveliness token of the node itself, without its endpoints."""
         return f"{self._head}/0/NN/%/{_mangled('/' + self.namespace)}/{self.name}"
 
     def endpoint_token(self, number: int, kind: Kind, name: str, type_name: str, qos: Qos) -> str:
-        """Return the liveliness token of an endpoint.
+        """Return the liveliness token of an endpoint of this node.
 
-        `number` identifies the endpoint in its session. The numbers start at 1. `name` is the fully
-        qualified name, and `type_name` is the type in the form `pkg/msg/Name`.
+        Args:
+            number: the number of the endpoint in its Zenoh session, from 1 on.
+            kind: the kind of the endpoint.
+            name: the fully qualified name of the topic or service.
+            type_name: the type in the form `pkg/msg/Name`.
+            qos: the QoS profile of the endpoint.
         """
         return (
             f"{self._head}/{number}/{kind}/%/{_mangled('/' + self.namespace)}/{self.name}"
@@ -139,7 +146,10 @@ class Node(Struct, frozen=True):
 
 
 def rmw_qos(qos: Qos) -> str:
-    """Return a QoS profile as rmw_zenoh_cpp writes it in a token, which omits default values."""
+    """Return a QoS profile in the form of the tokens of rmw_zenoh_cpp.
+
+    This form leaves out the values that are the defaults of rmw_zenoh_cpp.
+    """
     depth = "" if qos.depth == RMW_DEFAULT_DEPTH else qos.depth
     reliability = "2" if qos.best_effort else ""
     return f"{reliability}:{'1' if qos.transient else ''}:,{depth}:,:,:,,"
@@ -151,12 +161,12 @@ def gid(token: str) -> bytes:
 
 
 def bridge_presence(zid: str) -> str:
-    """Return the token with which a ros2dds bridge announces itself."""
+    """Return the liveliness token with which a ros2dds bridge announces itself."""
     return f"@/{zid}/@ros2_lv"
 
 
 def bridge_token(zid: str, kind: Kind, name: str, type_name: str, qos: Qos) -> str:
-    """Return the token with which a ros2dds bridge announces an endpoint.
+    """Return the liveliness token with which a ros2dds bridge announces an endpoint.
 
     `zid` is the id of the Zenoh session. The other arguments are those of `Node.endpoint_token`.
     """

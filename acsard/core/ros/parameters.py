@@ -1,10 +1,10 @@
 """Offers the configuration as ROS parameters, for `ros2 param` and `rqt_reconfigure`.
 
-A parameter has the name of its key in `acsard.toml`, with a dot between table and key. Only the
-settings in `core/config/live.py` can be set while the daemon runs. This module decodes a request to
-set parameters, and `core/robot.py` accepts or refuses the request. The description and the range of
-a parameter come from the types in `core/config/settings.py`. The structs of this module are types
-of rcl_interfaces.
+A parameter has the name of its key in `acsard.toml`, with a dot between table and key. Its
+description and range come from the types in `core/config/settings.py`. Only the settings in
+`core/config/live.py` can be set while the daemon runs. This module decodes a request to set
+parameters, and `core/robot.py` accepts or refuses it. The structs of this module are types of
+rcl_interfaces.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ Unsigned64 = Annotated[int, Meta(extra={"cdr": "Q"})]
 
 
 class FloatingPointRange(Struct, frozen=True):
-    """Bounds of a float parameter."""
+    """Allowed range of a parameter that is a float."""
 
     from_value: float
     to_value: float
@@ -37,7 +37,7 @@ class FloatingPointRange(Struct, frozen=True):
 
 
 class IntegerRange(Struct, frozen=True):
-    """Bounds of an integer parameter."""
+    """Allowed range of a parameter that is an integer."""
 
     from_value: Signed64
     to_value: Signed64
@@ -58,9 +58,9 @@ class ParameterDescriptor(Struct, frozen=True):
 
 
 def described(name: str, type_of: int) -> ParameterDescriptor:
-    """Return the descriptor of the parameter `name`.
+    """Return the descriptor of the parameter `name`, as `ros2 param describe` shows it.
 
-    `type_of` is the ROS type of the parameter, or 0 if there is no such parameter.
+    `type_of` is the ROS type of the parameter, or 0 if the parameter does not exist.
     """
     if not type_of:
         return ParameterDescriptor(name, type_of)
@@ -91,10 +91,10 @@ def _described(name: str, type_of: int) -> ParameterDescriptor:
 
 
 def kind_of(name: str) -> inspect.Type:
-    """Return the declared type of the setting with the dotted key `name`.
+    """Return the declared type of an existing setting. `name` is the dotted key of the setting.
 
     For a setting of a command source, the key contains the name of the source, as in
-    `commands.sources.app.timeout`. Raises `KeyError` for the key of a table.
+    `commands.sources.app.timeout`. Raises `KeyError` if `name` is the key of a table.
     """
     cls: type[Struct] = Config
     parts = iter(name.split("."))
@@ -114,11 +114,11 @@ def kind_of(name: str) -> inspect.Type:
 
 T = TypeVar("T")
 Some = Annotated[list[T], Meta(max_length=128)]
-"""List with at most 128 items, for the parameters that a request sets. The robot has fewer than 128
+"""List with at most 128 items, for the parameters that a request sets. The robot has fewer
 parameters. Decoding a longer list would take too much of the time of a control step."""
 Many = Annotated[list[T], Meta(max_length=256)]
-"""List with at most 256 items, for names of parameters. The limit is higher than that of `Some`,
-because a name is decoded faster than a parameter with its value."""
+"""List with at most 256 items, for names of parameters. The limit is higher than the limit of
+`Some`, because a name is decoded faster than a parameter with its value."""
 
 MAX_REQUEST_BYTES = 16384
 """Largest size of a request, bytes. A request with the names of all parameters is smaller."""
@@ -164,39 +164,42 @@ class ListRequest(Struct, frozen=True):
     """Request of the service `list_parameters`."""
 
     prefixes: Many[str]
-    """Prefixes of the names to list. If there are none, all names are listed."""
+    """Prefixes of the names to list. If the list is empty, all names are listed."""
     depth: Unsigned64
-    """Largest number of dot-separated parts that a listed name may have after its prefix. 0 means
-    any number."""
+    """Largest number of parts, separated by dots, that a listed name may have after its prefix. 0
+    means any number."""
 
 
 class ListReply(Struct, frozen=True):
-    """Reply of `list_parameters`. A prefix in it is the part of a name before the last dot."""
+    """Reply of the service `list_parameters`.
+
+    `prefixes` contains, for each name with a dot, the part before the last dot.
+    """
 
     names: list[str]
     prefixes: list[str]
 
 
 class Names(Struct, frozen=True):
-    """Request of the services that return the values, types or descriptors of the parameters."""
+    """Request with names of parameters, whose values, types or descriptors the reply contains."""
 
     names: Many[str]
 
 
 class Values(Struct, frozen=True):
-    """Reply of `get_parameters`."""
+    """Reply of `get_parameters`: the value of each requested parameter, in order."""
 
     values: list[ParameterValue]
 
 
 class Types(Struct, frozen=True):
-    """Reply of `get_parameter_types`, with the number that ROS gives to each parameter's type."""
+    """Reply of `get_parameter_types`: the ROS type of each requested parameter, in order."""
 
     types: list[Unsigned8]
 
 
 class Descriptors(Struct, frozen=True):
-    """Reply of `describe_parameters`."""
+    """Reply of `describe_parameters`: the descriptor of each requested parameter, in order."""
 
     descriptors: list[ParameterDescriptor]
 
@@ -220,16 +223,19 @@ class SetAtomicallyReply(Struct, frozen=True):
 
 
 SETTING = ("set_parameters", "set_parameters_atomically")
-"""The services that set parameters. `Parameters` does not answer them, because that class answers
-only the services that read."""
+"""The services that set parameters. `Parameters.answer` does not answer them."""
 
 
 def failure(service: str, why: str, request: bytes = b"") -> bytes:
-    """Return the reply to a refused request. Without a reply, the client would wait forever.
+    """Return the reply to a refused request of a parameter service, in CDR.
 
-    `service` is the name of the service. If the request sets parameters, the reply contains the
-    reason `why`. The replies of the other services have no field for a reason, so they are empty,
-    as in rclcpp.
+    Without a reply, the client would wait forever.
+
+    Args:
+        service: the name of the service.
+        why: the reason of the refusal. Only the replies of the services in `SETTING` contain it.
+            All other replies are empty, as in rclcpp.
+        request: the refused request, in CDR.
     """
     refused = SetParametersResult(False, why)
     if service in SETTING:
@@ -248,7 +254,7 @@ def failure(service: str, why: str, request: bytes = b"") -> bytes:
 
 
 class Parameters:
-    """The replies to the services that only read parameters.
+    """Answers requests of the ROS services that only read parameters.
 
     `tables` is the configuration in the form that `core.config.parsing.effective()` returns.
     """
@@ -263,7 +269,7 @@ class Parameters:
         }
 
     def answer(self, service: str, payload: bytes) -> bytes:
-        """Return the reply to the request `payload`, both in CDR.
+        """Return the reply to a request of `service`. `payload` and the reply are CDR.
 
         Raises `CdrError` if the request is not valid.
         """
@@ -294,10 +300,10 @@ class Parameters:
 
 
 def wished(payload: bytes) -> dict[str, Plain]:
-    """Return the value that a request sets for each parameter, by the names of the parameters.
+    """Decode a request to set parameters, and return the new values by parameter name.
 
-    `payload` is a request to set parameters, in CDR. Raises `CdrError` if the request is not valid,
-    or if it names a parameter twice.
+    `payload` is the request in CDR. Raises `CdrError` if the request is not valid, or if it
+    contains a parameter twice.
     """
     asked = Cdr(SetRequest).decode(payload)
     wishes: dict[str, Plain] = {}
@@ -309,12 +315,16 @@ def wished(payload: bytes) -> dict[str, Plain]:
 
 
 def outcome(service: str, payload: bytes, successful: bool, reason: str) -> bytes:
-    """Return the reply to a request to set parameters.
+    """Return the reply to a request to set parameters, in CDR.
 
-    `service` is the name of the service. `payload` is the request, and both it and the reply are
-    CDR. `reason` says why the request was refused. The robot sets all parameters of a request or
-    none, so each parameter has the same result. Raises `CdrError` for a request to `set_parameters`
-    that is not valid.
+    All parameters of the request get the same result, because the robot sets all of them or none.
+    Raises `CdrError` if a request of `set_parameters` is not valid.
+
+    Args:
+        service: the name of the service, one of `SETTING`.
+        payload: the request, in CDR.
+        successful: True if the robot has set the parameters.
+        reason: the text for the client, such as the reason of a refusal.
     """
     result = SetParametersResult(successful, reason)
     if service == "set_parameters_atomically":

@@ -43,7 +43,7 @@ NUMBERED = re.compile(r"\d+ (x|times)\b")
 """Pattern of a count at the beginning of an event's text, such as "3 x" or "3 times"."""
 
 LEVELS: dict[str, int] = {"info": 20, "warning": 30, "error": 40}
-"""The numbers of the log levels in ROS."""
+"""Maps each log level of acsard to its number in ROS."""
 
 
 def log(event: Event | LogEvent, stamp: Time) -> Log:
@@ -54,19 +54,21 @@ def log(event: Event | LogEvent, stamp: Time) -> Log:
 
 
 def how_often(text: str, count: int) -> str:
-    """Return the text to append to an event that occurred `count` times, such as " (3 times)".
+    """Return a suffix for the text of an event that occurred `count` times, like " (3 times)".
 
-    `text` is the text of the event. Return "" if `count` is 1, or if `text` already begins with a
-    count.
+    `text` is the text of the event. The suffix is "" if `count` is 1, or if `text` already begins
+    with a count.
     """
     return "" if count == 1 or NUMBERED.match(text) else f" ({count} times)"
 
 
 def asked(twist: BodyTwist, arrived: Time, frame: str) -> TwistStamped:
-    """Convert the command of a source to a message of the topic `cmd_vel_in/<source>`.
+    """Convert a received command to a message of the topic `cmd_vel_in/<source>`.
 
-    `twist` is the command. `arrived` is the time of its arrival, and `frame` is the frame id. Both
-    become the header of the message.
+    Args:
+        twist: the command.
+        arrived: the time at which the command arrived, for the header.
+        frame: the frame id for the header.
     """
     return TwistStamped(
         Header(arrived, frame), Twist(Vector3(x=twist.linear), Vector3(z=twist.angular))
@@ -74,7 +76,7 @@ def asked(twist: BodyTwist, arrived: Time, frame: str) -> TwistStamped:
 
 
 class Counter(Struct, frozen=True):
-    """The name of a counter, and its count since the start of the daemon."""
+    """The name of a counter and its value since the start of the daemon."""
 
     name: str
     count: Whole
@@ -83,9 +85,9 @@ class Counter(Struct, frozen=True):
 class Source(Struct, frozen=True):
     """A command source.
 
-    `age` is the time since the last accepted command of the source, s. It is None if no command was
-    accepted since the senders last had to return to neutral. `waits_for` says in words what
-    the source waits for, "" if it waits for nothing.
+    `age` is the time since the last accepted command of the source, s. It is None if no command
+    was accepted since the last event that requires a zero from each sender. `waits_for` is the
+    condition that must be met before the source can drive, in words, or "".
     """
 
     name: str
@@ -95,7 +97,7 @@ class Source(Struct, frozen=True):
 
 
 class State(Struct, frozen=True):
-    """A message of the ROS type acsard/msg/RobotState, with most fields of `RobotState`."""
+    """A message of the ROS type acsard/msg/RobotState. It has most fields of `RobotState`."""
 
     header: Header
     mode: str

@@ -1,8 +1,8 @@
-"""The table of the robot's ROS topics and services, with the native key of each of them.
+"""The table of the robot's ROS topics and services, with the native key of each topic and service.
 
-A native key is acsard's own Zenoh key. A ROS key is the Zenoh key that a ROS transport uses for the
-same messages. The two transports are zenoh-bridge-ros2dds ("bridge") and rmw_zenoh_cpp ("rmw").
-The bus declares its ROS endpoints from this table.
+A native key is acsard's own Zenoh key. A ROS key is the Zenoh key that a ROS transport uses for
+the same messages. The two transports are zenoh-bridge-ros2dds ("bridge") and rmw_zenoh_cpp
+("rmw"). The bus declares its ROS endpoints from this table.
 """
 
 from __future__ import annotations
@@ -39,12 +39,12 @@ Transport = Literal["bridge", "rmw"]
 
 
 class RosName(Struct, frozen=True):
-    """A ROS topic or service, with the native key (acsard's own) for the same messages."""
+    """A ROS topic or service, with acsard's own Zenoh key (native key) for the same messages."""
 
     name: str
     """ROS name relative to the robot's namespace."""
     native: str
-    """Native key without its beginning `acsard/<robot.id>/`."""
+    """Native key without the prefix `acsard/<robot.id>/`."""
     direction: Direction
     """Direction of the native key. In ROS, both "query" and "service" are services."""
     type: str
@@ -52,28 +52,29 @@ class RosName(Struct, frozen=True):
 
 
 class Endpoint(Struct, frozen=True):
-    """A ROS key to declare on the bus."""
+    """A ROS topic or service that the daemon declares on the bus for one ROS transport."""
 
     transport: Transport
     native: str
-    """Native key for the same messages."""
+    """Native key for the same messages, without the prefix `acsard/<robot.id>/`."""
     direction: Direction
     key: str
     token: str
-    """Liveliness token that announces the endpoint, or "" if it is not announced. rmw_zenoh
-    identifies the endpoint by its GID, which is a hash of this token."""
+    """Liveliness token that announces the endpoint, or "" if the endpoint is not announced.
+    rmw_zenoh identifies the endpoint by its GID, which is a hash of this token."""
     latched: bool
     """True if a new subscriber immediately receives the last message."""
     type: str
-    """ROS type of the messages. A key of the bridge may accept two types. Then this is the first of
-    them."""
+    """ROS type of the messages. If the endpoint accepts two types, which only the bridge allows,
+    this is the first type."""
 
     @property
     def encoding(self) -> str:
         """Zenoh Encoding to assume for an incoming sample, because samples from ROS have none.
 
-        For the bridge, the encoding does not name the ROS type, because a key may accept two types.
-        Then the length of a sample shows whether it is a Twist or a TwistStamped.
+        For rmw, it contains the ROS type. For the bridge, it does not, because an endpoint may
+        accept two types. The length of a sample then shows whether it is a Twist or a
+        TwistStamped.
         """
         cdr = encoding_name("cdr")
         return f"{cdr};{self.type}" if self.transport == "rmw" else cdr
@@ -95,8 +96,8 @@ PARAMETER_SERVICES = {
 }
 
 PARAMETERS = "parameters/"
-"""Beginning of `RosName.native` for the ROS services that read and set parameters. No native keys
-begin like this. Native clients read the same settings with the key `config`."""
+"""Prefix of `RosName.native` for the ROS services that read and set parameters. No native key on
+the bus begins like this, because native clients read the same settings with the key `config`."""
 
 PUBLISHED = (
     RosName("odom", "odom", "out", "nav_msgs/msg/Odometry"),
@@ -116,11 +117,11 @@ SOURCES = {
     "cmd_vel_teleop": "teleop",
     "joint_commands": "ros2_control",
 }
-"""Maps each ROS topic that commands the robot to its command source."""
+"""Maps each ROS topic that commands the robot to the name of its command source."""
 
 URDF = RosName(DESCRIPTION, DESCRIPTION, "out", "std_msgs/msg/String", Qos(1, transient=True))
-"""The topic of the robot's URDF. It is not in `PUBLISHED`, because all topics in `PUBLISHED` are
-recorded and this one is not."""
+"""The topic of the robot's URDF. It is not in `PUBLISHED`, because the topics in `PUBLISHED` are
+recorded and the URDF is not."""
 
 SLOWER = RosName(SPEED_LIMIT, SPEED_LIMIT, "in", "nav2_msgs/msg/SpeedLimit")
 """Subscription to the speed limits of Nav2's speed filter."""
@@ -133,7 +134,8 @@ drivers that publish with SensorDataQoS."""
 def left_out(config: Config) -> frozenset[str]:
     """Return the native keys that a daemon with the configuration `config` does not use.
 
-    The daemon does not announce them, so that ROS tools do not show them as topics.
+    The daemon does not announce them to ROS, so that ROS tools do not show topics without
+    messages.
     """
     silent = set() if config.odometry.publish_tf else {"tf"}
     # The simulated robot has a gyro of its own, so the daemon does not subscribe to one.
@@ -149,9 +151,11 @@ def left_out(config: Config) -> frozenset[str]:
 def ros_names(ros: RosConfig, silent: Container[str] = ()) -> tuple[RosName, ...]:
     """Return the ROS topics and services of a robot.
 
-    A topic that accepts Twist and TwistStamped appears twice, once for each type. `ros` is the
-    table `[ros]` of the configuration. `silent` contains the native keys to leave out, as
-    `left_out` returns them.
+    A topic that accepts Twist and TwistStamped appears twice, once for each type.
+
+    Args:
+        ros: the table `[ros]` of the configuration.
+        silent: the native keys to leave out, as `left_out` returns them.
     """
     kinds = [kind for kind in TWISTS if ros.cmd_vel_type in ("auto", kind)]
     return (
@@ -181,7 +185,7 @@ def ros_names(ros: RosConfig, silent: Container[str] = ()) -> tuple[RosName, ...
 
 
 def in_ros_words(text: str, ros: RosConfig) -> str:
-    """Return `text` with the ROS names of services instead of their native keys.
+    """Replace the native keys of services in `text` by their ROS names.
 
     For example, `srv/clear` becomes `/acsard/clear`.
     """
@@ -206,9 +210,10 @@ def endpoints(ros: RosConfig, zid: str, silent: Container[str] = ()) -> tuple[En
 
 
 def node_tokens(ros: RosConfig, zid: str) -> tuple[str, ...]:
-    """Return the tokens that announce the daemon to ROS: as a bridge, as a node, or as both.
+    """Return the liveliness tokens that announce the daemon itself to ROS.
 
-    `zid` is the id of the daemon's Zenoh session.
+    There is one token for the bridge and one for rmw, if `ros` switches them on. `zid` is the id
+    of the daemon's Zenoh session.
     """
     tokens = []
     if ros.bridge and ros.announce:
@@ -219,17 +224,17 @@ def node_tokens(ros: RosConfig, zid: str) -> tuple[str, ...]:
 
 
 def command_keys(ros: RosConfig) -> tuple[str, ...]:
-    """Return the ROS keys on which commands, speed limits and gyro samples arrive."""
+    """Return the Zenoh keys on which commands, speed limits and gyro samples arrive from ROS."""
     return tuple({e.key: None for e in endpoints(ros, "0") if e.direction == "in"})
 
 
 def claims(ros: RosConfig) -> tuple[str, ...]:
-    """Return the tokens with which this daemon claims the ROS name `cmd_vel` for itself.
+    """Return the tokens with which this daemon claims the ROS topic `cmd_vel` for itself.
 
     Two daemons with the same token would follow the same `cmd_vel`, so the second daemon does not
-    start. ROS's own tokens cannot serve as claims, because not every daemon announces itself to
-    ROS, and other ROS nodes may use the same names. So the keys of claims begin with
-    `acsard/@ros/`.
+    start. The tokens begin with `acsard/@ros/`. The tokens that announce endpoints to ROS cannot
+    serve as claims, because not every daemon announces itself, and other ROS nodes may use the
+    same names.
     """
     name = full_name(ros.namespace, "cmd_vel")
     trees = (("bridge", ros.bridge), (f"rmw/{ros.domain}", ros.rmw))
@@ -243,7 +248,8 @@ def _node(ros: RosConfig, zid: str) -> Node:
 def _bridge(ros: RosConfig, zid: str, names: tuple[RosName, ...]) -> Iterator[Endpoint]:
     """Yield one endpoint of the transport "bridge" for each ROS name.
 
-    The endpoint of a topic with two types is not announced, because a DDS reader has only one type.
+    The endpoint of a topic with two types is not announced, because a DDS reader has only one
+    type.
     """
     for row in names:
         twins = [other for other in names if other.name == row.name]

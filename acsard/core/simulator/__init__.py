@@ -1,1 +1,1 @@
-"""Simulates the robot: the vehicle, and the microcontroller that drives it."""
+"""Simulates the robot: the vehicle, and the microcontroller that controls its motors."""

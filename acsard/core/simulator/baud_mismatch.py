@@ -1,8 +1,8 @@
-"""Computes the bytes that a receiver gets from a sender with another baud rate.
+"""Computes the bytes that a receiver gets if the sender uses another baud rate.
 
-For each byte, the sender puts a start bit, eight data bits with the lowest first, and a stop bit on
-the wire. The receiver waits for a falling edge. Then it samples the wire ten times, in the middle
-of each bit as its own baud rate defines it.
+For each byte, the sender puts a start bit, eight data bits with the lowest first, and a stop bit
+on the wire. The receiver waits for a falling edge. Then it samples the wire ten times, in the
+middle of each bit as its own baud rate defines it.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ BITS = 10
 
 
 def garbled(data: bytes, sent: int, received: int) -> bytes:
-    """Return the bytes that a receiver at `received` baud reads from `data`, sent at `sent` baud.
+    """Return the bytes that a receiver at `received` baud gets if `data` is sent at `sent` baud.
 
     A byte with a wrong stop bit becomes a zero byte, as the Linux kernel delivers it.
     """

@@ -1,8 +1,8 @@
 """Simulates the board: its side of the serial protocol, with the time of each byte on the wire.
 
-The simulated board does not use the daemon's parser, so that an error in that parser makes the
-tests fail. A test switches a fault on for a `with` block, such as `with mcu.mute():` (`faults.py`).
-The faults that `[sim] faults` lists are always on.
+The simulated board does not use the daemon's parser. So an error in that parser makes tests fail.
+A test switches a fault on for a `with` block, such as `with mcu.mute():` (`faults.py`). The faults
+that `[sim] faults` lists are always on.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ RESET_NS = 2 * NS_PER_S
 """Time for which a board with a bootloader ignores its input after a reset, ns."""
 
 SHORTEST_WINDOW_NS = 4 * MS
-"""Shortest time over which the board computes speeds from encoder counts, ns. If less time has
-passed since the last computation, a reply repeats the speeds of that computation."""
+"""Shortest time over which the board computes speeds from encoder counts, ns. If the last
+computation is more recent, a reply repeats its speeds."""
 
 OUTPUT_BYTES = 255
 """Size of the board's output buffer, bytes. If a line does not fit into the buffer, the board drops
@@ -40,30 +40,29 @@ STATUS_NS = NS_PER_S // 10
 """Time between two status lines, ns."""
 
 EMPTY_VOLTS, CHARGED_VOLTS, RESISTANCE = 21.0, 4.2, 0.2
-"""Properties of the simulated battery, which has six cells. `EMPTY_VOLTS` is the voltage of the
-empty battery, V. A full battery has `CHARGED_VOLTS` more. `RESISTANCE` is the internal resistance,
-ohm."""
+"""Properties of the simulated battery, which has six cells: the voltage of the empty battery, V;
+the additional voltage of a full battery, V; and the internal resistance, ohm."""
 
 REST_AMPS, AMPS_PER_SPEED = 0.5, 0.05
-"""`REST_AMPS` is the battery current at rest, A. `AMPS_PER_SPEED` is the additional current for
-each rad/s of each wheel, A."""
+"""Battery current while the robot stands still, A, and the additional current for each rad/s of
+each wheel, A."""
 
 START_AMPS, START_NS = 10.0, 300 * MS
-"""`START_AMPS` is the additional battery current while the motors start, A. It lowers the battery
-voltage by 2 V. `START_NS` is the duration of the start, ns."""
+"""Additional battery current while the motors start, A, and the duration of the start, ns. The
+current lowers the battery voltage by 2 V."""
 
 NEVER_NS = 2**62
 
 PROCESSING_MS = (2.1, 1.3, 3.7, 1.0, 4.9, 2.6, 1.8, 3.2)
-"""Times from the arrival of a line from the host to the start of the board's reply, ms. The board
-uses these times in turn."""
+"""Delays from the arrival of a line at the board to the start of the reply, ms. The board uses the
+delays in turn."""
 
 
 class FakeMcu(Faults):
     """The simulated board.
 
-    Pass the bytes of the host to `receive()`. Call `advance()` at the times that `next_ns()`
-    returns, to get the bytes that the board sends.
+    Pass the bytes that the host sends to `receive()`. Call `advance()` at the times that
+    `next_ns()` returns. It returns the bytes that the host receives.
     """
 
     def __init__(self, config: Config, now_ns: int = 0) -> None:
@@ -92,25 +91,25 @@ class FakeMcu(Faults):
         self._counted = [0.0] * 4
         self._replied_ns = now_ns - NS_PER_S
         self.heard: deque[tuple[int, bytes]] = deque(maxlen=4096)
-        """The last received lines, valid or not. Each is a pair of the monotonic time at which its
-        last byte arrived, ns, and the line."""
+        """The last received lines, valid or not. Each item is a pair: the monotonic time at which
+        the last byte of the line arrived, ns, and the line."""
         self.valid_lines = 0
         self._watchdog_trips = 0
         self._checks = False
-        """Whether the host has sent a valid line with a checksum. If so, the board adds a checksum
-        to its status lines too."""
+        """True if the host has sent a valid line with a checksum. The board then also adds a
+        checksum to its status lines."""
         self._bumpers = "." * (len(config.safety.bumpers) or 4)
         """Field `bumpers` of the status line while no bumper is pressed: one dot per bumper."""
         self._inputs: tuple[tuple[int, int, str, str], ...] = ()
-        """The faults of the inputs that are on. Each is a tuple of four: the monotonic times at
-        which it begins and ends, ns, the field of the status line, and the value of this field. The
-        value `silent` leaves the field out of the line. If several faults of one field are on, the
-        last one decides. For bumpers instead, each bumper that any of the faults presses is
-        reported as pressed."""
+        """The input faults that are on, as tuples: begin and end (monotonic, ns), the name of a
+        field in the status line, and the value of this field. The value `silent` leaves the field
+        out of the line. If several faults of the same field are on, the last fault decides. For
+        the field `bumpers`, each bumper that at least one fault presses is reported as pressed."""
         self._inputs_clock = b""
         self._battery_clock = b""
         self._charge = self._capacity = 1.0
-        """State of charge of the battery, 0 to 1, and its capacity, ampere seconds."""
+        """`_charge` is the state of charge of the battery, 0 to 1. `_capacity` is the capacity of
+        the battery, ampere seconds."""
         self._drained_ns = self._rested_ns = now_ns
         """`_drained_ns` is the monotonic time at which the charge was last computed, ns.
         `_rested_ns` is the last monotonic time at which all set points were zero, ns."""
@@ -124,21 +123,24 @@ class FakeMcu(Faults):
     def vehicle(self) -> Vehicle:
         """The simulated robot at the time of the last call of `advance()`.
 
-        Its motion up to that time is computed only when this property is read.
+        Reading this property computes the motion of the robot up to that time.
         """
         self._catch_up()
         return self._vehicle
 
     @property
     def watchdog_trips(self) -> int:
-        """Number of times that the watchdog has stopped the motors."""
+        """Number of times that the watchdog of the board has stopped the motors."""
         self._catch_up()
         return self._watchdog_trips
 
     # Time.
 
     def receive(self, now_ns: int, data: bytes) -> None:
-        """Accept bytes that the host wrote at `now_ns`. They arrive at the speed of the wire."""
+        """Accept bytes that the host wrote at the monotonic time `now_ns`, ns.
+
+        The bytes reach the board later, at the speed of the wire.
+        """
         start, taken = max(self._in_free_ns, now_ns), 0
         data = self._damaged(data)
         *lines, rest = data.split(b"\n")
@@ -153,12 +155,15 @@ class FakeMcu(Faults):
     def next_ns(self) -> int | None:
         """Return the monotonic time at which to call `advance()` next, ns.
 
-        Return None if the board has nothing to do until the next call of `receive()`.
+        Return None if nothing will happen before the next call of `receive()`.
         """
         return self._events[0][0] if self._events else None
 
     def advance(self, now_ns: int) -> bytes:
-        """Advance the time to `now_ns`. Return the bytes that the host receives until then."""
+        """Simulate the board until `now_ns`. Return the bytes that the host receives until then.
+
+        `now_ns` is a monotonic time, ns.
+        """
         out = b""
         while self._events and self._events[0][0] <= now_ns:
             due_ns, _, what, data = heapq.heappop(self._events)
@@ -191,9 +196,10 @@ class FakeMcu(Faults):
         return out
 
     def reset(self, now_ns: int, deaf_ns: int = RESET_NS) -> None:
-        """Reset the board, which stops its motors and ignores its input for `deaf_ns` ns.
+        """Reset the board at the monotonic time `now_ns`, ns.
 
-        After half of this time, the board sends some noise, as a bootloader does.
+        The motors stop, and the board ignores its input for `deaf_ns` ns. After half of this time,
+        the board sends some noise, as a bootloader does.
         """
         self._now_ns = now_ns
         self._events.clear()
@@ -286,11 +292,11 @@ class FakeMcu(Faults):
         self._schedule(self._out_free_ns, "sent", data)
 
     def _handed_over(self, now_ns: int, what: str, data: bytes) -> bytes:
-        """Return the bytes that the USB adapter passes on to the host at `now_ns`.
+        """Return the bytes that the USB adapter passes to the host at the time `now_ns`.
 
-        `what` is "batch" if the timer of the adapter has expired, and "sent" if the bytes `data` of
-        the board have arrived at the adapter. During a stall, return b"" and schedule the same call
-        for the end of the stall.
+        `what` is "batch" if the timer of the adapter has expired. It is "sent" if the bytes `data`
+        of the board have arrived at the adapter. During a stall, return b"" and schedule the same
+        call for the end of the stall.
         """
         until_ns = self._stalled_until(now_ns)
         if until_ns > now_ns:
@@ -317,8 +323,7 @@ class FakeMcu(Faults):
     def _speeds(self, now_ns: int) -> list[float]:
         """Return the mean speeds of the motors a to d since the last computation, rad/s.
 
-        If less than `SHORTEST_WINDOW_NS` has passed since then, return the speeds of that
-        computation.
+        If the last computation is less than `SHORTEST_WINDOW_NS` old, return its speeds again.
         """
         since, before = self._window
         gains = self.gains
@@ -390,53 +395,54 @@ class FakeMcu(Faults):
     # The following faults are not in `faults.py`, because they need the events of the board.
 
     def estop(self) -> Fault:
-        """Make the board report ten times per second that the emergency stop is released."""
+        """Make the board report a released emergency stop ten times per second."""
         return self._input("estop", "ok")
 
     def estop_pressed(self, after_s: float, length_s: float) -> Fault:
-        """Make the board report that a person presses the emergency stop for a while.
+        """Make the board report a press of the emergency stop.
 
         The press begins `after_s` s after this fault is switched on, and lasts `length_s` s. If
-        `length_s` is 0, it does not end. The board reports a released emergency stop before and
-        after the press. The motors keep their power.
+        `length_s` is 0, the press does not end. Before and after the press, the board reports a
+        released emergency stop. The motors keep their power.
         """
         return self._input("estop", "pressed", after_s, length_s)
 
     def estop_silent(self, after_s: float, length_s: float) -> Fault:
-        """Make the board report a released emergency stop, and omit these reports for a while.
+        """Make the board report a released emergency stop, and stop these reports for some time.
 
-        The reports end `after_s` s after this fault is switched on, and begin again `length_s` s
-        later. If `length_s` is 0, they do not begin again.
+        The pause begins `after_s` s after this fault is switched on, and lasts `length_s` s. If
+        `length_s` is 0, the pause does not end.
         """
         return self._input("estop", "silent", after_s, length_s)
 
     def bumpers(self) -> Fault:
         """Make the board report that all bumpers are released.
 
-        The bumpers are those in `safety.bumpers`, or four bumpers if that list is empty.
+        There is one bumper for each place in `safety.bumpers`. If that list is empty, there are
+        four.
         """
         return self._input("bumpers", self._bumpers)
 
     def bumper_pressed(self, number: float, after_s: float, length_s: float) -> Fault:
-        """Make the board report that the bumper `number`, counted from 1, is pressed for a while.
+        """Make the board report a press of the bumper `number`, counted from 1.
 
         The press begins `after_s` s after this fault is switched on, and lasts `length_s` s. If
-        `length_s` is 0, it does not end. The board reports a released bumper before and after the
-        press. The motors keep their power.
+        `length_s` is 0, the press does not end. Before and after the press, the board reports
+        released bumpers. The motors keep their power.
         """
         marks = ["X" if i == number else mark for i, mark in enumerate(self._bumpers, 1)]
         return self._input("bumpers", "".join(marks), after_s, length_s)
 
     def bumpers_silent(self, after_s: float, length_s: float) -> Fault:
-        """Make the board report released bumpers, and omit these reports for a while.
+        """Make the board report released bumpers, and stop these reports for some time.
 
-        The reports end `after_s` s after this fault is switched on, and begin again `length_s` s
-        later. If `length_s` is 0, they do not begin again.
+        The pause begins `after_s` s after this fault is switched on, and lasts `length_s` s. If
+        `length_s` is 0, the pause does not end.
         """
         return self._input("bumpers", "silent", after_s, length_s)
 
     def driver_fault(self, after_s: float, length_s: float) -> Fault:
-        """Make the board report that the motor driver has a fault for a while.
+        """Make the board report a fault of the motor driver.
 
         The driver's fault begins `after_s` s after this simulated fault is switched on, and lasts
         `length_s` s. If `length_s` is 0, it does not end. Before and after it, the board reports
@@ -448,8 +454,8 @@ class FakeMcu(Faults):
     def battery(self, percent: float, minutes: float) -> Iterator[None]:
         """Make the board report a battery ten times per second. Its charge begins at `percent` %.
 
-        A full battery would last `minutes` minutes if the robot only stood. It drains faster while
-        the robot drives.
+        While the robot stands still, a full battery lasts `minutes` minutes. It drains faster
+        while the robot drives.
         """
         clock = b"battery %d" % next(self._order)
         self._schedule(self._now_ns + STATUS_NS, "battery", clock)
@@ -480,7 +486,7 @@ class FakeMcu(Faults):
 
     @contextmanager
     def free_running(self, period_s: float = 0.1) -> Iterator[None]:
-        """Make the board report every `period_s` s by its own clock instead of answering lines.
+        """Make the board send a report every `period_s` s, instead of one reply to each line.
 
         The reports end with a comma, and their speeds are not padded (`3.14` instead of `03.14`).
         """

@@ -1,4 +1,4 @@
-"""The switches for the faults of the simulated board and its wire.
+"""The switches for the faults of the simulated board and of its serial wire.
 
 `fake_mcu.py` implements the effects of the faults. No fault is random: a fault that affects only
 some of the lines affects every n-th line.
@@ -20,11 +20,11 @@ USB_PACKET = 62
 timer."""
 
 WATCHDOG_NS = 300_000_000
-"""Duration of the host's silence after which the board stops the motors, ns."""
+"""Time without a valid line from the host after which the board stops the motors, ns."""
 
 
 class Faults:
-    """The switches of all faults. A fault is on inside its `with` block."""
+    """The switches of all faults. A fault is on inside the `with` block of its method."""
 
     def __init__(self) -> None:
         self.muted = False
@@ -41,19 +41,18 @@ class Faults:
         self.watchdog = True
         self.watchdog_ns = WATCHDOG_NS
         self.any_feeds = False
-        """Whether invalid lines reset the watchdog too."""
+        """True if invalid lines also reset the watchdog."""
         self.baud_rate = 115200
         self.reply_gap_ns = 0
         self.drivers = [0, 1, 2, 3]
-        """The motor that each channel drives. Channels 0 to 3 are the outputs a to d of the
-        board."""
+        """The motor that each output drives. The outputs 0 to 3 are a to d of the board."""
         self.drives = [1.0] * 4
-        """For each channel, the factor from its command to the set point of its motor: 1, or -1 if
-        the motor is reversed, or 0 if it is dead."""
+        """For each output a to d of the board, the factor from its command to the set point of its
+        motor: 1, or -1 if the motor is reversed, or 0 if the motor is dead."""
         self.push: float | None = None
         """Speed at which a person pushes the robot, m/s, or None if nobody pushes it."""
         self.encoders = [0, 1, 2, 3]
-        """The motor whose encoder each channel reads."""
+        """The motor whose encoder is connected to each of the board's inputs a to d."""
         self.encoder_signs = [1, 1, 1, 1]
         self.understand: Callable[[bytes], protocol.Command | None] = protocol.whole
         self.samples = True
@@ -62,7 +61,7 @@ class Faults:
         packet even if the packet is not full. 0 means that there is no adapter."""
         self.stall_every_ns = self.stall_ns = 0
         self.lose_reply = self.lose_command = self.bit_error = 0
-        """Each of these faults affects every n-th line. The value is n, or 0 if the fault is
+        """Each of these three faults affects every n-th line. The value is n, or 0 if the fault is
         off."""
         self._passed = {"reply": 0, "command": 0, "bit": 0}
         self._clock = b""
@@ -77,7 +76,10 @@ class Faults:
             self._turn(before)
 
     def _turn(self, values: dict[str, object]) -> None:
-        """Simulate the vehicle up to now with the old switches, then set the switches `values`."""
+        """Set the switches in `values`.
+
+        Before that, simulate the vehicle up to now with the old switches.
+        """
         self._catch_up()
         for name, value in values.items():
             setattr(self, name, value)
@@ -86,9 +88,9 @@ class Faults:
         """Simulate the vehicle up to now. `FakeMcu` implements this."""
 
     def _hit(self, what: str, every: int) -> bool:
-        """Count an event. Return True for every n-th event of the same kind, where n is `every`.
+        """Count an event of the kind `what`. Return True for every n-th event, where n is `every`.
 
-        `what` is the kind: "reply", "command" or "bit". If `every` is 0, always return False.
+        The kinds are "reply", "command" and "bit". If `every` is 0, always return False.
         """
         self._passed[what] += 1
         return every > 0 and self._passed[what] % every == 0
@@ -105,7 +107,7 @@ class Faults:
         return block
 
     def mute(self) -> Fault:
-        """Make the board obey lines without sending any reply or status line."""
+        """Make the board obey lines but send no replies and no status lines."""
         return self._with(muted=True)
 
     def noise(self, data: bytes = b"\x00\xff~") -> Fault:
@@ -113,55 +115,61 @@ class Faults:
         return self._with(noise_bytes=data)
 
     def partial_line(self) -> Fault:
-        """Make the board send only the first half of every reply."""
+        """Make the board send only the first half of each reply."""
         return self._with(cut_replies=True)
 
     def bias(self, wheel: int, gain: float) -> Fault:
-        """Multiply the reported speed and counts of motor `wheel` (0 to 3 for a to d) by `gain`."""
+        """Multiply the reported speed and counts of motor `wheel` by `gain`.
+
+        `wheel` is 0 to 3 for the motors a to d.
+        """
         return self._with(gains=[gain if i == wheel else g for i, g in enumerate(self.gains)])
 
     def stuck_encoder(self, wheel: int) -> Fault:
-        """Make the board report motor `wheel` (0 to 3 for a to d) as still, even while it turns."""
+        """Make the board report that motor `wheel` stands still, even while it turns.
+
+        `wheel` is 0 to 3 for the motors a to d.
+        """
         return self._with(stuck=wheel)
 
     def frozen_encoder(self, wheel: int) -> Fault:
-        """Make the board keep reporting the last speed of motor `wheel` (0 to 3 for a to d)."""
+        """Make the board repeat the last speed of motor `wheel` (0 to 3 for a to d) forever."""
         return self._with(frozen=wheel)
 
     @contextmanager
     def swapped_wheels(self, wheel: int, other: int) -> Iterator[None]:
-        """Swap the wheels of the channels `wheel` and `other` (0 to 3 for a to d).
+        """Exchange two wheels, so that both their motors and their encoders are swapped.
 
-        Both the motors and the encoders are swapped.
+        `wheel` and `other` are the numbers of the motors, 0 to 3 for a to d.
         """
         with self.swapped_motors(wheel, other), self.swapped_encoders(wheel, other):
             yield
 
     def swapped_motors(self, wheel: int, other: int) -> Fault:
-        """Swap the motors of the channels `wheel` and `other` (0 to 3 for a to d)."""
+        """Exchange the wires of the motors `wheel` and `other` (0 to 3 for a to d)."""
         return self._with(drivers=_swapped(self.drivers, wheel, other))
 
     def swapped_encoders(self, wheel: int, other: int) -> Fault:
-        """Swap the encoders of the channels `wheel` and `other` (0 to 3 for a to d)."""
+        """Exchange the wires of the encoders `wheel` and `other` (0 to 3 for a to d)."""
         return self._with(encoders=_swapped(self.encoders, wheel, other))
 
     @contextmanager
     def reversed_wheel(self, wheel: int) -> Iterator[None]:
-        """Reverse the motor and the encoder of channel `wheel` (0 to 3 for a to d)."""
+        """Reverse both the motor and the encoder `wheel` (0 to 3 for a to d)."""
         with self.reversed_motor(wheel), self.reversed_encoder(wheel):
             yield
 
     def reversed_motor(self, wheel: int) -> Fault:
-        """Swap the two leads of the motor of channel `wheel` (0 to 3 for a to d)."""
+        """Swap the two leads of motor `wheel` (0 to 3 for a to d), so that it turns backward."""
         return self._with(drives=[-d if i == wheel else d for i, d in enumerate(self.drives)])
 
     def reversed_encoder(self, wheel: int) -> Fault:
-        """Swap the A and B signals of the encoder of channel `wheel` (0 to 3 for a to d)."""
+        """Swap the signals A and B of encoder `wheel` (0 to 3 for a to d), which reverses it."""
         signs = enumerate(self.encoder_signs)
         return self._with(encoder_signs=[-s if i == wheel else s for i, s in signs])
 
     def dead_motor(self, wheel: int) -> Fault:
-        """Make the motor of channel `wheel` (0 to 3 for a to d) ignore its commands."""
+        """Make the motor `wheel` (0 to 3 for a to d) ignore its commands."""
         return self._with(drives=[0.0 if i == wheel else d for i, d in enumerate(self.drives)])
 
     def pushed(self, speed: float) -> Fault:
@@ -172,11 +180,11 @@ class Faults:
         return self._with(push=speed)
 
     def slow_reply(self, delay_s: float = 0.03) -> Fault:
-        """Make the board obey and answer each line `delay_s` s later than usual."""
+        """Make the board obey and answer each line with an additional delay of `delay_s` s."""
         return self._with(extra_delay_ns=int(delay_s * NS_PER_S))
 
     def sparse_replies(self, period_s: float = 0.1) -> Fault:
-        """Make the board answer at most one line every `period_s` s."""
+        """Make the board send at most one reply every `period_s` s."""
         return self._with(reply_gap_ns=int(period_s * NS_PER_S))
 
     def wrong_baud(self, baud_rate: int) -> Fault:
@@ -196,7 +204,7 @@ class Faults:
         return self._with(ending=",\r\n")
 
     def comma_latched(self) -> Fault:
-        """Make the board obey each value that a comma follows, and ignore checksums.
+        """Make the board obey each speed that is followed by a comma, and ignore checksums.
 
         Some old firmware behaves like this.
         """
@@ -211,49 +219,47 @@ class Faults:
         return self._with(understand=protocol.plain_only)
 
     def no_sample(self) -> Fault:
-        """Make the board reply with a checksum, but never with the board's time and counts."""
+        """Make the board reply with checksums, but never with its time and encoder counts."""
         return self._with(samples=False)
 
     def no_watchdog(self) -> Fault:
-        """Keep the motors running when the host is silent."""
+        """Make the board keep the motors running when the host sends no lines."""
         return self._with(watchdog=False)
 
     def late_watchdog(self, time_s: float = 1.0) -> Fault:
-        """Make the board stop the motors only after the host was silent for `time_s` s."""
+        """Make the board stop the motors only after `time_s` s without a valid line."""
         return self._with(watchdog_ns=int(time_s * NS_PER_S))
 
     def watchdog_fed_by_bad_lines(self) -> Fault:
-        """Let invalid lines reset the watchdog too, although the board does not obey them."""
+        """Let invalid lines reset the watchdog, although the board does not obey them."""
         return self._with(any_feeds=True)
 
     def lost_replies(self, every: int = 5) -> Fault:
-        """Drop every n-th reply on its way to the host, where n is `every`."""
+        """Lose one of every `every` replies on its way to the host."""
         return self._with(lose_reply=every)
 
     def lost_commands(self, every: int = 5) -> Fault:
-        """Drop every n-th line on its way to the board, where n is `every`."""
+        """Lose one of every `every` lines on its way to the board."""
         return self._with(lose_command=every)
 
     def bit_errors(self, every: int = 7) -> Fault:
-        """Flip one bit in every n-th line, where n is `every`.
+        """Flip one bit in one of every `every` lines.
 
-        Lines in both directions are counted together. Another bit of the line is flipped each time.
+        Lines in both directions are counted together. The position of the bit in the line changes
+        each time.
         """
         return self._with(bit_error=every)
 
     def ftdi(self, latency_s: float = 0.016) -> Fault:
-        """Send replies through a USB adapter, which delays them by up to `latency_s` s."""
+        """Send replies through a USB adapter that delays them by up to `latency_s` s."""
         return self._with(latency_ns=int(latency_s * NS_PER_S))
 
     def stalls(self, every_s: float, length_s: float) -> Fault:
-        """Hold back all bytes to the host again and again.
-
-        Such a stall begins every `every_s` s and lasts `length_s` s.
-        """
+        """Hold back all bytes to the host for `length_s` s. A stall begins every `every_s` s."""
         return self._with(stall_every_ns=int(every_s * NS_PER_S), stall_ns=int(length_s * NS_PER_S))
 
     def _stalled_until(self, now_ns: int) -> int:
-        """Return the end of the present stall, ns, or `now_ns` if there is no stall."""
+        """Return the end of the present stall, ns. Outside a stall, return `now_ns`."""
         if not self.stall_every_ns:
             return now_ns
         began_ns = now_ns // self.stall_every_ns * self.stall_every_ns

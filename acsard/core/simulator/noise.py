@@ -1,7 +1,8 @@
-"""Generates repeatable random numbers: the n-th number of a seed is the same in any order of calls.
+"""Generates repeatable random numbers.
 
+The n-th number of a seed is always the same, in any order of calls, so the module keeps no state.
 The numbers come from the mixing function of SplitMix64 (Steele, Lea & Flood, Fast splittable
-pseudorandom number generators, 2014), applied to n. So the module keeps no state.
+pseudorandom number generators, 2014), applied to n.
 """
 
 from __future__ import annotations
@@ -19,7 +20,10 @@ def uniform(seed: int, n: int) -> float:
 
 
 def gauss(seed: int, n: int) -> float:
-    """Return the n-th random number of `seed`, with a standard normal distribution (Box-Muller)."""
+    """Return the n-th random number of `seed`, normally distributed with mean 0 and variance 1.
+
+    The method is the Box-Muller transform.
+    """
     radius = math.sqrt(-2.0 * math.log(1.0 - uniform(seed, 2 * n)))
     return radius * math.cos(math.tau * uniform(seed, 2 * n + 1))
 

@@ -1,8 +1,8 @@
-"""The serial protocol as the board implements it: the lines that it obeys, and its answers.
+"""The serial protocol on the side of the board: the commands that it obeys, and its replies.
 
-There is a decoder for each kind of firmware. `whole()` is the decoder of the reference firmware. A
-checked line is a plain line with a suffix: a sequence number and a checksum. The module shares no
-code with the host.
+There is one decoder for each kind of firmware. `whole` is the decoder of the reference firmware. A
+checked line is a plain line with a suffix that contains a sequence number and a checksum. The
+module shares no code with the host.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ PLAIN = 31
 
 
 class Command(Struct, frozen=True):
-    """A line that the board obeys."""
+    """A valid command line from the host, decoded."""
 
     values: dict[int, float]
-    """Speeds by motor (0 to 3 for a to d), rad/s."""
+    """Commanded speeds, rad/s, by motor (0 to 3 for a to d)."""
     sequence: bytes = b""
     """The two digits of the sequence number of a checked line, or b"" for a plain line."""
     wants_sample: bool = False
-    """Whether the line asks for a reply with the board's time and encoder counts."""
+    """True if the reply must contain the board's time and its encoder counts."""
 
 
 def whole(line: bytes) -> Command | None:
@@ -54,22 +54,22 @@ def whole(line: bytes) -> Command | None:
 
 
 def plain_only(line: bytes) -> Command | None:
-    """Decode a line like firmware that accepts only plain lines. Return None for any other line."""
+    """Decode a line like firmware without checksums. Return None if the line is not plain."""
     return _plain(line.removesuffix(b"\n").removesuffix(b"\r"))
 
 
 def prefix(line: bytes) -> Command | None:
-    """Decode a line like firmware that ignores all text after the four values.
+    """Decode a line like firmware that ignores all text after the four speeds.
 
-    Return None if the four values are not valid.
+    Return None if the four speeds are not valid.
     """
     return _plain(line[:PLAIN])
 
 
 def latched(line: bytes) -> Command:
-    """Decode a line like old firmware, which obeys each value that a comma follows.
+    """Decode a line like old firmware, which obeys each speed that is followed by a comma.
 
-    Such firmware obeys these values even if the rest of the line is not valid.
+    Such firmware obeys these speeds even if the rest of the line is not valid.
     """
     values = {}
     for token in line.split(b",")[:-1]:
@@ -103,10 +103,10 @@ def _value(word: bytes) -> float:
 
 @lru_cache(1024)
 def speeds_text(speeds: tuple[float, ...], separator: str, unpadded: bool) -> bytes:
-    """Return the plain part of a reply with the speeds of the motors a to d, rad/s.
+    """Return the plain part of a reply: the speeds of the motors a to d, rad/s.
 
-    `separator` is the text between two speeds, such as ",". `unpadded` says whether a speed below
-    ten has only one integer digit.
+    `separator` is the text between two speeds, such as ",". If `unpadded` is true, a speed below
+    ten has only one digit before the decimal point.
     """
     form = "%s%s%.2f" if unpadded else "%s%s%05.2f"
     words = [
@@ -117,10 +117,13 @@ def speeds_text(speeds: tuple[float, ...], separator: str, unpadded: bool) -> by
 
 
 def suffix(text: bytes, sequence: bytes, sample: Sequence[int]) -> bytes:
-    """Return the suffix of a checked reply whose plain part is `text`.
+    """Return the suffix of a checked reply.
 
-    `sequence` are the two digits of the sequence number. `sample` is the board's time in ms and the
-    four encoder counts, or empty for a reply without them.
+    Args:
+        text: the plain part of the reply.
+        sequence: the two digits of the sequence number.
+        sample: the board's time in ms and the four encoder counts, or an empty sequence for a
+            reply without these values.
     """
     body = b"#" + sequence
     if sample:
@@ -132,7 +135,7 @@ def suffix(text: bytes, sequence: bytes, sample: Sequence[int]) -> bytes:
 
 
 def status(fields: Mapping[str, str], check: bool) -> bytes:
-    """Return the status line with `fields`, such as `{"estop": "ok"}`.
+    """Return a status line with the given fields, such as `{"estop": "ok"}`.
 
     If `check` is true, the line has a checksum.
     """
@@ -143,9 +146,10 @@ def status(fields: Mapping[str, str], check: bool) -> bytes:
 def identity(counts: int, watchdog_ms: int, sample: bool) -> bytes:
     """Return the line with which the firmware identifies itself.
 
-    `counts` is the number of encoder counts per wheel revolution. `watchdog_ms` is the time without
-    a valid line after which the board stops the motors, ms. `sample` says whether the firmware can
-    add the board's time and encoder counts to replies.
+    Args:
+        counts: the number of encoder counts per wheel turn.
+        watchdog_ms: the time without a valid line after which the board stops the motors, ms.
+        sample: True if replies can contain the board's time and encoder counts.
     """
     text = f"!acsard-mcu 1 counts={counts} watchdog_ms={watchdog_ms} check=1 sample={int(sample)}"
     return text.encode() + b"\r\n"

@@ -1,6 +1,7 @@
-"""Observes the true motion of the simulated robot at 100 Hz, and simulates a gyro.
+"""Observes the true motion of the simulated robot 100 times per second, and simulates a gyro.
 
-The simulated board does not use these observations. It reports only what its encoders measure.
+The simulated board does not use these observations. It reports only the measurements of its
+encoders.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from acsard.core.simulator.noise import gauss
 from acsard.core.values import NS_PER_S, Pose
 
 LOOK_NS = NS_PER_S // 100
-"""Time between two observations of the simulated robot, each with a sample of its gyro, ns."""
+"""Interval at which the simulated robot is observed, ns. The gyro has the same interval."""
 
 
 class Sight(Struct, frozen=True):
@@ -26,12 +27,12 @@ class Sight(Struct, frozen=True):
     """Monotonic time of the observation, ns."""
     pose: Pose
     gyro: float
-    """Turn rate that the gyro reports, rad/s. It is the mean rate between two observations, delayed
-    by `[sim] gyro_delay`, with the bias and the noise of the gyro."""
+    """Turn rate that the gyro reports, rad/s. It is the mean turn rate between two observations,
+    delayed by `[sim] gyro_delay`, plus the bias and the noise of the gyro."""
 
 
 class WatchedMcu(FakeMcu):
-    """A `FakeMcu` that passes an observation to the callback `see` every 10 simulated ms."""
+    """A `FakeMcu` that passes a `Sight` to the callback `see` every 10 ms of simulated time."""
 
     def __init__(self, config: Config, now_ns: int, see: Callable[[Sight], None]) -> None:
         super().__init__(config, now_ns)
@@ -40,8 +41,8 @@ class WatchedMcu(FakeMcu):
         self._looks = 0
         self._look_ns = now_ns + LOOK_NS
         self._history: deque[tuple[int, float]] = deque([(now_ns, 0.0)])
-        """The motion that the delayed gyro still needs, oldest first. Each item is a pair of a
-        monotonic time, ns, and the angle by which the robot had turned at that time, rad."""
+        """The motion that the delayed gyro has not reported yet, oldest first. Each item is a
+        pair: a monotonic time, ns, and the angle by which the robot had turned until then, rad."""
 
     def next_ns(self) -> int:
         """Return the monotonic time at which to call `advance()` next, ns."""
@@ -49,7 +50,10 @@ class WatchedMcu(FakeMcu):
         return self._look_ns if due_ns is None else min(due_ns, self._look_ns)
 
     def advance(self, now_ns: int) -> bytes:
-        """Advance the time to `now_ns`. Return the bytes that the host receives until then."""
+        """Simulate the board until `now_ns`. Return the bytes that the host receives until then.
+
+        `now_ns` is a monotonic time, ns.
+        """
         out = b""
         while self._look_ns <= now_ns:
             out += super().advance(self._look_ns)
@@ -70,7 +74,7 @@ class WatchedMcu(FakeMcu):
         self._see(Sight(now_ns, self.vehicle.pose, rate))
 
     def _turned(self, at_ns: int) -> float:
-        """Return the angle that the robot had turned at `at_ns`, rad.
+        """Return the angle by which the robot had turned at the time `at_ns`, rad.
 
         If `at_ns` is outside the history, return the angle at the nearer end of the history.
         """

@@ -1,4 +1,7 @@
-"""Makes the messages that the simulator publishes from a `Sight`, an observation of its robot."""
+"""Makes the messages that the simulator publishes about the true motion of its robot.
+
+Each message is made from a `Sight`, which is one observation of the robot.
+"""
 
 from __future__ import annotations
 
@@ -24,8 +27,11 @@ def true_pose(sight: Sight, wall_ns: int) -> PoseStamped:
 def turn_rate(sight: Sight, frame: str, deviation: float, wall_ns: int) -> Imu:
     """Return the turn rate that the gyro measured, as an Imu message without other measurements.
 
-    `frame` is the frame id. `deviation` is the standard deviation of the gyro's noise, rad/s.
-    `wall_ns` is the stamp of the message, ns since 1970.
+    Args:
+        sight: the observation of the robot.
+        frame: the frame id of the gyro.
+        deviation: the standard deviation of the gyro's noise, rad/s.
+        wall_ns: the stamp of the message, ns since 1970.
     """
     unknown, variance = [-1.0] + [0.0] * 8, deviation * deviation
     known = [variance, 0.0, 0.0, 0.0, variance, 0.0, 0.0, 0.0, variance]

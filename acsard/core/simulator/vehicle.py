@@ -1,17 +1,18 @@
 """Simulates the robot: four motors with lag, and the motion of the base on the floor.
 
-A motor follows its set point as a first-order system. The base moves according to the true speeds
-of the wheels, their true radii and the true effective track. Settings in `[sim]` can make the true
-radii and the true track differ from those in `[drive]`. Wheels are in the order `values.WHEELS`.
+A motor follows its set point as a first-order system. The true speeds of the wheels, their true
+radii and the true effective track determine the motion of the base. Settings in `[sim]` can make
+the true radii and the true track differ from the values in `[drive]`. Wheels are in the order
+`values.WHEELS`.
 
 The true effective track depends on the turn rate. Let L be the configured effective track, m the
-setting `track_multiplier`, k the setting `track_rate_dependence`, and w the turn rate in rad/s that
-the wheels would give with the track m L. The base turns at the rate
+setting `track_multiplier`, k the setting `track_rate_dependence`, and w the turn rate in rad/s
+that the wheels would give with the track m L. The base turns at the rate
 
     w / (1 + 2 k |w| / (1 + |w|))
 
-The true track is therefore m L at very low turn rates and (1 + k) m L at 1 rad/s, and it approaches
-(1 + 2 k) m L.
+The true track is therefore m L at very low turn rates and (1 + k) m L at 1 rad/s. At high turn
+rates, it approaches (1 + 2 k) m L.
 """
 
 from __future__ import annotations
@@ -24,11 +25,11 @@ from acsard.core.simulator.noise import uniform
 from acsard.core.values import Pose
 
 GRIP_S = 0.25
-"""Interval at which the random grip of the wheels on the floor changes, s."""
+"""Time after which the random grip of the wheels on the floor changes, s."""
 
 HANDS_S = 0.1
-"""When a person pushes the robot, the speeds of its wheels approach the speed of the push with this
-time constant, s."""
+"""Time constant, s, with which the wheel speeds approach the speed of a person who pushes the
+robot."""
 
 
 class Vehicle:
@@ -49,18 +50,19 @@ class Vehicle:
         self.pose = Pose()
         """The true pose of base_link relative to its start."""
         self.turned = 0.0
-        """Angle by which the robot turned left since its start, rad. Each full turn adds 2 pi."""
+        """Total angle by which the robot has turned left since its start, rad. Each full turn adds
+        2 pi."""
         self.turn_slip = 0.0
-        """Fraction of each turn that the robot does not make because its wheels skid, 0 to 1."""
+        """Fraction of each turn that is lost because the wheels skid, 0 to 1."""
         self.load = 0.0
         """Load of the motors, 0 to 1. The motors reach only the fraction 1 - `load` of each set
         point."""
 
     def advance(self, dt: float, push: float | None = None) -> None:
-        """Move the robot for `dt` s according to its set points.
+        """Simulate the motion of the robot for `dt` s.
 
-        If `push` is not None, a person pushes the robot at `push` m/s, and the set points have no
-        effect.
+        The motors follow their set points. If `push` is not None, a person pushes the robot at
+        `push` m/s, and the set points have no effect.
         """
         if dt <= 0.0:
             return
@@ -96,7 +98,7 @@ class Vehicle:
         self.pose = arc(self.pose, (left + right) / 2, turn)
 
     def _grip(self) -> float:
-        """Return the fraction of a turn that the robot makes although its wheels skid, 0 to 1."""
+        """Return the fraction of a turn that remains although the wheels skid, 0 to 1."""
         kept = 1.0 - self.turn_slip
         if self._floor:
             kept *= 1.0 - self._floor * uniform(self._seed, int(self._time / GRIP_S))

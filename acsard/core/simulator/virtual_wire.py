@@ -1,7 +1,7 @@
-"""A serial connection to the simulated board in virtual time, in which waiting takes no real time.
+"""A serial connection to the simulated board in virtual time, so that waiting takes no real time.
 
-`acsard mcu check` can use this connection in place of a serial port (`checkup.board.Wire`). If the
-baud rates of host and board differ, the bytes of both directions arrive garbled.
+`acsard mcu check` can use this connection instead of a serial port (`checkup.board.Wire`). If the
+host and the board use different baud rates, the bytes in both directions are garbled.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ class VirtualWire:
         self._now_ns = now_ns
 
     def open(self, baud_rate: int) -> None:
-        """Open the connection, or change the baud rate of the open connection."""
+        """Open the connection at `baud_rate`, or change the baud rate of the open connection."""
         self.is_open, self._baud_rate = True, baud_rate
 
     def close(self) -> None:
-        """Close the connection. No bytes can be sent after that."""
+        """Close the connection. After that, no bytes can be sent."""
         self.is_open = False
 
     def now_ns(self) -> int:
@@ -34,7 +34,7 @@ class VirtualWire:
         return self._now_ns
 
     def late_ns(self) -> int:
-        """Return 0, because in virtual time a busy processor delays nothing."""
+        """Return the delay that this computer has caused, ns. It is always 0 in virtual time."""
         return 0
 
     def send(self, data: bytes) -> None:
@@ -44,8 +44,8 @@ class VirtualWire:
     def listen(self, until_ns: int) -> list[Piece]:
         """Advance the virtual time to `until_ns`, and return the bytes that the host receives.
 
-        The bytes come in pieces. Each piece is a pair of the virtual time of its arrival, ns, and
-        its bytes.
+        The result is a list of pairs: the virtual time at which some bytes arrived, ns, and these
+        bytes.
         """
         pieces = []
         while (due_ns := self.mcu.next_ns()) is not None and due_ns <= until_ns:

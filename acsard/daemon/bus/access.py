@@ -2,9 +2,9 @@
 
 Zenoh denies every message that no rule allows.
 
-- Zenoh checks the rules in the session at the end of a client's link. That is the daemon's session
-  or, over TLS, the session of the TLS gateway. This session knows only the neighbor on the link, so
-  a client that connects through a router has the permissions of the router.
+- Zenoh checks the rules in the session at the far end of a client's link. That session belongs to
+  the daemon or, over TLS, to the TLS gateway. It knows only the neighbor on the link, so a client
+  that connects through a router has the permissions of the router.
 - A rule allows a message only if one of the rule's key expressions includes the whole key
   expression of the message. A query with a wildcard therefore needs a rule with a wildcard.
 - A client over TLS may use exact keys only, unless `access.wildcards` is set. A few wildcards can
@@ -39,7 +39,7 @@ from acsard.core.ros.transports import PARAMETERS, Endpoint, claims, endpoints, 
 from acsard.core.values import ROLES, ROOT, Role
 
 LOCAL_LINKS = ("tcp",)
-"""Link protocols that use no certificate. Such a link connects two programs on the same machine,
+"""Link protocols without certificates. Such a link connects two programs on the same machine,
 unless `bus.insecure` permits links to other machines."""
 
 TOKENS = ("@ros2_lv/**", "@/*/@ros2_lv/**")
@@ -53,7 +53,8 @@ SPOKEN = (
     "declare_liveliness_subscriber",
     "liveliness_query",
 )
-"""Zenoh's names of the message types that a daemon sends, except `put` (data)."""
+"""Zenoh's names of the message types that a daemon sends. The type `put` (data) has rules of its
+own."""
 
 EVERYTHING = (*SPOKEN, "put", "delete", "query")
 
@@ -66,7 +67,7 @@ def _grants(role: Role) -> tuple[str, ...]:
 
 
 USES = ("subscribes", "queries", "publishes")
-"""The three ways to use a key. They are the last words in the names of access rules, such as
+"""The three permissions for a key. They are the last words in the names of access rules, such as
 "viewer queries"."""
 
 GRANTS: dict[Role, tuple[str, ...]] = {role: _grants(role) for role in ROLES}
@@ -77,8 +78,8 @@ WIDE: dict[Role, tuple[str, ...]] = {
     "operator": ("roam", "recall"),
     "maintainer": ("roam", "recall", "browse", "attend"),
 }
-"""Maps each role to the names of the additional access rules that it gets if `access.wildcards` is
-true."""
+"""Maps each role to the names of the additional access rules that the role gets if
+`access.wildcards` is true."""
 
 LOCAL = (
     *GRANTS["maintainer"],
@@ -90,10 +91,13 @@ LOCAL = (
     "err",
     "forge",
 )
-"""The names of the access rules for a client on the robot's own machine. These are all rules of a
-maintainer, and more: such a client may also subscribe with any wildcard and receive the commands of
-other clients. It may even put on keys that do not exist. The daemon then counts and refuses the
-sample, and gives the reason. The client may not put on the keys on which the robot publishes."""
+"""The names of the access rules for a client on the robot's own machine.
+
+They are the rules of a maintainer, and more. Such a client may also subscribe with any wildcard,
+and receive the commands of other clients. It may put on any key except those on which the robot
+publishes. If the key does not exist, the daemon counts and refuses the sample, and gives the
+reason.
+"""
 
 Flow = Literal["ingress", "egress"]
 
@@ -113,7 +117,7 @@ class Rule(TypedDict):
 
 
 class _Keys:
-    """The native keys and ROS keys of one robot. Each attribute is a group for an access rule."""
+    """The key expressions of one robot, native and ROS, in groups for the access rules."""
 
     def __init__(self, config: Config) -> None:
         robot = config.robot.id
@@ -121,10 +125,11 @@ class _Keys:
         self._ros = ros = endpoints(config.ros, "*", left_out(config) & {IMU, DESCRIPTION})
         topics, outgoing = offered(config), published(config)
         self._incoming = [topic for topic in topics if topic not in outgoing]
-        """Rows of the topic table that the daemon does not publish: inputs, queries and services.
-        With the simulator, the daemon publishes the gyro itself, so the gyro's row is missing."""
+        """Rows of the table of keys that the daemon does not publish: inputs, queries and services.
+        With the simulator, the daemon publishes the gyro's key itself, so the gyro's row is missing
+        here."""
         self._readable = [*outgoing, *(t for t in self._incoming if t.direction != "in")]
-        """Rows of the topic table that clients may subscribe to or query."""
+        """Rows of the table of keys that clients may subscribe to or query."""
         self.all = full_key(robot, "**")
         self.alive = full_key(robot, "alive")
         self.claims = claims(config.ros)
@@ -140,7 +145,8 @@ class _Keys:
         self.subscribed += _of(ros, "in")
         """Key expressions to which the daemon subscribes."""
         self.commands = [full_key(robot, key) for key in source_keys(self._sources)]
-        """Command keys of the configured sources, for clients without a certificate."""
+        """Command keys of the configured sources, for clients that connect without a
+        certificate."""
         self.viewer_queries = [
             full_key(robot, t.pattern)
             for t in topics
@@ -158,7 +164,7 @@ class _Keys:
         """Return the keys for which `role` is the lowest role with the permission `use`.
 
         The result contains native keys and ROS keys, without wildcards. It does not contain the
-        command keys that end with a certificate's name: `commands_by` returns these.
+        command keys that end with a certificate's name, which `commands_by` returns.
         """
         rows = self._incoming if use == "publish" else self._readable
         keys = [full_key(self._robot, key) for key in keys_for(role, use, rows)]
@@ -167,9 +173,10 @@ class _Keys:
     def commands_by(self, certificate: str) -> list[str]:
         """Return the command keys of all sources for one certificate.
 
-        `certificate` is the common name of the certificate. If it is "*", return key expressions
-        that match the command keys of all certificates. A router needs these, because it forwards
-        the commands of every client.
+        Args:
+            certificate: the common name of the certificate. For "*", the result is key expressions
+                that match the command keys of all certificates. A router needs these key
+                expressions, because it forwards the commands of every client.
         """
         return [full_key(self._robot, key) for key in source_keys(self._sources, certificate)]
 
@@ -177,8 +184,9 @@ class _Keys:
         """Return the lowest role that may use a ROS endpoint.
 
         Return None for the commands of a source that is not configured. A ROS key cannot contain a
-        certificate's name, so every role that may command may use the ROS key of a command. Raises
-        `LookupError` if the endpoint's native key is not in the table of keys.
+        certificate's name, so each role that may command may use the ROS command keys of all
+        configured sources. Raises `LookupError` if the endpoint's native key is not in the table of
+        keys.
         """
         native = endpoint.native
         if native.startswith(PARAMETERS):
@@ -203,9 +211,8 @@ def _uses(endpoint: Endpoint) -> tuple[Use, ...]:
 def access_control(config: Config) -> dict[str, object]:
     """Return the value of Zenoh's setting `access_control` for the session of the daemon.
 
-    Every TLS link of that session leads to a router. The daemon accepts commands for any
-    certificate from the router, because the router checks the certificate of each client: it lets
-    a client put only on the command keys of the client's own certificate.
+    Every TLS link of that session leads to a router. The daemon accepts commands with the name of
+    any certificate from the router, because the router has checked the certificate of each client.
     """
     return _access(config, LOCAL, gateway=False)
 
@@ -213,9 +220,9 @@ def access_control(config: Config) -> dict[str, object]:
 def gateway_access(config: Config) -> dict[str, object]:
     """Return the value of Zenoh's setting `access_control` for the session of the TLS gateway.
 
-    The gateway's link to the daemon is its only link without a certificate. Zenoh assigns rules to
-    "subjects". There is a subject for each role, and one more for each certificate that may
-    command, which permits the command keys of this certificate.
+    Zenoh assigns access rules to "subjects". Each role is a subject. Each certificate that may
+    command is a further subject, which may put on the command keys of this certificate. The
+    gateway's link to the daemon is its only link without a certificate, and passes all messages.
     """
     return _access(config, ("pass",), gateway=True)
 
@@ -223,8 +230,8 @@ def gateway_access(config: Config) -> dict[str, object]:
 def _access(config: Config, local: tuple[str, ...], *, gateway: bool) -> dict[str, object]:
     """Return the value of Zenoh's setting `access_control` for one session.
 
-    `local` contains the names of the rules for links without a certificate. `gateway` says whether
-    the session belongs to the TLS gateway, and not to the daemon. Only the gateway limits each
+    `local` contains the names of the rules for links without a certificate. `gateway` is true for
+    the session of the TLS gateway, and false for the daemon's. Only the gateway limits each
     certificate to the command keys of this certificate.
     """
     keys = _Keys(config)

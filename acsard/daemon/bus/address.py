@@ -15,7 +15,7 @@ from acsard.host.errors import UsageError
 
 
 class Address(NamedTuple):
-    """The endpoint and the id of a robot, and the TLS directory of the client."""
+    """The address of a robot for a client: its endpoint, its id, and the client's TLS directory."""
 
     endpoint: str
     robot_id: str
@@ -31,9 +31,15 @@ def address_of(
 ) -> Address:
     """Return the address of a robot from its configuration and from the options of a tool.
 
-    `connect` is an endpoint, and `tls` is a directory with the client's certificate. An option that
-    is given replaces the value of the configuration. Raises `UsageError` for an id that no robot
-    can have.
+    An option that is None is taken from the configuration. Raises `UsageError` if `robot_id` does
+    not have the form of a robot's id.
+
+    Args:
+        config: the robot's configuration.
+        connect: the endpoint.
+        robot_id: the robot's id.
+        tls: the directory with the client's certificate. It is ignored if the endpoint needs no
+            certificate.
     """
     robot_id = config.robot.id if robot_id is None else robot_id
     require_id(robot_id)
@@ -49,9 +55,10 @@ def address_of(
 def address_by_environment(endpoint: str | None, robot_id: str | None, tls: str | None) -> Address:
     """Return a robot's address for a program that uses the client library.
 
-    Each argument that is None is replaced by a value from the configuration file in $ACSARD_CONFIG
-    or, without such a file, by the default. $ACSARD_TLS has priority over the certificate directory
-    in the file. Raises `UsageError` for an id that no robot can have, and for an unusable file.
+    An argument that is None is taken from the configuration file that $ACSARD_CONFIG names. Without
+    such a file, it has its default value. $ACSARD_TLS has priority over the certificate directory
+    in the file. Raises `UsageError` if `robot_id` does not have the form of a robot's id, or if the
+    file is unusable.
     """
     complete = endpoint is not None and robot_id is not None
     if complete and (tls is not None or not _is_tls(endpoint or "")):

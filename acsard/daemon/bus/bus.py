@@ -1,4 +1,4 @@
-"""Owns the daemon's Zenoh session and the robot's keys, receives from the bus and publishes to it.
+"""Connects the daemon to the Zenoh bus: owns the Zenoh session, and declares the robot's keys.
 
 Every Zenoh call that may block (open, declare, put, reply, close) runs in a thread, never on the
 event loop.
@@ -35,18 +35,21 @@ OPEN_TIMEOUT_S = 10.0
 CLOSE_TIMEOUT_S = 0.3
 
 TWIN_TIMEOUT_S = 0.5
-"""Time for which a starting daemon looks for another daemon with the same robot id or the same ROS
-names, s."""
+"""Time for which a starting daemon looks for another daemon with its robot id or its ROS names,
+s."""
 
 
 class ZenohBus:
     """The robot's keys on the bus, as an asynchronous context manager.
 
-    Entering the context declares the keys, and leaving it removes them.
+    The keys are declared when the context is entered, and removed when it is left.
     """
 
     def __init__(self, config: Config, waker: Waker) -> None:
-        """Prepare the buffers. `waker` wakes the control loop when a command or a stop arrives."""
+        """Prepare the buffers for samples and queries.
+
+        `waker` wakes the control loop when a command or a stop arrives.
+        """
         self._config, self._id = config, config.robot.id
         self._alive = full_key(self._id, "alive")
         prefix = full_key(self._id, "")
@@ -56,17 +59,21 @@ class ZenohBus:
         self._outlets, self._links = Outlets(), RouterLinks(config.bus)
         self._session: zenoh.Session
         self._kept: list[object] = []
-        """The declared entities. Zenoh undeclares an entity when nothing refers to it."""
+        """References to the declared Zenoh entities. Zenoh undeclares an entity when nothing refers
+        to it."""
 
     # The control loop calls the methods below.
 
     @property
     def wanted(self) -> frozenset[str]:
-        """The published topics that have a subscriber, on a native key or on a ROS key."""
+        """Native keys of the published topics that have a subscriber or are latched.
+
+        A subscriber of a topic's ROS key counts too.
+        """
         return self._outlets.wanted
 
     def take(self, queries: int) -> BusInput:
-        """Return the samples, queries and changes from the bus since the last call.
+        """Return the samples and queries that have arrived since the last call, and other changes.
 
         `queries` limits the number of returned queries. One slow query may exceed this limit, as
         `Inbox.take` explains. The other queries wait for the next call.
@@ -81,11 +88,17 @@ class ZenohBus:
         return replace(taken, dropped=dropped, stuck=stuck) if dropped or stuck else taken
 
     def publish(self, key: str, message: Message) -> None:
-        """Queue a message for the subscribers of the topic `key`. `flush` sends it."""
+        """Queue a message for the subscribers of a topic. `flush` lets the message be sent.
+
+        `key` is the native key of the topic, without the robot's id.
+        """
         self._outlets.publish(key, message)
 
     def flush(self) -> None:
-        """Wake the sending thread without waiting. Raise the error of a bus thread that failed."""
+        """Wake the thread that sends the queued messages, without waiting for this thread.
+
+        If an exception has ended a thread of the bus, raise this exception.
+        """
         self._outlets.flush()
         self._replies.check()
         self._links.check()
@@ -94,9 +107,9 @@ class ZenohBus:
         self._replies.send(reply)
 
     def retire(self, ticket: int) -> None:
-        """End a query. It gets no more replies, so the client stops waiting.
+        """End a query, so that its client stops waiting for replies.
 
-        `ticket` is the number of the query from `take`.
+        `ticket` is the number of the query, from the result of `take`.
         """
         self._replies.retire(ticket)
 
@@ -133,7 +146,8 @@ class ZenohBus:
     def _conflict(self, tokens: set[str]) -> str:
         """Return an error message if another daemon has this robot's id or ROS names, else "".
 
-        `tokens` contains the liveliness tokens that `_others` has found.
+        `tokens` contains the liveliness tokens of this robot that other sessions have declared
+        (`_others`).
         """
         if self._alive in tokens:
             return (
@@ -172,10 +186,10 @@ class ZenohBus:
             self._declare_json(session, topic)
 
     def _declare_json(self, session: zenoh.Session, topic: Topic) -> None:
-        """Declare the topic's JSON key, for clients without msgpack.
+        """Declare the JSON key of a topic, for clients without msgpack.
 
         The publisher on this key is never latched, because a latched publisher must encode every
-        message even without subscribers. A late subscriber can query the key for the present value
+        message even without subscribers. A late subscriber can query the key for the newest message
         instead.
         """
         below = json_key(topic.key)
@@ -220,7 +234,7 @@ class ZenohBus:
 
 
 def _others(session: zenoh.Session, alive: str, claims: tuple[str, ...]) -> set[str]:
-    """Return those of this robot's liveliness tokens that other sessions hold already.
+    """Return those of this robot's liveliness tokens that other sessions have declared already.
 
     `alive` is the token of the robot's id, and `claims` are the tokens of its ROS names. Blocks for
     up to `TWIN_TIMEOUT_S`.

@@ -1,6 +1,7 @@
-"""A thread of the bus. If an exception ends the thread, the daemon ends too.
+"""A thread of the bus that passes its exception to the control loop, so that the daemon ends too.
 
-Otherwise the robot would drive on, but would no longer publish or answer.
+If the daemon went on without the thread, it would drive the robot, but would no longer publish or
+answer.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from threading import Thread
 
 
 class BusThread(Thread):
-    """A thread that stores the exception that has ended it. The control loop calls `check`."""
+    """A thread of the bus. If an exception ends the thread, `check` raises this exception."""
 
     def __init__(self, name: str, work: Callable[[], None]) -> None:
         super().__init__(name=name, daemon=True)
@@ -24,6 +25,6 @@ class BusThread(Thread):
             self._error = error
 
     def check(self) -> None:
-        """Raise the exception that has ended this thread. Do nothing if there is none."""
+        """Raise the exception that has ended this thread, if any."""
         if self._error is not None:
             raise self._error

@@ -1,9 +1,9 @@
 """Detects that the certificate files of the bus were replaced, and reads when they expire.
 
 Zenoh reads the files of a listening endpoint only when it opens the endpoint. So a process that
-listens must know when its files have been replaced (`CertificateFiles.renewed`). Three files cannot
-be replaced at the same moment, so new files are reported only when they belong together and no
-longer change. A thread reads the expiry times, because a disk or a router may not answer.
+listens must detect new files and restart (`CertificateFiles.renewed`). Three files cannot be
+replaced at the same moment, so new files are reported only when they belong together and no longer
+change. A thread reads the expiry times, because a disk or a router may not answer.
 """
 
 from __future__ import annotations
@@ -20,30 +20,34 @@ from acsard.host import clock
 from acsard.host.threads import NoThreadError, in_thread
 
 FILES_LOOK_NS = 2 * NS_PER_S
-"""Time between two checks for replaced files, ns. Copying three files takes less time, so files
-that have not changed between two checks are complete."""
+"""Time between two checks for replaced files, ns. Copying three files takes less time. So if the
+files have not changed between two checks, all of them have been copied."""
 
 Signature = tuple[tuple[int, int, int], ...]
 """Inode, size in bytes and modification time in ns of each file; () if a file is missing."""
 
 
 class CertificateFiles:
-    """The three TLS files of a process that listens: authority, certificate and key."""
+    """The three TLS files of a process that listens: authority, certificate and key.
+
+    `renewed` detects that they were replaced.
+    """
 
     def __init__(self, authority: Path, certificate: Path, key: Path) -> None:
-        """Record the state of the files.
+        """Record the present state of the files.
 
-        Call this before Zenoh reads the files. If a file were replaced between the reading and this
-        call, `renewed` would not notice it.
+        Call this before Zenoh reads the files. If a file were replaced after Zenoh has read it and
+        before this call, `renewed` would not detect that.
         """
         self._files = authority, certificate, key
         self._used = self._seen = self._signature()
         self._due_ns = clock.mono_ns() + FILES_LOOK_NS
 
     def renewed(self) -> bool:
-        """Return whether the files were replaced by new ones that can be used together.
+        """Return whether the files have been replaced by new ones that can be used together.
 
-        Returns True once for each replacement. Checks the files at most every `FILES_LOOK_NS`.
+        Return True only once for each replacement. The files are checked at most every
+        `FILES_LOOK_NS`.
         """
         now_ns = clock.mono_ns()
         if now_ns < self._due_ns:
@@ -58,9 +62,9 @@ class CertificateFiles:
         return True
 
     def refused(self) -> str:
-        """Return why Zenoh refuses the present files, or "" if it accepts them.
+        """Return the reason why Zenoh refuses the present files, or "" if Zenoh accepts them.
 
-        Call this after `renewed` has returned True. It takes half a second.
+        Call this after `renewed` has returned True. The call takes half a second.
         """
         return certificate_trouble(*self._files)
 
@@ -76,17 +80,21 @@ ENDS_LOOK_S = 60.0
 """Pause between two readings of the certificates' expiry times, s."""
 
 ROUTER_LOOKS = 60
-"""The routers' certificates are read only at every 60th reading of the robot's own certificates,
-because each reading takes one of a router's connections. If a router did not answer, all routers
-are tried again at the next reading of the robot's certificates."""
+"""Number of readings of the robot's own certificates for each reading of the routers' certificates.
+The routers' certificates are read less often, because each reading takes one of a router's
+connections. If a router did not answer, all routers are tried again at the next reading of the
+robot's certificates."""
 
 
 def ends_of(routers: Iterable[str], directory: str) -> dict[str, int]:
     """Return the expiry time of each router's certificate, ns since 1970.
 
     A router that does not answer is left out. The keys of the returned dict are texts for messages,
-    like "the router tls/HOST:PORT". `directory` contains the certificate with which this machine
-    connects.
+    such as "the router tls/HOST:PORT".
+
+    Args:
+        routers: the endpoints of the routers.
+        directory: the directory with the certificate of this machine.
     """
     found = {f"the router {one}": peer_ends_ns(one, directory) for one in routers}
     return {whose: ends_ns for whose, ends_ns in found.items() if ends_ns is not None}
@@ -95,9 +103,13 @@ def ends_of(routers: Iterable[str], directory: str) -> dict[str, int]:
 async def watch_certificates(bus: BusConfig, known: MutableMapping[str, int]) -> None:
     """Update the expiry times in `known` every `ENDS_LOOK_S`, until this task is cancelled.
 
-    `known` maps the name of each certificate to its expiry time, ns since 1970. The names are the
-    dict keys of `tls.ends` and `ends_of`. If a certificate cannot be read, its value stays
-    unchanged.
+    If a certificate cannot be read, its value stays unchanged. If `bus.outside` names endpoints,
+    the value of the robot's own certificate is not updated, because the TLS gateway reports it.
+
+    Args:
+        bus: the settings with the certificate directory and the routers.
+        known: maps the name of each certificate to its expiry time, ns since 1970. The names are
+            the dict keys of `tls.ends` and `ends_of`.
     """
     routers = [endpoint for endpoint in bus.connect if endpoint.startswith(TLS)]
     answered, look = 0, 0

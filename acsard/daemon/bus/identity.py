@@ -1,9 +1,9 @@
-"""Finds out which role this client has at a robot, and which certificate it uses.
+"""Finds out which role this client has at a robot, and which certificate the client uses.
 
 Zenoh does not tell the daemon over which link a query came. But each role has a key, and the access
 rules let a client query only the keys of its own role and of lower roles. So the client queries the
-keys of all roles, and the highest role whose key answers is its own. The certificate's name comes
-from the client's own file.
+keys of all roles, and its role is the highest one whose query is answered. The certificate's name
+comes from the client's own file.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from acsard.daemon.bus.tls import common_name
 from acsard.host import clock
 
 WHOAMI_S, WHOAMI_MORE_S = 2.0, 0.3
-"""`WHOAMI_S` is the longest wait for the first answer to the queries for the role, s.
-`WHOAMI_MORE_S` is the wait for the other answers after the first one, s."""
+"""`WHOAMI_S` is the longest wait for the first answer to the queries for the role, s. After that
+answer, the client waits `WHOAMI_MORE_S` for further answers, s."""
 
 Ask = Callable[[str, Callable[[zenoh.Sample], object]], None]
-"""Function that queries a key of the robot, and calls the callback with each replied sample."""
+"""Function that queries a key of the robot. It calls the callback with each sample of the reply."""
 
 
 class Identity(Struct, frozen=True):
@@ -38,16 +38,16 @@ class Identity(Struct, frozen=True):
     certificate: str
     """The common name of the client's certificate; "" if the client has no certificate."""
     sender: str
-    """The name that the daemon gives to the sender of this client's commands."""
+    """The name that the daemon gives to this client as a sender of commands."""
     robot: str = ""
     endpoint: str = ""
 
     def lacks(self, key: str) -> str:
         """Return the reason, in words, why this client may not use a Zenoh key of the robot.
 
-        The result is "" if the client may use the key. If the robot answered no query for the
-        client's role, the role is unknown. Then the result is the text of `silence`, which is "" if
-        the client connects without a certificate.
+        Return "" if the client may use the key. If the robot answered no query for the client's
+        role, the role is unknown. In this case, return the text of `silence`, which is "" for a
+        client without a certificate.
 
         Args:
             key: the part of the Zenoh key after the robot's id, such as `state`.
@@ -61,7 +61,7 @@ class Identity(Struct, frozen=True):
 
     @property
     def silence(self) -> str:
-        """The likeliest reasons why the robot answered no query for the client's role, in words.
+        """Likely reasons why the robot answered no query for the client's role, in words.
 
         The text names several reasons, because a client cannot tell whether the robot is absent,
         hangs, or does not list the client's certificate. The text is "" if the robot answered a
@@ -88,7 +88,7 @@ class Identity(Struct, frozen=True):
     def words(self) -> str:
         """Return a sentence about the client's role and certificate.
 
-        If the role is unknown, the text says why the robot may not have answered.
+        If the role is unknown, the text says instead why the robot may not have answered.
         """
         if not self.role:
             return self._nobody()
@@ -106,9 +106,9 @@ def identity(ask: Ask, tls: str, sender: str, robot: str = "", endpoint: str = "
     Blocks for up to `WHOAMI_S`.
 
     Args:
-        ask: sends a query to the robot.
-        tls: the directory of the client's certificate, or "".
-        sender: the name that the daemon gives to the sender of this client's commands.
+        ask: function that sends a query to the robot.
+        tls: the directory of the client's certificate, or "" without a certificate.
+        sender: the name that the daemon gives to this client as a sender of commands.
         robot: the robot's id, for messages.
         endpoint: the endpoint of the daemon or router, for messages.
     """

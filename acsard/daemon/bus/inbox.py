@@ -35,26 +35,27 @@ from acsard.host import clock
 from acsard.host.mailbox import Mailbox
 
 TICKETS = 1024
-"""Largest number of unfinished queries. Further queries are dropped without an answer."""
+"""Largest number of queries that are not ended yet. A further query is dropped without an
+answer."""
 
 
 class Replies:
-    """The unfinished queries of one robot, and the thread that sends the replies to them."""
+    """The queries that are not ended yet, and the thread that sends the replies to them."""
 
     def __init__(self, prefix: str) -> None:
         self._prefix = prefix
         self._queries: dict[int, tuple[zenoh.Query, str]] = {}
         self._tickets = count(1)
         self._queue: queue.SimpleQueue[Reply | int | None] = queue.SimpleQueue()
-        """Replies to send, and tickets (numbers) of queries to end, in the order of their arrival.
-        None ends the thread."""
+        """Items for the thread, in the order of their arrival. A `Reply` is sent, a ticket (number)
+        ends its query, and None ends the thread."""
         self._thread: BusThread | None = None
 
     def issue(self, query: zenoh.Query, key: str) -> int | None:
-        """Return a ticket, the number of this query, or None if too many queries are unfinished.
+        """Store a query, and return its ticket, which is a number.
 
-        The replies to the query are sent on the full key `key`. If it is "", each reply is sent on
-        its own key below the robot's id.
+        Return None if `TICKETS` queries are stored already. The replies are sent on the full key
+        `key`. If `key` is "", each reply is sent on its own key below the robot's id.
         """
         if len(self._queries) >= TICKETS:
             return None
@@ -70,12 +71,12 @@ class Replies:
         self._queue.put(ticket)
 
     def start(self, session: zenoh.Session) -> None:
-        """Start the thread that sends the replies, beginning with the queued replies."""
+        """Start the thread that sends the replies. Replies may be queued already."""
         self._thread = BusThread("replies", partial(self._run, session))
         self._thread.start()
 
     def check(self) -> None:
-        """Raise the error that has ended the sending thread. Do nothing if there is none."""
+        """Raise the exception that has ended the sending thread, if any."""
         if self._thread is not None:
             self._thread.check()
 
@@ -115,9 +116,9 @@ class Replies:
 
 
 ARRIVALS = 16
-"""Size of the buffer of each command key at 100 steps a second, in samples. It is larger if the
-control rate is lower. A newer sample displaces the oldest one. A sender at the limit of 1000 Hz
-puts 10 samples between two steps."""
+"""Size of the buffer of each command key at 100 control steps a second, in samples. At a lower
+control rate the buffer is larger. A newer sample displaces the oldest one. A sender at the limit of
+1000 Hz puts 10 samples between two steps."""
 
 SAMPLES = 64
 """Size of the buffer for gyro samples. A gyro at 400 Hz fills it if the control loop takes no
@@ -128,10 +129,11 @@ OTHERS = ""
 cannot displace the command of a configured source."""
 
 ALL = "*"
-"""Stands in a command key for the name of any certificate."""
+"""Placeholder in a command key for the name of any certificate."""
 
 STOPS = 16
-"""Size of the buffer for stops. It is separate, so that no flood of commands displaces a stop."""
+"""Size of the buffer for stops. Stops have a buffer of their own, so that no flood of commands
+displaces a stop."""
 
 QUERIES = 256
 """Size of each of the three queues: services, other native queries, and slow queries. If a queue is
@@ -140,15 +142,15 @@ full, further queries are refused with `BUSY`. One slow query is answered per st
 
 ATTACHMENT_BYTES = 256
 """Largest size of an attachment, bytes. An attachment of rmw_zenoh has 33 bytes, and an attachment
-of acsard has up to 140. The rest of a longer attachment is cut off. Such an attachment cannot be
-decoded, so it names no sender."""
+of acsard has up to 140. A longer attachment is cut off. It then cannot be decoded, so it names no
+sender."""
 
 STOP, SET = service_key("stop"), service_key("set")
 STOP_ALL = full_key("*", "stop")
 
 
 class Inbox:
-    """Samples and queries of one robot, buffered until `take`."""
+    """The samples and queries for one robot, buffered until the control loop calls `take`."""
 
     def __init__(
         self,
@@ -160,8 +162,12 @@ class Inbox:
     ) -> None:
         """Start with empty buffers.
 
-        `prefix` is the beginning of the robot's keys, and `sources` are the names of its command
-        sources. `waker` wakes the control loop, which makes `rate_hz` steps a second.
+        Args:
+            prefix: the beginning of the robot's keys.
+            replies: stores each query until the query is ended, and sends its replies.
+            sources: the names of the robot's command sources.
+            waker: wakes the control loop when a command or a stop arrives.
+            rate_hz: number of control steps a second.
         """
         self.own_id: zenoh.TimestampId | None = None
         """The id in the timestamps that the daemon's session makes. The session stamps each sample
@@ -175,26 +181,29 @@ class Inbox:
         self._arrivals[IMU] = Mailbox(SAMPLES, self._note)
         self._arrivals[SPEED_LIMIT] = Mailbox(ARRIVALS, self._note)
         self._stops = Mailbox[Arrival](STOPS, self._stopped)
-        # In a mailbox a new query would displace the oldest one. Here the new query is refused.
+        # These queues are not mailboxes. In a mailbox a new query would displace the oldest one,
+        # but a new query that finds the queue full must be refused.
         self._services: deque[Query] = deque()
         self._others: deque[Query] = deque()
         """Native queries that are neither services nor slow."""
         self._slow: deque[Query] = deque()
-        """Slow queries: ROS parameters and settings. The answer to one slow query takes as long as
-        the answers to all other queries of a step."""
+        """Slow queries: ROS parameters and settings. The answer to one slow query takes about as
+        much time as the answers to all other queries of a step."""
         self._lost = dict.fromkeys(self._arrivals, 0)
-        """For each buffer, the total of displaced samples that the last `take` has seen."""
+        """For each buffer, the total number of displaced samples that `take` has already
+        reported."""
         self._any = False
-        """True if a sample or query waits. It is set after the item is queued, so that `take` never
-        overlooks an item."""
+        """True if a sample or query waits. It becomes True after the item is in its buffer, so that
+        `take` never overlooks an item."""
         self._waker = waker
 
     def take(self, queries: int) -> BusInput:
-        """Return the samples since the last call, and at most `queries` of the waiting queries.
+        """Return the samples since the last call, and the first of the waiting queries.
 
         The stops come first, and then the other samples in the order of their arrival. The queries
-        are in this order: service calls, one slow query, other queries. If service calls alone
-        reach the limit `queries`, the slow query is returned in addition.
+        are in this order: service calls, one slow query, other queries. At most `queries` queries
+        are returned. If service calls alone reach this limit, the slow query is returned in
+        addition.
         """
         if not self._any:
             return NOTHING
@@ -226,9 +235,9 @@ class Inbox:
         self._arrived(sample, key, str(sample.encoding), "native")
 
     def on_ros_sample(self, endpoint: Endpoint, sample: zenoh.Sample) -> None:
-        """Queue a sample of a ROS key as if it had arrived on the native key of `endpoint`.
+        """Queue a sample of a ROS key as if the sample had arrived on the native key of `endpoint`.
 
-        A sample of ROS has no encoding, so `endpoint.encoding` is used.
+        A sample from ROS does not name its encoding, so `endpoint.encoding` is used.
         """
         key = str(sample.key_expr)
         native = endpoint.native if key == endpoint.key else key
@@ -262,7 +271,11 @@ class Inbox:
             self._buffer(key).put(arrival)
 
     def _buffer(self, key: str) -> Mailbox[Arrival]:
-        """Return the buffer of a key. All certificates of one source share a buffer."""
+        """Return the buffer for the samples of a key.
+
+        All certificates of one source share a buffer. All keys of unknown sources share another
+        one.
+        """
         buffer = self._arrivals.get(key)
         if buffer is None:
             buffer = self._arrivals.get(f"{key.rpartition('/')[0]}/{ALL}", self._arrivals[OTHERS])
@@ -280,7 +293,11 @@ class Inbox:
         self._waker.stop()
 
     def on_query(self, topic: str, query: zenoh.Query) -> None:
-        """Queue a query that matches `topic`, a row of the native topic table."""
+        """Queue a query on a native key.
+
+        A query with a wildcard is dropped if it matches a service or a JSON key. `topic` is the
+        native key of the queryable that has received the query.
+        """
         asked = str(query.key_expr).removeprefix(self._prefix)
         if asked != topic and (topic in VERBS or topic.startswith(JSON_TREE)):
             # A query with a wildcard must not call a service. A JSON key does not answer such a
@@ -290,7 +307,10 @@ class Inbox:
         self._queried(query, topic, asked, "", "native")
 
     def on_ros_query(self, endpoint: Endpoint, query: zenoh.Query) -> None:
-        """Queue a query on a ROS key, such as a call of a ROS service."""
+        """Queue a query on a ROS key, such as a call of a ROS service.
+
+        A query with a wildcard is dropped.
+        """
         if str(query.key_expr) == endpoint.key:
             native = endpoint.native
             self._queried(query, native, native, endpoint.key, endpoint.transport)
@@ -335,9 +355,9 @@ class Inbox:
 
 
 def _bytes(payload: zenoh.ZBytes | None, most: int) -> bytes:
-    """Return the payload's first `most` + 1 bytes.
+    """Return the first `most` + 1 bytes of the payload.
 
-    A result longer than `most` shows that the payload is too long.
+    If the result is longer than `most`, the payload is too long.
     """
     return b"" if payload is None else payload.to_bytes()[: most + 1]
 

@@ -1,11 +1,12 @@
-"""Publishes each topic on the keys of the topic that have a subscriber.
+"""Publishes the messages of each topic on those of the topic's keys that have a subscriber.
 
 A topic has native keys and perhaps ROS keys. Each key has an outlet, which is the publisher on that
 key. A message is encoded once per encoding, and only if an outlet with that encoding has a
 subscriber.
 
-The control loop only puts messages into slots, and a thread encodes and sends them. So if the bus
-blocks, messages are lost, but the control loop misses no period.
+The control loop only puts a message into the slot of its topic, which is a bounded queue. A thread
+encodes and sends the messages. So if the bus blocks, messages are lost, but the control loop misses
+no period.
 """
 
 from __future__ import annotations
@@ -32,16 +33,16 @@ OPTIONS: dict[str, Any] = {
 }
 
 HELD = 16
-"""Number of messages that the slot of a topic holds until the thread sends them. A newer message
-displaces the oldest one. At 100 Hz a slot holds 0.16 s of odometry. A busy machine or a client that
-connects usually blocks the thread for a shorter time."""
+"""Largest number of messages of a topic that wait in its slot for the thread. A newer message
+displaces the oldest one. With odometry at 100 Hz, a slot covers 0.16 s. A busy machine, or a client
+that connects, usually blocks the thread for a shorter time."""
 
 STUCK_NS = NS_PER_S // 4
-"""If the thread needs longer than this to send all waiting messages, ns, the bus counts as blocked.
+"""Time after which the bus counts as blocked, ns, if the thread has not sent all waiting messages.
 Usually the thread needs 0.1 ms."""
 
 HEARTBEAT = zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=0.5)
-"""Heartbeat of the publishers of latched ROS topics, with the settings of rmw_zenoh."""
+"""Heartbeat of the publishers of latched ROS topics. The settings are those of rmw_zenoh."""
 
 
 def direct(callback: Callable[[Any], None]) -> Any:
@@ -53,7 +54,7 @@ class _Outlet:
     def __init__(self, publisher: Any, form: Format, gid: bytes, signed: bytes) -> None:
         self.publisher, self.form = publisher, form
         self.wanted = False
-        """True if the key has a subscriber."""
+        """True if the key has a subscriber, or if the publisher is latched."""
         self._gid, self._sequence = gid, 0
         self._signed = {"attachment": signed} if signed else {}
 
@@ -76,19 +77,21 @@ class Outlets:
         """References to Zenoh's listeners. Zenoh ends a listener when nothing refers to it."""
         self._counting = Lock()
         self.wanted: frozenset[str] = frozenset()
-        """The native keys of the topics that have a subscriber."""
+        """The native keys of the topics that have a subscriber or a latched publisher."""
         self._slots: dict[str, Mailbox[Message]] = {}
         self._bell = Bell()
-        """Signal that wakes the thread. All slots share it, because a step fills several slots."""
+        """Signal that wakes the thread. All slots share it, because a control step fills several
+        slots."""
         self._waiting = self._leaving = self._stuck = False
         self._dropped = 0
-        """Number of messages that newer ones have displaced since the last call of `losses`."""
+        """Number of messages that newer messages have displaced since the last call of `losses`."""
         self._began_ns: int | None = None
-        """Monotonic time at which the present round of puts began, ns; None between rounds."""
+        """Monotonic time at which the thread began to send the waiting messages, ns; None while it
+        waits."""
         self._thread = BusThread("outlets", self._run)
 
     def _count(self, outlet: _Outlet, wanted: bool) -> None:
-        # Several threads of Zenoh call this method, so it needs a lock. It replaces the set
+        # Several threads of Zenoh call this method, so it takes a lock. It replaces the set
         # `wanted` as a whole, because the control loop may be reading the set.
         with self._counting:
             outlet.wanted = wanted
@@ -101,13 +104,19 @@ class Outlets:
     # The control loop calls the methods below. None of them waits or calls Zenoh.
 
     def publish(self, topic: str, message: Message) -> None:
-        """Put a message into the slot of its topic. `flush` sends it."""
+        """Put a message into the slot of its topic. `flush` lets the thread send the message.
+
+        `topic` is the native key of the topic.
+        """
         if not self._slots[topic].store(message):
             self._dropped += 1
         self._waiting = True
 
     def flush(self) -> None:
-        """Wake the thread that sends the messages. If the thread has failed, raise its error."""
+        """Wake the thread that sends the messages.
+
+        If an exception has ended this thread, raise the exception.
+        """
         self._thread.check()
         if self._waiting:
             self._waiting = False
@@ -115,13 +124,16 @@ class Outlets:
 
     @property
     def behind(self) -> bool:
-        """True if messages were dropped or the bus may block. If so, `losses` must be called."""
+        """True if messages were dropped, or if the bus may be blocked.
+
+        The caller must then call `losses`.
+        """
         return self._began_ns is not None or self._stuck or self._dropped > 0
 
     def losses(self, now_ns: int) -> tuple[int, bool]:
         """Return the number of dropped messages, and whether the bus has begun to block.
 
-        Both values cover the time since the last call, so a blockage is reported only once.
+        Both values cover the time since the last call, so a blocked bus is reported only once.
         `now_ns` is the present monotonic time, ns.
         """
         dropped, self._dropped = self._dropped, 0
@@ -130,11 +142,11 @@ class Outlets:
         return dropped, self._stuck and not was_stuck
 
     def start(self) -> None:
-        """Start the thread that sends the messages, beginning with the messages in the slots."""
+        """Start the thread that sends the messages. Messages may already wait in the slots."""
         self._thread.start()
 
     def stop(self, timeout: float) -> None:
-        """End the thread after it has sent the waiting messages. Wait at most `timeout` s."""
+        """Let the thread end after it has sent the waiting messages. Wait at most `timeout` s."""
         self._leaving = True
         self._bell.ring()
         self._thread.join(timeout)
@@ -175,14 +187,15 @@ class Outlets:
         """Declare one publisher of a topic.
 
         Args:
+            session: the Zenoh session of the daemon.
             topic: native key of the topic.
             key: full key on which the publisher puts the topic's messages.
             form: encoding of the messages.
             encoding: Zenoh's name of this encoding.
             latched: whether the publisher keeps its last sample for late subscribers.
-            gid: identity of a ROS publisher, or b"" for a native publisher. The samples of a ROS
-                publisher carry an attachment of rmw_zenoh.
-            signed: attachment of a native publisher's samples, or b"" for none.
+            gid: identity of a ROS publisher, or b"" for a native publisher. Each sample of a ROS
+                publisher gets an attachment in the form of rmw_zenoh.
+            signed: attachment of each sample of a native publisher, or b"" for no attachment.
         """
         if latched:
             publisher: Any = zenoh.ext.declare_advanced_publisher(

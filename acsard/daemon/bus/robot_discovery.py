@@ -1,7 +1,7 @@
 """Finds, follows or stops the robots that an `--id` names, and explains why a robot is silent.
 
-Over TLS the access rules allow exact keys only, because a few wildcards can take all the time of a
-router. A client over TLS must therefore name each robot.
+Over TLS the access rules allow only exact keys, because a few wildcards can take all the processor
+time of a router. So a client over TLS must name each robot.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from acsard.host.errors import NoAnswerError, UsageError
 
 ALL = "*"
 PRESENT_S = 2.0
-"""Time to wait for the liveliness tokens of the daemons, s."""
+"""Longest wait for the liveliness tokens of the daemons, s."""
 
 
 def named(text: str) -> tuple[str, ...]:
     """Return the robot ids in the text of an option `--id` that names several robots.
 
-    Returns `("*",)` for all robots, and () if the text names only one robot. Raises `UsageError`
-    for a text with commas that is not a list of robot ids.
+    Return ("*",) for all robots, and () if the text names only one robot. Raises `UsageError` for a
+    text with commas that is not a list of robot ids.
     """
     if text == ALL:
         return (ALL,)
@@ -51,8 +51,8 @@ def named(text: str) -> tuple[str, ...]:
 def present(session: zenoh.Session, ids: Sequence[str], endpoint: str) -> list[str]:
     """Return the sorted ids of those robots in `ids` whose daemon is running.
 
-    An id "*" in `ids` stands for all robots. Raises `NoAnswerError` if `ids` contains "*" and no
-    robot is visible. `endpoint` is the client's endpoint, for the text of this error.
+    An id "*" stands for all robots. If `ids` contains "*" and no robot is visible, raise
+    `NoAnswerError`. `endpoint` is the client's endpoint, for the text of this error.
     """
     found = set()
     for robot_id in ids:
@@ -65,9 +65,9 @@ def present(session: zenoh.Session, ids: Sequence[str], endpoint: str) -> list[s
 
 
 def presence(session: zenoh.Session, robot_id: str, endpoint: str) -> Presence | None:
-    """Return whether this client sees a robot on the bus, and which others if it does not.
+    """Return whether a robot is visible on the bus, and the other visible robots if it is not.
 
-    `endpoint` is the client's endpoint. Returns None if the session is closing.
+    `endpoint` is the client's endpoint. Return None if the session is closing.
     """
     try:
         if not session.info.links():
@@ -82,9 +82,11 @@ def presence(session: zenoh.Session, robot_id: str, endpoint: str) -> Presence |
 
 
 def stop(session: zenoh.Session, ids: Sequence[str], sender: str) -> None:
-    """Stop these robots ("*" stands for all robots) without waiting for answers.
+    """Send a stop to each of these robots, without waiting for an answer.
 
-    `sender` is the caller's sender id, `NAME/SECRET`.
+    Args:
+        ids: the ids of the robots; "*" stands for all robots.
+        sender: the caller's sender id, `NAME/SECRET`.
     """
     by = msgspec.msgpack.encode({"sender": sender})
     for robot_id in ids:
@@ -111,11 +113,14 @@ def nobody(endpoint: str) -> str:
 
 
 def follow(session: zenoh.Session, ids: Sequence[str], name: str) -> Subscription:
-    """Subscribe to a key of several robots, and return the samples of all these robots.
+    """Subscribe to a key of several robots, and return the subscription.
 
-    `ids` are the robots' ids; "*" stands for all robots. `name` is the key below the robot's id.
-    Use `robot_of` to find which robot published a sample. Raises `UsageError` if `name` is not a
-    key.
+    It receives the samples of all these robots. `robot_of` tells from a sample's key which robot
+    published the sample. Raises `UsageError` if `name` is not a key.
+
+    Args:
+        ids: the ids of the robots; "*" stands for all robots.
+        name: the part of the key after the robot's id, such as `state`.
     """
     topic = by_key(name)
     latched = topic is not None and topic.latched
@@ -127,7 +132,10 @@ def follow(session: zenoh.Session, ids: Sequence[str], name: str) -> Subscriptio
 
 
 def robot_of(key: str) -> str:
-    """Return the robot id in a full key; "" for any other key, or if the key has a wildcard."""
+    """Return the robot id in a full key, such as `acsard/robot1/state`.
+
+    Return "" for any other key, and for a key with a wildcard.
+    """
     root, _, rest = key.partition("/")
     return rest.partition("/")[0] if root == ROOT and not set(key) & set("*$") else ""
 
@@ -140,19 +148,22 @@ class Presence(Struct, frozen=True):
     """The result of `presence`: the robots that a client sees on the bus."""
 
     linked: bool
-    """True if the client is connected to its endpoint."""
+    """True if the client has a connection to its endpoint."""
     here: bool
     """True if the requested robot is present."""
     others: tuple[str, ...] = ()
-    """The ids of the visible robots if the requested robot is absent, else (). Over TLS, a client
-    sees other robots only if `access.wildcards` is set."""
+    """The ids of the other visible robots if the requested robot is absent, else (). Over TLS, a
+    client sees other robots only if `access.wildcards` is set."""
 
 
 def explain_silence(key: str, robot_id: str, endpoint: str, presence: Presence) -> str:
-    """Return why no sample arrives on a key of a robot, and how to fix it.
+    """Return a text that says why no sample arrives on a key of a robot, and how to fix this.
 
-    `key` is the part of the key below the robot's id. `presence` is the result of the function
-    `presence` for this robot.
+    Args:
+        key: the part of the key after the robot's id, such as `state`.
+        robot_id: the robot's id.
+        endpoint: the client's endpoint.
+        presence: the result of the function `presence` for this robot.
     """
     if not presence.linked:
         return (

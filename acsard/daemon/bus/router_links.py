@@ -1,4 +1,4 @@
-"""Watches the links of the daemon's session to the endpoints of `bus.connect`."""
+"""Watches whether the daemon's session is connected to the endpoints of `bus.connect`."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from acsard.daemon.bus.bus_thread import BusThread
 from acsard.host.mailbox import Mailbox
 
 POLL_S = 0.5
-"""Time between two polls, s. One poll takes Zenoh 0.1 ms."""
+"""Time between two polls of Zenoh, s. One poll takes Zenoh 0.1 ms."""
 
 STOP_S = 0.05
 """Longest time for which `stop` waits until the polling thread ends, s."""
 
 
 class RouterLinks:
-    """Observer of the connections to the endpoints of `bus.connect`.
+    """Observer of the daemon's connections to the endpoints of `bus.connect`.
 
     Zenoh reconnects by itself, but does not report that a connection is lost or restored. A
     separate thread polls Zenoh, because the call may block.
@@ -35,21 +35,27 @@ class RouterLinks:
         self._session: zenoh.Session
 
     def changed(self) -> RoutersStatus | None:
-        """Return the status if it has changed since the last call, else None. This never waits."""
+        """Return the state of the connections if it has changed since the last call, else None.
+
+        This method never waits.
+        """
         return self._changes.pop()
 
     def check(self) -> None:
-        """Raise the error that has ended the polling thread. Do nothing if there is none."""
+        """Raise the exception that has ended the polling thread, if any."""
         self._thread.check()
 
     def start(self, session: zenoh.Session) -> None:
-        """Start polling, unless `bus.connect` is empty."""
+        """Start the polling thread, unless `bus.connect` is empty."""
         self._session = session
         if self._bus.connect:
             self._thread.start()
 
     def stop(self) -> None:
-        """Stop polling. Wait at most `STOP_S` for the thread, which may be in a name lookup."""
+        """Stop polling.
+
+        Wait at most `STOP_S` for the end of the polling thread, because a name lookup may block it.
+        """
         self._over.set()
         if self._thread.is_alive():
             self._thread.join(STOP_S)
@@ -82,11 +88,12 @@ def unreached(mode: str, endpoints: tuple[str, ...], ends: set[str]) -> tuple[st
     """Return those of `endpoints` to which the daemon has no link. May block in a name lookup.
 
     Args:
-        mode: Zenoh's mode. In mode "client" there is only one link. If it exists, no endpoint
-            counts as unreached.
+        mode: Zenoh's mode. In mode "client" there is only one link. If this link exists, no
+            endpoint counts as unreached.
         endpoints: the endpoints of `bus.connect`.
-        ends: the address at the far end of each link. A program that has itself connected to the
-            daemon, such as the TLS gateway, has an ephemeral port, so it matches no endpoint.
+        ends: the address at the far end of each link, such as "tcp/192.168.0.2:7447". A program
+            that has itself connected to the daemon, such as the TLS gateway, has an ephemeral port,
+            so it matches no endpoint.
     """
     if mode == "client":
         return () if ends else endpoints
@@ -96,7 +103,7 @@ def unreached(mode: str, endpoints: tuple[str, ...], ends: set[str]) -> tuple[st
 def _leads_there(endpoint: str, ends: set[str]) -> bool:
     """Return whether a link leads to the endpoint. May block in a name lookup.
 
-    `ends` contains the address at the far end of each link, like "tcp/192.168.0.2:7447".
+    `ends` contains the address at the far end of each link, such as "tcp/192.168.0.2:7447".
     """
     bare = endpoint.partition("?")[0].partition("#")[0]
     protocol, _, address = bare.partition("/")

@@ -1,4 +1,4 @@
-"""Subscriptions for clients: the samples of a key, queued until the client takes them."""
+"""Subscriptions for clients. The samples of a key wait in a queue until the client takes them."""
 
 from __future__ import annotations
 
@@ -15,11 +15,12 @@ from acsard.host import clock
 from acsard.host.mailbox import Mailbox
 
 QUEUED = 1000
-"""Largest number of samples that wait for a slow reader. Newer samples displace the oldest."""
+"""Largest number of samples that wait for a slow reader. A newer sample displaces the oldest
+one."""
 
 
 class Arrivals(Mailbox[zenoh.Sample]):
-    """Queue between Zenoh's thread, which adds the samples of a subscription, and their reader."""
+    """The queue of a subscription. Zenoh's thread adds the samples, and a reader takes them."""
 
     def __init__(self) -> None:
         super().__init__(QUEUED)
@@ -27,7 +28,7 @@ class Arrivals(Mailbox[zenoh.Sample]):
         """The Zenoh subscribers that fill this queue."""
 
     def try_recv(self) -> zenoh.Sample | None:
-        """Return the next sample, or None if none waits.
+        """Return the next sample, or None if no sample waits.
 
         Raises `ZError` if the session has closed and no sample waits.
         """
@@ -42,18 +43,18 @@ class Arrivals(Mailbox[zenoh.Sample]):
 
 
 class Subscription:
-    """The samples of one or more keys, in the order of their arrival."""
+    """The samples of the keys to which a client has subscribed, in the order of their arrival."""
 
     def __init__(self, queue: Any, key: str = "") -> None:
-        """Read samples from `queue`.
+        """Read the samples from `queue`.
 
-        If `key` is not "", return only samples that were put on exactly this key. Samples on other
-        keys, and on keys with a wildcard, are skipped.
+        If `key` is not "", skip each sample that was not put on exactly this key. This includes
+        samples on a key with a wildcard.
         """
         self._queue, self._key = queue, key
 
     def try_recv(self) -> zenoh.Sample | None:
-        """Return the next sample, or None if none waits.
+        """Return the next sample, or None if no sample waits.
 
         Raises `ZError` if the session has closed and no sample waits.
         """
@@ -69,14 +70,14 @@ class Subscription:
         self._queue.wakes(wake)
 
     def add(self, sample: zenoh.Sample) -> None:
-        """Append a sample that came as the reply to a query, as if it had just been published."""
+        """Append a sample from the reply to a query, as if the sample had just been published."""
         self._queue.put(sample)
 
     def until_silence(self, timeout: float | None) -> Iterator[zenoh.Sample]:
-        """Yield samples until the session closes or no sample arrives for `timeout` s.
+        """Yield samples until the session closes, or until no sample has arrived for `timeout` s.
 
-        If `timeout` is None, there is no time limit. The subscribers are undeclared when the
-        iteration ends.
+        If `timeout` is None, there is no time limit. When the iteration ends, the Zenoh subscribers
+        are undeclared.
         """
         quiet_since_ns = clock.mono_ns()
         try:
@@ -98,7 +99,7 @@ class Subscription:
             self.undeclare()
 
     async def arriving(self) -> AsyncGenerator[zenoh.Sample, None]:
-        """Yield samples until the session closes. Undeclare the subscribers at the end."""
+        """Yield samples until the session closes. Then undeclare the Zenoh subscribers."""
         arrived, loop = asyncio.Event(), asyncio.get_running_loop()
 
         def wake() -> None:
@@ -122,7 +123,7 @@ class Subscription:
             self.undeclare()
 
     def undeclare(self) -> None:
-        """Undeclare the Zenoh subscribers. Do nothing if the session has closed."""
+        """Undeclare the Zenoh subscribers. If the session has closed, do nothing."""
         try:
             self._queue.undeclare()
         except zenoh.ZError:
@@ -140,7 +141,7 @@ def encoded(sample: zenoh.Sample) -> tuple[str, bytes]:
 
 
 def queue_on(session: zenoh.Session, *keys: str, latched: bool) -> Arrivals:
-    """Subscribe to the keys, and return the queue of their samples.
+    """Subscribe to the full keys `keys`, and return the queue of their samples.
 
     If `latched` is true, the queue first gets the last sample that was published on each key.
     """

@@ -1,8 +1,8 @@
 """Checks and reads the certificate files, and explains why a TLS endpoint cannot be reached.
 
 Zenoh reports the same error for every cause. `trouble` therefore repeats the connection step by
-step with Python's own TLS, and returns a message for each cause. Only reading the expiry times of
-certificates needs a library from the optional extra `tls`.
+step with Python's own TLS, and returns a message for each cause. This module needs a library from
+the optional extra `tls` only to read the expiry times of certificates.
 """
 
 from __future__ import annotations
@@ -21,14 +21,15 @@ from acsard.core.values import NS_PER_S
 from acsard.host.errors import CertificateError, NotPermittedError
 
 CA, CERTIFICATE, KEY = "ca.pem", "certificate.pem", "key.pem"
-"""File names in a TLS directory."""
+"""File names in a TLS directory: the certificate of the authority, the certificate of the
+directory's owner, and the owner's private key."""
 
 
 def require_usable(directory: str) -> None:
     """Check that the files of a TLS directory can be read and belong together.
 
     Raises `CertificateError` for a missing or unusable file, and `NotPermittedError` for a file
-    that this user may not read. The message says what to do.
+    that this user may not read. The error's message says how to fix the problem.
     """
     if not Path(directory).is_dir():
         raise CertificateError(
@@ -64,13 +65,13 @@ def files_in(directory: str) -> tuple[Path, Path, Path]:
 
 
 def unusable(authority: Path, certificate: Path, key: Path) -> str:
-    """Return why OpenSSL cannot use these files together, or "" if it can."""
+    """Return the reason why OpenSSL cannot use these files together, or "" if it can use them."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     try:
         context.load_verify_locations(authority)
         # If no password is passed, OpenSSL asks on the terminal for the password of an encrypted
-        # key. With an empty password it fails, which is right, because Zenoh accepts no encrypted
-        # key.
+        # key. With an empty password, OpenSSL refuses such a key, which is right, because Zenoh
+        # accepts no encrypted key.
         context.load_cert_chain(certificate, key, password="")
     except (OSError, ValueError) as error:
         # SSLError is an OSError.
@@ -88,22 +89,22 @@ def common_name(directory: str) -> str:
 def shown_at(endpoint: str, directory: str) -> str:
     """Return the common name of the certificate that this client shows to an endpoint.
 
-    `directory` contains the certificate. Returns "" if the endpoint needs no certificate, or if the
-    certificate cannot be read.
+    Return "" if the endpoint needs no certificate, or if the certificate cannot be read.
+    `directory` is the TLS directory of the client, or "".
     """
     return common_name(directory) if directory and endpoint.startswith(TLS) else ""
 
 
 def names_in(directory: str) -> list[str]:
-    """Return the host names and IP addresses that the certificate in `directory` is valid for."""
+    """Return the host names and IP addresses for which the certificate in `directory` is valid."""
     alternative: Any = _decoded(directory).get("subjectAltName", ())
     return [_plain(str(name)) for _, name in alternative]
 
 
 def _plain(name: str) -> str:
-    """Return an IPv6 address in its short form, because `ssl` writes it with all its zeros.
+    """Return an IP address in its short form. Return any other name unchanged.
 
-    Any other name is returned unchanged.
+    `ssl` writes an IPv6 address with all its zeros.
     """
     try:
         return str(ipaddress.ip_address(name))
@@ -112,10 +113,10 @@ def _plain(name: str) -> str:
 
 
 def _decoded(directory: str) -> dict[str, Any]:
-    """Return the decoded certificate in `directory`, or an empty dict if it cannot be read.
+    """Return the decoded certificate in `directory`, or {} if it cannot be read.
 
-    The standard library decodes only the certificate of a connected peer. This function therefore
-    connects a TLS client and a TLS server in memory, which both use this certificate.
+    The standard library decodes only the certificate of a connected peer. So this function connects
+    a TLS client and a TLS server in memory, both of which use this certificate.
     """
     server_context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     server_context.verify_mode = ssl.CERT_REQUIRED
@@ -140,14 +141,14 @@ NO_CHECK_TIME = 0x200000
 """OpenSSL's flag X509_V_FLAG_NO_CHECK_TIME, which Python's `ssl` does not name."""
 
 AUTHORITY = "the authority"
-"""Dict key that stands for the authority's certificate in the result of `ends()`."""
+"""Key of the authority's certificate in the dict that `ends()` returns."""
 
 
 def ends(directory: str) -> dict[str, int]:
-    """Return when the certificates in `directory` expire, ns since 1970.
+    """Return the expiry times of the certificates in a TLS directory, ns since 1970.
 
-    The dict key "" stands for `certificate.pem`, and `AUTHORITY` for `ca.pem`. Returns {} if a
-    file cannot be read or the library `cryptography` is missing.
+    In the returned dict, the key "" stands for `certificate.pem`, and `AUTHORITY` for `ca.pem`.
+    Return {} if a file cannot be read, or if the library `cryptography` is missing.
     """
     try:
         from cryptography import x509
@@ -165,12 +166,15 @@ def ends(directory: str) -> dict[str, int]:
 
 
 def peer_ends_ns(endpoint: str, directory: str) -> int | None:
-    """Return when the certificate of the program at a TLS endpoint expires, ns since 1970.
+    """Return the expiry time of the certificate that a TLS endpoint uses, ns since 1970.
 
-    `directory` contains this machine's certificate, which the program may require. The program's
-    certificate is not verified, so this function also works if it has expired. Returns None if the
-    program cannot be reached or the library `cryptography` is missing. Blocks for up to twice
-    `PATIENCE_S`.
+    The certificate is not verified, so the function also works if the certificate has expired.
+    Return None if no program answers at the endpoint, or if the library `cryptography` is missing.
+    Each wait for the program lasts at most `PATIENCE_S`.
+
+    Args:
+        endpoint: the endpoint, such as "tls/robot.local:7449".
+        directory: the TLS directory of this machine, whose certificate the program may require.
     """
     try:
         from cryptography import x509
@@ -188,9 +192,9 @@ def peer_ends_ns(endpoint: str, directory: str) -> int | None:
 
 
 def _trusting(directory: str) -> ssl.SSLContext:
-    """Return a TLS client context that does not verify the server.
+    """Return a TLS client context that accepts any certificate of the server.
 
-    It shows the certificate in `directory` to the server.
+    The client shows the certificate in `directory` to the server.
     """
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
@@ -203,7 +207,7 @@ def _load(context: ssl.SSLContext, directory: str) -> None:
 
 
 def _ends_ns(certificate: Any) -> int:
-    """Return when a certificate (an object of `cryptography`) expires, ns since 1970."""
+    """Return the expiry time of a certificate (an object of `cryptography`), ns since 1970."""
     return int(certificate.not_valid_after_utc.timestamp()) * NS_PER_S
 
 
@@ -219,24 +223,25 @@ def _place(endpoint: str) -> tuple[str, str]:
 
 
 PATIENCE_S = 2.0
-"""Longest wait for the server to accept the TCP connection, and for each of its answers in the TLS
-handshake, s."""
+"""Longest wait for the server to accept the TCP connection, s. It is also the longest wait for each
+answer of the server in the TLS handshake."""
 
 REFUSAL_S = 0.5
-"""Time for which this client waits after the TLS handshake, s. A server that rejects the client's
-certificate reports that within this time. A server that accepts it sends nothing."""
+"""Time for which this client waits after the TLS handshake, s. If the server rejects the client's
+certificate, it reports that within this time. If the server accepts it, the server sends
+nothing."""
 
 AWAY = (errno.EHOSTUNREACH, errno.ENETUNREACH, errno.EHOSTDOWN)
-"""Error numbers that mean that no machine answers at the address."""
+"""Error numbers of the operating system that mean that no machine answers at the address."""
 
 EXPIRED, NOT_YET, WRONG_NAME, WRONG_ADDRESS = 10, 9, 62, 64
-"""OpenSSL's error codes (X509_V_ERR_...) for a certificate that has expired, is not valid yet, or
-is not for the host name or the IP address."""
+"""OpenSSL's error codes (X509_V_ERR_...) for a certificate that has expired, is not valid yet, is
+not for this host name, or is not for this IP address."""
 
 UNSIGNED, BARRED, WRONG_PURPOSE = (2, 7, 18, 19, 20, 21), (47, 48), 26
 """Further error codes of OpenSSL: another authority signed the certificate, the authority may not
-sign for the names in it, or it is not for a server. For any other code, `trouble` reports the text
-of OpenSSL."""
+sign for the names in the certificate, or the certificate is not for a server. For any other code,
+`trouble` reports OpenSSL's own text."""
 
 RENEW = (
     "run `acsard tls renew` on the machine that has ca-key.pem (with `--name NAME` for a robot of "
@@ -245,9 +250,9 @@ RENEW = (
 
 
 def trouble(endpoint: str, directory: str) -> str:
-    """Return why this machine cannot connect to a TLS endpoint, and how to fix it.
+    """Return the reason why this machine cannot connect to a TLS endpoint, and how to fix that.
 
-    `directory` contains the client's certificate. Returns "" if the connection succeeds. Blocks for
+    Return "" if the connection succeeds. `directory` is the TLS directory of the client. Blocks for
     a few seconds at most.
     """
     host, port = _place(endpoint)
@@ -301,9 +306,9 @@ def _tls_trouble(plain: socket.socket, host: str, directory: str) -> str:
 
 
 def _server_rejected(error: ssl.SSLCertVerificationError, host: str, directory: str) -> str:
-    """Return the message for a server whose certificate this machine rejects.
+    """Return the message for a server whose certificate this client does not accept.
 
-    `directory` contains the client's certificate and the certificate of its authority.
+    `directory` is the TLS directory of the client, with the certificate of its authority.
     """
     now = time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime())
     reason = error.verify_message
@@ -344,10 +349,10 @@ def _server_rejected(error: ssl.SSLCertVerificationError, host: str, directory: 
 
 
 def _client_rejected(reason: str, host: str, directory: str) -> str:
-    """Return the message for a server that rejects the client's certificate.
+    """Return the message for a server that does not accept the client's certificate.
 
-    `reason` is OpenSSL's name of the TLS alert that the server sent. `directory` contains the
-    client's certificate.
+    `reason` is OpenSSL's name of the TLS alert that the server sent. `directory` is the TLS
+    directory of the client.
     """
     certificate = f"{directory}/{CERTIFICATE}"
     if "CERTIFICATE_EXPIRED" in reason:

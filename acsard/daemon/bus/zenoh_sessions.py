@@ -1,6 +1,6 @@
 """Opens the Zenoh sessions of the daemon, of the TLS gateway and of the client tools.
 
-This module contains the settings of these sessions, and the reason for each setting.
+This module contains all settings of these sessions, each with its reason.
 """
 
 from __future__ import annotations
@@ -24,14 +24,15 @@ from acsard.host.terminal_modes import coloured
 COMMAND_RATE_HZ = 1000.0
 """Largest number of commands per second that a session accepts on each key. The limit is high
 enough for a zero command 1 ms after another command. It is low enough that a flood of commands does
-not make the daemon miss a control period. The TLS gateway also applies this limit to stops. It may
-drop a stop safely, because it has then passed another stop less than a millisecond before."""
+not make the daemon miss a control period. The TLS gateway also applies this limit to stops. If it
+drops a stop, it has passed another stop less than a millisecond before, so the robot stops
+anyway."""
 
 MAX_SESSIONS = 256
 """Largest number of connections of the daemon's session, and of the TLS gateway's session."""
 
 MESSAGE_BYTES = 65536
-"""Largest size of a message that a link accepts, bytes. The limit for commands is far lower."""
+"""Largest size of a message that a link accepts, bytes. Commands have a far lower limit."""
 
 
 def daemon_session(config: Config) -> zenoh.Session:
@@ -59,9 +60,9 @@ def daemon_session(config: Config) -> zenoh.Session:
 
 
 def gateway_session(config: Config) -> zenoh.Session:
-    """Open the TLS gateway's session, which is a Zenoh router.
+    """Open the session of the TLS gateway, which is a Zenoh router.
 
-    Raises `InUseError` if the session cannot listen.
+    Raises `InUseError` if the session cannot listen, for example on an address that is in use.
     """
     bus = config.bus
     settings = _base("router") | PATIENT | _tls(bus.tls) | _listening()
@@ -81,7 +82,7 @@ def gateway_session(config: Config) -> zenoh.Session:
 
 
 def certificate_trouble(authority: Path, certificate: Path, key: Path) -> str:
-    """Return why Zenoh cannot listen with these certificate files, or "" if it can.
+    """Return the reason why Zenoh cannot listen with these certificate files, or "" if it can.
 
     OpenSSL accepts some files that Zenoh refuses: certificates without extensions (X.509 version
     1), and keys of the curves P-521 and Ed448. This call takes half a second.
@@ -104,10 +105,10 @@ def certificate_trouble(authority: Path, certificate: Path, key: Path) -> str:
 
 
 def reachable(endpoint: str) -> str:
-    """Return the endpoint with which a program on this machine can connect to a listening program.
+    """Return the endpoint with which a program on this machine can connect to `endpoint`.
 
-    `endpoint` is the endpoint at which that program listens. If its address is 0.0.0.0 or [::],
-    which stand for all addresses of the machine, the loopback address replaces it.
+    Another program listens at `endpoint`. An address that stands for all addresses of the machine
+    (0.0.0.0 or [::]) is replaced by the loopback address. Any other endpoint is returned unchanged.
     """
     return endpoint.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:")
 
@@ -123,13 +124,13 @@ def _lacks_port(endpoint: str) -> bool:
 
 
 PATIENT = {"connect/timeout_ms": -1, "connect/exit_on_failure": False}
-"""Settings with which a session tries to connect until it succeeds."""
+"""Settings with which a session tries to connect again and again until it succeeds."""
 
 
 def _listening() -> dict[str, object]:
     """Return settings that protect a listening session against faulty clients.
 
-    Such clients stay silent, send too much or do not read.
+    Such clients send nothing, send too much, or do not read.
     """
     return {
         "transport/link/rx/max_message_size": MESSAGE_BYTES,
@@ -165,9 +166,12 @@ def _opened(settings: dict[str, object], where: tuple[str, ...]) -> zenoh.Sessio
 def client_session(endpoint: str, tls: str = "") -> zenoh.Session:
     """Open a session in Zenoh's client mode to the daemon or router at `endpoint`.
 
-    The session is not in peer mode, because it would then reach no program behind a router. `tls`
-    is the directory with the client's certificate. Only an endpoint like "tls/robot.local:7449"
-    needs it.
+    In peer mode, the session would reach no program behind a router.
+
+    Args:
+        endpoint: the endpoint, such as "tcp/127.0.0.1:7448".
+        tls: the directory with the client's certificate. Only a TLS endpoint, such as
+            "tls/robot.local:7449", needs it.
 
     Raises:
         UsageError: `endpoint` is not an endpoint.
@@ -228,7 +232,7 @@ def _base(mode: str) -> dict[str, object]:
 def _tls(directory: str) -> dict[str, object]:
     """Return Zenoh's TLS settings for the certificate files in `directory`.
 
-    With them, a link closes when the certificate at either of its ends expires.
+    With these settings, a link closes when the certificate at either end of the link expires.
     """
     certificate, key = f"{directory}/{CERTIFICATE}", f"{directory}/{KEY}"
     return {
@@ -251,7 +255,8 @@ def _command_limits(config: Config) -> dict[str, object]:
     that lower the robot's highest speed (`SPEED_LIMIT`). The limit covers native and ROS keys.
 
     Zenoh counts the messages of each connection separately. On each command key of a configured
-    source, all certificates share one limit. All sources that are not configured share another one.
+    source, all certificates share one limit. All sources that are not configured share one limit
+    too.
     """
     names = [*(source.name for source in config.commands.sources), "*"]
     below = [*source_keys(names), *source_keys(names, "*"), IMU, SPEED_LIMIT]
@@ -282,7 +287,7 @@ def first_line(error: Exception) -> str:
 
 
 def log_from_environment() -> None:
-    """Start Zenoh's own log on standard output, if RUST_LOG is set."""
+    """Start Zenoh's own log on standard output if the environment variable RUST_LOG is set."""
     if "RUST_LOG" not in os.environ:
         return
     before = os.environ.get("NO_COLOR")

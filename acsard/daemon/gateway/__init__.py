@@ -1,1 +1,1 @@
-"""The processes that accept connections from the network: TLS gateway and router of a fleet."""
+"""The processes that accept connections from the network: the TLS gateway and a fleet's router."""

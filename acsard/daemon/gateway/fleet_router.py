@@ -1,8 +1,8 @@
-"""The router of a fleet: writes its Zenoh configuration file, and runs Zenoh as a router with it.
+"""The router of a fleet: makes its configuration file, and runs Zenoh as a router.
 
-As with zenohd, the access rules in the file say what each client may do. Within these rules, any
-client with a certificate can still make a router hang. This router detects that and restarts within
-2 s (`listener_process.py`).
+As with zenohd, the access rules in the file say what each client may do. Any client with a
+certificate can still make a router hang with requests that the rules allow. This router detects
+that it hangs, and restarts within 2 s (`listener_process.py`).
 
 The template `deploy/zenoh/router.json5` is for one robot. `router_file` repeats the template's
 lines between the marks ROBOT and END for each robot. It repeats the lines between PERSON and END
@@ -30,14 +30,15 @@ EXAMPLE = "robot1"
 """Id of the robot in the template."""
 
 IS_FOR = "// This file is for {}. To make a file for your own robots:\n"
-"""Comment near the top of the template and of the router's file. {} stands for the robots' ids."""
+"""Comment near the top of the template and of the router's file. The ids of the robots replace
+{}."""
 
 _BLOCK = re.compile(r"^ *// ROBOT\n(.*?)^ *// END\n", re.M | re.S)
 _NAME = re.compile(rf"\b{EXAMPLE}\b")
 
 PERSON: Role = "operator"
-"""Example name in the template's lines between PERSON and END PERSON. The common names of the
-certificates that may command replace it."""
+"""Example name in the template's lines between PERSON and END PERSON. It is replaced by the common
+name of each certificate that may command."""
 
 _PERSONS = re.compile(r"^ *// PERSON\n(.*?)^ *// END PERSON\n", re.M | re.S)
 # Match a whole name or the last part of a key, but not the beginning of a robot's id "operator-1".
@@ -53,9 +54,9 @@ def router_file(template: str, robots: Sequence[str], people: Mapping[Role, Sequ
     Args:
         template: the text of `deploy/zenoh/router.json5`.
         robots: the robots' ids.
-        people: maps each role to the common names of the certificates with this role. Leave out the
-            names "viewer", "operator" and "maintainer": these certificates always have the role of
-            this name.
+        people: maps each role to the common names of the certificates with this role. The
+            certificates "viewer", "operator" and "maintainer" always have the role of their name,
+            so leave them out.
     """
     names = [*robots, *ROLES, *(name for role in ROLES for name in people.get(role, ()))]
     twice = [name for name, count in Counter(names).items() if count > 1]
@@ -98,7 +99,8 @@ ROUTER_EVENTS: Events = {
 }
 
 CERTIFICATE_FILES = ("root_ca_certificate", "listen_certificate", "listen_private_key")
-"""Settings in Zenoh's `transport/link/tls` that name the files of a listening endpoint."""
+"""Names of the settings in Zenoh's `transport/link/tls` that name the certificate files of a
+listening endpoint."""
 
 AN_ADDRESS = re.compile(r"^(tcp|tls|udp|quic|ws)/[^?#]*")
 """Matches the protocol and the address of an endpoint, without its settings."""
@@ -117,7 +119,7 @@ _SYNTAX_ERROR = re.compile(
 def reason(error: zenoh.ZError) -> str:
     """Return the readable part of Zenoh's error about a configuration file.
 
-    The result begins with the line and the column in the file if the error names them.
+    If the error names a line and a column of the file, the result begins with them.
     """
     text = str(error)
     if match := _VALUE_ERROR.search(text):
@@ -129,12 +131,12 @@ def reason(error: zenoh.ZError) -> str:
 
 
 class Router(Listener):
-    """The router of a fleet. It reads a file for zenohd and works like zenohd, without plugins."""
+    """The router of a fleet. It reads a configuration file for zenohd, and runs without plugins."""
 
     events = ROUTER_EVENTS
 
     def __init__(self, file: Path) -> None:
-        """Read the file; raise `RouterFileError` if Zenoh does not accept it."""
+        """Read the file. Raises `RouterFileError` if Zenoh does not accept the file."""
         self._file = file
         try:
             # Read the file here, because Zenoh's error would not say why the file cannot be opened.
@@ -186,10 +188,9 @@ class Router(Listener):
             ) from error
 
     def _opens_elsewhere(self) -> bool:
-        """Return whether Zenoh opens a session if it listens on free loopback ports instead.
+        """Return whether Zenoh opens a session with free loopback ports in place of the addresses.
 
-        If it does, only the addresses in the file are wrong. Zenoh's own error does not show
-        whether the addresses or other settings are wrong.
+        If so, only the addresses in the file are wrong. Zenoh's own error does not show this.
         """
         config = zenoh.Config.from_file(str(self._file))
         free = [AN_ADDRESS.sub(r"\1/127.0.0.1:0", endpoint) for endpoint in self._endpoints]
@@ -203,9 +204,9 @@ class Router(Listener):
         return True
 
     def _certificate_files(self) -> CertificateFiles | None:
-        """Return the certificate files that the router's file names.
+        """Return the certificate files that the router's file names, or None.
 
-        Return None if it does not name all three of them.
+        The result is None unless the router's file names all three of them.
         """
         tls = json.loads(self._config.get_json("transport/link/tls")) or {}
         named = [Path(tls[name]) for name in CERTIFICATE_FILES if tls.get(name)]

@@ -1,9 +1,9 @@
 """Runs a Zenoh session that is open to the network, in a process of its own that can be restarted.
 
 A malicious client can make Zenoh compare key expressions for ever, use all connections, or use much
-memory. All of that happens in this process, and not in the daemon. During such an attack a call to
-Zenoh may never return. Therefore a separate thread observes the session. The main thread checks
-that new observations keep coming.
+memory. This process then suffers, but the daemon does not. During such an attack a call to Zenoh
+may never return. So a separate thread observes the session, and the main thread checks that new
+observations keep coming.
 """
 
 from __future__ import annotations
@@ -35,30 +35,32 @@ STUCK_NS = NS_PER_S
 millisecond."""
 
 FIRST_NS = 5 * NS_PER_S
-"""Time within which the daemon must connect after the session has been opened, ns. If it does not,
-this process restarts. The time is longer than `ALONE_NS`, because all clients connect at the same
-moment after a restart."""
+"""Time within which the daemon must connect after the session was opened, ns. Otherwise this
+process restarts. The time is longer than `ALONE_NS`, because all clients connect at the same moment
+after a restart."""
 
 ALONE_NS = NS_PER_S
-"""Time within which the daemon must connect again after its connection was lost, ns. If it does
-not, this process restarts."""
+"""Time within which the daemon must connect again after its connection was lost, ns. Otherwise this
+process restarts."""
 
 REPORTS = Rate(1 / 60)
 """Largest rate of the log event that reports that all connections are in use: one a minute."""
 
 MAX_UNANSWERED = 4
-"""If the daemon does not answer this number of consecutive queries within 1 s each, the gateway's
-connection to the daemon counts as dead: it is open, but its data does not reach the daemon."""
+"""Limit for unanswered queries. If the daemon does not answer this number of consecutive queries
+within 1 s each, the gateway's connection to the daemon counts as dead: the connection is open, but
+its data does not reach the daemon."""
 
 NAMES = 5
-"""Number of clients that the event about used-up connections names. These are the clients with the
-most connections."""
+"""Largest number of clients that the event about used-up connections names: those with the most
+connections."""
 
 Incident = Literal["open", "full", "stuck", "alone"]
 
 Events = dict[Incident, EventName]
-"""Name of the log event for each incident: the session listens (`open`), all connections are in use
-(`full`), Zenoh hangs (`stuck`), or the daemon is not connected (`alone`)."""
+"""Maps each incident to the name of its log event. The incidents are: the session listens (`open`),
+all connections are in use (`full`), Zenoh hangs (`stuck`), the daemon is not connected
+(`alone`)."""
 
 GATEWAY_EVENTS: Events = {
     "open": "gateway_open",
@@ -82,13 +84,15 @@ class Observation(Struct, frozen=True):
 
 
 class SessionHealth:
-    """The health of the session, derived from its successive observations."""
+    """The health of a session, derived from observations that follow each other."""
 
     def __init__(self, most: int, opened_ns: int, events: Events = GATEWAY_EVENTS) -> None:
         """Prepare for the first observation.
 
-        `most` is the largest number of connections. `opened_ns` is the monotonic time at which the
-        session was opened, ns. `events` has the names of the log events.
+        Args:
+            most: largest number of connections.
+            opened_ns: monotonic time at which the session was opened, ns.
+            events: names of the log events.
         """
         self._most, self._events = most, events
         self._linked_ns, self._patience_ns = opened_ns, FIRST_NS
@@ -100,7 +104,7 @@ class SessionHealth:
     def full_event(self, observed: Observation) -> Event | None:
         """Return a log event if all connections are in use, else None.
 
-        At most one event is returned in each minute.
+        Also count the observation in `full`. At most one event is returned in each minute.
         """
         if len(observed.holders) < self._most:
             return None
@@ -114,10 +118,12 @@ class SessionHealth:
         return Event(self._events["full"], text, "warning")
 
     def restart_event(self, observed: Observation, passed_ns: int) -> Event | None:
-        """Return an event that says why the process must restart, or None if it need not.
+        """Return a log event with the reason why the process must restart, or None.
 
-        `observed` is the latest observation. If it is still the one of the last call, Zenoh may
-        hang. `passed_ns` is the time since the last call, ns.
+        Args:
+            observed: the latest observation. If several calls get the same observation, Zenoh may
+                hang.
+            passed_ns: time since the last call, ns.
         """
         new, self._last_ns = observed.at_ns != self._last_ns, observed.at_ns
         stuck = self._silence.too_long(new, passed_ns)
@@ -145,7 +151,10 @@ class SessionHealth:
 
 
 def connection_counts(holders: Sequence[str]) -> str:
-    """Return a text with the clients that hold the most connections, and the count of each."""
+    """Return a text with the clients that have the most connections, and the count of each.
+
+    `holders` contains the name of the client of each connection, or "" if the name is unknown.
+    """
     most = Counter(holders).most_common(NAMES)
     return ", ".join(f"{count} by {name or 'an unnamed client'}" for name, count in most)
 
@@ -159,48 +168,54 @@ connections are in use. An attack can use another 600 MB in each second, too fas
 check. So the kernel enforces the limit: it refuses more memory, which ends the process."""
 
 NICE = 5
-"""Nice value of this process, so that the daemon and ordinary programs have priority over it."""
+"""Nice value of this process. It gives the daemon and ordinary programs priority over this
+process."""
 
 
 class Listener:
-    """A session that listens to the network: the TLS gateway, or the router of a fleet."""
+    """A Zenoh session that is open to the network: the TLS gateway, or the router of a fleet."""
 
     where: str
     """Addresses at which the session listens, separated by commas."""
     most: int
     """Largest number of connections from the network."""
     events: Events
+    """Names of the log events for the incidents of the session."""
     files: CertificateFiles | None
     """The certificate files of the session, or None if the session has no such files."""
 
     def ready(self) -> bool:
-        """Return whether clients may be admitted now."""
+        """Return whether the session may be opened now. The TLS gateway waits for the daemon."""
         return True
 
     def open(self) -> zenoh.Session:
-        """Open the session and listen. This call blocks."""
+        """Open the session, so that clients can connect. This call blocks."""
         raise NotImplementedError
 
     def observe(self, session: zenoh.Session) -> Observation:
-        """Return the state of the session. This call may never return."""
+        """Return the present state of the session. This call may never return."""
         raise NotImplementedError
 
     def report(self, session: zenoh.Session, observed: Observation, health: SessionHealth) -> None:
-        """Publish the session's state for the daemon. A router, which has no daemon, does nothing.
+        """Publish the state of the session for the daemon. This call may never return.
 
-        This call may never return.
+        A router has no daemon and publishes nothing.
         """
 
 
 class ListenerProcess:
-    """The process of one listener, from its start until it ends or must be restarted."""
+    """The process of one `Listener`, until the process must end or be restarted."""
 
     def __init__(self, listener: Listener, log: Log, manager: Systemd, parent: int | None) -> None:
         """Prepare the process; `run` runs it.
 
-        `manager` is the connection to systemd. `parent` is a file descriptor whose other end the
-        parent process holds, or None. This process ends when the parent closes that end. If the
-        descriptor is a socket, the process writes a sign of life to it in every period.
+        Args:
+            listener: the session of this process.
+            log: the log of this process.
+            manager: the connection to systemd.
+            parent: file descriptor whose other end belongs to the parent process, or None. This
+                process ends when the parent closes that end. If the descriptor is a socket, this
+                process writes a sign of life to it in every period.
         """
         self._listener, self._log, self._manager = listener, log, manager
         self._parent = None if parent is None else Parent(parent)
@@ -211,9 +226,10 @@ class ListenerProcess:
         self._leaving = False
 
     def run(self) -> Exit:
-        """Run until the process must end.
+        """Run until the process must end, and return its exit code.
 
-        Returns OK after a signal or the end of the parent, and FAILURE if a restart is needed.
+        The code is OK after a signal or the end of the parent, and FAILURE if a restart is needed.
+        If the observing thread fails, raise its exception.
         """
         for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
             signal.signal(number, self._leave)
@@ -247,7 +263,7 @@ class ListenerProcess:
     def _renewed(self) -> bool:
         """Return whether the process must restart to use a new certificate.
 
-        If a new certificate is unusable, log the reason and return False.
+        If there is a new certificate that cannot be used, log the reason and return False.
         """
         files = self._listener.files
         if files is None or not files.renewed():

@@ -33,8 +33,8 @@ from acsard.host import clock
 CONNECT_S = 1.0
 
 PROBE_NS = NS_PER_S
-"""Time between two queries to the daemon, ns. If a query has not ended when the next query is due,
-it counts as unanswered."""
+"""Time between two queries to the daemon, ns. A query that has not ended when the next query is due
+counts as unanswered."""
 
 QUERY_TIMEOUT_S = 60.0
 """Time after which Zenoh itself ends a query to the daemon, s. It is much longer than `PROBE_NS`,
@@ -42,17 +42,21 @@ after which the query counts as unanswered."""
 
 
 class Gateway(Listener):
-    """The TLS gateway.
+    """The TLS gateway, as a `Listener`.
 
-    It admits clients only after the daemon has started, and reports its connections to the daemon.
+    The gateway admits clients only after the daemon has started. It reports the number of its
+    connections to the daemon.
     """
 
     most = MAX_SESSIONS - 1
-    """Largest number of connections from the network. The daemon needs the remaining connection."""
+    """Largest number of connections from the network. One more connection is for the daemon."""
     events = GATEWAY_EVENTS
 
     def __init__(self, config: Config) -> None:
-        """Check the certificate files; raise `CertificateError` or `NotPermittedError`."""
+        """Check the certificate files.
+
+        Raises `CertificateError` or `NotPermittedError` if they cannot be used.
+        """
         self._config, self.where = config, ", ".join(config.bus.outside)
         require_usable(config.bus.tls)
         self.files = CertificateFiles(*files_in(config.bus.tls))
@@ -62,7 +66,7 @@ class Gateway(Listener):
         self._probe = DaemonProbe(full_key(config.robot.id, "info"))
 
     def ready(self) -> bool:
-        """Return whether the daemon accepts connections. Until it does, no client is admitted."""
+        """Return whether the daemon accepts connections. The gateway is opened only then."""
         host, _, port = reachable(self._config.bus.plain[0]).partition("/")[2].rpartition(":")
         try:
             with socket.create_connection((host.strip("[]"), int(port)), CONNECT_S):
@@ -104,21 +108,22 @@ class DaemonProbe:
     """Queries the daemon repeatedly to detect a connection that is open but carries no data.
 
     In a test on an overloaded machine, a connection stayed open for minutes, although the daemon's
-    Zenoh did not read from it.
+    Zenoh did not read from the connection.
     """
 
     def __init__(self, key: str) -> None:
-        """Prepare the probe. `key` is the full key of the queries, which the daemon answers."""
+        """Prepare the probe. `key` is the full key of the queries, which the daemon must answer."""
         self._key, self._asked_ns, self._unanswered = key, 0, 0
         self._ended = threading.Event()
-        """This event is set when the last query has ended, with or without a reply. A query that
-        ends within `PROBE_NS` has reached the daemon."""
+        """Set when a query has ended, with or without a reply, since the last query was sent. An
+        earlier query that ends late sets it too. A query that ends within `PROBE_NS` has reached
+        the daemon."""
 
     def unanswered(self, session: zenoh.Session, now_ns: int) -> int:
-        """Send the next query if it is due, and return how many of the latest queries failed.
+        """Send the next query if it is due, and return the number of consecutive failed queries.
 
-        The result is the number of consecutive queries that did not end within `PROBE_NS`. `now_ns`
-        is the present monotonic time, ns.
+        A query fails if it does not end within `PROBE_NS`. `now_ns` is the present monotonic time,
+        ns.
         """
         if now_ns - self._asked_ns < PROBE_NS:
             return self._unanswered

@@ -1,1 +1,1 @@
-"""Access to the serial port: opens it in raw mode and locked, and sends STOP before it closes."""
+"""Access to the serial port: opens and locks it in raw mode, and sends STOP before closing it."""

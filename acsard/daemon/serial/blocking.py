@@ -1,4 +1,4 @@
-"""The serial port of `acsard mcu check`: locked and blocking, with a time limit on every wait."""
+"""Blocking access to a locked serial port for `acsard mcu check`. Every wait has a time limit."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from acsard.host import clock
 from acsard.host.processes import Holder, master_of, waited_ns
 
 SEND_S = 0.5
-"""Longest time for which `send` waits until the driver has accepted all bytes, s. Even at the
-lowest baud rate, a line needs only 50 ms."""
+"""Longest time for which `send` waits until the driver has accepted all bytes, s. A line needs only
+50 ms, even at the lowest baud rate."""
 
 DRAIN_S = 0.5
-"""Longest time for which `close` waits for the driver to send the last stop lines, s."""
+"""Longest time for which `close` waits until the driver has sent the last stop lines, s."""
 
 CLOSE_S = 1.0
 """Longest time for which `close` waits until the device is closed, s. Some drivers take 30 s,
@@ -34,11 +34,15 @@ class BlockingPort:
         self._path = path
         self._device: serial.Serial | None = None
         self._program: Holder | None = None
-        """The program at the other end if the device is a pty, else None."""
+        """The program at the other end of a pty, or None for a real device."""
         self._waited_ns = 0
 
     def open(self, baud_rate: int) -> None:
-        """Open and lock the port. If it is open already, change its baud rate."""
+        """Open and lock the port. If the port is open already, change its baud rate.
+
+        Raises a `MendableError` if the port cannot be opened, and `WireLostError` if the baud rate
+        cannot be changed.
+        """
         if self._device is None:
             try:
                 self._device = open_raw(self._path, baud_rate)
@@ -57,9 +61,9 @@ class BlockingPort:
             raise WireLostError(f"{self._path}: {error}") from error
 
     def close(self) -> None:
-        """Send the last bytes, then unlock and close the port.
+        """Wait until the last bytes are sent, then unlock and close the port.
 
-        This waits for the driver for at most `DRAIN_S` plus `CLOSE_S`.
+        The wait takes at most `DRAIN_S` plus `CLOSE_S`.
         """
         device, self._device = self._device, None
         if device is None:
@@ -73,9 +77,9 @@ class BlockingPort:
         return clock.mono_ns()
 
     def late_ns(self) -> int:
-        """Return how long a simulator at the other end of a pty waited for a processor, ns.
+        """Return how long the simulator at the other end of a pty has waited for a processor, ns.
 
-        Only the waits since the last call count. The result is 0 for a real device.
+        Only the time since the last call counts. The result is 0 for a real device.
         """
         if self._program is None:
             return 0
@@ -83,7 +87,10 @@ class BlockingPort:
         return max(0, self._waited_ns - before_ns)
 
     def send(self, data: bytes) -> None:
-        """Write all of `data`. Raises `WireLostError` if the port is lost or hangs for `SEND_S`."""
+        """Write all of `data`.
+
+        Raises `WireLostError` if the port is lost, or if it accepts no byte for `SEND_S`.
+        """
         fd = self._fileno()
         deadline_ns = clock.mono_ns() + int(SEND_S * NS_PER_S)
         while data:
@@ -98,10 +105,10 @@ class BlockingPort:
                 raise WireLostError(f"{self._path} was lost: {error.strerror}") from error
 
     def listen(self, until_ns: int) -> list[tuple[int, bytes]]:
-        """Read all bytes that arrive until the monotonic time `until_ns`.
+        """Return the bytes that arrive until the monotonic time `until_ns`, ns.
 
-        Return a pair for each read: the monotonic time after the read, ns, and the bytes. Raises
-        `WireLostError` if the port is lost.
+        The result is a list of pairs, one pair for each read: the monotonic time after the read,
+        ns, and the bytes. Raises `WireLostError` if the port is lost.
         """
         fd = self._fileno()
         pieces: list[tuple[int, bytes]] = []

@@ -1,4 +1,7 @@
-"""System calls on the serial device: open it raw and locked, drain it, close it, explain errors."""
+"""System calls that open the serial device raw and locked, drain it and close it.
+
+This module also explains the errors of these calls to users.
+"""
 
 from __future__ import annotations
 
@@ -19,11 +22,11 @@ from acsard.host.errors import InUseError, MendableError, NoPortError, NotPermit
 from acsard.host.processes import holder_of
 
 _left_open: list[int] = []
-"""Descriptors that `close` could not close because no thread could be started."""
+"""File descriptors that `close` could not close, because it could not start a thread."""
 
 DRAIN_STEP_S = 0.001
-"""Pause between two checks whether the driver has sent all bytes, s. A line takes longer than this,
-even at the highest baud rate."""
+"""Pause between two checks whether the driver has sent all bytes, s. The pause is shorter than the
+time that a line takes, even at the highest baud rate."""
 
 
 class _Device(serial.Serial):  # type: ignore[misc]
@@ -48,7 +51,10 @@ class _Device(serial.Serial):  # type: ignore[misc]
 
 
 def open_raw(path: str, baud_rate: int) -> serial.Serial:
-    """Open the port in raw mode, lock it and empty its buffers. Raises `OSError` if that fails."""
+    """Open the port in raw mode, lock it and empty its buffers.
+
+    Raises `OSError` if one of these steps fails.
+    """
     # Close the devices that `close` could not close. Two threads may empty the list at the same
     # time.
     with suppress(IndexError):
@@ -94,7 +100,10 @@ def _set_up(device: serial.Serial) -> None:
 
 
 def unsent(fd: int) -> int:
-    """Return how many bytes the driver has not sent yet. Return 0 if the driver does not say so."""
+    """Return the number of bytes that the driver has not sent yet.
+
+    Return 0 if the driver does not report this number.
+    """
     waiting = array.array("i", [0])
     try:
         fcntl.ioctl(fd, termios.TIOCOUTQ, waiting)
@@ -106,15 +115,18 @@ def unsent(fd: int) -> int:
 def draining(fd: int, deadline_ns: int) -> Iterator[float]:
     """Yield the length of each pause, in seconds, until the driver has sent all bytes.
 
-    The caller must sleep for this time after each step of the iteration. The iteration also ends at
-    the monotonic time `deadline_ns`.
+    The caller must sleep for this time after each yield. The iteration ends at the monotonic time
+    `deadline_ns`, ns, even if the driver still has bytes to send.
     """
     while unsent(fd) and clock.mono_ns() < deadline_ns:
         yield DRAIN_STEP_S
 
 
 def unlock(fd: int) -> None:
-    """Unlock the device. A pty would otherwise stay locked even after this process has ended."""
+    """Unlock the device.
+
+    Without this call, a pty would stay locked even after this process has ended.
+    """
     try:
         fcntl.ioctl(fd, termios.TIOCNXCL)
     except OSError:
@@ -129,8 +141,9 @@ def close(device: serial.Serial, *, lost: bool = False, wait_s: float = 0.0) -> 
     /dev/null, so the caller can close `device` itself without delay.
 
     Args:
-        lost: whether the device has failed. Its output buffer is then discarded even if the driver
-            reports no unsent bytes.
+        device: the open device.
+        lost: whether the device has failed. In this case, its output buffer is discarded even if
+            the driver reports no unsent bytes.
         wait_s: longest time for which this call waits until the thread has closed the device, s.
     """
     fd = device.fileno()
@@ -159,7 +172,7 @@ def _end(fd: int) -> None:
 
 
 def refusal(path: str, error: OSError) -> MendableError:
-    """Return the error for users that explains why the port at `path` cannot be opened.
+    """Return the error that tells the user why the port at `path` cannot be opened, and what to do.
 
     `error` is the error of the operating system.
     """
@@ -191,10 +204,10 @@ _JOIN = (
 
 
 def require(path: str) -> None:
-    """Raise an error that says what is wrong if `path` is not a character device.
+    """Raise a `MendableError` that says what is wrong if `path` is not a character device.
 
-    Only the tools call this function. The daemon does not call it, because it waits until an absent
-    device appears.
+    Only the tools call this function. The daemon does not call it, because the daemon waits for an
+    absent device.
     """
     try:
         if not stat.S_ISCHR(os.stat(path).st_mode):

@@ -1,9 +1,9 @@
-"""The daemon's serial port: opens, reads and reopens the device, and sends STOP before it closes.
+"""The daemon's serial port: opens, reads and reopens the device, and sends STOP before closing it.
 
 The daemon uses pyserial-asyncio only to read. A transport of that library would queue the bytes
-that the kernel does not accept, and send an old line later (the third rule in `acsard/README.md`).
-So the daemon writes to the descriptor directly. Opening runs in a thread with a time limit, because
-drivers may block.
+that the kernel does not accept, and send an old line later, which the third rule in
+`acsard/README.md` forbids. So the daemon writes to the descriptor directly. Opening runs in a
+thread with a time limit, because drivers may block.
 """
 
 from __future__ import annotations
@@ -28,32 +28,32 @@ from acsard.host.threads import NoThreadError, in_thread
 
 OPEN_TIMEOUT_S = 5.0
 """Time limit of a call that opens a device, s. After this time the call counts as hung. The daemon
-does not try to open the same device again until the hung call returns."""
+does not try to open the same device again until that call has returned."""
 
 BACK_OFF_S = (0.05, 0.1, 0.2)
-"""Pauses between the attempts to reopen the port, s. All further pauses are as long as the third
-one. The first pauses are short, because udev soon sets the group of a new device."""
+"""Pauses between the attempts to reopen the port, s. The last pause is repeated. The first pauses
+are short, because udev soon sets the group of a new device."""
 
 PERMISSION_PATIENCE_S = 2.0
 """Time for which the starting daemon waits until udev grants access to the device, s. If the daemon
-has no access by then, its start fails."""
+still has no access after this time, its start fails."""
 
 HUNG = "the driver of the serial port did not answer"
 
 FAREWELL_S = 0.15
-"""Time limit for sending the last STOP, s. The limit is twice the time that a line takes at the
-lowest baud rate, plus a margin."""
+"""Longest time for sending the last STOP, s. It is twice the time of a line at the lowest baud
+rate, plus a margin."""
 
 
 AT_ONCE = 4096
-"""Largest number of bytes in one read. The buffer of a driver has this size."""
+"""Largest number of bytes in one read. It is the size of a driver's buffer."""
 
 
 class SerialPort:
     """The serial port to the board, as an asynchronous context manager.
 
-    Entering the context opens the port. While `keep_open` runs, a lost port is opened again.
-    Leaving the context sends STOP and closes the port.
+    The port is opened when the context is entered. When the context is left, the port sends STOP
+    and closes. A lost port is reopened while `keep_open` runs.
     """
 
     def __init__(
@@ -66,9 +66,21 @@ class SerialPort:
         log: Callable[[Event], None],
         asleep: Asleep | None = None,
     ) -> None:
+        """Prepare the port.
+
+        Args:
+            path: path of the serial device.
+            baud_rate: baud rate of the port.
+            stop: the line that commands speed zero for all wheels.
+            period_ns: control period, ns.
+            wake: function that is called after data has arrived or the port was lost.
+            log: function that writes an event to the log.
+            asleep: detector of a suspend of this computer.
+        """
         self.is_open = False
         self._asleep = asleep or Asleep()
         self.opened = 0
+        """Number of times that the port was opened."""
         self._path, self._baud_rate, self._stop = path, baud_rate, stop
         self._period_ns = period_ns
         self._wake, self._log = wake, log
@@ -78,9 +90,9 @@ class SerialPort:
         self._lost = asyncio.Event()
         self._fd = -1
         self._opening = set[tuple[int, int]]()
-        """The devices that threads are opening now. Each is a pair (`st_dev`, `st_ino`)."""
+        """The devices that threads are opening now, each as a pair (`st_dev`, `st_ino`)."""
         self.trouble = ""
-        """The reason why the port is closed; "" while the port is open."""
+        """Reason why the port is closed, in words; "" while the port is open."""
 
     # The control loop calls the methods below.
 
@@ -92,13 +104,14 @@ class SerialPort:
     def take(self, late: Instant | None = None) -> tuple[Received, ...]:
         """Return the bytes received since the last call.
 
-        `late` is the time of the present control step if periods were missed before it, else None.
-        In such a step, this method also reads the bytes that wait in the kernel. Otherwise the
-        delay of the step would look like silence of the board.
-
         After a suspend of the computer, this method closes the port, even if the device still
         works. `keep_open` then opens the port again, and every sender must send a zero before it
         can move the robot.
+
+        Args:
+            late: the time of the present control step if periods were missed before this step, else
+                None. In such a step, this method also reads the bytes that wait in the kernel.
+                Otherwise the delay of the step would look like silence of the board.
         """
         if self._asleep.was():
             self._leave(OSError(errno.EIO, "this computer was suspended"))
@@ -114,10 +127,12 @@ class SerialPort:
         return got
 
     def offer(self, line: bytes, now: Instant) -> Offered:
-        """Try to write a line, and return the result.
+        """Try to write a line immediately, and return the result.
 
-        Return "sent" if the kernel accepted the line, and "down" if the port is closed. Return
-        "superseded" if the line was not written completely: a newer line must then replace it.
+        - "sent": the kernel accepted the line.
+        - "superseded": the line was not written completely, so a newer line must replace it.
+        - "down": the port is closed.
+
         `now` is the time of the step that made the line.
         """
         if not self.is_open:
@@ -156,6 +171,7 @@ class SerialPort:
             await asyncio.sleep(BACK_OFF_S[-1])
 
     async def keep_open(self) -> None:
+        """Reopen the port whenever it is closed, until this task is cancelled."""
         while True:
             if self.is_open:
                 await self._lost.wait()
@@ -219,7 +235,7 @@ class SerialPort:
     def _leave(self, error: BaseException | None) -> None:
         """Close the port and discard unsent bytes.
 
-        `error` is the reason if the port was lost, or None if the daemon ends.
+        `error` is the reason if the port was lost, or None at the end of the daemon.
         """
         if not self.is_open:
             return
@@ -242,9 +258,9 @@ class SerialPort:
     # Closing.
 
     async def __aexit__(self, *_: object) -> None:
-        """Send STOP as the last line, and close the port.
+        """Send STOP as the last line, and close the port, even after an exception.
 
-        Sending takes at most `FAREWELL_S`. Also do this if an exception ends the context.
+        Sending takes at most `FAREWELL_S`.
         """
         deadline_ns = clock.now().mono_ns + int(FAREWELL_S * 1e9)
         while self.is_open and self.offer(self._stop, clock.now()) == "superseded":

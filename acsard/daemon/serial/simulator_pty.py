@@ -1,7 +1,8 @@
-"""The simulated board at the end of a pty, in real time, for the daemon's real serial code.
+"""The simulated board at the end of a pty, in real time.
 
-A pty carries data at any baud rate. If the host's rate differs from the board's, this module
-garbles the data in both directions, as a real wire would.
+The daemon uses its real serial code to communicate with this board. A pty carries data at any baud
+rate. If the daemon's baud rate differs from the board's, this module garbles the data in both
+directions, as a real wire would.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from acsard.host.timerfd import TimerFd
 
 
 class PtyEnd:
-    """The board's end of a pty. Its methods never block."""
+    """The board's end of a pty. No method blocks."""
 
     def __init__(self) -> None:
         self._master, self.slave = pty.openpty()
@@ -73,7 +74,7 @@ _RATES: dict[int, int] = {getattr(termios, f"B{rate}"): rate for rate in get_arg
 class SimPty:
     """The simulated board at one end of a pty, as a context manager.
 
-    Entering the context creates the pty. `path` is the serial device for the daemon.
+    The pty is created when the context is entered. `path` is then the serial device for the daemon.
     """
 
     def __init__(self, mcu: FakeMcu) -> None:
@@ -106,7 +107,7 @@ class SimPty:
             self._arm()
 
     def _set_speed(self) -> None:
-        """Set the pty to the board's baud rate, in case the host never sets a baud rate."""
+        """Set the pty to the board's baud rate, in case the host sets no baud rate."""
         attributes = termios.tcgetattr(self._end.slave)
         attributes[4] = attributes[5] = getattr(termios, f"B{self.mcu.baud_rate}")
         termios.tcsetattr(self._end.slave, termios.TCSANOW, attributes)
@@ -114,7 +115,7 @@ class SimPty:
     def _speed(self) -> int:
         """Return the baud rate that the host has set on the pty.
 
-        If it is not a rate that acsard supports, return the board's baud rate.
+        If acsard does not support that rate, return the board's baud rate.
         """
         return _RATES.get(termios.tcgetattr(self._end.slave)[5], self.mcu.baud_rate)
 
@@ -135,7 +136,7 @@ POSE = "sim/pose"
 
 
 class Simulated(SimPty):
-    """The simulated board of a daemon. It also publishes the robot's true pose on the bus."""
+    """The simulated board of a daemon. It also publishes the true pose and the gyro's samples."""
 
     def __init__(self, config: Config) -> None:
         super().__init__(WatchedMcu(config, clock.mono_ns(), self._see))
@@ -150,7 +151,7 @@ class Simulated(SimPty):
         self._bus = bus
 
     def current(self, key: str) -> Message | None:
-        """Return the newest true pose, or None if there is none or `key` is not `sim/pose`."""
+        """Return the newest true pose, or None if no pose is known or `key` is not `sim/pose`."""
         return true_pose(*self._last) if key == POSE and self._last is not None else None
 
     def _see(self, sight: Sight) -> None:
