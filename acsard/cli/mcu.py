@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 
 import msgspec
@@ -22,6 +23,7 @@ from acsard.host import clock
 from acsard.host.config_file import change, writable
 from acsard.host.errors import Exit, MendableError, UsageError
 from acsard.host.processes import master_of
+from acsard.host.terminal_modes import one_by_one
 from acsard.terminal.json_prompt import JsonPrompt
 from acsard.terminal.prompt import Prompt, ended_by_signals
 from acsard.terminal.terminal_prompt import NoPrompt, TerminalPrompt
@@ -87,8 +89,8 @@ def _checked(
 ) -> int:
     """Check the board, print the report, and return the exit code.
 
-    `config` is the configuration with the values of the options, with which the board is checked.
-    `configured` is the configuration in the file `where`. The report suggests changes to that file.
+    `config` contains the values of the options. The board is checked with it. `configured` is the
+    configuration in the file `where`, for which the report suggests changes.
     """
     port, simulated = config.mcu.port, config.mcu.simulated
     findings: list[Finding] = []
@@ -101,14 +103,18 @@ def _checked(
     prompt.begin(f"port {port}{words}, configuration {where}", simulated=simulated)
     trouble: MendableError | None = None
     try:
-        with ended_by_signals(
-            "stopping: acsard sends zero speeds to the board, then closes the port", exits=True
+        with (
+            ended_by_signals(
+                "stopping: acsard sends zero speeds to the board, then closes the port", exits=True
+            ),
+            one_by_one() if isinstance(prompt, TerminalPrompt) else nullcontext(),
         ):
             procedure.run(_wire(config), prompt, config, tell, clock.asleep_ns)
     except MendableError as error:
         if not args.json:
             raise
-        trouble = error  # with --json, print the report before the error
+        # With --json, print the report before the error.
+        trouble = error
     named = args.port if args.write or (args.json_lines and not simulated) else ""
     why = withheld(simulated, configured)
     found_changes = {} if why else changes(findings, configured, named)
@@ -117,7 +123,8 @@ def _checked(
         try:
             change(Path(where), found_changes)
             written = where
-        except MendableError as error:  # print the findings of the long check before the error
+        except MendableError as error:
+            # Print the findings of the long check before the error.
             trouble = error
     found = report(port, findings, found_changes, written, str(trouble or ""), why)
     prompt.result(msgspec.json.encode(found).decode() if args.json else summary(found, where))
@@ -129,9 +136,11 @@ def _checked(
 
 
 def _prompt(args: argparse.Namespace, port: str) -> TerminalPrompt | NoPrompt | JsonPrompt:
-    """Return the prompt that asks the person near the robot.
+    """Return the prompt that asks the person near the robot, or one that asks no questions.
 
-    Raises `UsageError` if wheels at `port` could turn without a person's consent.
+    `port` is the path of the serial device, or the name of the built-in simulator. Raises
+    `UsageError` if no port is configured, or if wheels at this port could turn without a person's
+    consent.
     """
     if port == SIMULATOR and args.port != SIMULATOR:
         raise UsageError(
@@ -163,9 +172,9 @@ def _prompt(args: argparse.Namespace, port: str) -> TerminalPrompt | NoPrompt | 
 
 
 def _wire(config: Config) -> Wire:
-    """Return the connection to the board: the serial port, or the built-in simulator.
+    """Return the connection to the configured board, which may be the built-in simulator.
 
-    The simulator runs in virtual time, so a check on it does not take real time.
+    The simulator runs in virtual time, so that the check does not wait in real time.
     """
     if config.mcu.port == SIMULATOR:
         return VirtualWire(FakeMcu(config))

@@ -1,7 +1,7 @@
-"""The prompt at a terminal, and the prompt without a person.
+"""Asks a person at a terminal, or answers questions itself if no person can be asked.
 
-Questions and texts go to standard error, so that the findings and the result on standard output can
-be redirected.
+Questions and texts go to standard error. Findings and the result go to standard output, so that
+they can be redirected.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import sys
 import termios
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from typing import Self
 
 from rich.table import Table
@@ -31,11 +31,11 @@ COLOURS = {"PASS": "green", "WARN": "yellow", "FAIL": "red", "SKIPPED": "bright_
 
 
 class Screen:
-    """Output of a subcommand that asks questions.
+    """Shows the output of a subcommand that asks questions.
 
-    On a terminal the present activity is a line that the next output overwrites. If `as_json` is
-    true, only texts and questions are shown, because the subcommand prints one JSON object at its
-    end.
+    On a terminal, the present activity is a line that the next output overwrites. If `as_json` is
+    true, only texts and questions are shown, because the subcommand prints one JSON object as its
+    result.
     """
 
     def __init__(self, as_json: bool = False) -> None:
@@ -73,7 +73,7 @@ class Screen:
         print(text)
 
     def offer(self, config: str | None, keys: Mapping[str, object], trouble: str = "") -> bool:
-        """Return False without a question: at a terminal the option `--write` changes the file."""
+        """Return False, and do not ask. At a terminal, the option `--write` changes the file."""
         return False
 
     def _clear(self) -> None:
@@ -86,10 +86,10 @@ class Screen:
 
 
 class NoPrompt(Screen):
-    """Prompt that asks no person and answers the questions itself.
+    """Prompt that does not ask a person, but answers the questions itself.
 
-    It confirms each request that has only one possible answer, starts every drive without waiting,
-    and returns the default number. It leaves all other questions without an answer.
+    It confirms each question that has only one possible answer, starts every drive without a wait,
+    and returns the default of each number. Other questions get no answer.
     """
 
     def ask(self, question: str, answers: Sequence[str]) -> str | None:
@@ -116,29 +116,31 @@ class NoPrompt(Screen):
 class TerminalPrompt(Screen):
     """Prompt that asks a person on standard error and reads the answers from standard input.
 
-    Use it in the context `host.terminal_modes.one_by_one`, so that a single key starts or stops the
-    robot.
+    Outside the context `host.terminal_modes.one_by_one`, a key press takes effect only after Enter.
+    Use that context if a single key press must stop the robot.
     """
 
     def ask(self, question: str, answers: Sequence[str]) -> str:
-        """Ask the question, and return one of `answers`.
+        """Ask a question until the person types one of `answers`, and return this answer.
 
-        The answer "q" or the end of the input ends the subcommand.
+        Raises `KeyboardInterrupt` if the person types "q", or if standard input ends.
         """
         self._clear()
         choice = f" [{'/'.join((*answers, LEAVES))}]" if len(answers) > 1 else ""
-        # A line that was typed before the question appeared must not answer it.
-        if sys.stdin.isatty():
-            termios.tcflush(sys.stdin, termios.TCIFLUSH)
-        while True:
-            self._print(f"\n{question}{choice} ")
-            line = sys.stdin.readline()
-            word = line.strip().lower()
-            if not line or word == LEAVES:
-                raise KeyboardInterrupt
-            if word in answers:
-                return word
-            self._print(f"   please type {' or '.join(answers)}; {LEAVES} quits\n")
+        at_terminal = sys.stdin.isatty()
+        with _lines() if at_terminal else nullcontext():
+            # A line that was typed before the question appeared must not answer it.
+            if at_terminal:
+                termios.tcflush(sys.stdin, termios.TCIFLUSH)
+            while True:
+                self._print(f"\n{question}{choice} ")
+                line = sys.stdin.readline()
+                word = line.strip().lower()
+                if not line or word == LEAVES:
+                    raise KeyboardInterrupt
+                if word in answers:
+                    return word
+                self._print(f"   please type {' or '.join(answers)}; {LEAVES} quits\n")
 
     def start(self, text: str, by_key: bool = False) -> None:
         self.say(text)
@@ -177,7 +179,7 @@ class TerminalPrompt(Screen):
 
 
 def row(finding: Finding) -> Table:
-    """Return a finding as a table: verdict, name and figure, then its meaning and its remedy."""
+    """Return a table that shows a finding: verdict, name, measurement, meaning and remedy."""
     verdict = Text(f"{finding.verdict:<7}", COLOURS[finding.verdict])
     below = [finding.text, f"-> {finding.mend}" if finding.mend else ""]
     head = f"{finding.name:<22} {finding.figure}"

@@ -108,6 +108,18 @@ def test_ctrl_c_at_the_first_question_ends_mcu_check_with_130(tmp_path: Path) ->
         assert "Traceback" not in terminal.screen
 
 
+@pytest.mark.slow
+def test_q_without_enter_ends_mcu_check_while_a_motor_turns(tmp_path: Path) -> None:
+    with Program(acsard("sim"), tmp_path) as sim:
+        port = sim.says("acsard run --port").split()[-1]
+        with at_terminal(tmp_path, "mcu", "check", "--port", port) as (terminal, program):
+            answer(terminal, 'then type "lifted"', "lifted", 1, 10.0)
+            until(lambda: "motor a" in terminal.screen, CHECK_S, "the first motor")
+            terminal.press("q")
+            assert program.ended(5.0) == 130
+            assert "Traceback" not in terminal.screen
+
+
 # on ptys, in real time
 
 FAULTS: dict[str, tuple[str, list[str], dict[str, object]]] = {
