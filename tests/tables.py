@@ -27,7 +27,7 @@ from acsard.core.messages.permissions import (
     keys_for,
 )
 from acsard.core.values import ROLES, Role
-from acsard.daemon.gateway.fleet_router import EXAMPLE
+from acsard.daemon.gateway.fleet_router import EXAMPLE_ROBOT
 
 ROOT = Path(__file__).parent.parent
 
@@ -107,7 +107,7 @@ def router_file(text: str) -> str:
         )
     for role in ROLES:
         held = [rule for (least, _), rule in RULES.items() if has(role, least)]
-        names = " ".join(f'"{rule}-{EXAMPLE}",' for rule in dict.fromkeys(held))
+        names = " ".join(f'"{rule}-{EXAMPLE_ROBOT}",' for rule in dict.fromkeys(held))
         text = _replaced(
             rf'(^ *subjects: \["{role}s"\],\n *rules: \[\n.*\n *// ROBOT\n).*\n',
             f"          {names}\n",
@@ -125,16 +125,16 @@ def _rule_keys() -> dict[str, list[str]]:
         for use in USES:
             keys = keys_for(role, use, TOPICS if use == "publish" else given)
             if keys:
-                rule = found.setdefault(f"{RULES[role, use]}-{EXAMPLE}", [])
-                rule += [full_key(EXAMPLE, key) for key in keys]
+                rule = found.setdefault(f"{RULES[role, use]}-{EXAMPLE_ROBOT}", [])
+                rule += [full_key(EXAMPLE_ROBOT, key) for key in keys]
     own = [row.pattern for row in TOPICS if not row.local and "<key>" not in row.key]
     own += [json_key(topic.key) for topic in PUBLISHED]
-    found[f"own-{EXAMPLE}"] = [full_key(EXAMPLE, key) for key in own]
+    found[f"own-{EXAMPLE_ROBOT}"] = [full_key(EXAMPLE_ROBOT, key) for key in own]
     sources = [source.name for source in Config().commands.sources]
     for role in ROLES:
         if has(role, COMMAND_ROLE):
             keys = source_keys(sources, role)
-            found[f"commands of {role}"] = [full_key(EXAMPLE, key) for key in keys]
+            found[f"commands of {role}"] = [full_key(EXAMPLE_ROBOT, key) for key in keys]
     return {rule: list(dict.fromkeys(keys)) for rule, keys in found.items()}
 
 

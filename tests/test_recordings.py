@@ -13,7 +13,7 @@ import pytest
 
 from acsard.recording.file import Recording
 from acsard.recording.file_replay import replay_file
-from acsard.recording.replay import WORDING
+from acsard.recording.replay import TEXT_OUTPUTS
 from acsard.recording.replay_text import describe_difference
 from tests.each import each
 
@@ -35,7 +35,7 @@ def test_a_recording_replays_with_the_same_result(path: Path) -> None:
     comparison = result.comparison
     assert result.gaps == []
     for output, first in comparison.first_by_output.items():
-        if output not in WORDING:
+        if output not in TEXT_OUTPUTS:
             pytest.fail("\n".join(describe_difference(first, recording.about.mono_ns)))
     assert comparison.lines == comparison.lines_same > 100
     assert comparison.modes_same == comparison.steps

@@ -17,7 +17,7 @@ from acsard.core.link.codec import Codec
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.values import Instant
 
-STEPS = 1000
+CYCLE_LENGTH = 1000
 """Number of commands, or of feedback lines, after which the speeds repeat.
 
 Two lines with equal speeds are distinguished by their times.
@@ -29,7 +29,7 @@ LOWEST, STEP = 5.0, 0.02
 The step is so small that the limits on acceleration do not change the speeds.
 """
 
-PATIENCE_NS = 1_000_000_000
+LOSS_TIMEOUT_NS = 1_000_000_000
 """Time after which a command without a line on the wire counts as lost, ns."""
 
 Chunk = tuple[int, bytes]
@@ -58,12 +58,12 @@ class Fed(Struct, frozen=True):
 def staircase(number: int) -> float:
     """Return the speed of all wheels in the command or feedback line with this number, rad/s.
 
-    The speeds rise and then fall, and repeat after `STEPS` lines. The falling speeds lie between
-    the rising speeds, so all speeds of a period differ.
+    The speeds rise and then fall, and repeat after `CYCLE_LENGTH` lines. The falling speeds lie
+    between the rising speeds, so all speeds of a period differ.
     """
-    half = STEPS // 2
-    place = number % STEPS
-    rung = 2 * place if place < half else 2 * (STEPS - place) - 1
+    half = CYCLE_LENGTH // 2
+    place = number % CYCLE_LENGTH
+    rung = 2 * place if place < half else 2 * (CYCLE_LENGTH - place) - 1
     return round(LOWEST + rung * STEP / 2, 2)
 
 
@@ -87,7 +87,7 @@ def lines_of(chunks: Iterable[Chunk]) -> list[Chunk]:
 def commands_to_lines(sent: Sequence[Chunk], lines: Sequence[Chunk]) -> list[int]:
     """Return the time from each command to the line that carries it to the board, ns.
 
-    If no such line follows within `PATIENCE_NS`, the command is lost and has no entry in the
+    If no such line follows within `LOSS_TIMEOUT_NS`, the command is lost and has no entry in the
     result.
 
     Args:
@@ -101,7 +101,7 @@ def commands_to_lines(sent: Sequence[Chunk], lines: Sequence[Chunk]) -> list[int
     for at_ns, line in sent:
         all_ns = times.get(line, [])
         place = bisect_left(all_ns, at_ns)
-        if place < len(all_ns) and all_ns[place] - at_ns < PATIENCE_NS:
+        if place < len(all_ns) and all_ns[place] - at_ns < LOSS_TIMEOUT_NS:
             found.append(all_ns[place] - at_ns)
     return found
 

@@ -44,7 +44,7 @@ from acsard.host.child import end, end_with_parent, environment, how_it_ended
 from acsard.host.errors import Exit, ExitError, MendableError, NoAnswerError, UnreachableError
 from acsard.host.own_identity import sender_id
 
-END_S = 5.0
+END_TIMEOUT_S = 5.0
 """Time limit for a process to end after the request to end, s. It usually takes 0.2 s."""
 
 
@@ -89,19 +89,19 @@ T = TypeVar("T")
 
 ACSARD = (sys.executable, "-m", "acsard", "run")
 
-START_S = 15.0
+START_TIMEOUT_S = 15.0
 """Time limit for each step of the daemon's start, s.
 
 A start takes 0.3 s, or 2.3 s if opening the port resets the board.
 """
 
-SETTLED = 10
+START_SAMPLES = 10
 """Number of odometry samples that must arrive before the daemon's start counts as complete."""
 
-LOOK_S = 0.5
+CHECK_PERIOD_S = 0.5
 """Interval at which the benchmark checks that all its processes are running, s."""
 
-FAR_END = "the simulated microcontroller's process"
+SIMULATOR_PROCESS = "the simulated microcontroller's process"
 
 SPACING_S = (0.02, 0.06)
 """Shortest and longest random time between two commands, s. If this time were constant, all
@@ -162,7 +162,9 @@ class Rig:
                 encoding=encoding_name("msgpack", "Twist"),
                 express=True,
             )
-            self._wait(lambda: len(self._arrived) >= SETTLED or None, "odometry from the daemon")
+            self._wait(
+                lambda: len(self._arrived) >= START_SAMPLES or None, "odometry from the daemon"
+            )
             self._settled_ns = clock.mono_ns()
             self._stack = stack.pop_all()
         return self
@@ -186,11 +188,11 @@ class Rig:
             stdout=subprocess.PIPE,
             start_new_session=True,
         )
-        stack.callback(end, far_end, END_S)
+        stack.callback(end, far_end, END_TIMEOUT_S)
         assert far_end.stdout is not None
         device = far_end.stdout.readline().decode().strip()
         if not device:
-            raise ended(FAR_END, far_end.wait())
+            raise ended(SIMULATOR_PROCESS, far_end.wait())
         return device
 
     def _start_program(self, stack: ExitStack, port: str) -> None:
@@ -212,7 +214,7 @@ class Rig:
                 # If the benchmark is killed, no daemon may remain.
                 preexec_fn=partial(end_with_parent, signal.SIGTERM),
             )
-        stack.callback(end, self.process, END_S)
+        stack.callback(end, self.process, END_TIMEOUT_S)
 
     def _connect(self) -> zenoh.Session | None:
         try:
@@ -221,14 +223,14 @@ class Rig:
             return None
 
     def _wait(self, look: Callable[[], T | None], what: str) -> T:
-        deadline_ns = clock.mono_ns() + int(START_S * NS_PER_S)
+        deadline_ns = clock.mono_ns() + int(START_TIMEOUT_S * NS_PER_S)
         while True:
             self._alive()
             found = look()
             if found is not None:
                 return found
             if clock.mono_ns() > deadline_ns:
-                raise MendableError(f"no {what} within {START_S:g} s{self._why()}")
+                raise MendableError(f"no {what} within {START_TIMEOUT_S:g} s{self._why()}")
             time.sleep(0.01)
 
     def _why(self) -> str:
@@ -239,7 +241,7 @@ class Rig:
 
     def _alive(self) -> None:
         if self._far_end is not None and self._far_end.poll() is not None:
-            raise ended(FAR_END, self._far_end.returncode)
+            raise ended(SIMULATOR_PROCESS, self._far_end.returncode)
         code = self.process.poll()
         if code is not None:
             raise daemon_ended(code, self._log)
@@ -257,7 +259,7 @@ class Rig:
         began_ns, used_ns = clock.mono_ns(), processor_ns(self.process.pid)
         end_ns = began_ns + int(seconds * NS_PER_S)
         while (left_ns := end_ns - clock.mono_ns()) > 0:
-            time.sleep(min(LOOK_S, left_ns / NS_PER_S))
+            time.sleep(min(CHECK_PERIOD_S, left_ns / NS_PER_S))
             self._alive()
         return self._share(began_ns, used_ns)
 
@@ -328,7 +330,7 @@ class Rig:
         raise NoAnswerError(f"no answer on {key}")
 
     def leave(self) -> None:
-        end(self.process, END_S)
+        end(self.process, END_TIMEOUT_S)
 
     def end(self) -> Record:
         """End the measured program and return the record. Do not use the rig after this."""
@@ -355,6 +357,6 @@ def _last_words(far_end: subprocess.Popen[bytes]) -> Seen:
     assert far_end.stdout is not None
     far_end.stdin.close()
     told = far_end.stdout.read()
-    if far_end.wait(END_S):
-        raise ended(FAR_END, far_end.returncode)
+    if far_end.wait(END_TIMEOUT_S):
+        raise ended(SIMULATOR_PROCESS, far_end.returncode)
     return msgspec.msgpack.decode(told, type=Seen)

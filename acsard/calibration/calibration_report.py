@@ -8,9 +8,9 @@ from collections.abc import Iterator, Sequence
 from msgspec import Struct
 from rich.console import RenderableType
 
-from acsard.calibration.improvement import NOTHING, BeforeAfter
+from acsard.calibration.improvement import NOT_COMPARED, BeforeAfter
 from acsard.calibration.multipliers import SEPARATION
-from acsard.calibration.odometry_noise import METRES
+from acsard.calibration.odometry_noise import REPORT_DISTANCE_M
 from acsard.calibration.plausibility import RATIO, TRACK
 from acsard.calibration.solve import Calibration
 from acsard.core.config.settings import DriveConfig
@@ -205,7 +205,8 @@ def report(log: str, calibration: Calibration, drive: DriveConfig, written: str)
 
 
 def _noise(calibration: Calibration) -> tuple[BeforeAfter, BeforeAfter]:
-    """Return a pair: the uncertainty after `METRES` m of the heading, deg, and of the distance, m.
+    """Return a pair: the uncertainty after `REPORT_DISTANCE_M` m of the heading, deg, and of the
+    distance, m.
 
     Each item contains two standard deviations: with the configured and with the new noise
     settings. They are None if the noise settings stay as configured. Those of the distance are
@@ -213,9 +214,9 @@ def _noise(calibration: Calibration) -> tuple[BeforeAfter, BeforeAfter]:
     """
     noise = calibration.noise
     if noise is None or not noise.better:
-        return NOTHING, NOTHING
+        return NOT_COMPARED, NOT_COMPARED
     heading = BeforeAfter(*(math.degrees(angle) for angle in noise.heading()))
-    return heading, BeforeAfter(*noise.distance()) if noise.places else NOTHING
+    return heading, BeforeAfter(*noise.distance()) if noise.places else NOT_COMPARED
 
 
 def _deviations(calibration: Calibration) -> list[float | None]:
@@ -286,7 +287,10 @@ def parts(
 
 
 def _better(report: Report) -> list[str]:
-    noise = f"random {{}} error after {METRES:g} m of driving, according to the odometry messages"
+    noise = (
+        f"random {{}} error after {REPORT_DISTANCE_M:g} m of driving, "
+        "according to the odometry messages"
+    )
     sentences = [
         f"{words}: {_two(before * factor)} {unit} now, {_two(after * factor)} {unit} with the new "
         "values"

@@ -24,7 +24,7 @@ from acsard.core.config.settings import DriveConfig
 
 
 class P(IntEnum):
-    """Indices of the fitted parameters in an array of `COUNT` numbers."""
+    """Indices of the fitted parameters in an array of `PARAMETER_COUNT` numbers."""
 
     LEFT = 0
     """Ratio of the left wheels' radius to the configured wheel radius."""
@@ -52,9 +52,9 @@ class P(IntEnum):
     """Relative error of the gyro's scale: with 0.01, the gyro shows turns 1 % too large."""
 
 
-COUNT = len(P)
+PARAMETER_COUNT = len(P)
 
-HUBER = 2.0
+HUBER_LIMIT = 2.0
 """Size of a residual, in standard deviations, above which its weight is less than 1 (Huber)."""
 
 
@@ -78,11 +78,13 @@ class Base(Struct, frozen=True):
         )  # fmt: skip
 
     def start(self) -> Floats:
-        """Return the parameters that describe the configured robot, shape (COUNT,).
+        """Return the parameters that describe the configured robot, shape (PARAMETER_COUNT,).
 
         The track growth and all parameters of sensors are 0.
         """
-        return np.array([self.left, self.right, 1 / self.track, *[0.0] * (COUNT - P.TRACK_GROWTH)])
+        return np.array(
+            [self.left, self.right, 1 / self.track, *[0.0] * (PARAMETER_COUNT - P.TRACK_GROWTH)]
+        )
 
     @property
     def gain(self) -> float:
@@ -101,9 +103,10 @@ class Evidence(Struct, frozen=True):
     """
 
     normal: Floats
-    """Left-hand sides J^T W J of the normal equations, shape (blocks, COUNT, COUNT)."""
+    """Left-hand sides J^T W J of the normal equations, shape (blocks, PARAMETER_COUNT,
+    PARAMETER_COUNT)."""
     score: Floats
-    """Right-hand sides J^T W r of the normal equations, shape (blocks, COUNT)."""
+    """Right-hand sides J^T W r of the normal equations, shape (blocks, PARAMETER_COUNT)."""
     squares: Floats
     """Sum of weighted squared residuals per block."""
     counts: Floats
@@ -117,14 +120,14 @@ def of_rows(
 
     Args:
         jacobian: derivatives of each prediction with respect to the parameters, shape
-            (measurements, COUNT).
+            (measurements, PARAMETER_COUNT).
         residual: measured minus predicted value of each measurement.
         weight: weight of each measurement.
         block: index of the block of each measurement.
         blocks: number of blocks.
     """
-    normal = np.zeros((blocks, COUNT, COUNT))
-    score = np.zeros((blocks, COUNT))
+    normal = np.zeros((blocks, PARAMETER_COUNT, PARAMETER_COUNT))
+    score = np.zeros((blocks, PARAMETER_COUNT))
     weighted = jacobian * weight[:, None]
     np.add.at(normal, block, weighted[:, :, None] * jacobian[:, None, :])
     np.add.at(score, block, weighted * residual[:, None])
@@ -146,50 +149,51 @@ def condition(normal: Floats) -> float:
 
 
 def huber(residuals: Floats | Complexes, least: float) -> Floats:
-    """Return Huber's weight of each residual: 1 up to `HUBER` standard deviations, less above.
+    """Return Huber's weight of each residual: 1 up to `HUBER_LIMIT` standard deviations, less
+    above.
 
     The standard deviation is taken as 1.4826 times the median absolute residual, but at least
     `least`.
     """
     size = np.abs(residuals)
     scale = max(least, 1.4826 * float(np.median(size)) if len(size) else 0.0)
-    return np.asarray(np.minimum(1.0, HUBER * scale / np.maximum(size, 1e-300)))
+    return np.asarray(np.minimum(1.0, HUBER_LIMIT * scale / np.maximum(size, 1e-300)))
 
 
 Source = Callable[[Floats], Evidence]
 """Function that returns the evidence of one sensor for given parameters."""
 
-MOST_STEPS = 30
+MAX_STEPS = 30
 SMALL, SETTLED = 1e-5, 0.02
 """Step sizes at which the fit ends (`SMALL`), and at which it has converged (`SETTLED`).
 
-The fit ends after a step below `SMALL`, or after `MOST_STEPS` steps. It has converged if its last
+The fit ends after a step below `SMALL`, or after `MAX_STEPS` steps. It has converged if its last
 step is below `SETTLED`. The size of a step is the largest change of the two radii, the inverse
 track and the track growth, in the units of `P`. A size of 0.01 is a change by 1 % of a radius.
 """
 
-USUAL = {P.TRACK_GROWTH: 0.06, P.DELAY: 1.0, P.SENSOR_X: 0.5, P.SENSOR_Y: 0.5}
+PRIOR_STD = {P.TRACK_GROWTH: 0.06, P.DELAY: 1.0, P.SENSOR_X: 0.5, P.SENSOR_Y: 0.5}
 """Prior standard deviations of parameters that some logs do not determine, in the units of `P`."""
 
-GYRO_SCALE = 0.005
+GYRO_SCALE_STD = 0.005
 """Prior relative standard deviation of the scale of a MEMS gyro.
 
 Only positions can show that the scale is wrong.
 """
 
-HELD = 1e9
+CONSTRAINT_WEIGHT = 1e9
 """Weight of a constraint (`Held`) in the normal equations, large enough to enforce it."""
 
 Held = tuple[Floats, float]
-"""Constraint on the parameters: a pair of weights, shape (COUNT,), and a value.
+"""Constraint on the parameters: a pair of weights, shape (PARAMETER_COUNT,), and a value.
 
 The weighted sum of the parameters must be equal to the value.
 """
 
-MANY = 16
+MIN_PAIR_BLOCKS = 16
 """Minimum number of blocks at which the jackknife also leaves out pairs of neighboring blocks."""
 
-LEAST_BLOCKS = 5
+MIN_BLOCKS = 5
 """Minimum number of blocks that a log must have.
 
 It is also the minimum number of runs at which the jackknife also leaves out whole runs.
@@ -207,12 +211,12 @@ class Fit(Struct, frozen=True):
 
     parameters: Floats
     normal: Floats
-    """Left-hand sides of the normal equations, shape (blocks, COUNT, COUNT)."""
+    """Left-hand sides of the normal equations, shape (blocks, PARAMETER_COUNT, PARAMETER_COUNT)."""
     score: Floats
-    """Right-hand sides of the normal equations, shape (blocks, COUNT)."""
+    """Right-hand sides of the normal equations, shape (blocks, PARAMETER_COUNT)."""
     known: Floats
     """Matrix that the constraints and the prior information add to the left-hand side of the normal
-    equations, shape (COUNT, COUNT)."""
+    equations, shape (PARAMETER_COUNT, PARAMETER_COUNT)."""
     active: tuple[P, ...]
     """Indices of the parameters that were fitted."""
     converged: bool
@@ -252,22 +256,22 @@ class Fit(Struct, frozen=True):
     def covariance(self, runs: Sequence[int] = ()) -> Floats:
         """Return the covariance of the parameters, from the jackknife and the prior information.
 
-        `runs` contains the index of the run of each block. If there are at least `LEAST_BLOCKS`
+        `runs` contains the index of the run of each block. If there are at least `MIN_BLOCKS`
         runs, the jackknife also leaves out whole runs.
         """
         alone = np.arange(len(self.score))
         change, size = self._changes(alone)
         # Leaving out neighboring blocks or whole runs shows errors that last longer than a block.
-        if len(alone) >= MANY:
+        if len(alone) >= MIN_PAIR_BLOCKS:
             size = np.maximum(size, self._changes(alone // 2)[1])
-        if len(set(runs)) >= LEAST_BLOCKS:
+        if len(set(runs)) >= MIN_BLOCKS:
             size = np.maximum(size, self._changes(np.array(runs))[1])
         wider = np.sqrt(size / np.maximum(change**2, 1e-150).sum(axis=0))
         chance = change.T @ change * np.outer(wider, wider)
-        usual = np.zeros(COUNT)
+        usual = np.zeros(PARAMETER_COUNT)
         usual[list(self.usual)] = np.array(list(self.usual.values())) ** -2
         total = self.normal.sum(axis=0) + self.known
-        pull = np.zeros((COUNT, COUNT))
+        pull = np.zeros((PARAMETER_COUNT, PARAMETER_COUNT))
         pull[list(self.active)] = _solved(total, np.diag(usual), self.active)
         return np.asarray(chance + pull @ np.diag(1 / np.where(usual, usual, np.inf)) @ pull.T)
 
@@ -308,26 +312,26 @@ def fit(
         held: constraints on the parameters.
     """
     active: tuple[P, ...] = tuple(P)[: P.BIAS_ERROR if places else P.DELAY]
-    usual = dict(USUAL)
+    usual = dict(PRIOR_STD)
     if gyro:
-        active, usual[P.SCALE_ERROR] = (*active, P.SCALE_ERROR), GYRO_SCALE
+        active, usual[P.SCALE_ERROR] = (*active, P.SCALE_ERROR), GYRO_SCALE_STD
     if bias_std:
         active, usual[P.BIAS_ERROR] = (*active, P.BIAS_ERROR), bias_std
     if not places:
-        both = np.zeros(COUNT)
+        both = np.zeros(PARAMETER_COUNT)
         both[[P.LEFT, P.RIGHT]] = 1.0
         held = (*held, (both, float(both @ start)))
     parameters, size = start.copy(), np.inf
-    for at in range(MOST_STEPS):
+    for at in range(MAX_STEPS):
         normal, score = _sum([source(parameters) for source in sources])
         known, prior = _known(parameters, held, usual)
-        step = np.zeros(COUNT)
+        step = np.zeros(PARAMETER_COUNT)
         step[list(active)] = _solved(normal.sum(axis=0) + known, score.sum(axis=0) + prior, active)
         # Far from the solution, take only a part of the step, because the linearization holds only
         # nearby. After a third of the steps, halve each step. Otherwise a residual could become an
         # outlier in every second step, and the fit would not converge.
         size = float(np.max(np.abs(step[: P.DELAY])))
-        whole = 1.0 if at < MOST_STEPS // 3 else 0.5
+        whole = 1.0 if at < MAX_STEPS // 3 else 0.5
         parameters = parameters + step * min(whole, 0.3 / size if size else 1.0)
         if size < SMALL:
             break
@@ -339,9 +343,9 @@ def fit(
 def _sum(evidence: Sequence[Evidence]) -> tuple[Floats, Floats]:
     """Return the normal equations of all sensors, as a pair of arrays.
 
-    The first array has the left-hand side for each block, shape (blocks, COUNT, COUNT). The second
-    array has the right-hand side for each block, shape (blocks, COUNT). Both arrays are weighted
-    sums over the sensors.
+    The first array has the left-hand side for each block, shape (blocks, PARAMETER_COUNT,
+    PARAMETER_COUNT). The second array has the right-hand side for each block, shape (blocks,
+    PARAMETER_COUNT). Both arrays are weighted sums over the sensors.
     """
     normal, score = np.zeros_like(evidence[0].normal), np.zeros_like(evidence[0].score)
     for part in evidence:
@@ -371,21 +375,21 @@ def _known(
 ) -> tuple[Floats, Floats]:
     """Return the normal equations of the constraints and of the prior information, as a pair.
 
-    The first array is the left-hand side, shape (COUNT, COUNT). The second array is the right-hand
-    side, shape (COUNT,).
+    The first array is the left-hand side, shape (PARAMETER_COUNT, PARAMETER_COUNT). The second
+    array is the right-hand side, shape (PARAMETER_COUNT,).
 
     Args:
         parameters: the present parameters of the fit.
         held: the constraints.
         usual: the prior standard deviation of each parameter that has one.
     """
-    normal, score = np.zeros((COUNT, COUNT)), np.zeros(COUNT)
+    normal, score = np.zeros((PARAMETER_COUNT, PARAMETER_COUNT)), np.zeros(PARAMETER_COUNT)
     for index, deviation in usual.items():
         normal[index, index] = deviation**-2
         score[index] = -parameters[index] * deviation**-2
     for weights, value in held:
-        normal += HELD * np.outer(weights, weights)
-        score += HELD * weights * (value - weights @ parameters)
+        normal += CONSTRAINT_WEIGHT * np.outer(weights, weights)
+        score += CONSTRAINT_WEIGHT * weights * (value - weights @ parameters)
     return normal, score
 
 

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Struct
 
-from acsard.calibration.fit import COUNT, Base, Evidence, P, huber, of_rows
+from acsard.calibration.fit import PARAMETER_COUNT, Base, Evidence, P, huber, of_rows
 from acsard.calibration.log_table import Floats, LogError
 from acsard.calibration.runs import Block, Run, cumulative, gaps, inside, rests
 
@@ -28,38 +28,38 @@ The time `EDGE_S` is cut off at both ends of the standstill, because the robot m
 remaining time must be at least `REST_S`.
 """
 
-TURNED_BY_HAND = 0.05
+MAX_RATE_AT_REST = 0.05
 """Largest accepted deviation of the gyro's mean rate in a standstill from its usual rate, rad/s.
 
 The usual rate is the median over all standstills. If the deviation is larger, a person turned the
 robot during this standstill, so the standstill is not used.
 """
 
-LEAST_SAMPLES = 5
+MIN_SAMPLES = 5
 """Minimum number of gyro samples in a standstill from which the bias is measured."""
 
-OUTLIER = 6.0
+OUTLIER_RATIO = 6.0
 """Limit above which a gyro sample in a standstill is left out as an outlier.
 
 The limit applies to the sample's deviation from the median, divided by the median deviation.
 """
 
-WALK = 5e-5
+MIN_RANDOM_WALK = 5e-5
 """Smallest random walk assumed for the gyro bias, rad/s per square root of a second."""
 
-UNSEEN_WALK = 2e-4
+ASSUMED_RANDOM_WALK = 2e-4
 """Random walk assumed for the gyro bias if the robot does not stand still twice in any run.
 
 The unit is rad/s per square root of a second.
 """
 
-ROW_S = 1.0
+INTERVAL_S = 1.0
 """Approximate length of the intervals in which turns of wheels and sensor are compared, s."""
 
 GRID_S, FURTHEST_S = 0.02, 2.0
 """Step of the search for the heading sensor's delay, and the largest delay that is tried, s."""
 
-DEGREES = 10.0
+DEGREES_RATIO = 10.0
 """Limit for the turns in the column yaw, divided by the turns of the wheels.
 
 Above this limit, the yaw must be in degrees.
@@ -108,10 +108,10 @@ class Headings(Struct, frozen=True):
     """
 
 
-TURNING = 0.05
+STRAIGHT_RATE = 0.05
 """Turn rate up to which the robot is considered to drive straight, rad/s."""
 
-FASTEST = 0.95
+FASTEST_QUANTILE = 0.95
 """Fraction of the total turned angle that the robot turned at rates below `Rates.fastest`."""
 
 
@@ -143,7 +143,8 @@ class Rates(Struct, frozen=True):
     mean: float
     """Mean turn rate, rad/s, weighted by the turned angle."""
     fastest: float
-    """Turn rate, rad/s, below which the robot turned 95 % (`FASTEST`) of its total turned angle."""
+    """Turn rate, rad/s, below which the robot turned 95 % (`FASTEST_QUANTILE`) of its total turned
+    angle."""
 
 
 def of_gyro(driven: Sequence[Run]) -> Headings | None:
@@ -162,7 +163,7 @@ def of_gyro(driven: Sequence[Run]) -> Headings | None:
     usual = float(np.median(all_biases)) if len(all_biases) else 0.0
     found, rested = [], []
     for run, (t, values, noise) in zip(driven, biases, strict=True):
-        true = np.abs(values - usual) < TURNED_BY_HAND
+        true = np.abs(values - usual) < MAX_RATE_AT_REST
         rested.append((t[true], values[true], noise[true]))
         bias = np.interp(run.gyro_t, t[true], values[true]) if true.any() else usual
         rate = run.gyro - bias
@@ -204,7 +205,9 @@ def _in_degrees(run: Run, gain: float) -> bool:
     left, right = run.angles(run.yaw_t)
     by_wheels = gain * np.diff(right - left)
     small = np.abs(steps) < 100.0
-    return float(np.sum(np.abs(steps[small]))) > DEGREES * float(np.sum(np.abs(by_wheels[small])))
+    return float(np.sum(np.abs(steps[small]))) > DEGREES_RATIO * float(
+        np.sum(np.abs(by_wheels[small]))
+    )
 
 
 Rests = tuple[Floats, Floats, Floats]
@@ -216,7 +219,7 @@ def _biases(run: Run) -> Rests:
     found = []
     for begin, end in rests(run, REST_S, EDGE_S):
         a, b = np.searchsorted(run.gyro_t, (begin, end))
-        if b - a >= LEAST_SAMPLES:
+        if b - a >= MIN_SAMPLES:
             found.append(((begin + end) / 2, *_mean(run.gyro[a:b])))
     times, values, noise = np.array(found, dtype=np.float64).reshape(-1, 3).T
     return times, values, noise
@@ -230,12 +233,12 @@ def _mean(samples: Floats) -> tuple[float, float]:
     off = np.abs(samples - np.median(samples))
     steps = np.diff(np.unique(samples))
     step = float(steps.min()) if len(steps) else 0.0
-    kept = samples[off <= max(OUTLIER * float(np.median(off)), 1.01 * step)]
-    kept = kept if len(kept) >= LEAST_SAMPLES else samples
+    kept = samples[off <= max(OUTLIER_RATIO * float(np.median(off)), 1.01 * step)]
+    kept = kept if len(kept) >= MIN_SAMPLES else samples
     # The variance comes from the means of five parts, so it is right for correlated noise as well.
     # The result is not the median, because the median of a coarse gyro is always one of its few
     # reported values.
-    parts = [float(part.mean()) for part in np.array_split(kept, LEAST_SAMPLES)]
+    parts = [float(part.mean()) for part in np.array_split(kept, MIN_SAMPLES)]
     few = step**2 / 12 if len(np.unique(kept)) <= 2 else 0.0
     return float(kept.mean()), float(np.var(parts, ddof=1)) / len(parts) + few
 
@@ -252,7 +255,7 @@ def _bias_std(rested: Sequence[Rests], seconds: Sequence[float]) -> float:
     changed, lasted = np.concatenate(walked).sum(axis=0)
     # An estimate from few differences is uncertain, so increase it.
     few = 1 + 2 / max(1, count - len(rested))
-    walk = max(WALK**2, few * changed / lasted) if lasted else UNSEEN_WALK**2
+    walk = max(MIN_RANDOM_WALK**2, few * changed / lasted) if lasted else ASSUMED_RANDOM_WALK**2
     # Between two standstills, the bias error is a Brownian bridge. Before the first and after the
     # last standstill, the bias error is a free random walk.
     whole = sum(seconds)
@@ -313,7 +316,7 @@ def _correlation(later: Floats, earlier: Floats, reach: int) -> Floats:
 
 
 def rows(headings: Headings | None, driven: Sequence[Run], parts: Sequence[Block]) -> Rows:
-    """Return the motion of the robot in intervals of about `ROW_S` s.
+    """Return the motion of the robot in intervals of about `INTERVAL_S` s.
 
     The intervals are parts of the blocks `parts`. An interval without samples of the heading
     sensor is left out. If `headings` is None, no interval is left out.
@@ -321,7 +324,7 @@ def rows(headings: Headings | None, driven: Sequence[Run], parts: Sequence[Block
     fast = [_fast(run) for run in driven]
     found: list[tuple[Floats, ...]] = []
     for number, part in enumerate(parts):
-        count = max(1, round((part.end - part.begin) / ROW_S))
+        count = max(1, round((part.end - part.begin) / INTERVAL_S))
         edges = np.linspace(part.begin, part.end, count + 1)
         angle, whole = np.zeros(count + 1), np.ones(count, dtype=bool)
         if headings is not None:
@@ -349,12 +352,12 @@ def rates(rows: Rows, by_wheels: Floats) -> Rates:
     """
     turned = np.abs(by_wheels)
     rate = turned / rows.seconds
-    turning = rate > TURNING
+    turning = rate > STRAIGHT_RATE
     if not turning.any():
         return Rates(0.0, 0.0)
     order = np.argsort(rate[turning])
     share = np.cumsum(turned[turning][order]) / turned[turning].sum()
-    fastest = rate[turning][order][int(np.searchsorted(share, FASTEST))]
+    fastest = rate[turning][order][int(np.searchsorted(share, FASTEST_QUANTILE))]
     mean = float(rate[turning] @ turned[turning] / turned[turning].sum())
     return Rates(mean, float(fastest))
 
@@ -375,7 +378,7 @@ def level(rows: Rows) -> Rows:
 
 def _fast(run: Run) -> Floats:
     apart = run.speed_difference(run.t)
-    steps = np.minimum(np.diff(run.t), ROW_S)
+    steps = np.minimum(np.diff(run.t), INTERVAL_S)
     return _sums(np.abs(apart) * apart, steps)
 
 
@@ -408,7 +411,7 @@ def evidence(rows: Rows, base: Base, parameters: Floats, blocks: int) -> Evidenc
     """
     turn = parameters[P.INVERSE_TRACK]
     by_wheels = turned(rows, base, parameters)
-    jacobian = np.zeros((len(rows.turned), COUNT))
+    jacobian = np.zeros((len(rows.turned), PARAMETER_COUNT))
     jacobian[:, P.LEFT] = -base.gain * turn * rows.left
     jacobian[:, P.RIGHT] = base.gain * turn * rows.right
     jacobian[:, P.TRACK_GROWTH] = _by_growth(rows, base, parameters)

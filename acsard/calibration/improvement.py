@@ -16,22 +16,22 @@ import numpy.typing as npt
 from msgspec import Struct
 
 from acsard.calibration.fit import Base, Fit, P, student_factor
-from acsard.calibration.heading import TURNING, Rates, Rows, turned
+from acsard.calibration.heading import STRAIGHT_RATE, Rates, Rows, turned
 from acsard.calibration.log_table import Floats
 from acsard.calibration.positions import Segment, WheelSteps, path, segments, spread
 from acsard.calibration.runs import Block, Mask, Run, cumulative
 
 FOLDS = 5
-LEAST_RUNS = 3
+MIN_RUNS = 3
 """Minimum number of runs at which the cross-validation leaves out whole runs.
 
 If a log has fewer runs, the cross-validation leaves out a fifth of the log at a time (`FOLDS`).
 """
 
-STRAIGHT = 0.1
+MAX_STRAIGHT_CURVATURE = 0.1
 """Curvature of the path according to the wheels, rad/m, below which the path counts as straight."""
 
-STRAIGHT_M = 1.0
+MIN_STRAIGHT_M = 1.0
 """Minimum total distance of straight driving in a log, m.
 
 If a log has less, the heading error per 10 m is not computed, because it would be only noise.
@@ -48,12 +48,12 @@ class BeforeAfter(Struct, frozen=True):
     after: float | None
 
 
-NOTHING = BeforeAfter(None, None)
+NOT_COMPARED = BeforeAfter(None, None)
 
-SURE = 2.0
+SURE_DEVIATIONS = 2.0
 """Smallest ratio of a gain to its standard deviation at which the gain counts as sure (95 %)."""
 
-HALVED = float(np.log(2.0))
+SURE_GAIN = float(np.log(2.0))
 """Value of `Improvement.gain` if the calibration halves one error.
 
 A larger gain always counts as sure. In a guided drive, one leg may show nearly all of the error.
@@ -68,7 +68,7 @@ needed to accept the new multipliers becomes smaller: at twice `FAR`, half of it
 chance alone, the distance exceeds `FAR` in one log of thirty.
 """
 
-LEAST_SQUARE = 1e-9
+MIN_SQUARE = 1e-9
 """Constant, m2 or deg2, that is added to sums of squared errors so that their logarithm exists."""
 
 
@@ -103,11 +103,11 @@ class Improvement(Struct, frozen=True):
     @property
     def sure(self) -> bool:
         """Whether the new multipliers are better by more than chance explains."""
-        least = SURE * self.chance * min(1.0, FAR / max(NEAR, self.apart))
-        return self.apart > NEAR and self.gain > min(least, HALVED)
+        least = SURE_DEVIATIONS * self.chance * min(1.0, FAR / max(NEAR, self.apart))
+        return self.apart > NEAR and self.gain > min(least, SURE_GAIN)
 
 
-UNMEASURED = Improvement(NOTHING, NOTHING, NOTHING, NOTHING)
+UNMEASURED = Improvement(NOT_COMPARED, NOT_COMPARED, NOT_COMPARED, NOT_COMPARED)
 
 
 class Fold(Struct, frozen=True):
@@ -122,10 +122,10 @@ class Fold(Struct, frozen=True):
 def drives(driven: Sequence[Run]) -> list[Block]:
     """Return the parts of the log that the cross-validation leaves out, one at a time.
 
-    A part is a whole run, or a fifth of the log if the log has fewer than `LEAST_RUNS` runs.
+    A part is a whole run, or a fifth of the log if the log has fewer than `MIN_RUNS` runs.
     """
     longest = np.inf
-    if len(driven) < LEAST_RUNS:
+    if len(driven) < MIN_RUNS:
         longest = sum(float(run.t[-1]) for run in driven) / FOLDS
     found = []
     for number, run in enumerate(driven):
@@ -198,19 +198,19 @@ def improvement(
         out = fold.blocks[rows.block]
         after[out] = (rows.turned - turned(rows, base, fold.parameters))[out]
     measured = rows.turned != 0.0
-    turning = np.abs(rows.turned) > TURNING * rows.seconds
+    turning = np.abs(rows.turned) > STRAIGHT_RATE * rows.seconds
     distance = base.radius * np.abs(rows.left + rows.right) / 2
-    straight = ~turning & measured & (np.abs(by_wheels) < STRAIGHT * distance)
+    straight = ~turning & measured & (np.abs(by_wheels) < MAX_STRAIGHT_CURVATURE * distance)
     block_and_side = 2 * rows.block + (rows.turned > 0.0)
     angle, metres = float(np.abs(rows.turned[turning]).sum()), float(distance[straight].sum())
-    if metres < STRAIGHT_M:
+    if metres < MIN_STRAIGHT_M:
         metres = 0.0
     squares = [_of_headings(held, before, after, rows)] if measured.any() else []
     squares += [_of_positions(held, configured, base, places, steps)] if steps else []
     gain, chance = _gain(squares)
     of_heading, of_place = (
-        rms(squares[0].sum(axis=0)) if measured.any() else NOTHING,
-        rms(squares[-1].sum(axis=0)) if steps else NOTHING,
+        rms(squares[0].sum(axis=0)) if measured.any() else NOT_COMPARED,
+        rms(squares[-1].sum(axis=0)) if steps else NOT_COMPARED,
     )
     return Improvement(
         per_amount(_by_group(before, after, block_and_side, turning, angle), 360.0),
@@ -227,7 +227,7 @@ def rms(sums: Floats) -> BeforeAfter:
     """
     before, after, count = sums.tolist()
     if not count:
-        return NOTHING
+        return NOT_COMPARED
     return BeforeAfter(float(np.sqrt(before / count)), float(np.sqrt(after / count)))
 
 
@@ -241,7 +241,7 @@ def per_amount(sums: Floats, unit: float) -> BeforeAfter:
     """
     before, after, amount = sums.tolist()
     if not amount:
-        return NOTHING
+        return NOT_COMPARED
     return BeforeAfter(float(unit * before / amount), float(unit * after / amount))
 
 
@@ -256,7 +256,7 @@ def _gain(kinds: Sequence[Floats]) -> tuple[float, float]:
         return 0.0, np.inf
 
     def gain(left: Mask) -> float:
-        sums = [squares[left].sum(axis=0) + LEAST_SQUARE for squares in kinds]
+        sums = [squares[left].sum(axis=0) + MIN_SQUARE for squares in kinds]
         return float(sum(np.log(before / after) for before, after, _ in sums) / 2)
 
     return with_chance(gain, drives)

@@ -72,14 +72,14 @@ Floats = npt.NDArray[np.float64]
 WHEELS = ("fr", "fl", "rl", "rr", "left", "right")
 
 BOUNDS = dict.fromkeys(WHEELS, 1e3) | {"t": 1e20, "yaw_rate": 1e4, "yaw": 1e7}
-PLACE_BOUND = 1e9
+DEFAULT_BOUND = 1e9
 """Largest plausible absolute value in a column that `BOUNDS` does not list, in SI units.
 
 This limit and those in `BOUNDS` also allow values in degrees or nanoseconds, so that later checks
 can name the wrong unit.
 """
 
-RATES = frozenset((*WHEELS, "yaw_rate"))
+SPIKE_COLUMNS = frozenset((*WHEELS, "yaw_rate"))
 """Columns of wheel speeds and turn rates. Spikes are removed only from these columns."""
 
 SPIKE, FEW_VALUES, SLOW = 10.0, 0.02, 0.02
@@ -99,8 +99,8 @@ def bounded(columns: dict[str, Floats]) -> Iterator[str]:
     order = np.argsort(columns["t"], kind="stable")
     for name, values in columns.items():
         with np.errstate(invalid="ignore"):
-            wild = np.abs(values) > BOUNDS.get(name, PLACE_BOUND)
-        if name in RATES:
+            wild = np.abs(values) > BOUNDS.get(name, DEFAULT_BOUND)
+        if name in SPIKE_COLUMNS:
             wild |= spikes(np.where(wild, math.nan, values), order)
         if wild.any():
             example = float(values[wild][0])
@@ -147,20 +147,20 @@ FOUR, TWO = ("fr", "fl", "rl", "rr"), ("left", "right")
 `FOUR` has a column for each wheel. `TWO` has a column for the mean speed of each side.
 """
 
-NUMBERS = ("t", *FOUR, *TWO, "yaw_rate", "x", "y", "yaw", *APPLIED)
-COLUMNS = (*NUMBERS, "run")
-"""Columns that a log can have: `NUMBERS`, and the column with the name of the run."""
+NUMBER_COLUMNS = ("t", *FOUR, *TWO, "yaw_rate", "x", "y", "yaw", *APPLIED)
+COLUMNS = (*NUMBER_COLUMNS, "run")
+"""Columns that a log can have: `NUMBER_COLUMNS`, and the column with the name of the run."""
 
-MISSING = frozenset(("", "nan", "-nan(ind)", "null", "none", "na", "n/a", "#n/a", "-", "--"))
+EMPTY_CELLS = frozenset(("", "nan", "-nan(ind)", "null", "none", "na", "n/a", "#n/a", "-", "--"))
 """Contents of a cell without a value, in lower case."""
 
-COUNTS = re.compile(r"tick|count|(?:^|_)enc")
+COUNT_COLUMN = re.compile(r"tick|count|(?:^|_)enc")
 """Pattern for names of columns with encoder counts, which the user must convert to speeds."""
 
-COMMENTS = ("#", "%")
+COMMENT_MARKS = ("#", "%")
 """Characters with which a comment line above the table begins."""
 
-BEHIND = re.compile(r"(?:^|\s)#")
+TRAILING_COMMENT = re.compile(r"(?:^|\s)#")
 """Pattern for the start of a comment after a number.
 
 It does not match the "#" in "1.#QNAN", which means NaN.
@@ -174,7 +174,7 @@ At most `FEW` rows may be unreadable, or the fraction `SHARE` of the readable ro
 
 EXAMPLE = '"t,left,right,yaw_rate" or "t,fr,fl,rl,rr,x,y"'
 
-AS_CSV = f"export the drive as a CSV file whose first line names the columns, like {EXAMPLE}"
+CSV_ADVICE = f"export the drive as a CSV file whose first line names the columns, like {EXAMPLE}"
 
 
 class LogError(AcsardError):
@@ -238,7 +238,7 @@ def _text(data: bytes) -> str:
         if data.startswith(mark):
             return data.decode(coding, errors="replace")
     if b"\0" in data[:4096]:
-        raise LogError(f"the file is not text (perhaps a ROS bag): {AS_CSV}")
+        raise LogError(f"the file is not text (perhaps a ROS bag): {CSV_ADVICE}")
     return data.decode("utf-8-sig", errors="replace")
 
 
@@ -251,7 +251,7 @@ def _header(lines: Sequence[str]) -> tuple[int, list[tuple[str, str]], str]:
     comment = ""
     for at, line in enumerate(lines):
         text = line.strip()
-        if text.startswith(COMMENTS):
+        if text.startswith(COMMENT_MARKS):
             comment = text.strip("#% \t") or comment
         elif text and not text.lower().startswith("sep="):  # `sep=` is a hint for spreadsheets
             separator = _separator(text)
@@ -289,7 +289,7 @@ def _is_number(cell: str) -> bool:
     try:
         float(cell)
     except ValueError:
-        return cell.lower() in MISSING
+        return cell.lower() in EMPTY_CELLS
     return True
 
 
@@ -328,7 +328,7 @@ def _near(names: Sequence[str], header: Sequence[str]) -> str:
     others = [name for name in header if name and name not in COLUMNS]
     if "t" in names and (times := [name for name in others if "time" in name or "stamp" in name]):
         return f" (if column {times[0][:40]} is the time, rename it to t and convert it to seconds)"
-    if counts := [name for name in others if COUNTS.search(name)]:
+    if counts := [name for name in others if COUNT_COLUMN.search(name)]:
         return (
             f" (column {counts[0][:40]} has counts, not speeds: convert the counts of each row to "
             "rad/s with 2 pi x counts / (counts per turn x seconds))"
@@ -408,7 +408,7 @@ class _Reader:
         for i, cell in enumerate(cells):
             if i == self._run or (i < self._last and i not in self._picks):
                 continue
-            if cell.lower() not in MISSING and (comment := BEHIND.search(cell)):
+            if cell.lower() not in EMPTY_CELLS and (comment := TRAILING_COMMENT.search(cell)):
                 return [*cells[:i], cell[: comment.start()]]
         return cells
 
@@ -423,7 +423,7 @@ class _Reader:
         row = []
         for i in self._picks:
             cell = cells[i].strip()
-            if cell.lower() in MISSING:
+            if cell.lower() in EMPTY_CELLS:
                 row.append(math.nan)
                 continue
             try:

@@ -21,7 +21,7 @@ SEPARATION, LEFT_RADIUS, RIGHT_RADIUS = range(3)
 """Indices into `Multipliers.values` and `Multipliers.covariance`."""
 
 
-SAME = 1e-4
+NO_CHANGE = 1e-4
 """Difference between two multipliers that is too small to matter."""
 
 
@@ -75,7 +75,7 @@ class Multipliers(Struct, frozen=True):
         nothing.
         """
         off = self.values - (base.track, base.left, base.right)
-        return math.sqrt(off @ np.linalg.solve(self.covariance + SAME**2 * np.eye(3), off))
+        return math.sqrt(off @ np.linalg.solve(self.covariance + NO_CHANGE**2 * np.eye(3), off))
 
     def own(self) -> Deviations:
         """Return the relative standard deviations of track, ratio of the radii and mean radius.
@@ -115,7 +115,7 @@ def multipliers(parameters: Floats, covariance: Floats, rate: Rates) -> Multipli
     return Multipliers(values, jacobian @ covariance @ jacobian.T)
 
 
-TAPE_M = 0.01
+TAPE_STD_M = 0.01
 """Standard deviation of a distance that a person measures by tape, m.
 
 It includes the error of choosing the point on the robot to measure.
@@ -128,13 +128,13 @@ If the difference exceeds the fraction `CONTRADICTS` of the distance and also ex
 `CONTRADICTS_STD` standard deviations, one of the two distances is wrong.
 """
 
-UNKNOWN = 1.0
+UNKNOWN_SIZE_STD = 1.0
 """Standard deviation of the logarithm of the wheels' size if no measurement has shown the size."""
 
-LEAST_M = 0.5
+MIN_TAPE_M = 0.5
 """Shortest distance between start and end of a run, m, that a person may measure by tape."""
 
-STRAIGHT = 0.8
+MIN_STRAIGHTNESS = 0.8
 """Smallest `Extent.straight` of a run whose distance a person may measure by tape."""
 
 
@@ -156,8 +156,9 @@ class Extent(Struct, frozen=True):
 
     @property
     def straight(self) -> float:
-        """`distance` / `length`, which is 1 for a straight path; 0 if `distance` <= `LEAST_M`."""
-        return self.distance / self.length if self.distance > LEAST_M else 0.0
+        """`distance` / `length`, which is 1 for a straight path; 0 if `distance` <=
+        `MIN_TAPE_M`."""
+        return self.distance / self.length if self.distance > MIN_TAPE_M else 0.0
 
 
 Follow = Callable[[Floats, int], Extent]
@@ -196,7 +197,7 @@ def scaled(
     extents = {number: follow(found.values, number) for number in numbers}
     best = max(extents, key=lambda number: extents[number].straight)
     extent = extents[best]
-    if extent.straight < STRAIGHT:
+    if extent.straight < MIN_STRAIGHTNESS:
         raise RefusedError(
             f"--distance: run {names[best]} ends {extent.distance:.2f} m from its start, and its "
             f"path is {extent.length:.2f} m long, so it is too short or not straight enough: drive "
@@ -212,8 +213,8 @@ def scaled(
     logs = np.diag(1 / found.values)
     covariance = logs @ found.covariance @ logs
     if not known:
-        covariance = covariance + UNKNOWN**2
-    noise = (TAPE_M / tape.metres) ** 2
+        covariance = covariance + UNKNOWN_SIZE_STD**2
+    noise = (TAPE_STD_M / tape.metres) ** 2
     variance = float(jacobian @ covariance @ jacobian + noise)
     longer_by = math.log(tape.metres / extent.distance)
     if known and abs(longer_by) > max(CONTRADICTS, CONTRADICTS_STD * math.sqrt(variance)):

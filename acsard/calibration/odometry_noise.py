@@ -21,7 +21,7 @@ from msgspec import Struct
 
 from acsard.calibration.fit import Base, P, student_factor
 from acsard.calibration.heading import Heading, Headings
-from acsard.calibration.improvement import SURE, Fold, positions_of, with_chance
+from acsard.calibration.improvement import SURE_DEVIATIONS, Fold, positions_of, with_chance
 from acsard.calibration.log_table import Floats
 from acsard.calibration.multipliers import Deviations
 from acsard.calibration.plausibility import RATIO, TRACK
@@ -69,10 +69,10 @@ class Source(IntEnum):
     """Variance of a measured coordinate, m2."""
 
 
-COUNT = len(Source)
-SENSORS = np.arange(COUNT) > Source.TRACK
-RATES = np.arange(COUNT) < Source.SLIP
-START = np.array([1e-4, 1e-4, 1e-3, 1e-4, 1e-6, 1e-4, 1e-5, 1e-6, 1e-4])
+SOURCE_COUNT = len(Source)
+SENSOR_SOURCES = np.arange(SOURCE_COUNT) > Source.TRACK
+ROLLING_SOURCES = np.arange(SOURCE_COUNT) < Source.SLIP
+INITIAL_NOISE = np.array([1e-4, 1e-4, 1e-3, 1e-4, 1e-6, 1e-4, 1e-5, 1e-6, 1e-4])
 """Noise of each `Source` from which the search starts. The numbers only have to be positive."""
 
 WINDOW_S, APART_S = 32.0, 4.0
@@ -81,26 +81,26 @@ WINDOW_S, APART_S = 32.0, 4.0
 A drive that is shorter than a window has one window of its own length.
 """
 
-LEAST = 4
+MIN_INTERVALS = 4
 """Minimum number of intervals between the residuals of a window.
 
 If the window is short, these intervals are shorter than `APART_S`.
 """
 
-MOST_WINDOWS = 80
+MAX_WINDOWS = 80
 """Maximum number of windows that are used.
 
 If a log has more windows, only every n-th window is used.
 """
 
-FINE_S = 0.5
+STEP_S = 0.5
 """Duration of the steps into which a window is divided, s.
 
 The sources `SLIP`, `RATIO` and `TRACK` cause the same relative error in all steps of a window.
 Errors from other sources are independent from step to step.
 """
 
-MOST_FOLDS = 10
+MAX_FOLDS = 10
 """Maximum number of groups into which the drives are divided for the cross-validation.
 
 Each group is left out once, which takes two searches.
@@ -112,13 +112,13 @@ STEPS, FEWER_STEPS = 150, 60
 `FEWER_STEPS` suffices for a search that starts from the noise of the whole log.
 """
 
-OUTLIER = 9.0
+OUTLIER_LIMIT = 9.0
 """Mean square of a window's normalized residuals, above which the window weighs less."""
 
-ROUNDING = 1e-12
+MIN_VARIANCE = 1e-12
 """Variance added to each residual, so that even a perfect sensor's covariance can be inverted."""
 
-FLOOR = 0.25
+MIN_NOISE_RATIO = 0.25
 """Minimum for the noise of `DISTANCE`, `YAW` and `SKID`, in standard deviations of its estimate.
 
 In a short log, the fit often finds a noise of 0. Without the minimum, the odometry would then state
@@ -127,27 +127,27 @@ that the pose is exact.
 
 # A window does not show whether an error lasts longer than the window. Without this minimum, the
 # pose covariance of one robot in eight was singular.
-CHANGES = 0.1
+MIN_CHANGING_FRACTION = 0.1
 """Minimum for the noise of `DISTANCE`, as a fraction of the noise of `SLIP`.
 
 In the same way, `RATIO` gives the minimum for `YAW`, and `TRACK` gives the minimum for `SKID`.
 `Windows.lasting` first converts the noise of one source to the unit of the other.
 """
 
-TWICE = math.log(2.0) - 3 / 8
+CERTAIN_GAIN = math.log(2.0) - 3 / 8
 """Value of `Noise.gain` above which the new noise always counts as better.
 
 The value is the mean loss of log likelihood per residual if each standard deviation is stated at
 twice its true value. Above this value, a large `Noise.chance` does not matter.
 """
 
-MOST = 1.0
+MAX_SETTING = 1.0
 """Largest value of a proposed setting. Larger values are reduced to this one.
 
 The configuration accepts this value.
 """
 
-METRES = 10.0
+REPORT_DISTANCE_M = 10.0
 """Distance, m, after which the report states how uncertain heading and distance are due to noise.
 """
 
@@ -177,7 +177,7 @@ class Windows(Struct, frozen=True):
     effects: Floats
     """Covariance of the residuals that each source alone causes if its noise is 1.
 
-    The shape is (windows, COUNT, n, n).
+    The shape is (windows, SOURCE_COUNT, n, n).
     """
     known: Floats
     """Covariance of the residuals due to the uncertain geometry and the uncertain gyro bias.
@@ -210,12 +210,12 @@ class Windows(Struct, frozen=True):
         The search starts from the noise `start` and takes `steps` steps. Sources outside the mask
         `free` keep the noise that they have in `start`.
         """
-        noise, flat = start.copy(), np.moveaxis(self.effects, 1, 0).reshape(COUNT, -1)
+        noise, flat = start.copy(), np.moveaxis(self.effects, 1, 0).reshape(SOURCE_COUNT, -1)
         for _ in range(steps):
             inverse = np.linalg.inv(self.covariance(noise))
             scores = np.einsum("wij,wj->wi", inverse, self.residual)
             squares = np.einsum("wi,wi->w", scores, self.residual)
-            weight = np.minimum(1.0, OUTLIER * self.size / np.maximum(squares, 1e-300))
+            weight = np.minimum(1.0, OUTLIER_LIMIT * self.size / np.maximum(squares, 1e-300))
             seen = flat @ np.einsum("w,wi,wj->wij", weight, scores, scores).ravel()
             expected = flat @ inverse.ravel()
             used = free & (expected > 0.0)
@@ -225,18 +225,23 @@ class Windows(Struct, frozen=True):
     def at_least(self, noise: Floats) -> Floats:
         """Return `noise`, increased so that it is not too small for other drives.
 
-        `FLOOR` and `CHANGES` give minima. If few residuals show the noise of `DISTANCE`, `YAW` or
-        `SKID`, this noise is also increased like the variance of Student's t.
+        `MIN_NOISE_RATIO` and `MIN_CHANGING_FRACTION` give minima. If few residuals show the noise
+        of `DISTANCE`, `YAW` or `SKID`, this noise is also increased like the variance of Student's
+        t.
         """
         # Windows overlap by half, so each residual counts as half a degree of freedom.
         shares = np.linalg.inv(self.covariance(noise))[:, None] @ self.effects
         free = noise * np.einsum("wkii->k", shares) / 2
-        noise = np.where(RATES, noise * student_factor(free), noise)
+        noise = np.where(ROLLING_SOURCES, noise * student_factor(free), noise)
         information = np.einsum("wkij,wkji->k", shares, shares) / 2
-        least = np.where(information > 0.0, FLOOR / np.sqrt(np.maximum(information, 1e-300)), 0.0)
+        least = np.where(
+            information > 0.0, MIN_NOISE_RATIO / np.sqrt(np.maximum(information, 1e-300)), 0.0
+        )
         least[Source.SLIP :] = 0.0
         lasting = noise[[Source.SLIP, Source.RATIO, Source.TRACK]]
-        least[: Source.SLIP] = np.maximum(least[: Source.SLIP], CHANGES * self.lasting * lasting)
+        least[: Source.SLIP] = np.maximum(
+            least[: Source.SLIP], MIN_CHANGING_FRACTION * self.lasting * lasting
+        )
         return np.asarray(np.maximum(noise, least))
 
     def likelihood(self, noise: Floats) -> Floats:
@@ -247,7 +252,7 @@ class Windows(Struct, frozen=True):
         covariance = self.covariance(noise)
         solved = np.linalg.solve(covariance, self.residual[:, :, None])[:, :, 0]
         squares = np.einsum("wi,wi->w", solved, self.residual)
-        squares = np.minimum(squares, OUTLIER * self.size)
+        squares = np.minimum(squares, OUTLIER_LIMIT * self.size)
         return np.asarray(-(np.linalg.slogdet(covariance)[1] + squares) / 2)
 
 
@@ -275,17 +280,18 @@ class Noise(Struct, frozen=True):
     @property
     def better(self) -> bool:
         """Whether the found noise describes other drives clearly better than the configured one."""
-        return self.gain > min(SURE * self.chance, TWICE)
+        return self.gain > min(SURE_DEVIATIONS * self.chance, CERTAIN_GAIN)
 
     def heading(self) -> tuple[float, float]:
-        """Return the standard deviations of the heading after `METRES` m of driving, rad.
+        """Return the standard deviations of the heading after `REPORT_DISTANCE_M` m of driving,
+        rad.
 
         The first number is due to the configured noise, the second number to the found noise.
         """
         return self._after(Source.YAW, Source.RATIO, Source.SKID)
 
     def distance(self) -> tuple[float, float]:
-        """Return the standard deviations of the distance after `METRES` m of driving, m.
+        """Return the standard deviations of the distance after `REPORT_DISTANCE_M` m of driving, m.
 
         The first number is due to the configured noise, the second number to the found noise.
         """
@@ -294,8 +300,9 @@ class Noise(Struct, frozen=True):
     def _after(self, rate: Source, lasting: Source, skid: Source | None) -> tuple[float, float]:
         now, then = (
             math.sqrt(
-                METRES * (x[rate] + (self.turning * x[skid] if skid is not None else 0.0))
-                + METRES**2 * x[lasting] / (self.track**2 if skid is not None else 1.0)
+                REPORT_DISTANCE_M
+                * (x[rate] + (self.turning * x[skid] if skid is not None else 0.0))
+                + REPORT_DISTANCE_M**2 * x[lasting] / (self.track**2 if skid is not None else 1.0)
             )
             for x in (self.present, self.found)
         )
@@ -317,7 +324,7 @@ def settings(
         shown: the noise that the log shows, or None if the noise settings stay as configured.
         scaled: whether the size of the wheels was measured.
     """
-    found, x = {}, np.zeros(COUNT) if shown is None else shown.found
+    found, x = {}, np.zeros(SOURCE_COUNT) if shown is None else shown.found
     if TRACK not in kept or shown is not None:
         std = math.hypot(known.track, math.sqrt(x[Source.TRACK]))
         found["wheel_separation_multiplier_std"] = track * std
@@ -335,7 +342,7 @@ def settings(
         if shown.places:
             found["distance_variance_per_metre"] = float(x[Source.DISTANCE])
             found["wheel_slip_std"] = math.sqrt(x[Source.SLIP])
-    return {name: min(value, MOST) for name, value in found.items()}
+    return {name: min(value, MAX_SETTING) for name, value in found.items()}
 
 
 class Reference(Struct, frozen=True):
@@ -369,21 +376,21 @@ def noise(
     windows = _windows(held, seen, known, motions)
     if windows is None or len(np.unique(windows.drive)) < 2:
         return None
-    present = START.copy()
+    present = INITIAL_NOISE.copy()
     present[: Source.HEADING] = (
         odometry.distance_variance_per_metre, odometry.yaw_variance_per_metre,
         odometry.yaw_variance_per_radian, odometry.wheel_slip_std**2, 0.0, 0.0,
     )  # fmt: skip
-    every = np.ones(COUNT, dtype=bool)
-    found = windows.search(START, every)
-    by_present = windows.search(present, SENSORS)
+    every = np.ones(SOURCE_COUNT, dtype=bool)
+    found = windows.search(INITIAL_NOISE, every)
+    by_present = windows.search(present, SENSOR_SOURCES)
     gains: list[tuple[float, float]] = []
-    fold = np.unique(windows.drive, return_inverse=True)[1] % MOST_FOLDS
+    fold = np.unique(windows.drive, return_inverse=True)[1] % MAX_FOLDS
     for number in range(fold.max() + 1):
         out = fold == number
         rest, tested = windows.of(~out), windows.of(out)
         then = rest.at_least(rest.search(found, every, FEWER_STEPS))
-        now = rest.search(by_present, SENSORS, FEWER_STEPS)
+        now = rest.search(by_present, SENSOR_SOURCES, FEWER_STEPS)
         more = tested.likelihood(then) - tested.likelihood(now)
         gains.append((float(more.sum()), float(tested.size.sum())))
     found = windows.at_least(found)
@@ -417,7 +424,7 @@ class _Motion(Struct, frozen=True):
 
     @classmethod
     def of(cls, t: Floats, way: Path, track: float) -> _Motion:
-        count = max(1, round((t[-1] - t[0]) / FINE_S))
+        count = max(1, round((t[-1] - t[0]) / STEP_S))
         edges = np.linspace(t[0], t[-1], count + 1)
         heading, place = np.interp(edges, way.t, way.heading), np.interp(edges, way.t, way.place)
         turn = np.diff(heading)
@@ -460,7 +467,7 @@ class _Window(Struct, frozen=True):
         """
         distance, turn, track = self.motion.distance, self.motion.turn, self.motion.track
         sides = np.maximum(np.abs(distance), track / 2 * np.abs(turn))
-        effects = np.zeros((COUNT, len(self.residual), len(self.residual)))
+        effects = np.zeros((SOURCE_COUNT, len(self.residual), len(self.residual)))
         effects[Source.DISTANCE] = (self.along * np.abs(distance)) @ self.along.T
         effects[Source.YAW] = (self.yaw * sides) @ self.yaw.T
         effects[Source.SKID] = (self.yaw * np.abs(turn)) @ self.yaw.T
@@ -491,7 +498,7 @@ def _windows(
         for window in _of_drive(fold, seen):
             motions.append(window.motion)
             rows.append((number, *window.projected(known)))
-    rows = rows[:: 1 + len(rows) // MOST_WINDOWS]
+    rows = rows[:: 1 + len(rows) // MAX_WINDOWS]
     if not rows:
         return None
     most = max(len(residual) for _, residual, _, _ in rows)
@@ -500,14 +507,14 @@ def _windows(
     made = Windows(
         np.array([number for number, *_ in rows]),
         np.array([float(len(residual)) for _, residual, *_ in rows]),
-        np.zeros((len(rows), most)), np.zeros((len(rows), COUNT, most, most)),
+        np.zeros((len(rows), most)), np.zeros((len(rows), SOURCE_COUNT, most, most)),
         np.tile(np.eye(most), (len(rows), 1, 1)), lasting,
     )  # fmt: skip
     for at, (_, residual, effects, sure_of) in enumerate(rows):
         size = len(residual)
         made.residual[at, :size] = residual
         made.effects[at, :, :size, :size] = effects
-        made.known[at, :size, :size] = sure_of + ROUNDING * np.eye(size)
+        made.known[at, :size, :size] = sure_of + MIN_VARIANCE * np.eye(size)
     return made
 
 
@@ -539,7 +546,7 @@ def _times(begin: float, end: float) -> Iterator[Floats]:
     if whole > 0.0:
         count = max(1, round(2 * (end - begin) / WINDOW_S) - 1)
         for first in np.linspace(begin, end - whole, count):
-            yield np.linspace(first, first + whole, max(LEAST, round(whole / APART_S)) + 1)
+            yield np.linspace(first, first + whole, max(MIN_INTERVALS, round(whole / APART_S)) + 1)
 
 
 def _by_headings(

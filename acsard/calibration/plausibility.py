@@ -12,66 +12,66 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from acsard.calibration import heading
-from acsard.calibration.fit import LEAST_BLOCKS, Base, Fit, P, condition
+from acsard.calibration.fit import MIN_BLOCKS, Base, Fit, P, condition
 from acsard.calibration.heading import Rows
 from acsard.calibration.log_table import Floats, RefusedError
 from acsard.calibration.multipliers import Multipliers
 from acsard.calibration.positions import StartingPoint
 from acsard.calibration.runs import Block
 
-LEAST_ANGLE = 2 * np.pi
+MIN_TOTAL_TURN = 2 * np.pi
 """Minimum total turn of the robot in a log, rad. Left turns and right turns are added."""
 
-LEAST_ROLL = 3.0
+MIN_ROLL = 3.0
 """Minimum angle that the wheels must roll in a log, rad.
 
 The limit applies to the mean of the left and the right angle, and also to half of their
 difference. The absolute values of all intervals are added.
 """
 
-ALIKE = 0.98
+MAX_CORRELATION = 0.98
 """Largest squared correlation between the mean and the difference of left and right motion.
 
 If it is larger, the robot drives the same curve all the time, and the log is refused.
 """
 
-WORST = 0.2, 0.03
+MAX_STDS = 0.2, 0.03
 """Largest accepted relative standard deviations of the track and of the ratio of the radii."""
 
-WORST_CONDITION = 1e4
+MAX_CONDITION = 1e4
 """Largest condition number of the normal equations at which radii and track can be separated."""
 
-DRIVE = (
+DRIVE_ADVICE = (
     "record a drive of 60 s: stand for 3 s, drive 2 m straight ahead and back, make three full "
     "turns to the left and three to the right, some slow and some fast, then drive curves both ways"
 )
 
-UNLIKE = 0.5
+MAX_CONTRADICTION = 0.5
 """Largest fraction of a sensor's motion (sum of squares) that the wheels may leave unexplained."""
 
-UNITS = 8.0
+WRONG_UNIT_RATIO = 8.0
 """Largest credible ratio of a measured value to a configured one. Above it, a unit is wrong."""
 
-LEAST_TURN = 0.2
+MIN_TURN_RATIO = 0.2
 """Smallest credible ratio of the measured turn to the turn that the configured wheels predict.
 
 Skidding does not explain a smaller ratio. The wheel speeds are then probably in rpm.
 """
 
-FAR_SIZE = 2e-3
+WRONG_POSITION_UNIT_RATIO = 2e-3
 """Limit for the ratio of the measured wheel radius to the configured wheel radius.
 
-Below `FAR_SIZE`, the positions have a wrong unit. From `FAR_SIZE` to 1 / `UNITS`, the wheel speeds
-have a wrong unit.
+Below `WRONG_POSITION_UNIT_RATIO`, the positions have a wrong unit. From `WRONG_POSITION_UNIT_RATIO`
+to 1 / `WRONG_UNIT_RATIO`, the wheel speeds have a wrong unit.
 """
 
-FASTEST_TURN = 12.0
+MAX_TURN_RATE = 12.0
 """Largest credible turn rate of a heading sensor, rad/s (two turns in a second).
 
 A larger value is probably in deg/s.
 """
 
-LEAST_CHI = 0.4
+MIN_TRACK_RATIO = 0.4
 """Smallest credible ratio of effective track to wheel separation. Skidding only makes it larger."""
 
 LEAST_FACTOR, MOST_FACTOR = 0.1, 10.0
@@ -87,16 +87,16 @@ synchronize the clocks.
 LARGE_BIAS = 0.05
 """Gyro bias, rad/s, above which the bias is reported."""
 
-ONE_SIDED = 0.1
+ONE_SIDED_RATIO = 0.1
 """Limit for the ratio of the turns to one side to the turns to the other side.
 
 If the ratio is smaller, a remark says that nearly all turns are to one side.
 """
 
-ODD_SIZE = 1.25
+REPORTED_SIZE_RATIO = 1.25
 """Factor between measured and configured wheel radius above which a remark states this factor."""
 
-ODD_RATIO = 1.1
+REPORTED_RADIUS_RATIO = 1.1
 """Ratio of the larger to the smaller wheel radius above which a remark calls it unusual."""
 
 LEAST_TRACK, MOST_TRACK = 0.85, 3.0
@@ -108,34 +108,36 @@ A remark states any other ratio.
 
 def drives_enough(parts: Sequence[Block]) -> None:
     """Raise `RefusedError` if the log has too few blocks (of a few seconds of driving each)."""
-    if len(parts) < LEAST_BLOCKS:
+    if len(parts) < MIN_BLOCKS:
         seconds = sum(part.end - part.begin for part in parts)
-        raise RefusedError(f"the wheels turn for only {seconds:.0f} s, which is too short: {DRIVE}")
+        raise RefusedError(
+            f"the wheels turn for only {seconds:.0f} s, which is too short: {DRIVE_ADVICE}"
+        )
 
 
 def rolls_enough(rows: Rows, *, spins: bool = False) -> None:
     """Raise `RefusedError` if the log lacks a movement of the wheels that the fit needs.
 
     Two angles are computed in each interval of `rows`: the mean of the left and the right angle,
-    and half of their difference. Each angle must add up to `LEAST_ROLL`. The two angles must not
-    be proportional to each other (`ALIKE`). If `spins` is true, a log with only turns in place, in
-    which the mean is nearly 0, is accepted too.
+    and half of their difference. Each angle must add up to `MIN_ROLL`. The two angles must not
+    be proportional to each other (`MAX_CORRELATION`). If `spins` is true, a log with only turns in
+    place, in which the mean is nearly 0, is accepted too.
     """
     together, against = (rows.right + rows.left) / 2, (rows.right - rows.left) / 2
     for rolled, what in ((together, "ahead or back"), (against, "in opposite directions")):
-        if (turns := float(np.abs(rolled).sum()) / (2 * np.pi)) < LEAST_ROLL / (2 * np.pi):
+        if (turns := float(np.abs(rolled).sum()) / (2 * np.pi)) < MIN_ROLL / (2 * np.pi):
             if spins and what == "ahead or back":
                 continue
             raise RefusedError(
                 f"in the whole log, the wheels of the two sides roll only {turns:.1f} revolutions "
                 f"{what}, which is too little to measure the wheel radii and the effective track: "
-                f"{DRIVE}"
+                f"{DRIVE_ADVICE}"
             )
         cross = float(together @ against) ** 2
-        if cross > ALIKE * float(together @ together) * float(against @ against):
+        if cross > MAX_CORRELATION * float(together @ together) * float(against @ against):
             raise RefusedError(
                 "the robot always drives the same curve, so the log cannot separate errors of the "
-                f"wheel radii from errors of the track width: {DRIVE}"
+                f"wheel radii from errors of the track width: {DRIVE_ADVICE}"
             )
 
 
@@ -144,10 +146,10 @@ def turns_enough(turned: Floats) -> None:
 
     `turned` contains the robot's turn in each interval of the log, rad.
     """
-    if (angle := float(np.abs(turned).sum())) < LEAST_ANGLE:
+    if (angle := float(np.abs(turned).sum())) < MIN_TOTAL_TURN:
         raise RefusedError(
             f"the robot turned by {np.degrees(angle):.0f} deg in total, which is too little to "
-            f"measure the effective track: {DRIVE}"
+            f"measure the effective track: {DRIVE_ADVICE}"
         )
 
 
@@ -156,7 +158,7 @@ TRACK, RATIO = "the effective track", "the ratio of the left to the right wheel 
 
 
 def unsure(
-    found: Multipliers, track_std: float, worst: tuple[float, float] = WORST
+    found: Multipliers, track_std: float, worst: tuple[float, float] = MAX_STDS
 ) -> dict[str, float]:
     """Return the quantities that a log determines too inaccurately.
 
@@ -179,7 +181,7 @@ def unsure(
 
 def separates_track(fitted: Fit) -> bool:
     """Return whether the log distinguishes errors of the wheel radii from errors of the track."""
-    return condition(fitted.marginal()) <= WORST_CONDITION
+    return condition(fitted.marginal()) <= MAX_CONDITION
 
 
 def heading_follows(source: str, rows: Rows, base: Base, sides: Floats) -> None:
@@ -190,7 +192,7 @@ def heading_follows(source: str, rows: Rows, base: Base, sides: Floats) -> None:
     """
     spread = float(rows.turned @ rows.turned)
     off = rows.turned - heading.by_sides(rows, base, sides)
-    if not spread or float(off @ off) > UNLIKE * spread:
+    if not spread or float(off @ off) > MAX_CONTRADICTION * spread:
         raise RefusedError(
             f"{source} does not follow the wheels. Check that it is the yaw rate (not roll or "
             "pitch), that it and the wheel speeds come from the same run, that their clocks differ "
@@ -201,7 +203,7 @@ def heading_follows(source: str, rows: Rows, base: Base, sides: Floats) -> None:
 
 def positions_follow(begun: StartingPoint) -> None:
     """Raise `RefusedError` if the positions do not follow the path of the wheels."""
-    if begun.unexplained > UNLIKE:
+    if begun.unexplained > MAX_CONTRADICTION:
         raise RefusedError(
             "the positions do not match the motion of the wheels: check that x is ahead and y to "
             "the left in m (not latitude and longitude), that wheels and positions come from the "
@@ -271,11 +273,11 @@ def _wrong_sign(sides: Floats) -> str:
 def turns_like_the_wheels(source: str, rows: Rows, base: Base) -> None:
     """Raise `RefusedError` if the heading sensor shows far smaller turns than the wheels.
 
-    `source` is the name of the sensor. `LEAST_TURN` is the limit for the ratio of the turns.
+    `source` is the name of the sensor. `MIN_TURN_RATIO` is the limit for the ratio of the turns.
     """
     shown = float(np.abs(rows.turned).sum())
     by_wheels = float(np.abs(heading.by_sides(rows, base, np.ones(2))).sum())
-    if shown < LEAST_TURN * by_wheels:
+    if shown < MIN_TURN_RATIO * by_wheels:
         raise RefusedError(
             f"{source} shows turns of {np.degrees(shown):.0f} deg in total, but the wheels would "
             f"turn the robot by up to {np.degrees(by_wheels):.0f} deg: is {source} the rate about "
@@ -292,7 +294,7 @@ def turn_rates(source: str, rows: Rows) -> None:
     the wheel speeds may be in degrees as well.
     """
     rate = float(np.percentile(np.abs(rows.turned) / rows.seconds, 90))
-    if rate > FASTEST_TURN:
+    if rate > MAX_TURN_RATE:
         raise RefusedError(
             f"{source} seems to be in degrees (multiply by pi / 180), because as radians the robot "
             f"would turn at {rate:.0f} rad/s; also check that the wheel speeds are in rad/s, not "
@@ -309,7 +311,7 @@ def turn_units(source: str, turn: float, bare: float, base: Base) -> None:
         bare: the ratio of the measured turn to the turn that multipliers of 1 predict.
         base: the configured geometry.
     """
-    if LEAST_TURN < turn < UNITS and bare < 1 / LEAST_CHI:
+    if MIN_TURN_RATIO < turn < WRONG_UNIT_RATIO and bare < 1 / MIN_TRACK_RATIO:
         return
     degrees = f"{source} is in degrees (multiply by pi / 180), or " * bool(source)
     may = (
@@ -330,14 +332,14 @@ def distance_units(size: float, base: Base) -> None:
 
     `size` is the ratio of the measured to the configured wheel radius.
     """
-    if 1 / UNITS < size < UNITS:
+    if 1 / WRONG_UNIT_RATIO < size < WRONG_UNIT_RATIO:
         return
     may = (
         "the wheel speeds are in m/s (divide by the wheel radius), or the positions are in mm or cm"
         if size > 1
         else "the positions are latitude and longitude, or in km (they must be x ahead and y to "
         "the left, in m)"
-        if size < FAR_SIZE
+        if size < WRONG_POSITION_UNIT_RATIO
         else "the wheel speeds are in deg/s, rpm or counts, or are angles (they must be in rad/s)"
     )
     raise RefusedError(
@@ -393,19 +395,19 @@ def remarks(
             "corrected this large value"
         )
     left, right = float(turned[turned > 0].sum()), float(-turned[turned < 0].sum())
-    if min(left, right) < ONE_SIDED * max(left, right):
+    if min(left, right) < ONE_SIDED_RATIO * max(left, right):
         yield (
             "nearly all turns are to one side, so the calibration does not show a difference "
             "between left and right turns: drive turns to both sides"
         )
     size = float(values[1:].mean())
-    if sized and not 1 / ODD_SIZE < size < ODD_SIZE:
+    if sized and not 1 / REPORTED_SIZE_RATIO < size < REPORTED_SIZE_RATIO:
         yield (
             f"the wheels are {size:.3g} times as large as drive.wheel_radius = {base.radius:g}: "
             "measure the radius, and check that wheel speeds are in rad/s and x, y in m"
         )
     ratio = float(values[2] / values[1])
-    if not 1 / ODD_RATIO < ratio < ODD_RATIO:
+    if not 1 / REPORTED_RADIUS_RATIO < ratio < REPORTED_RADIUS_RATIO:
         yield (
             f"the right wheels are {ratio:.3g} times as large as the left ones, which is unusual: "
             "compare their sizes, and check that the speeds of both sides have the same unit and "

@@ -16,14 +16,14 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
-from acsard.calibration.fit import COUNT, Base, Evidence, P, fit, huber
+from acsard.calibration.fit import PARAMETER_COUNT, Base, Evidence, P, fit, huber
 from acsard.calibration.log_table import Floats
 from acsard.calibration.runs import Block, Complexes, Run, cumulative
 
-LEAST_POINTS = 5
+MIN_POINTS = 5
 """Minimum number of positions in a segment. The alignment has three unknowns (x, y, angle)."""
 
-FINE_S = 0.02
+STEP_S = 0.02
 """Time step for integrating the path, s. Finer steps cost time and add no accuracy."""
 
 JUMP, JUMP_M = 6.0, 0.05
@@ -33,7 +33,7 @@ The distance may exceed the distance that the wheels rolled by `JUMP` standard d
 `JUMP_M` m. At a jump, the source of the positions was wrong, or it corrected itself.
 """
 
-SPEED_S = 0.05
+SPEED_HALF_INTERVAL_S = 0.05
 """Half of the interval from which the speed of the position sensor is computed, s."""
 
 
@@ -91,18 +91,22 @@ class Path(Struct, frozen=True):
         """Return the places of the position sensor at the times `t`, m, and their derivatives.
 
         `t` contains recorded times of positions, s. The delay `P.DELAY` is subtracted from them.
-        The derivatives are with respect to the parameters, and have the shape (times, COUNT).
+        The derivatives are with respect to the parameters, and have the shape (times,
+        PARAMETER_COUNT).
         """
         t = t - parameters[P.DELAY]
-        derivatives = np.zeros((len(t), COUNT), dtype=np.complex128)
+        derivatives = np.zeros((len(t), PARAMETER_COUNT), dtype=np.complex128)
         here, ahead = self._sensor(t, parameters)
         lever = 1j * complex(parameters[P.SENSOR_X], parameters[P.SENSOR_Y]) * ahead
         for index, values in self.derivatives.items():
             turned = np.interp(t, self.t, self.heading_derivatives[index])
             derivatives[:, index] = np.interp(t, self.t, values) + lever * turned
         derivatives[:, P.SENSOR_X], derivatives[:, P.SENSOR_Y] = ahead, 1j * ahead
-        before, after = (self._sensor(t + s, parameters)[0] for s in (-SPEED_S, SPEED_S))
-        derivatives[:, P.DELAY] = (before - after) / (2 * SPEED_S)
+        before, after = (
+            self._sensor(t + s, parameters)[0]
+            for s in (-SPEED_HALF_INTERVAL_S, SPEED_HALF_INTERVAL_S)
+        )
+        derivatives[:, P.DELAY] = (before - after) / (2 * SPEED_HALF_INTERVAL_S)
         return here, derivatives
 
     def _sensor(self, t: Floats, parameters: Floats) -> tuple[Complexes, Complexes]:
@@ -119,7 +123,7 @@ class Path(Struct, frozen=True):
 def segments(driven: Sequence[Run], parts: Sequence[Block]) -> list[Segment]:
     """Return the measured positions in the blocks `parts`, split at jumps of the positions.
 
-    Segments with fewer than `LEAST_POINTS` positions are left out.
+    Segments with fewer than `MIN_POINTS` positions are left out.
     """
     edges = [jumps(run) for run in driven]
     found = []
@@ -128,7 +132,7 @@ def segments(driven: Sequence[Run], parts: Sequence[Block]) -> list[Segment]:
         a, b = np.searchsorted(run.place_t, (part.begin, part.end))
         cuts = edges[part.run]
         for piece in np.split(np.arange(a, b), cuts[(cuts > a) & (cuts < b)] - a):
-            if len(piece) >= LEAST_POINTS:
+            if len(piece) >= MIN_POINTS:
                 found.append(Segment(number, part.run, run.place_t[piece], run.place[piece]))
     return found
 
@@ -139,7 +143,7 @@ def jumps(run: Run) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
     `JUMP` and `JUMP_M` define a jump.
     """
     steps = np.abs(np.diff(run.place))
-    if len(steps) < LEAST_POINTS:
+    if len(steps) < MIN_POINTS:
         return np.zeros(0, dtype=np.int64)
     left, right = run.angles(run.place_t)
     rolled = np.maximum(np.abs(np.diff(left)), np.abs(np.diff(right)))
@@ -150,7 +154,7 @@ def jumps(run: Run) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
     return np.flatnonzero(beyond > JUMP * usual + JUMP_M) + 1
 
 
-def wheel_steps(run: Run, fine_s: float = FINE_S) -> WheelSteps:
+def wheel_steps(run: Run, fine_s: float = STEP_S) -> WheelSteps:
     """Return the rolling of the wheels in steps of about `fine_s` s.
 
     If the samples of the wheels are further apart, a step is the interval between two samples.
@@ -224,7 +228,8 @@ class Aligned(Struct, frozen=True):
     residual: Complexes
     """Position minus aligned path, m, times the square root of the position's weight."""
     derivatives: Complexes
-    """Derivatives of the aligned path with respect to the parameters, shape (positions, COUNT).
+    """Derivatives of the aligned path with respect to the parameters, shape (positions,
+    PARAMETER_COUNT).
 
     They are multiplied by the square root of the position's weight. They include the change of the
     aligning shift and rotation.
@@ -263,7 +268,10 @@ def evidence(
 
     `paths` must be computed with the same parameters. `blocks` is the number of blocks.
     """
-    normal, score = np.zeros((blocks, COUNT, COUNT)), np.zeros((blocks, COUNT))
+    normal, score = (
+        np.zeros((blocks, PARAMETER_COUNT, PARAMETER_COUNT)),
+        np.zeros((blocks, PARAMETER_COUNT)),
+    )
     squares, counts = np.zeros(blocks), np.zeros(blocks)
     for part in aligned(segments, paths, parameters):
         conj = np.conj(part.derivatives.T)
@@ -284,13 +292,15 @@ def spread(segments: Sequence[Segment], paths: Paths, parameters: Floats) -> flo
     return float(np.sqrt(squares / max(1, count)))
 
 
-TURNS = np.unique(np.concatenate((np.geomspace(0.03, 10.0, 60), np.geomspace(0.28, 1.4, 40))))
+TRACK_RATIOS = np.unique(
+    np.concatenate((np.geomspace(0.03, 10.0, 60), np.geomspace(0.28, 1.4, 40)))
+)
 """Ratios of configured to true track that the search tries.
 
 The ratios in the usual range are closer together than the others.
 """
 
-DELAYS = np.arange(-1.5, 1.55, 0.1)
+DELAYS_S = np.arange(-1.5, 1.55, 0.1)
 """Delays of the positions that the search tries, s."""
 
 MOST_SEGMENTS, REFINED_SEGMENTS = 60, 20
@@ -300,7 +310,7 @@ MOST_SEGMENTS, REFINED_SEGMENTS = 60, 20
 refined. If there are more segments, those with the largest extent are used.
 """
 
-MOST_POINTS = 80
+MAX_POINTS = 80
 """Approximate largest number of positions of a segment that the search uses, evenly spaced."""
 
 MOST_REFINED, FAR_WORSE = 4, 20.0
@@ -310,36 +320,36 @@ At most `MOST_REFINED` points are refined. A point is not refined if its badness
 more than `FAR_WORSE` times that of the best point.
 """
 
-USUAL_TURN = 0.31, 1.25
+USUAL_TURN_RANGE = 0.31, 1.25
 """Usual range of the robot's turn, divided by the turn that the configured geometry predicts.
 
 The prediction uses wheel radius and wheel separation without multipliers. A robot that skids much
 is at the lower end. A robot that does not skid is near the upper end.
 """
 
-NEAR_HEADING = 0.8, 1.25
+HEADING_TURN_RANGE = 0.8, 1.25
 """Usual range of the turn that positions show, divided by the turn that a heading sensor shows."""
 
-WRONG_WAY = 4.0
+REVERSAL_PENALTY = 4.0
 """Penalty factor for a starting point with reversed wheels or turns.
 
 The factor applies if the wheels of one side seem to roll backwards, or if all turns seem reversed.
 """
 
-NOTHING = 1e-3
+UNEXPLAINED_OFFSET = 1e-3
 """Number that is added to each `StartingPoint.unexplained` before two points are compared.
 
 Smaller differences between points are only noise of the positions. With this number added, they
 hardly matter.
 """
 
-STRAYED = 1.3
+MAX_REFINEMENT = 1.3
 """Largest factor by which a refinement may change the robot's turn.
 
 After a larger change, the refinement is discarded.
 """
 
-COARSE_S = 0.1
+SEARCH_STEP_S = 0.1
 """Time step for integrating paths during the search, s."""
 
 
@@ -371,18 +381,18 @@ def search(
     """
     kept = _furthest(segments, MOST_SEGMENTS)
     needed = sorted({segment.run for segment in kept})
-    steps = {run: wheel_steps(driven[run], COARSE_S) for run in needed}
+    steps = {run: wheel_steps(driven[run], SEARCH_STEP_S) for run in needed}
     points: list[StartingPoint] = []
     for left, way in itertools.product((1.0, -1.0), (1.0, -1.0)):
         points += _local_minima(
-            [_tried(kept, steps, base, (left, way * turn, 0.0)) for turn in TURNS]
+            [_tried(kept, steps, base, (left, way * turn, 0.0)) for turn in TRACK_RATIOS]
         )
     if sides is not None:
         left, way = np.sign(sides[0] * sides[1]), np.sign(sides[1]) * np.abs(sides).mean()
         points.append(_tried(kept, steps, base, (float(left), float(way), 0.0)))
 
     def badness(point: StartingPoint) -> float:
-        return (point.unexplained + NOTHING) * _penalty(point, sides)
+        return (point.unexplained + UNEXPLAINED_OFFSET) * _penalty(point, sides)
 
     points.sort(key=badness)
     few, worst = _furthest(kept, REFINED_SEGMENTS), FAR_WORSE * badness(points[0])
@@ -398,8 +408,8 @@ def _furthest(segments: Sequence[Segment], most: int) -> list[Segment]:
     reach = [extent(s.place) for s in segments]
     kept = [segments[i] for i in sorted(np.argsort(reach)[::-1][:most])]
     return [
-        replace(s, t=s.t[:: 1 + len(s.t) // MOST_POINTS],
-                place=s.place[:: 1 + len(s.t) // MOST_POINTS])
+        replace(s, t=s.t[:: 1 + len(s.t) // MAX_POINTS],
+                place=s.place[:: 1 + len(s.t) // MAX_POINTS])
         for s in kept
     ]  # fmt: skip
 
@@ -416,13 +426,15 @@ def _penalty(point: StartingPoint, sides: Floats | None) -> float:
     `sides` is the result of `heading.first()`, or None without a heading sensor.
     """
     signed = point.parameters[[P.LEFT, P.RIGHT]] * point.parameters[P.INVERSE_TRACK]
-    turn, (least, most) = float(np.abs(signed).mean()), USUAL_TURN
+    turn, (least, most) = float(np.abs(signed).mean()), USUAL_TURN_RANGE
     like = np.ones(2)
     if sides is not None:
         turn, like = turn / max(1e-9, float(np.abs(sides).mean())), np.sign(sides)
-        least, most = NEAR_HEADING
+        least, most = HEADING_TURN_RANGE
     beyond = max(0.0, np.log(least / turn), np.log(turn / most))
-    return (1.0 if np.array_equal(np.sign(signed), like) else WRONG_WAY) * float(1.0 + 2.0 * beyond)
+    return (1.0 if np.array_equal(np.sign(signed), like) else REVERSAL_PENALTY) * float(
+        1.0 + 2.0 * beyond
+    )
 
 
 def _turn(parameters: Floats) -> float:
@@ -433,14 +445,14 @@ def _turn(parameters: Floats) -> float:
 def _timed(
     point: StartingPoint, kept: Sequence[Segment], steps: dict[int, WheelSteps], base: Base
 ) -> StartingPoint:
-    """Return `point` with the delay of the positions that fits best among `DELAYS`.
+    """Return `point` with the delay of the positions that fits best among `DELAYS_S`.
 
     `kept` contains the segments that are compared with the path, and `steps` the rolling of the
     wheels in each run.
     """
     parameters = point.parameters
     shape = float(np.sign(parameters[P.LEFT])), _turn(parameters)
-    tried = [_tried(kept, steps, base, (*shape, late)) for late in DELAYS]
+    tried = [_tried(kept, steps, base, (*shape, late)) for late in DELAYS_S]
     return min([point, *tried], key=lambda point: point.unexplained)
 
 
@@ -485,7 +497,7 @@ def _refined(
     """Return a starting point that is refined by a fit to the segments `few`.
 
     The parameters of `point` are kept if the refined ones fit worse, or if the refinement changes
-    the robot's turn too much (`STRAYED`).
+    the robot's turn too much (`MAX_REFINEMENT`).
     """
     segments = [replace(segment, block=number) for number, segment in enumerate(few)]
 
@@ -505,7 +517,7 @@ def _refined(
         return point
     parameters = fit([source], point.parameters, places=True).parameters
     moved = _turn(parameters) / _turn(point.parameters)
-    if not 1 / STRAYED < moved < STRAYED:
+    if not 1 / MAX_REFINEMENT < moved < MAX_REFINEMENT:
         return before  # the data does not determine the turn there
     after = StartingPoint(parameters, unexplained(parameters))
     return min([before, after], key=lambda point: point.unexplained)

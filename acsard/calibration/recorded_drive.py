@@ -15,24 +15,24 @@ from mcap.reader import NonSeekingReader
 from msgspec.structs import replace
 
 from acsard.calibration import ros_bag_log
-from acsard.calibration.log_table import AS_CSV, LogError, Table, noted, read
+from acsard.calibration.log_table import CSV_ADVICE, LogError, Table, noted, read
 from acsard.calibration.multipliers import Tape
-from acsard.calibration.ros_bag_log import PAGE, Choice, RosMessage
+from acsard.calibration.ros_bag_log import GUIDE_PAGE, Choice, RosMessage
 from acsard.calibration.runs import runs
 from acsard.calibration.solve import Calibration, calibrate
 from acsard.core.config.settings import Config
 from acsard.host.errors import MendableError, RecordingError
 from acsard.recording.export import measured
 from acsard.recording.file import Recording
-from acsard.recording.mcap_records import DAMAGE, MAGIC
+from acsard.recording.mcap_records import DAMAGE_ERRORS, MAGIC
 
-MOST_BYTES = 1 << 30
+MAX_FILE_BYTES = 1 << 30
 """Maximum size of a CSV file or a black-box recording, bytes. The file is read into memory."""
 
-MOST_RECORD_BYTES = 1 << 28
+MAX_RECORD_BYTES = 1 << 28
 """Maximum size of a record in a bag, bytes. It is ample: a chunk of rosbag2 is below 1 MiB."""
 
-BAG_DAMAGE = (*DAMAGE, RuntimeError, KeyError)
+BAG_DAMAGE = (*DAMAGE_ERRORS, RuntimeError, KeyError)
 """Exceptions that the MCAP reader and LZ4 raise for a damaged bag.
 
 A `KeyError` means that a schema is missing.
@@ -92,7 +92,7 @@ def _table(log: Path, config: Config, choice: Choice) -> Table:
             "--topic and --yaw-axis are only for a ROS 2 bag, and this log is not a ROS 2 bag: "
             "leave both options out"
         )
-    if log.stat().st_size > MOST_BYTES:
+    if log.stat().st_size > MAX_FILE_BYTES:
         raise MendableError(f"{log} is larger than 1 GiB: use a part of it; ten minutes are enough")
     return read(_measured(log) if begin.startswith(MAGIC) else log.read_bytes())
 
@@ -105,25 +105,25 @@ def _files_of(directory: Path) -> list[Path]:
                 raise LogError(_other_bag(what))
         raise LogError(
             f"this directory contains no MCAP file: give the directory of a ROS 2 bag with --log, "
-            f"or {AS_CSV}"
+            f"or {CSV_ADVICE}"
         )
     return sorted(files, key=lambda path: [int(n) for n in re.findall(r"\d+", path.stem)])
 
 
 def _other_bag(what: str) -> str:
-    return f"this log is a ROS bag {what} ({PAGE} has the commands)"
+    return f"this log is a ROS bag {what} ({GUIDE_PAGE} has the commands)"
 
 
 def _is_ours(log: Path) -> bool:
     with log.open("rb") as stream:
         try:
             return _reader(stream).get_header().profile == "acsard"
-        except (*DAMAGE, StopIteration):
+        except (*DAMAGE_ERRORS, StopIteration):
             return True  # the reader of acsard's recordings then reports the damage
 
 
 def _reader(stream: IO[bytes]) -> NonSeekingReader:
-    return NonSeekingReader(stream, record_size_limit=MOST_RECORD_BYTES)
+    return NonSeekingReader(stream, record_size_limit=MAX_RECORD_BYTES)
 
 
 def _bag(files: list[Path], config: Config, choice: Choice) -> Table:
@@ -165,7 +165,7 @@ def _measured(log: Path) -> bytes:
     try:
         recording = Recording(log)
     except RecordingError as error:
-        raise LogError(f"{error}; {AS_CSV}") from None
+        raise LogError(f"{error}; {CSV_ADVICE}") from None
     try:
         return measured(recording)
     except RecordingError as error:

@@ -23,7 +23,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from acsard.calibration.log_table import FOUR, TWO, Floats, LogError, Table, bounded, spikes
-from acsard.calibration.runs import RESTART_S, cumulative, gaps, on_arrival_clock
+from acsard.calibration.runs import MIN_RESTART_S, cumulative, gaps, on_arrival_clock
 from acsard.core.formatting import many, printable
 from acsard.core.messages.encodings import DecodeError, decode_cdr
 from acsard.core.messages.schema import Imu, JointState, Odometry, PoseStamped, Quaternion
@@ -38,21 +38,21 @@ TYPES: dict[str, type[JointState | Imu | Odometry | PoseStamped]] = {
 
 REFERENCES = "a gyro (sensor_msgs/msg/Imu) or positions (geometry_msgs/msg/PoseStamped)"
 
-PAGE = "deploy/calibration/README.md"
+GUIDE_PAGE = "deploy/calibration/README.md"
 
 AXES = ("z", "-z", "x", "-x", "y", "-y")
 """Axes of an IMU that may point up. `-x` means that x points down."""
 
-LEAST_MESSAGES = 20
+MIN_MESSAGES = 20
 """Minimum number of messages with a value in a topic that is used."""
 
-CLOCKS_APART_S = 1.0
+MAX_DELAY_DIFFERENCE_S = 1.0
 """Largest difference between the delays of two topics whose stamps come from the same clock, s.
 
 The delay of a topic is the median time from the stamp of a message to its recording.
 """
 
-STEP_S = 1.0
+INTERVAL_S = 1.0
 """Length of the intervals in which a sensor's turns are compared with those of the wheels, s."""
 
 UPRIGHT, LYING = 0.5, 0.8
@@ -62,7 +62,7 @@ If the correlation is below `UPRIGHT` for the chosen axis and above `LYING` for 
 IMU lies on its side. The log is then refused.
 """
 
-OWN = 3e-3
+MAX_COPY_DIFFERENCE = 3e-3
 """Limit for the RMS difference between the turns of an `Odometry` and those of the wheels.
 
 The limit is relative to the RMS turn. Up to this limit, the `Odometry` counts as computed from the
@@ -313,7 +313,7 @@ class _Log:
         places = self._one("the positions", of[PoseStamped] if free else
                            [*of[PoseStamped], *of[Odometry]], free=free)  # fmt: skip
         if free and places is None:
-            odometry = [topic for topic in of[Odometry] if len(topic) >= LEAST_MESSAGES]
+            odometry = [topic for topic in of[Odometry] if len(topic) >= MIN_MESSAGES]
             if gyro is None:
                 places = self._one("the positions", odometry)
             elif odometry:
@@ -340,11 +340,11 @@ class _Log:
         """
         named = [topic for topic in fit if topic.name in self._choice.topics]
         for topic in named:
-            if len(topic) < LEAST_MESSAGES:
+            if len(topic) < MIN_MESSAGES:
                 raise LogError(_too_few(topic))
         if not named and not free:
             return None
-        candidates = named or [topic for topic in fit if len(topic) >= LEAST_MESSAGES]
+        candidates = named or [topic for topic in fit if len(topic) >= MIN_MESSAGES]
         if len(candidates) > 1:
             names = ", ".join(map(str, candidates))
             raise LogError(
@@ -367,7 +367,7 @@ class _Log:
                 return (
                     f"the joints of {topic} must include a known left wheel and a known right "
                     f"wheel, but are {names}. Write the names of the wheel joints into [joints] "
-                    f"of the configuration, or convert the bag as {PAGE} shows"
+                    f"of the configuration, or convert the bag as {GUIDE_PAGE} shows"
                 )
             if topic.unreadable or topic.wheels:
                 return _too_few(topic)
@@ -392,7 +392,7 @@ class _Log:
         made = [topic.seconds(topic.made, since_ns) for topic in used]
         for topic, stamps in zip(used, made, strict=True):
             back = float(np.diff(stamps).min(initial=0.0))
-            if topic.stamped and back < -RESTART_S:
+            if topic.stamped and back < -MIN_RESTART_S:
                 raise LogError(
                     f"the stamps of {topic} go back by {-back:.0f} s in the middle of the bag, "
                     "because a simulation or a played bag restarted: record each drive in its own "
@@ -402,7 +402,7 @@ class _Log:
         if all(topic.stamped for topic in used):
             delays = [float(np.median(c - m)) for c, m in zip(came, made, strict=True)]
             apart = max(delays) - min(delays)
-            if apart <= CLOCKS_APART_S:
+            if apart <= MAX_DELAY_DIFFERENCE_S:
                 return [stamps + start for stamps in made]
             self._notes.append(
                 f"the stamps of the topics come from different clocks, {apart:.3g} s apart: the "
@@ -536,7 +536,7 @@ def _edges(t: Floats, sides: tuple[Floats, Floats, Floats]) -> Floats:
     wheels = sides[0]
     if not len(t) or not len(wheels):
         return np.zeros(0)
-    return np.arange(max(t.min(), wheels[0]), min(t.max(), wheels[-1]), STEP_S)
+    return np.arange(max(t.min(), wheels[0]), min(t.max(), wheels[-1]), INTERVAL_S)
 
 
 def _follows(t: Floats, rates: Floats, sides: tuple[Floats, Floats, Floats]) -> float:
@@ -574,6 +574,6 @@ def _computed_from(t: Floats, yaw: Floats, sides: tuple[Floats, Floats, Floats])
     for delay in DELAYS_S:
         turned = np.diff(np.interp(edges + delay, times, angle))
         off = turned - rolled @ np.linalg.lstsq(rolled, turned, rcond=None)[0]
-        if float(off @ off) <= OWN**2 * float(turned @ turned):
+        if float(off @ off) <= MAX_COPY_DIFFERENCE**2 * float(turned @ turned):
             return True
     return False

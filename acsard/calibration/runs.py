@@ -26,26 +26,26 @@ Complexes = npt.NDArray[np.complex128]
 Mask = npt.NDArray[np.bool_]
 Rows = npt.NDArray[np.int64]
 
-RESTART_S = 1.0
+MIN_RESTART_S = 1.0
 """Smallest backward step of the times in a log that may be a restart of the recording, s."""
 
-FEW_RESTARTS = 100
+MAX_RESTARTS = 100
 """Maximum number of restarts in a log.
 
 If the times jump back more often, the log counts as one recording whose rows are not sorted by
 time.
 """
 
-SLOWEST_S = 0.7
+MAX_PERIOD_S = 0.7
 """Longest accepted median period of wheel samples, s.
 
 If the period is longer, the times are probably not in seconds.
 """
 
-LEAST_ROWS = 20
+MIN_ROWS = 20
 """Minimum number of wheel samples in a run."""
 
-PAUSE_S = 60.0
+NEW_RUN_AFTER_S = 60.0
 """Time without a wheel sample, s, after which a new run begins."""
 
 ROUNDED_S, REPEATED = 0.2, 4.0
@@ -74,10 +74,10 @@ A name consists of the columns of the sensor, separated by spaces.
 Streams = dict[str, tuple[Floats, ...]]
 """The times and the values of each sensor, by the name of the sensor in `STREAMS`."""
 
-MOST_RUNS = 1000
+MAX_RUNS = 1000
 """Maximum number of different values in the column `run`. A log with more values is refused."""
 
-TOGETHER = 50
+SUMMED_ROWS = 50
 """Number of rows over which wheel speeds are summed before two wheels are compared."""
 
 NOTED, APART = 0.15, 0.8
@@ -94,14 +94,14 @@ An interval is a gap if it exceeds `GAP_S` s and also exceeds `GAP_PERIODS` time
 interval.
 """
 
-STILL = 0.02
+STANDSTILL_SPEED = 0.02
 """Largest speed at which a wheel is considered to stand still, rad/s."""
 
-BLOCKS = 16
+BLOCK_COUNT = 16
 """Number of blocks into which a log is divided, unless the blocks would be too short or too long.
 """
 
-LONGEST_S = 12.0
+MAX_BLOCK_S = 12.0
 """Maximum length of a block, s, unless the caller of `blocks()` asks for longer blocks."""
 
 SMOOTH_S = 0.3
@@ -111,13 +111,13 @@ Without this average, the speeds of a coarse encoder would be 0 in some samples 
 in others.
 """
 
-LEAST_TURN = 0.2
+MIN_BLOCK_ROLL = 0.2
 """Minimum angle that the wheels of one side must roll in a block, rad.
 
 A block in which neither side rolls this far is left out.
 """
 
-MOST_JITTER_S = 5.0
+MAX_JITTER_S = 5.0
 """Largest accepted variation of the delay from stamp to arrival, s.
 
 If the delay varies by more, the stamps are not used.
@@ -173,7 +173,9 @@ class Run(Struct, frozen=True, dict=True):
     @cached_property
     def moving(self) -> Mask:
         """Mask of the wheel samples in which the wheels of at least one side turn."""
-        return np.asarray((np.abs(self.left) > STILL) | (np.abs(self.right) > STILL))
+        return np.asarray(
+            (np.abs(self.left) > STANDSTILL_SPEED) | (np.abs(self.right) > STANDSTILL_SPEED)
+        )
 
     def angles(self, t: Floats) -> tuple[Floats, Floats]:
         """Return the angles that the left and the right wheels have rolled at the times `t`, rad.
@@ -235,7 +237,7 @@ def runs(table: Table) -> Log:
     columns = dict(table.columns)
     t = columns["t"]
     columns["left"], columns["right"] = _sides(columns, notes)
-    if len(table.names) > MOST_RUNS:
+    if len(table.names) > MAX_RUNS:
         raise LogError(
             f"column run has {len(table.names)} different names, which is too many: each name must "
             "stand for a drive, not for a row"
@@ -253,7 +255,8 @@ def runs(table: Table) -> Log:
         _in_seconds(name, t, parts, columns)
         whole, parts = len(parts), [piece for part in parts for piece in _pauses(t, part, columns)]
         notes.add(
-            f"a new run begins after each gap of over {PAUSE_S:g} s in the wheel speeds; number "
+            f"a new run begins after each gap of over {NEW_RUN_AFTER_S:g} s in the wheel speeds; "
+            f"number "
             "of gaps: {}",
             len(parts) - whole,
         )
@@ -272,7 +275,7 @@ def runs(table: Table) -> Log:
         raise LogError(
             f"column {empty[0]} has no number in any row: record the wheels while the robot drives"
             if empty
-            else f"no run has {LEAST_ROWS} rows with a time and both sides' wheel speeds: "
+            else f"no run has {MIN_ROWS} rows with a time and both sides' wheel speeds: "
             "record the wheels at 5 Hz or more while the robot drives"
         )
     return Log(tuple(found), notes.sentences())
@@ -298,7 +301,7 @@ def _apart(columns: dict[str, Floats], front: str, rear: str) -> float:
     The difference is a fraction of the rolled distance. Raises `LogError` if it is above `APART`.
     """
     seen = np.isfinite(columns[front]) & np.isfinite(columns[rear])
-    starts = np.arange(0, int(seen.sum()), TOGETHER)
+    starts = np.arange(0, int(seen.sum()), SUMMED_ROWS)
     if not len(starts):
         return 0.0
     a, b = (np.add.reduceat(columns[name][seen], starts) for name in (front, rear))
@@ -320,16 +323,16 @@ def _restarts(t: Floats, rows: Rows, columns: dict[str, Floats]) -> list[Rows]:
     """Split `rows` where the times `t` jump back. Return the rows of each drive.
 
     Only the times of rows with wheel speeds are checked. The rows stay together if there are more
-    than `FEW_RESTARTS` jumps. The rows also stay together if the parts do not overlap in time,
+    than `MAX_RESTARTS` jumps. The rows also stay together if the parts do not overlap in time,
     because they are then unsorted rows of one drive.
     """
     # The times of rows without wheel speeds may jump back within a drive, because a file may list
     # all rows of one sensor after all rows of another.
     wheels = rows[np.isfinite(columns["left"][rows]) & np.isfinite(columns["right"][rows])]
-    back = np.flatnonzero(np.diff(t[wheels]) < -RESTART_S) + 1
-    if not 0 < len(back) <= FEW_RESTARTS:
+    back = np.flatnonzero(np.diff(t[wheels]) < -MIN_RESTART_S) + 1
+    if not 0 < len(back) <= MAX_RESTARTS:
         return [rows]
-    blocks = [part for part in np.split(wheels, back) if len(part) >= LEAST_ROWS]
+    blocks = [part for part in np.split(wheels, back) if len(part) >= MIN_ROWS]
     spans = sorted((float(np.min(t[part])), float(np.max(t[part]))) for part in blocks)
     if not any(a[1] > b[0] for a, b in pairwise(spans)):
         return [rows]
@@ -345,7 +348,7 @@ def _in_seconds(name: str, t: Floats, parts: list[Rows], columns: dict[str, Floa
     """Raise `LogError` if the times of run `name` are not in seconds or are too coarse."""
     for rows in parts:
         times = _wheel_times(t, rows, columns)
-        if len(times) < LEAST_ROWS:
+        if len(times) < MIN_ROWS:
             continue
         once = np.unique(times)
         period = float(np.median(np.diff(once))) if len(once) > 1 else np.inf
@@ -354,7 +357,7 @@ def _in_seconds(name: str, t: Floats, parts: list[Rows], columns: dict[str, Floa
                 f"run {name or 1}: {len(times)} rows of wheel speeds have only {len(once)} "
                 "different times, because t was rounded: write t in seconds with 3 decimals"
             )
-        if period > SLOWEST_S:
+        if period > MAX_PERIOD_S:
             raise LogError(
                 f"run {name or 1}: {period:g} s pass between two rows of wheel speeds: t must be "
                 "in seconds (divide ms by 1000, ns by 1e9), and the wheel speeds must be recorded "
@@ -363,10 +366,13 @@ def _in_seconds(name: str, t: Floats, parts: list[Rows], columns: dict[str, Floa
 
 
 def _pauses(t: Floats, rows: Rows, columns: dict[str, Floats]) -> list[Rows]:
-    """Split `rows` where the wheels have no sample for `PAUSE_S`. Return the rows of each drive."""
+    """Split `rows` where the wheels have no sample for `NEW_RUN_AFTER_S`.
+
+    Return the rows of each drive.
+    """
     # Without this split, one row with a time of another day would make the drive many hours long.
     times = _wheel_times(t, rows, columns)
-    ends = np.flatnonzero(np.diff(times) > PAUSE_S)
+    ends = np.flatnonzero(np.diff(times) > NEW_RUN_AFTER_S)
     if not len(ends):
         return [rows]
     drive = np.searchsorted((times[ends] + times[ends + 1]) / 2, t[rows])
@@ -377,10 +383,10 @@ def _pauses(t: Floats, rows: Rows, columns: dict[str, Floats]) -> list[Rows]:
 
 def _streams(columns: dict[str, Floats], rows: Rows, notes: Notes) -> Streams | None:
     streams = {name: _stream(columns, rows, name.split(), notes) for name in STREAMS}
-    if len(streams[WHEELS][0]) >= LEAST_ROWS:
+    if len(streams[WHEELS][0]) >= MIN_ROWS:
         return streams
     notes.add(
-        f"runs left out because they have fewer than {LEAST_ROWS} rows of wheel speeds: {{}}",
+        f"runs left out because they have fewer than {MIN_ROWS} rows of wheel speeds: {{}}",
         int(len(rows) > 0),
     )
     return None
@@ -521,11 +527,11 @@ def rests(run: Run, least_s: float, edge_s: float) -> Floats:
 def blocks(driven: Sequence[Run], shortest_s: float) -> list[Block]:
     """Return the blocks of all runs, without the blocks in which the robot hardly moved.
 
-    The blocks are about `shortest_s` s long. If the log would then have more than `BLOCKS` blocks,
-    the blocks are longer, up to `LONGEST_S`.
+    The blocks are about `shortest_s` s long. If the log would then have more than `BLOCK_COUNT`
+    blocks, the blocks are longer, up to `MAX_BLOCK_S`.
     """
     moved = sum(float(np.minimum(np.diff(r.t), GAP_S) @ r.moving[1:]) for r in driven)
-    length = float(np.clip(moved / BLOCKS, shortest_s, max(LONGEST_S, shortest_s)))
+    length = float(np.clip(moved / BLOCK_COUNT, shortest_s, max(MAX_BLOCK_S, shortest_s)))
     found = []
     for number, run in enumerate(driven):
         ends = np.concatenate((run.gaps[:, 0], run.t[-1:]))
@@ -542,29 +548,29 @@ def blocks(driven: Sequence[Run], shortest_s: float) -> list[Block]:
 
 
 def _turned(run: Run, begin: float, end: float, left: Floats, right: Floats) -> bool:
-    """Return whether the wheels of a side rolled by at least `LEAST_TURN` in a time interval.
+    """Return whether the wheels of a side rolled by at least `MIN_BLOCK_ROLL` in a time interval.
 
     The interval is from `begin` to `end`, s. `left` and `right` contain the rolled angles at the
     two times, rad. Angles that the wheels roll back and ahead are added.
     """
-    if max(abs(left[1] - left[0]), abs(right[1] - right[0])) >= LEAST_TURN:
+    if max(abs(left[1] - left[0]), abs(right[1] - right[0])) >= MIN_BLOCK_ROLL:
         return True
     a, b = np.searchsorted(run.t, (begin, end))
     speed = max(float(np.sum(np.abs(v[a:b]))) for v in (run.left, run.right))
-    return bool(speed * (end - begin) / max(1, b - a) >= LEAST_TURN)
+    return bool(speed * (end - begin) / max(1, b - a) >= MIN_BLOCK_ROLL)
 
 
 def on_arrival_clock(came: Floats, made: Floats) -> Floats:
     """Return the times at which a sender made its samples, s, on the receiver's clock.
 
     The times are the stamps plus the smallest delay from stamp to arrival. If this delay varies by
-    more than `MOST_JITTER_S`, the times are the times of arrival.
+    more than `MAX_JITTER_S`, the times are the times of arrival.
 
     Args:
         came: the times of arrival on the receiver's clock, s.
         made: the stamps of the sender's clock, s.
     """
     delay = came - made
-    if float(np.ptp(delay)) > MOST_JITTER_S:
+    if float(np.ptp(delay)) > MAX_JITTER_S:
         return came
     return np.asarray(made + float(delay.min()))

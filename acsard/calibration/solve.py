@@ -12,7 +12,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from acsard.calibration import heading, plausibility, positions
-from acsard.calibration.fit import COUNT, Base, Fit, Held, P, Source, fit
+from acsard.calibration.fit import PARAMETER_COUNT, Base, Fit, Held, P, Source, fit
 from acsard.calibration.heading import Headings, Rates, Rows, rates
 from acsard.calibration.improvement import (
     UNMEASURED,
@@ -38,14 +38,14 @@ from acsard.calibration.multipliers import (
     scaled,
 )  # fmt: skip
 from acsard.calibration.odometry_noise import Noise, Reference, noise, settings
-from acsard.calibration.plausibility import DRIVE, RATIO, TRACK
+from acsard.calibration.plausibility import DRIVE_ADVICE, RATIO, TRACK
 from acsard.calibration.positions import Segment, WheelSteps, search
 from acsard.calibration.runs import Block, Log, Run, blocks
 from acsard.calibration.wheel_response import response
 from acsard.core.config.settings import DriveConfig, FeedbackConfig, OdometryConfig
 from acsard.core.values import AcsardError
 
-LENGTHS_S = (4.0, 8.0, 16.0, 32.0, 64.0)
+BLOCK_LENGTHS_S = (4.0, 8.0, 16.0, 32.0, 64.0)
 """Block lengths to try, s. The tool uses the length that improves the odometry most.
 
 Short blocks suit accurate positions. Long blocks suit coarse positions, and wheels whose errors
@@ -54,14 +54,14 @@ heading sensor, it does not try the shortest length.
 """
 
 # With six blocks, the standard deviation of the ratio of the radii was up to three times too small.
-ENOUGH_BLOCKS = 8
+MIN_BLOCKS = 8
 """Number of blocks that a log should have.
 
 A block length that gives fewer blocks is not tried if a shorter length has already given a fit.
 """
 
 # For comparison: on a good floor, motion capture differs from the wheels by less than 1e-3.
-PERFECT = 1e-4
+MIN_DIFFERENCE = 1e-4
 """Smallest credible difference between a sensor and the wheels, as a fraction of the motion.
 
 If the difference is smaller, the sensor's data were probably computed from the wheels.
@@ -280,7 +280,7 @@ class Candidate(Struct, frozen=True):
     made: Prepared
     fitted: Fit
     covariance: Floats
-    """Covariance of the parameters, shape (COUNT, COUNT)."""
+    """Covariance of the parameters, shape (PARAMETER_COUNT, PARAMETER_COUNT)."""
     rows: Rows
     """The motion in intervals of about a second, with the gyro corrected for its bias and scale."""
     rate: Rates
@@ -305,10 +305,10 @@ def _calibrated(
     candidates: list[Candidate] = []
     refusals: list[RefusedError] = []
     places = any(len(run.place) for run in log.runs)
-    for length in LENGTHS_S[headings is None and places : None if places else 1]:
+    for length in BLOCK_LENGTHS_S[headings is None and places : None if places else 1]:
         try:
             made = prepared(log.runs, headings, base, length)
-            if candidates and len(made.parts) < ENOUGH_BLOCKS:
+            if candidates and len(made.parts) < MIN_BLOCKS:
                 break
             candidates += _candidates(made)
         except RefusedError as error:
@@ -397,9 +397,9 @@ def _candidates(made: Prepared) -> list[Candidate]:
     if not found:
         shares = " and ".join(f"{name} only to {share:.1%}" for name, share in deviations.items())
         raise RefusedError(
-            f"this log determines {shares}. That is too inaccurate: {DRIVE}"
+            f"this log determines {shares}. That is too inaccurate: {DRIVE_ADVICE}"
             if shares
-            else f"the search for the parameters does not converge: {DRIVE}"
+            else f"the search for the parameters does not converge: {DRIVE_ADVICE}"
         )
     return found
 
@@ -409,7 +409,7 @@ def _held(base: Base) -> dict[str, list[Held]]:
 
     The name "" stands for a fit without constraints.
     """
-    ratio, track, growth = np.zeros((3, COUNT))
+    ratio, track, growth = np.zeros((3, PARAMETER_COUNT))
     ratio[[P.LEFT, P.RIGHT]] = base.right, -base.left
     track[P.INVERSE_TRACK] = growth[P.TRACK_GROWTH] = 1.0
     return {"": [], RATIO: [(ratio, 0.0)], TRACK: [(track, 1 / base.track), (growth, 0.0)]}
@@ -520,12 +520,12 @@ def _too_good(made: Prepared, fitted: Fit, log: Log) -> Iterator[str]:
     if headings is not None:
         off = rows.turned - heading.turned(rows, base, fitted.parameters)
         off -= np.median(off / rows.seconds) * rows.seconds
-        if float(off @ off) < PERFECT**2 * float(rows.turned @ rows.turned):
+        if float(off @ off) < MIN_DIFFERENCE**2 * float(rows.turned @ rows.turned):
             yield _own(headings.source)
     if made.segments and not log.true_positions:
         along = [positions.path(steps, base, fitted.parameters) for steps in made.steps]
         reach = max(positions.extent(segment.place) for segment in made.segments)
-        if positions.spread(made.segments, along, fitted.parameters) < PERFECT * reach:
+        if positions.spread(made.segments, along, fitted.parameters) < MIN_DIFFERENCE * reach:
             yield _own("the positions")
 
 

@@ -17,14 +17,14 @@ from msgspec import Struct
 
 from acsard.calibration.log_table import Floats
 from acsard.calibration.runs import GAP_S, Run
-from acsard.core.config.motion_rules import LINES_OF_EVIDENCE
+from acsard.core.config.motion_rules import MIN_EVIDENCE_LINES
 from acsard.core.config.settings import DriveConfig, FeedbackConfig
 from acsard.core.motion.kinematics import Kinematics
-from acsard.core.motion.wheel_faults import LEAST
-from acsard.core.motion.wheel_witness import SLACK, Expected, Witness
+from acsard.core.motion.wheel_faults import MIN_COMMANDED_SPEED
+from acsard.core.motion.wheel_witness import MIN_FAULT_SPEED, Expected, Witness
 from acsard.core.values import Twist
 
-TRIED = np.geomspace(0.01, 5.0, 60)
+RESPONSE_TIMES_S = np.geomspace(0.01, 5.0, 60)
 """Response times that are tried, s. They cover the range of `feedback.response_time`."""
 
 LEAST_ROWS, MOST_ROWS = 200, 30_000
@@ -34,10 +34,10 @@ A log with fewer samples than `LEAST_ROWS` gives no response time. At most `MOST
 used, which is 5 minutes at 100 Hz.
 """
 
-FOLLOWS = 0.5
+MAX_UNEXPLAINED = 0.5
 """Largest fraction of the sum of squared wheel speeds that the model may leave unexplained."""
 
-SPARE = 0.5
+MAX_FAULTY_FRACTION = 0.5
 """Longest time for which a healthy wheel may look faulty with the proposed response time.
 
 The time is a fraction of `feedback.fault_time`.
@@ -50,7 +50,7 @@ The speed of such a wheel stays below `REACHED` times its command for at least 2
 the last `STEADY_S` s, the speed changes by less than the fraction `CONSTANT`.
 """
 
-SAME = 1.5
+AGREEMENT_FACTOR = 1.5
 """Largest factor between the fitted and the configured response time at which they agree."""
 
 
@@ -63,8 +63,8 @@ class WheelResponse(Struct, frozen=True):
     """Response time to configure, s; None if the tool proposes no change.
 
     There is a proposal only if `false_fault` is true. The proposal is the smallest time in
-    `TRIED`, not below `seconds`, with which no wheel looks faulty for longer than `SPARE` permits.
-    If no time fulfils this, the value is None.
+    `RESPONSE_TIMES_S`, not below `seconds`, with which no wheel looks faulty for longer than
+    `MAX_FAULTY_FRACTION` permits. If no time fulfils this, the value is None.
     """
     present: float
     """Configured response time, s."""
@@ -105,7 +105,7 @@ class WheelResponse(Struct, frozen=True):
                     "a longer response time would not prevent this with enough reserve; if the "
                     "wheels are healthy, raise feedback.fault_time"
                 )
-        elif max(self.seconds / self.present, self.present / self.seconds) > SAME:
+        elif max(self.seconds / self.present, self.present / self.seconds) > AGREEMENT_FACTOR:
             then = (
                 f"; the configured feedback.response_time = {self.present:g} s differs, but causes "
                 "no fault in this log"
@@ -138,20 +138,26 @@ def response(
     if sum(len(steps) for steps, _, _ in parts) < LEAST_ROWS:
         return None
     fastest = _fastest(parts)
-    squares, whole = np.zeros(len(TRIED)), 0.0
+    squares, whole = np.zeros(len(RESPONSE_TIMES_S)), 0.0
     for steps, wanted, seen in parts:
         expected = _expected(steps, np.clip(wanted, -fastest, fastest), seen)
         squares += ((expected - seen[:, :, None]) ** 2).sum(axis=(0, 1))
         whole += float((seen**2).sum())
     best = int(np.argmin(squares))
-    if not squares[best] < FOLLOWS * whole:
+    if not squares[best] < MAX_UNEXPLAINED * whole:
         return None
     limit, proposed = feedback.fault_time, None
     false_fault = limit > 0.0 and _evidence(parts, feedback.response_time, limit) > limit
     if false_fault:
-        good = (t for t in TRIED[best:].tolist() if _evidence(parts, t, limit) <= SPARE * limit)
+        good = (
+            t
+            for t in RESPONSE_TIMES_S[best:].tolist()
+            if _evidence(parts, t, limit) <= MAX_FAULTY_FRACTION * limit
+        )
         proposed = next((float(f"{t:.2g}") for t in good), None)
-    return WheelResponse(float(TRIED[best]), proposed, feedback.response_time, false_fault, fastest)
+    return WheelResponse(
+        float(RESPONSE_TIMES_S[best]), proposed, feedback.response_time, false_fault, fastest
+    )
 
 
 def _commanded(run: Run, drive: DriveConfig) -> tuple[Floats, Floats, Floats]:
@@ -174,7 +180,8 @@ def _commanded(run: Run, drive: DriveConfig) -> tuple[Floats, Floats, Floats]:
 
 
 def _expected(steps: Floats, wanted: Floats, seen: Floats) -> Floats:
-    """Return the speeds of the wheels that each response time in `TRIED` predicts, rad/s.
+    """Return the speeds of the wheels that each response time in `RESPONSE_TIMES_S` predicts,
+    rad/s.
 
     The arguments are the arrays that `_commanded` returns. The shape of the result is (samples, 2,
     times).
@@ -182,13 +189,13 @@ def _expected(steps: Floats, wanted: Floats, seen: Floats) -> Floats:
     # The speed y of a healthy wheel follows the command u with the response time T:
     #
     #     T dy/dt = u - y
-    expected = np.empty((*wanted.shape, len(TRIED)))
-    last = np.zeros((2, len(TRIED)))
+    expected = np.empty((*wanted.shape, len(RESPONSE_TIMES_S)))
+    last = np.zeros((2, len(RESPONSE_TIMES_S)))
     for number, step in enumerate(steps):
         if np.isnan(step):
-            last = np.repeat(seen[number, :, None], len(TRIED), axis=1)
+            last = np.repeat(seen[number, :, None], len(RESPONSE_TIMES_S), axis=1)
         else:
-            last = last + (wanted[number, :, None] - last) * (step / (TRIED + step))
+            last = last + (wanted[number, :, None] - last) * (step / (RESPONSE_TIMES_S + step))
         expected[number] = last
     return expected
 
@@ -200,11 +207,11 @@ def _evidence(
 
     `parts` contains the triples that `_commanded` returns.
     """
-    longest, most = 0.0, fault_time / LINES_OF_EVIDENCE
+    longest, most = 0.0, fault_time / MIN_EVIDENCE_LINES
     for steps, wanted, seen in parts:
         sides = [(Expected(), Witness()) for _ in range(2)]
         for step, told, speeds in zip(steps.tolist(), wanted.tolist(), seen.tolist(), strict=True):
-            still = max(map(abs, told)) < LEAST
+            still = max(map(abs, told)) < MIN_COMMANDED_SPEED
             for (expected, witness), command, speed in zip(sides, told, speeds, strict=True):
                 if math.isnan(step):
                     expected.forget()
@@ -225,7 +232,7 @@ def _fastest(parts: Sequence[tuple[Floats, Floats, Floats]]) -> float:
     found: list[float] = []
     for steps, wanted, seen in parts:
         for told, speed in zip(wanted.T, np.abs(seen.T), strict=True):
-            short = (speed > SLACK) & (speed < REACHED * np.abs(told)) & ~np.isnan(steps)
+            short = (speed > MIN_FAULT_SPEED) & (speed < REACHED * np.abs(told)) & ~np.isnan(steps)
             edges = np.flatnonzero(np.diff(short.astype(np.int8), prepend=0, append=0))
             for begin, end in edges.reshape(-1, 2):
                 at = np.cumsum(steps[begin:end])

@@ -19,10 +19,10 @@ from acsard.checkup.findings import StoppedError, WireLostError, motor_name, mot
 from acsard.checkup.lateness import Lateness
 from acsard.checkup.motion import ZERO, Reply
 from acsard.checkup.restarts import RestartedError, Restarts
-from acsard.core.config.settings import LONGEST_REPLY_S, McuConfig, WheelMap
+from acsard.core.config.settings import MAX_REPLY_PERIOD_S, McuConfig, WheelMap
 from acsard.core.config.wire_time import line_bytes, wire_ns
 from acsard.core.link.board_status import STATUS, decode_status
-from acsard.core.link.checked_line import ASK_SAMPLE, SEQUENCES, seal, unseal
+from acsard.core.link.checked_line import SAMPLE_REQUEST, SEQUENCES, seal, unseal
 from acsard.core.link.codec import LETTERS, Codec, FrameError, Motors
 from acsard.core.link.lines import LineReader
 from acsard.core.link.link_diagnosis import Heard
@@ -83,18 +83,18 @@ def _nothing() -> None:
     """Do nothing. This is the default of `Board.between`."""
 
 
-LEAST_S = 0.001
+MIN_WAIT_S = 0.001
 """Shortest remaining time in which `Board.drive` sends one more line, s."""
 
-BEAT_NS = int(motion.PERIOD_S * NS_PER_S)
+BEAT_NS = int(motion.LINE_PERIOD_S * NS_PER_S)
 """Longest uninterrupted wait of `Board.listen`, ns. After each such wait, `listen` measures by how
 much this computer runs the check too late."""
 
-FAREWELL = 5
+FINAL_ZEROS = 5
 """Number of times that the check sends zeros at its end."""
 
 
-KNOWN = ("comma", "latched", "sealed", "sampled", "own_clock", "gap_s", "paced", "lost")
+RESULT_FIELDS = ("comma", "latched", "sealed", "sampled", "own_clock", "gap_s", "paced", "lost")
 """Names of the attributes of `Board` that are set back before a step is repeated.
 
 They contain results of earlier steps, which later steps use.
@@ -109,7 +109,7 @@ class Board:
     """
 
     def __init__(
-        self, wire: Wire, mcu: McuConfig, rate_hz: float, longest_reply: float = LONGEST_REPLY_S
+        self, wire: Wire, mcu: McuConfig, rate_hz: float, longest_reply: float = MAX_REPLY_PERIOD_S
     ) -> None:
         self.wire, self.mcu, self.rate_hz = wire, mcu, rate_hz
         self.longest_reply_s = longest_reply
@@ -202,12 +202,12 @@ class Board:
         # when zeros are sent. Each further line would keep the watchdog from stopping the motor.
         self.armed, self.restarts.watched, self.between = False, False, _nothing
         try:
-            for _ in range(FAREWELL):
+            for _ in range(FINAL_ZEROS):
                 if self.fled:
                     break
                 self.zeros()
                 self.listen(2 * self.period_s)
-                self.fled = motion.fastest(self.replies, motion.RUNAWAY) is not None
+                self.fled = motion.fastest(self.replies, motion.RUNAWAY_SPEED) is not None
         except WireLostError:
             # No line reaches the board any more, so its own watchdog must stop the motors.
             pass
@@ -219,11 +219,11 @@ class Board:
 
     @property
     def known(self) -> dict[str, object]:
-        """Mapping from each name in `KNOWN` to the value of that attribute.
+        """Mapping from each name in `RESULT_FIELDS` to the value of that attribute.
 
         Assign an earlier mapping to set the attributes back, before a step is repeated.
         """
-        return {name: getattr(self, name) for name in KNOWN}
+        return {name: getattr(self, name) for name in RESULT_FIELDS}
 
     @known.setter
     def known(self, known: Mapping[str, object]) -> None:
@@ -239,7 +239,7 @@ class Board:
     @property
     def period_s(self) -> float:
         """Time from one sent line to the next, s. It is longer than usual on a slow wire."""
-        return max(motion.PERIOD_S, self.line_s)
+        return max(motion.LINE_PERIOD_S, self.line_s)
 
     # Sending
 
@@ -253,7 +253,7 @@ class Board:
         if not self.sealed:
             return line
         self._sequence = (self._sequence + 1) % SEQUENCES
-        return seal(line, self._sequence, ASK_SAMPLE if self.sampled else b"")
+        return seal(line, self._sequence, SAMPLE_REQUEST if self.sampled else b"")
 
     def send(self, motors: Motors, comma: bool | None = None) -> None:
         """Send one line that commands the speeds `motors`, rad/s.
@@ -312,7 +312,7 @@ class Board:
             comma: whether the lines end with a comma. None means the value of `self.comma`.
         """
         # Receive the replies to earlier lines now, so that they are not taken for replies to these.
-        self.listen(max(motion.GLANCE_S / 4, wait_s))
+        self.listen(max(motion.SHORT_MEASUREMENT_S / 4, wait_s))
         got: list[tuple[float, Reply]] = []
         for _ in range(lines):
             self.ask(max(wait_s, 1.5 * self.period_s), comma)
@@ -330,7 +330,7 @@ class Board:
         period_s = period_s or self.period_s
         end_s = self.now_s + seconds
         got: list[Reply] = []
-        while (began_s := self.now_s) < end_s - LEAST_S:
+        while (began_s := self.now_s) < end_s - MIN_WAIT_S:
             self.send(motors)
             answers = self.listen(min(period_s, end_s - began_s))
             took_s = self.now_s - began_s
@@ -425,14 +425,14 @@ class Board:
         return self.now_s - self.replies[-1].at_s if self.replies and not self.fled else 0.0
 
     def _guard(self) -> None:
-        fastest = motion.fastest(self.replies, motion.RUNAWAY)
+        fastest = motion.fastest(self.replies, motion.RUNAWAY_SPEED)
         if fastest is None:
             return
         motor, seen = fastest
         told = self._commanded[motor]
         self._flee()
         outcome = "runaway: against" if told * seen < 0 else "runaway: along"
-        name, letter, most = motor_name(self.mcu, motor), LETTERS[motor], motion.RUNAWAY
+        name, letter, most = motor_name(self.mcu, motor), LETTERS[motor], motion.RUNAWAY_SPEED
         found = outcomes.find(outcome, motor=name, letter=letter, told=told, seen=seen, most=most)
         raise StoppedError(found)
 
@@ -444,7 +444,7 @@ class Board:
 
     def turning(self) -> list[int]:
         last = self.replies[-1].motors if self.replies else ZERO
-        return motion.moving(last, motion.STANDING)
+        return motion.moving(last, motion.STANDING_SPEED)
 
     def rest(self) -> None:
         """Send zeros until all motors stand still. Raises `StoppedError` if a motor keeps turning.
@@ -470,21 +470,21 @@ class Board:
     def settles(self, comma: bool) -> bool:
         """Send zeros until all motors stand still, and return whether this happens in time.
 
-        The time limit is `motion.MOTOR_S`, or `motion.PATIENCE_S` while a motor slows down. `comma`
-        says whether the lines of zeros end with a comma.
+        The time limit is `motion.MOTOR_TIMEOUT_S`, or `motion.SLOWING_TIMEOUT_S` while a motor
+        slows down. `comma` says whether the lines of zeros end with a comma.
         """
         # The motors stand still if the last two replies since the call report no motion, and if no
         # earlier reply shows that a motor with a coarse encoder may still turn (`motion.turning`).
         began_s = self.now_s
         while True:
             last = motion.since(self.replies[-2:], began_s)
-            shown = any(motion.moving(reply.motors, motion.STANDING) for reply in last)
+            shown = any(motion.moving(reply.motors, motion.STANDING_SPEED) for reply in last)
             if len(last) == 2 and not (shown or motion.turning(self.replies, self.now_s)):
                 return True
-            patience_s = motion.PATIENCE_S if self._slows() else motion.MOTOR_S
+            patience_s = motion.SLOWING_TIMEOUT_S if self._slows() else motion.MOTOR_TIMEOUT_S
             if self.now_s - began_s >= patience_s:
                 return False
             self.ask(comma=comma)
 
     def _slows(self) -> bool:
-        return min(motion.trend(self.replies, self.now_s, self.gap_s)) < motion.FALLS
+        return min(motion.trend(self.replies, self.now_s, self.gap_s)) < motion.SLOWING_RATIO

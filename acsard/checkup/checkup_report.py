@@ -10,7 +10,7 @@ from typing import Any, get_args
 from msgspec import Struct, ValidationError
 
 from acsard.checkup import lateness
-from acsard.checkup.findings import REST, Finding, Verdict
+from acsard.checkup.findings import SKIPPED_STEPS, Finding, Verdict
 from acsard.core.config.contradictions import contradictions
 from acsard.core.config.parsing import effective, from_builtins
 from acsard.core.config.settings import Config
@@ -19,7 +19,7 @@ from acsard.core.config.toml_text import excerpt
 Changes = dict[str, object]
 """Maps dotted keys of the configuration, such as "mcu.port", to new values."""
 
-OPTIONAL = ("mcu.encoder_counts", "mcu.link_check")
+OPTIONAL_KEYS = ("mcu.encoder_counts", "mcu.link_check")
 """Keys of settings that improve the link but make its lines longer.
 
 If the wire is too slow for the longer lines, `changes` leaves out the first key. If that is not
@@ -37,8 +37,8 @@ def changes(findings: Sequence[Finding], config: Config, port: str = "") -> Chan
 
     They come from the findings. If a board answered, `mcu.port` gets the value `port`, unless
     `port` is "". If the suggested values contradict each other, for example because the lines
-    would be too long for the control rate, suggestions for `OPTIONAL` keys are left out. If that is
-    not enough, `control.rate` gets the value "auto", provided that this helps.
+    would be too long for the control rate, suggestions for `OPTIONAL_KEYS` keys are left out. If
+    that is not enough, `control.rate` gets the value "auto", provided that this helps.
     """
     wanted: Changes = {"mcu.port": port} if port and answered(findings) else {}
     for finding in findings:
@@ -51,7 +51,7 @@ def changes(findings: Sequence[Finding], config: Config, port: str = "") -> Chan
 
     # Longer or slower lines may take too long for the control rate. Then leave out one optional key
     # after the other, the least important one first.
-    for optional in ("", *OPTIONAL):
+    for optional in ("", *OPTIONAL_KEYS):
         if optional and attrgetter(optional)(config) in (0, "off"):
             differing.pop(optional, None)
         if fits(differing):
@@ -119,7 +119,9 @@ def report(
     failed. In the report, None takes the place of an empty `written`, `error` or `withheld`.
     """
     judged = answered(findings) and not lateness.unjudged(findings)
-    passed = judged and not any(one.verdict == "FAIL" or one.name == REST for one in findings)
+    passed = judged and not any(
+        one.verdict == "FAIL" or one.name == SKIPPED_STEPS for one in findings
+    )
     toml = "\n".join(excerpt(changes))
     return Report(
         port, passed, findings, changes, toml, written or None, error or None, withheld or None

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from acsard.checkup import outcomes
 from acsard.checkup.board import Board
 from acsard.checkup.findings import Finding
-from acsard.checkup.motion import GLANCE_S, SPEED, ZERO, moving
+from acsard.checkup.motion import SHORT_MEASUREMENT_S, SPEED, ZERO, moving
 from acsard.core.link.checked_line import seal
 from acsard.core.link.codec import LETTERS
 
@@ -63,7 +63,7 @@ def finding(board: Board, motors: Sequence[int]) -> Finding:
         return outcomes.find("damaged lines: untested")
     lines = broken_lines(board.comma, board.sealed, motors)
     # A coarse encoder may report an earlier movement only now.
-    board.drive(ZERO, GLANCE_S)
+    board.drive(ZERO, SHORT_MEASUREMENT_S)
     took = dict.fromkeys(what for what, line in lines if _moves(board, line))
     if not took:
         return outcomes.find("damaged lines: right", lines=len(lines))
@@ -76,7 +76,7 @@ def _moves(board: Board, line: bytes) -> bool:
     # Send the line three times, because a motor needs some time until its encoder shows a movement.
     for _ in range(3):
         board.wire.send(line)
-        board.listen(max(GLANCE_S / 6, len(line) * 12 / board.baud_rate))
-    shown = board.drive(ZERO, GLANCE_S + 2 * board.gap_s)
+        board.listen(max(SHORT_MEASUREMENT_S / 6, len(line) * 12 / board.baud_rate))
+    shown = board.drive(ZERO, SHORT_MEASUREMENT_S + 2 * board.gap_s)
     board.rest()
     return any(moving(reply.motors) for reply in shown)

@@ -15,7 +15,7 @@ from typing import get_args
 from acsard.checkup import lateness, outcomes
 from acsard.checkup.board import Board
 from acsard.checkup.findings import Finding, StoppedError, motor_name
-from acsard.checkup.motion import BOOT_S, CUT_S, GLANCE_S, ZERO, Reply
+from acsard.checkup.motion import BOOT_S, SHORT_MEASUREMENT_S, WATCHDOG_SILENCE_S, ZERO, Reply
 from acsard.core.config.settings import Baud
 from acsard.core.config.wire_time import COMFORTABLE_USE, highest_rate, line_bytes
 from acsard.core.link.checked_line import seal
@@ -55,7 +55,7 @@ def _knock(board: Board, seconds: float) -> bool:
         board.zeros()
         # Firmware with the checked link refuses plain lines once it has accepted a checked line.
         board.wire.send(seal(board.line(ZERO), 0))
-        board.listen(max(GLANCE_S / 4, 5 * board.period_s))
+        board.listen(max(SHORT_MEASUREMENT_S / 4, 5 * board.period_s))
         if len(board.replies) >= 3:
             board.sealed = all(b"#" in reply.line for reply in board.replies)
             return True
@@ -73,7 +73,7 @@ def identity(board: Board) -> Finding:
     for _ in range(3):
         board.restarts.asked(board.now_s)
         board.wire.send(b"\r\n?\r\n")
-        board.listen(1.5 * GLANCE_S)
+        board.listen(1.5 * SHORT_MEASUREMENT_S)
         if any(line.startswith(IDENTITY) or line == b"?" for line in board.others):
             break
     for line in board.others:
@@ -103,7 +103,7 @@ def form(board: Board) -> Finding | None:
 
 
 def _answers(board: Board, comma: bool) -> list[Reply]:
-    return [reply for _, reply in board.answers(5, GLANCE_S / 6, comma)]
+    return [reply for _, reply in board.answers(5, SHORT_MEASUREMENT_S / 6, comma)]
 
 
 def comma(board: Board, dead: bool) -> Finding:
@@ -177,10 +177,10 @@ def rate(board: Board) -> Finding:
     The results are stored in `board.gap_s` and `board.own_clock`.
     """
     board.paced = True
-    board.listen(GLANCE_S / 4)
-    unasked = board.listen(CUT_S)
+    board.listen(SHORT_MEASUREMENT_S / 4)
+    unasked = board.listen(WATCHDOG_SILENCE_S)
     # Late replies to earlier lines arrive almost at the same time, unlike reports.
-    board.own_clock = bool(unasked) and unasked[-1].at_s - unasked[0].at_s > GLANCE_S
+    board.own_clock = bool(unasked) and unasked[-1].at_s - unasked[0].at_s > SHORT_MEASUREMENT_S
     highest_hz = highest_rate(board.baud_rate, line_bytes(board.comma), COMFORTABLE_USE)
     period_s, before = 1 / min(board.rate_hz, highest_hz), board.sent_lines
     got = board.drive(ZERO, 0.5, period_s)
@@ -221,7 +221,7 @@ def trip(board: Board) -> Finding:
         return lateness.finding("round trip", board.lateness.since(0.0))
     if board.own_clock:
         return outcomes.find("round trip: own clock")
-    trips = [trip_s for trip_s, _ in board.answers(10, GLANCE_S)]
+    trips = [trip_s for trip_s, _ in board.answers(10, SHORT_MEASUREMENT_S)]
     if not trips:
         return outcomes.find("round trip: none")
     middle_s, longest_s = median(trips), max(trips)

@@ -9,37 +9,37 @@ from statistics import fmean, median
 from acsard.checkup import line_loss, outcomes
 from acsard.checkup.board import Board
 from acsard.checkup.findings import Finding, motor_names
-from acsard.checkup.motion import GLANCE_S, Reply, steps
+from acsard.checkup.motion import SHORT_MEASUREMENT_S, Reply, steps
 from acsard.core.link.codec import LETTERS
 
-AGREES = 0.02
+MAX_COUNT_DIFFERENCE = 0.02
 """Largest tolerated difference between the measured counts per turn and the expected number.
 
 It is relative to the expected number, which the configuration or the firmware states.
 """
 
-ALIKE = 0.75
+MIN_COUNT_RATIO = 0.75
 """Smallest tolerated ratio of the smallest to the largest counts per turn of the motors.
 
 The limit is low, because a coarse encoder allows only a rough measurement.
 """
 
-COARSE = 0.015
+COARSE_ANGLE = 0.015
 """Smallest mean variation of the angles between replies that shows a coarse encoder, rad.
 
 The daemon must know the counts per turn of a coarse encoder.
 """
 
-LONGEST_S = 0.05
+MAX_REPLY_GAP_S = 0.05
 """Longest time between two replies at which jumps of the speed reveal a coarse encoder, s.
 
 With a longer time, an accelerating motor causes similar jumps.
 """
 
-LEAST_ANGLES = 20
+MIN_READINGS = 20
 """Smallest number of reported speeds other than 0 from which a coarse encoder is recognized."""
 
-MOST_COUNTS = 100_000
+MAX_COUNTS = 100_000
 """Largest value that `mcu.encoder_counts` accepts."""
 
 
@@ -51,7 +51,7 @@ def per_turn(replies: Sequence[Reply], motors: Sequence[int]) -> float | None:
     """
     counts = angle = 0.0
     for step in steps(replies):
-        for motor in motors if step.counts and step.mcu_s <= GLANCE_S else ():
+        for motor in motors if step.counts and step.mcu_s <= SHORT_MEASUREMENT_S else ():
             speed = step.speeds[motor]
             if step.counts and abs(speed) >= 1.0:
                 counts += math.copysign(1.0, speed) * step.counts[motor]
@@ -65,12 +65,12 @@ def coarse(replies: Sequence[Reply], motors: Sequence[int]) -> float | None:
 
     This function is for replies that contain no counts. `motors` are numbers from 0 to 3. Return
     None if the encoders are not coarse, if too few replies contain a speed other than 0, or if the
-    replies are too rare (`LONGEST_S`).
+    replies are too rare (`MAX_REPLY_GAP_S`).
     """
-    course = [step for step in steps(replies) if 0.0 < step.seconds <= GLANCE_S]
+    course = [step for step in steps(replies) if 0.0 < step.seconds <= SHORT_MEASUREMENT_S]
     # Use the median, because the arrival time of a single reply is wrong if this computer is late.
     period = median([step.seconds for step in course] or [math.inf])
-    if period > LONGEST_S:
+    if period > MAX_REPLY_GAP_S:
         return None
     jumps, angles = [], []
     for motor in motors:
@@ -79,7 +79,7 @@ def coarse(replies: Sequence[Reply], motors: Sequence[int]) -> float | None:
         for one, two, three in zip(speeds, speeds[1:], speeds[2:], strict=False):
             if one or two or three:
                 jumps.append(abs(one - 2 * two + three) / 2 * period)
-    if len(angles) < LEAST_ANGLES or fmean(jumps) < COARSE:
+    if len(angles) < MIN_READINGS or fmean(jumps) < COARSE_ANGLE:
         return None
     least = sorted(angles)[len(angles) // 20]
     return math.tau / fmean([angle for angle in angles if angle <= 1.5 * least])
@@ -97,7 +97,7 @@ def finding(board: Board, motors: Sequence[int]) -> Finding:
         if about is None or board.mcu.encoder_counts:
             return outcomes.find("encoder counts: none")
         return outcomes.find("encoder counts: coarse", about=about)
-    if board.lost > line_loss.MOST:
+    if board.lost > line_loss.MAX_LOSS:
         return outcomes.find("encoder counts: damaged", share=board.lost)
     said = board.identity.get("counts", "")
     named = int(said) if said.isdigit() and len(said) < 9 else 0
@@ -111,26 +111,26 @@ def finding(board: Board, motors: Sequence[int]) -> Finding:
     if wrong := [motor for motor, counts in each.items() if counts < 1]:
         names, least = motor_names(board.mcu, wrong), min(each.values())
         return outcomes.find("encoder counts: backward", unused, names=names, measured=least)
-    if each and min(each.values()) < ALIKE * max(each.values()):
+    if each and min(each.values()) < MIN_COUNT_RATIO * max(each.values()):
         shown = ", ".join(f"{LETTERS[motor]} {counts:.0f}" for motor, counts in each.items())
         return outcomes.find("encoder counts: unequal", unused, shown=shown)
     if measured is None:
         counts, how = named, "the firmware states this number; the check could not measure it"
     elif not named:
-        near = abs(measured - configured) <= AGREES * configured
+        near = abs(measured - configured) <= MAX_COUNT_DIFFERENCE * configured
         if board.lost and not near:
             return outcomes.find("encoder counts: damaged", share=board.lost)
         counts = configured if near else round(measured)
         how = (
             f"counts and speeds in the replies give {measured:.0f} per turn; the check tolerates a "
-            f"difference of {AGREES:.0%}"
+            f"difference of {MAX_COUNT_DIFFERENCE:.0%}"
         )
-    elif abs(measured - named) > AGREES * named:
+    elif abs(measured - named) > MAX_COUNT_DIFFERENCE * named:
         return outcomes.find("encoder counts: misnamed", named=named, measured=measured)
     else:
         counts, how = named, f"the firmware states this number; the check measured {measured:.0f}"
-    if counts > MOST_COUNTS:
-        return outcomes.find("encoder counts: many", unused, counts=counts, most=MOST_COUNTS)
+    if counts > MAX_COUNTS:
+        return outcomes.find("encoder counts: many", unused, counts=counts, most=MAX_COUNTS)
     right, off = configured in (0, counts), abs(configured / counts - 1)
     return outcomes.find(
         "encoder counts: right" if right else "encoder counts: wrong",

@@ -13,7 +13,7 @@ from acsard.core.values import WHEELS, AcsardError
 
 Verdict = Literal["PASS", "WARN", "FAIL", "SKIPPED"]
 
-REST = "the rest"
+SKIPPED_STEPS = "the rest"
 """Name of the finding that lists the steps without a result after an early end of the check."""
 
 

@@ -14,10 +14,10 @@ from acsard.checkup.board import Board, Operator
 from acsard.checkup.findings import Finding
 from acsard.core.config.settings import SafetyConfig
 
-PRESS_S = 20.0
+PRESS_TIMEOUT_S = 20.0
 """Time within which the operator must press and release the emergency stop or a bumper, s."""
 
-NEWS_S = 0.5
+REPORT_TIMEOUT_S = 0.5
 """Time within which every board reports its emergency stop and each bumper at least once, s."""
 
 
@@ -36,7 +36,7 @@ def finding(board: Board, operator: Operator, safety: SafetyConfig) -> Finding:
     board reports. The operator sees a bumper's configured place on the robot as its name, or its
     number if the configuration gives no places. The inputs are not tested if no operator is ready.
     """
-    board.ask(NEWS_S)
+    board.ask(REPORT_TIMEOUT_S)
     estop = safety.estop == "required" or (safety.estop == "auto" and 0 in board.inputs)
     places = () if safety.bumper == "off" else safety.bumpers
     counted = 0 if safety.bumper == "off" else sum(number > 0 for number in board.inputs)
@@ -70,10 +70,10 @@ def finding(board: Board, operator: Operator, safety: SafetyConfig) -> Finding:
 def _pressed(board: Board, operator: Operator, asked: Input, inputs: list[Input]) -> str:
     """Let the operator press and release the input `asked`, and describe wrong reports.
 
-    Return "" if the board reported exactly this press and its release, within `PRESS_S`.
+    Return "" if the board reported exactly this press and its release, within `PRESS_TIMEOUT_S`.
     """
-    operator.doing(f"press the {asked.name} and release it, within {PRESS_S:g} s")
-    end_s, seen = board.now_s + PRESS_S, set[int]()
+    operator.doing(f"press the {asked.name} and release it, within {PRESS_TIMEOUT_S:g} s")
+    end_s, seen = board.now_s + PRESS_TIMEOUT_S, set[int]()
     while board.now_s < end_s:
         board.ask()
         now = {number for number, pressed in board.inputs.items() if pressed}

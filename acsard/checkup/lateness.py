@@ -15,23 +15,23 @@ from acsard.checkup import motion, outcomes
 from acsard.checkup.findings import Finding
 from acsard.checkup.outcomes import Unsure
 
-LEAST_S = 0.005
+MIN_DELAY_S = 0.005
 """Shortest delay of this computer that `Lateness` records, s. Shorter delays are normal."""
 
-SPOILS_S = motion.PERIOD_S
+MAX_LATENESS_S = motion.LINE_PERIOD_S
 """Shortest delay of this computer that makes a finding doubtful if its verdict is not PASS, s.
 
 It is the time from one line of the check to the next.
 """
 
-PAUSE_S = motion.WATCHDOG_LEAST_S
+MAX_PAUSE_S = motion.MIN_WATCHDOG_S
 """Shortest delay of this computer that makes even a finding with the verdict PASS doubtful, s.
 
 During such a delay the board's watchdog may have stopped the motors.
 """
 
 
-LATE = "late: not judged"
+NOT_JUDGED = "late: not judged"
 
 
 class Lateness:
@@ -43,9 +43,9 @@ class Lateness:
     def look(self, late_s: float, now_s: float) -> None:
         """Record a delay of `late_s` s that ended at the monotonic time `now_s`, s.
 
-        A delay that is shorter than `LEAST_S` is ignored.
+        A delay that is shorter than `MIN_DELAY_S` is ignored.
         """
-        if late_s >= LEAST_S:
+        if late_s >= MIN_DELAY_S:
             self._seen.append((now_s, late_s))
 
     def since(self, began_s: float) -> float:
@@ -60,12 +60,12 @@ def spoilt(found: Unsure, late_s: float) -> bool:
     """Return whether the finding may be wrong because this computer was late.
 
     `late_s` is the longest delay of this computer during the step, s. The result is True if the
-    delay reaches both half of `found.margin_s` and a minimum. The minimum is `PAUSE_S` for a
-    finding with the verdict PASS, else `SPOILS_S`.
+    delay reaches both half of `found.margin_s` and a minimum. The minimum is `MAX_PAUSE_S` for a
+    finding with the verdict PASS, else `MAX_LATENESS_S`.
     """
     # Half of the margin is enough, because this computer may have been late by the same time at the
     # start and at the end of the measurement.
-    least_s = PAUSE_S if found.verdict == "PASS" else SPOILS_S
+    least_s = MAX_PAUSE_S if found.verdict == "PASS" else MAX_LATENESS_S
     return late_s >= max(least_s, found.margin_s / 2)
 
 
@@ -74,12 +74,12 @@ def finding(name: str, late_s: float) -> Finding:
 
     `late_s` is the longest delay of this computer during the step, s.
     """
-    return outcomes.find(LATE, name=name, late=late_s * 1000)
+    return outcomes.find(NOT_JUDGED, name=name, late=late_s * 1000)
 
 
 def judged(found: Finding) -> bool:
     """Return whether the step was judged: False if this computer was too late for a judgment."""
-    return found.figure != outcomes.MANUAL[LATE].figure
+    return found.figure != outcomes.MANUAL[NOT_JUDGED].figure
 
 
 def unjudged(findings: Iterable[Finding]) -> list[str]:

@@ -20,13 +20,13 @@ from acsard.checkup.findings import Finding, StoppedError
 from acsard.checkup.motion import ZERO, Reply
 from acsard.core.config.wire_time import COMFORTABLE_USE, highest_rate, line_bytes
 from acsard.core.formatting import printable_bytes
-from acsard.core.link.link_diagnosis import SHOWN
+from acsard.core.link.link_diagnosis import MAX_SHOWN_BYTES
 from acsard.core.link.session import IDENTITY
 
-MOST = 0.02
+MAX_LOSS = 0.02
 """Largest fraction of lost lines that the check accepts. A good link loses no line."""
 
-FEW = 2
+MIN_LOST_LINES = 2
 """Smallest number of lost lines that shows a fault. A single lost line may be a coincidence."""
 
 LINES, LEAST_S, MOST_S = 300, 3.0, 10.0
@@ -36,7 +36,7 @@ The count takes `LEAST_S` if no line is lost. Otherwise it ends after `LINES` li
 enough to show a loss of 2 %, or after `MOST_S`.
 """
 
-SILENT = 2.0
+SILENCE_FACTOR = 2.0
 """A gap between two replies is a silence only if it exceeds the mean gap times this number."""
 
 
@@ -53,33 +53,33 @@ class Count(Struct, frozen=True):
 
     @property
     def share(self) -> float:
-        """Fraction of lost lines, 0 to 1. It is 0 if fewer than `FEW` lines are lost."""
-        return self.lost / self.lines if self.lost >= FEW else 0.0
+        """Fraction of lost lines, 0 to 1. It is 0 if fewer than `MIN_LOST_LINES` lines are lost."""
+        return self.lost / self.lines if self.lost >= MIN_LOST_LINES else 0.0
 
 
 def finding(board: Board) -> Finding:
     """Send zeros at the control rate, count the lost lines, and set `board.lost`.
 
-    Raises `StoppedError` if more than `MOST` of the lines are lost, some lines arrive damaged, and
-    the lines have no checksum. On such a link, a damaged line could command any speed. If an
+    Raises `StoppedError` if more than `MAX_LOSS` of the lines are lost, some lines arrive damaged,
+    and the lines have no checksum. On such a link, a damaged line could command any speed. If an
     earlier step could not measure the rate of the replies, the finding says that the loss was not
     judged.
     """
     if not board.paced:
         return lateness.finding("lost lines", board.lateness.since(0.0))
     # Wait until the replies to earlier lines have arrived.
-    board.listen(motion.GLANCE_S)
+    board.listen(motion.SHORT_MEASUREMENT_S)
     began_s, sent, others = board.now_s, board.sent_lines, len(board.others)
     board.drive(ZERO, LEAST_S, _period_s(board))
     silent_s = _silence_s(board, motion.since(board.replies, began_s))
     while True:
-        board.listen(motion.GLANCE_S)
+        board.listen(motion.SHORT_MEASUREMENT_S)
         count = _counted(board, began_s, board.sent_lines - sent, others)
         if not count.lost or count.lines >= LINES or board.now_s - began_s > MOST_S:
             break
         board.drive(ZERO, 0.5, _period_s(board))
     board.lost = count.share
-    if board.lost <= MOST:
+    if board.lost <= MAX_LOSS:
         outcome = "late" if silent_s else "few" if count.lost else "none"
     elif not count.damaged:
         outcome = "silent" if board.own_clock else "either"
@@ -92,7 +92,7 @@ def finding(board: Board) -> Finding:
         share=board.lost,
         silent=silent_s * 1000,
         damaged=count.damaged,
-        last=printable_bytes(board.others[-1], SHOWN) if count.damaged else "",
+        last=printable_bytes(board.others[-1], MAX_SHOWN_BYTES) if count.damaged else "",
     )
     if outcome in ("back", "both") and not board.sealed:
         raise StoppedError(found)
@@ -139,7 +139,7 @@ def _silence_s(board: Board, replies: Sequence[Reply]) -> float:
     """Return the longest gap between two replies, s, or 0 if the daemon would tolerate the gap."""
     longest = max(_gaps(replies), default=0.0)
     quiet_s = max(0.1, 4 / board.rate_hz, 3 * board.mcu.reply_period)
-    return longest if longest > max(quiet_s, SILENT * board.gap_s) else 0.0
+    return longest if longest > max(quiet_s, SILENCE_FACTOR * board.gap_s) else 0.0
 
 
 PULSE_S = 0.08
@@ -163,7 +163,7 @@ The pause after pulse n is the shortest pause plus (n * `STRIDE`) % `SPREAD` per
 were equal, a link that loses every n-th line might never lose a pulse.
 """
 
-OBEYED = 0.5
+OBEYED_FRACTION = 0.5
 """Smallest angle of the motors that shows that they obeyed a pulse.
 
 It is a fraction of the median angle by which all pulses turned the motors.
@@ -195,17 +195,17 @@ def direction(board: Board, operator: Operator, motors: Sequence[int]) -> Findin
 
     The motors turn briefly, several times. `motors` are the numbers of the motors that turn as
     commanded: their encoders show which lines arrived. If the board replies to lines and loses at
-    most `MOST` of them, return None, and do not turn the motors.
+    most `MAX_LOSS` of them, return None, and do not turn the motors.
     """
-    if not (board.own_clock or board.lost > MOST):
+    if not (board.own_clock or board.lost > MAX_LOSS):
         return None
     operator.doing("the motors turn briefly, several times, to find out where lines are lost")
     ways = pulsed(board, motors) if motors else None
     if ways is None:
         return outcomes.find("lost where: untold")
-    if ways.there + ways.back < FEW:
+    if ways.there + ways.back < MIN_LOST_LINES:
         outcome = "not seen"
-    elif min(ways.there, ways.back) >= FEW:
+    elif min(ways.there, ways.back) >= MIN_LOST_LINES:
         outcome = "both"
     else:
         outcome = "there" if ways.there > ways.back else "back"
@@ -227,7 +227,7 @@ def pulsed(board: Board, motors: Sequence[int]) -> Ways | None:
     count = 0
     while len(unanswered) < TOLD and board.now_s < end_s:
         # The reply to an earlier line must not be taken for the reply to this pulse.
-        board.listen(motion.GLANCE_S / 4)
+        board.listen(motion.SHORT_MEASUREMENT_S / 4)
         since_s, coasting = board.now_s, board.replies[-1].motors
         answered = bool(board.drive(on, PULSE_S, PULSE_S))
         board.drive(ZERO, 2 * board.gap_s + (4 + STRIDE * count % SPREAD) * board.period_s)
@@ -246,8 +246,8 @@ def pulsed(board: Board, motors: Sequence[int]) -> Ways | None:
     if board.own_clock and len(every) < TOLD:
         return None
     if board.own_clock:
-        return Ways(len(every), sum(angle < OBEYED * usual for angle in every), 0)
-    back = sum(angle >= OBEYED * usual for angle in unanswered)
+        return Ways(len(every), sum(angle < OBEYED_FRACTION * usual for angle in every), 0)
+    back = sum(angle >= OBEYED_FRACTION * usual for angle in unanswered)
     return Ways(len(every), len(unanswered) - back, back)
 
 
@@ -274,7 +274,7 @@ def _stand(board: Board) -> bool:
     """
     began_s = board.now_s
     while board.turning():
-        if board.now_s - began_s > motion.MOTOR_S / 2:
+        if board.now_s - began_s > motion.MOTOR_TIMEOUT_S / 2:
             board.rest()
             return False
         board.ask()

@@ -14,48 +14,48 @@ from statistics import fmean
 
 from msgspec import Struct
 
-from acsard.core.config.wire_time import FIELD
+from acsard.core.config.wire_time import FIELD_VALUES
 from acsard.core.link.checked_line import Reading
 from acsard.core.link.codec import Motors
 
 # Shortest and longest delay after which a correct watchdog of the board stops the motors, s. The
 # firmware's `WATCHDOG_S` is between these limits, which leave room for errors of the measurement.
-WATCHDOG_LEAST_S = 0.1
-WATCHDOG_MOST_S = 0.5
+MIN_WATCHDOG_S = 0.1
+MAX_WATCHDOG_S = 0.5
 
 # Speeds, rad/s
 SPEED = 3.0  # the highest speed that the check commands: half a turn per second
-RUNAWAY = 2 * SPEED  # a faster motor ends the check
-MOVES = SPEED / 4  # a motor at this speed or above counts as moving
-STANDING = SPEED / 10  # a motor below this speed counts as standing still
+RUNAWAY_SPEED = 2 * SPEED  # a faster motor ends the check
+MOVING_SPEED = SPEED / 4  # a motor at this speed or above counts as moving
+STANDING_SPEED = SPEED / 10  # a motor below this speed counts as standing still
 # A motor that reaches this mean speed in a short probe (`wheels.probe`) counts as moving. The limit
 # is low, because a heavy wheel has hardly begun to turn by then.
-PROBE_MOVES = SPEED / 40
+PROBE_MOVING_SPEED = SPEED / 40
 
 # Times, s
-PERIOD_S = 0.02  # time from one line to the next, unless the wire is too slow for this
-GLANCE_S = 0.2  # a short measurement: a few replies, and some counts of a coarse encoder
+LINE_PERIOD_S = 0.02  # time from one line to the next, unless the wire is too slow for this
+SHORT_MEASUREMENT_S = 0.2  # a short measurement: a few replies, and some counts of a coarse encoder
 # A lifted wheel usually reaches the commanded speed, or comes to rest, within this time. If its
 # speed still changes then, the check waits longer.
-MOTOR_S = 2.0
+MOTOR_TIMEOUT_S = 2.0
 # Longest wait for a speed that still changes: a heavy wheel, or a hub motor that coasts.
-PATIENCE_S = 3 * MOTOR_S
+SLOWING_TIMEOUT_S = 3 * MOTOR_TIMEOUT_S
 BOOT_S = 3.0  # a restarted board answers by then; many bootloaders wait two seconds
 # If no line is sent for this time, a correct watchdog has switched the motors off.
-CUT_S = WATCHDOG_MOST_S + GLANCE_S
+WATCHDOG_SILENCE_S = MAX_WATCHDOG_S + SHORT_MEASUREMENT_S
 # If no line is sent for this time, the motors stand still, unless the MCU has no watchdog.
-STOOD_S = WATCHDOG_MOST_S + MOTOR_S
+STANDSTILL_TIMEOUT_S = MAX_WATCHDOG_S + MOTOR_TIMEOUT_S
 
 
 # `turning` ignores replies that are older than this, s.
-COUNT_S = 1.0
+MAX_REPLY_AGE_S = 1.0
 
 ZERO: Motors = (0.0, 0.0, 0.0, 0.0)
 
 TREND_S = 0.5
 """Shortest duration of each of the two intervals whose mean speeds `trend` compares, s."""
 
-FALLS = 0.97
+SLOWING_RATIO = 0.97
 """Limit for the ratio of two successive mean speeds of a motor, which `trend` returns.
 
 The motor is slowing down if the ratio is below this limit. It is speeding up if the ratio is above
@@ -98,7 +98,7 @@ def each(value: Callable[[int], float]) -> Motors:
     return a, b, c, d
 
 
-def moving(speeds: Motors, least: float = MOVES) -> list[int]:
+def moving(speeds: Motors, least: float = MOVING_SPEED) -> list[int]:
     """Return the numbers of the motors that turn at `least` rad/s or faster, in any direction."""
     return [motor for motor in range(4) if abs(speeds[motor]) >= least]
 
@@ -125,8 +125,8 @@ def steps(replies: Sequence[Reply]) -> Iterator[Step]:
             yield Step(seconds, after.motors)
             continue
         pairs = zip(one.counts, other.counts, strict=True)
-        went = [(b - a + FIELD // 2) % FIELD - FIELD // 2 for a, b in pairs]
-        mcu_s = (other.mcu_ms - one.mcu_ms) % FIELD / 1000
+        went = [(b - a + FIELD_VALUES // 2) % FIELD_VALUES - FIELD_VALUES // 2 for a, b in pairs]
+        mcu_s = (other.mcu_ms - one.mcu_ms) % FIELD_VALUES / 1000
         yield Step(seconds, after.motors, mcu_s, each(went.__getitem__))
 
 
@@ -152,17 +152,18 @@ def turning(replies: Sequence[Reply], now_s: float) -> list[int]:
     A coarse encoder reports a speed of 0 in most replies, even while its motor turns. After a reply
     that reports a movement, the motor therefore counts as turning for some time.
     """
-    # That time is the time in which the motor would turn by the same angle at the speed `STANDING`.
+    # That time is the time in which the motor would turn by the same angle at the speed
+    # `STANDING_SPEED`.
     found: set[int] = set()
     for reply, earlier in pairwise(reversed([Reply(-math.inf, ZERO, b""), *replies])):
         ago_s = now_s - reply.at_s
-        if ago_s > COUNT_S:
+        if ago_s > MAX_REPLY_AGE_S:
             break
-        gap_s = min(GLANCE_S, reply.at_s - earlier.at_s)
+        gap_s = min(SHORT_MEASUREMENT_S, reply.at_s - earlier.at_s)
         found.update(
             motor
-            for motor in moving(reply.motors, STANDING)
-            if ago_s <= abs(reply.motors[motor]) * gap_s / STANDING
+            for motor in moving(reply.motors, STANDING_SPEED)
+            if ago_s <= abs(reply.motors[motor]) * gap_s / STANDING_SPEED
         )
     return sorted(found)
 
@@ -206,15 +207,17 @@ def fastest(replies: Sequence[Reply], above: float) -> tuple[int, float] | None:
     # Leave out the largest movement of each interval, which a single wrong reply can cause. A short
     # interval shows a runaway motor sooner, and a longer interval shows it even with a coarse
     # encoder.
-    for span_s in (GLANCE_S / 2, GLANCE_S) if replies else ():
+    for span_s in (SHORT_MEASUREMENT_S / 2, SHORT_MEASUREMENT_S) if replies else ():
         near = since(replies, replies[-1].at_s - span_s)
         course = list(steps(max(near, replies[-4:], key=len)))
         for motor in range(4):
-            pieces = [(min(GLANCE_S, step.seconds), step.speeds[motor]) for step in course]
+            pieces = [
+                (min(SHORT_MEASUREMENT_S, step.seconds), step.speeds[motor]) for step in course
+            ]
             sure = sorted(pieces, key=lambda piece: abs(piece[0] * piece[1]))[:-1]
             # After a silence, two replies may arrive close together. A single count in such a short
             # time would look like a high speed.
-            seconds = max(GLANCE_S / 2, sum(seconds for seconds, _ in sure))
+            seconds = max(SHORT_MEASUREMENT_S / 2, sum(seconds for seconds, _ in sure))
             speed = sum(seconds * speed for seconds, speed in sure) / seconds
             if abs(speed) > above:
                 return motor, speed

@@ -25,8 +25,8 @@ from acsard.checkup import (
     wheels,
 )
 from acsard.checkup.board import Board, Operator, Wire
-from acsard.checkup.findings import REST, Finding, StoppedError, WireLostError, motor_name
-from acsard.checkup.motion import BOOT_S, GLANCE_S
+from acsard.checkup.findings import SKIPPED_STEPS, Finding, StoppedError, WireLostError, motor_name
+from acsard.checkup.motion import BOOT_S, SHORT_MEASUREMENT_S
 from acsard.checkup.outcomes import Unsure
 from acsard.checkup.restarts import Restart, RestartedError
 from acsard.checkup.wheels import Channel, encoder_finding, wheel_map
@@ -37,7 +37,7 @@ from acsard.core.values import NS_PER_S
 
 LIFTED, QUITS = "lifted", "q"
 
-CONFIRM = (
+CONFIRMATION = (
     "The wheels will turn one by one, then together. The tool commands 3 rad/s at most, but a "
     "wheel whose encoder is dead or reversed can reach full speed for about a second. Lift the "
     "robot so that no wheel touches anything, keep a hand on the power switch, then type "
@@ -49,10 +49,10 @@ STEPS = (
     "lost lines", "motors", "trailing comma", "wheel map", "encoder counts", "watchdog",
     "damaged lines", "inputs",
 )  # fmt: skip
-"""Names of all steps. After an early end of the check, the finding `REST` lists the steps without a
-result."""
+"""Names of all steps. After an early end of the check, the finding `SKIPPED_STEPS` lists the steps
+without a result."""
 
-SILENT: tuple[tuple[str, Callable[[Board], Finding | None]], ...] = (
+SILENT_STEPS: tuple[tuple[str, Callable[[Board], Finding | None]], ...] = (
     ("listening for 3 s at the configured baud rate, then at other baud rates", dialect.baud),
     ("asking the board for its name", dialect.identity),
     ("measuring how often the board answers", dialect.rate),
@@ -138,7 +138,7 @@ def run(
         longest_s = longest_reply(config.feedback.fault_time)
         with Board(wire, config.mcu, config.rate_hz, longest_s) as board:
             board.zeros()
-            if operator.ask(CONFIRM, (LIFTED,)) != LIFTED:
+            if operator.ask(CONFIRMATION, (LIFTED,)) != LIFTED:
                 raise StoppedError(outcomes.find("wheels: not lifted"))
             watched = _Watched(operator, board, asleep_ns)
             board.between = watched.look
@@ -154,7 +154,7 @@ def run(
     rest = [step for step in STEPS if step not in told]
     if why and rest:
         left = f"{why}; not tried: {', '.join(rest)}"
-        tell(Finding(REST, "SKIPPED", many(len(rest), "step"), left))
+        tell(Finding(SKIPPED_STEPS, "SKIPPED", many(len(rest), "step"), left))
 
 
 class _Watched:
@@ -220,7 +220,7 @@ class _Steps:
 
     def all(self, safety: SafetyConfig) -> None:
         board, operator = self._board, self._operator
-        for doing, step in SILENT:
+        for doing, step in SILENT_STEPS:
             self._measure(doing, partial(step, board))
         self._take("", self._stand)
         for motor in range(4):
@@ -341,10 +341,10 @@ class _Steps:
         try:
             finding = step()
         except StoppedError:
-            self._await_return(GLANCE_S)
+            self._await_return(SHORT_MEASUREMENT_S)
             raise
         if finding is not None and finding.verdict in ("WARN", "FAIL"):
-            self._await_return(2 * GLANCE_S)
+            self._await_return(2 * SHORT_MEASUREMENT_S)
         return finding
 
     def _await_return(self, silent_s: float) -> None:

@@ -15,36 +15,36 @@ from msgspec import Struct
 
 from acsard.checkup import outcomes
 from acsard.checkup.findings import Finding, motor_names
-from acsard.checkup.motion import BOOT_S, GLANCE_S, ZERO, Reply
+from acsard.checkup.motion import BOOT_S, SHORT_MEASUREMENT_S, ZERO, Reply
 from acsard.core.config.settings import McuConfig
 from acsard.core.link.codec import Motors
 from acsard.core.link.session import IDENTITY
 from acsard.core.values import AcsardError
 
-ASKED_S = 1.0
+ANSWER_TIMEOUT_S = 1.0
 """Longest time from a request for the board's identification to the answer, s.
 
 If an identification arrives later, the board sent it without a request, because it booted.
 """
 
-UNANSWERED = 5
+RESTART_UNANSWERED_LINES = 5
 """Smallest number of successive lines without a reply after which a text shows a restart.
 
 If the board has left fewer lines without a reply, the text may be a debug print of the firmware.
 """
 
-AHEAD_S = 2.0
+CLOCK_TOLERANCE_S = 2.0
 """Tolerated difference between the board's clock and this computer's clock, s.
 
 Between two replies, the board's clock may advance by this time more than this computer's clock, for
 example because a reply was delayed. If it advances by more, the board has restarted: the jump of
-its clock back to 0 looks like a large advance modulo `CLOCK`.
+its clock back to 0 looks like a large advance modulo `CLOCK_RANGE_MS`.
 """
 
-CLOCK = 65536
+CLOCK_RANGE_MS = 65536
 """Time after which the board's clock overflows and continues at 0, ms."""
 
-SILENT_S = 0.25
+MIN_SILENCE_S = 0.25
 """Shortest time without a line to the board that can make its watchdog restart the board, s."""
 
 CAUSES = {"power": "supply", "brown-out": "supply", "watchdog": "watchdog", "pin": "pin"}
@@ -130,7 +130,7 @@ class Restarts:
         if not (sign and self.watched):
             return None
         heard_s = float("inf") if self._replied_s is None else self._replied_s
-        turned = self._turned if self._turned_s > heard_s - GLANCE_S else ZERO
+        turned = self._turned if self._turned_s > heard_s - SHORT_MEASUREMENT_S else ZERO
         return Restart(sign, turned, self._silence_s(at_s), cause([line]))
 
     def _silence_s(self, at_s: float) -> float:
@@ -138,9 +138,9 @@ class Restarts:
         return max(self._silent_s, now_s)
 
     def _line_sign(self, line: bytes, at_s: float) -> str:
-        if line.startswith(IDENTITY) and at_s - self._asked_s > ASKED_S:
+        if line.startswith(IDENTITY) and at_s - self._asked_s > ANSWER_TIMEOUT_S:
             return "the board sent its name without a request"
-        boots = self._unanswered >= UNANSWERED and _WORD.search(line)
+        boots = self._unanswered >= RESTART_UNANSWERED_LINES and _WORD.search(line)
         return "the board was silent, then sent a text instead of replies" if boots else ""
 
     def _clock_sign(self, reply: Reply) -> str:
@@ -150,10 +150,10 @@ class Restarts:
         self._clock = reading.mcu_ms, reply.at_s
         if before is None:
             return ""
-        most_ms = 1000 * (reply.at_s - before[1] + AHEAD_S)
-        # After half a minute without a reply, the difference modulo `CLOCK` proves nothing, because
-        # the clock may have overflowed.
-        if most_ms < CLOCK / 2 and (reading.mcu_ms - before[0]) % CLOCK > most_ms:
+        most_ms = 1000 * (reply.at_s - before[1] + CLOCK_TOLERANCE_S)
+        # After half a minute without a reply, the difference modulo `CLOCK_RANGE_MS` proves
+        # nothing, because the clock may have overflowed.
+        if most_ms < CLOCK_RANGE_MS / 2 and (reading.mcu_ms - before[0]) % CLOCK_RANGE_MS > most_ms:
             return "the board's clock and encoder counts started again from 0"
         return ""
 
@@ -192,8 +192,9 @@ def _outcome(restarts: Sequence[Restart]) -> str:
 
 
 def _silent(restarts: Sequence[Restart]) -> bool:
-    """Return whether `restarts` are several, each after `SILENT_S` or more without a sent line."""
-    return len(restarts) > 1 and all(one.silent_s >= SILENT_S for one in restarts)
+    """Return whether `restarts` are several, each after `MIN_SILENCE_S` or more without a sent
+    line."""
+    return len(restarts) > 1 and all(one.silent_s >= MIN_SILENCE_S for one in restarts)
 
 
 def _told(mcu: McuConfig, restart: Restart) -> tuple[str, str]:

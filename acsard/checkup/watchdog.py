@@ -22,10 +22,10 @@ from acsard.checkup.board import Board
 from acsard.checkup.findings import Finding, StoppedError
 from acsard.checkup.motion import Reply
 from acsard.checkup.wheels import run_up
-from acsard.core.config.wire_time import FIELD
+from acsard.core.config.wire_time import FIELD_VALUES
 from acsard.core.link.codec import LETTERS, Motors
 
-FEEDING = ("a wrong letter", "neither p nor n", "cut short")
+DAMAGE_KINDS = ("a wrong letter", "neither p nor n", "cut short")
 """Kinds of damaged lines that must not feed the watchdog. The check sends lines of these kinds."""
 
 TURNING, STOPPED = 0.9, 0.1
@@ -34,7 +34,7 @@ TURNING, STOPPED = 0.9, 0.1
 A motor at `TURNING` or above has not slowed down. A motor below `STOPPED` stands still.
 """
 
-UNKNOWN = math.inf
+NOT_MEASURED = math.inf
 """Upper bound of the watchdog's delay if the motors did not stop even in the longest silence."""
 
 Between = tuple[float, float]
@@ -91,8 +91,8 @@ def finding(board: Board, motors: Sequence[int]) -> Finding:
     if judged.verdict == "FAIL":
         return judged
     lines = damage.broken_lines(board.comma, board.sealed, motors)
-    broken = cycle(line for what, line in lines if what in FEEDING)
-    fed = run(board, motors, max(motion.CUT_S, 2 * most_s) + stop.slow_s, broken)
+    broken = cycle(line for what, line in lines if what in DAMAGE_KINDS)
+    fed = run(board, motors, max(motion.WATCHDOG_SILENCE_S, 2 * most_s) + stop.slow_s, broken)
     if fed.ran_s >= 0.75 * fed.silent_s:
         # The motors ran on during most of the silence, so the damaged lines fed the watchdog.
         # Without them, the watchdog stops the motors after a smaller distance.
@@ -102,21 +102,21 @@ def finding(board: Board, motors: Sequence[int]) -> Finding:
 
 
 def _judged(least_s: float, most_s: float) -> Finding:
-    if most_s == UNKNOWN:
+    if most_s == NOT_MEASURED:
         return outcomes.find("watchdog: none", seconds=least_s)
     middle_s, half_s = (least_s + most_s) / 2, (most_s - least_s) / 2
     figure = f"{middle_s * 1000:.0f} ms" + (f" ± {half_s * 1000:.0f}" if half_s >= 0.005 else "")
     # The measurement is not more accurate than 0.01 s.
     least_s, most_s = round(least_s, 2), round(most_s, 2)
-    if least_s > motion.WATCHDOG_MOST_S:
+    if least_s > motion.MAX_WATCHDOG_S:
         outcome = "late"
-    elif most_s < motion.WATCHDOG_LEAST_S:
+    elif most_s < motion.MIN_WATCHDOG_S:
         outcome = "early"
-    elif most_s > motion.WATCHDOG_MOST_S:
+    elif most_s > motion.MAX_WATCHDOG_S:
         outcome = "unclear"
     else:
         outcome = "right"
-    beyond_s = least_s - motion.WATCHDOG_MOST_S if outcome == "late" else 0.0
+    beyond_s = least_s - motion.MAX_WATCHDOG_S if outcome == "late" else 0.0
     return outcomes.find(f"watchdog: {outcome}", figure=figure, seconds=middle_s, margin_s=beyond_s)
 
 
@@ -124,18 +124,21 @@ def measured(board: Board, motors: Sequence[int], stop: Run) -> Between:
     """Measure for how long motors run on when no lines are sent.
 
     Return a lower and an upper bound of this time, s. If the motors do not stop even in the longest
-    silence, the upper bound is `UNKNOWN`. `motors` are numbers from 0 to 3. `stop` is the behavior
-    of these motors in an ordinary stop.
+    silence, the upper bound is `NOT_MEASURED`. `motors` are numbers from 0 to 3. `stop` is the
+    behavior of these motors in an ordinary stop.
     """
     least_s = 0.0
-    for length_s in (motion.CUT_S + stop.slow_s, motion.STOOD_S + stop.slow_s):
+    for length_s in (
+        motion.WATCHDOG_SILENCE_S + stop.slow_s,
+        motion.STANDSTILL_TIMEOUT_S + stop.slow_s,
+    ):
         found = run(board, motors, length_s)
         ran_on_s = found.ran_s - stop.ran_s
         if ran_on_s < 0.95 * found.silent_s:
             break
         least_s = found.silent_s
     else:
-        return motion.STOOD_S, UNKNOWN
+        return motion.STANDSTILL_TIMEOUT_S, NOT_MEASURED
     by_counts = _per_turn(board, motors) > 0
     if not (board.own_clock or by_counts or found.first >= STOPPED):
         return _asked(board, motors, stop, (least_s, found.silent_s))
@@ -164,7 +167,7 @@ def _asked(board: Board, motors: Sequence[int], stop: Run, between: Between) -> 
     # silence. In the same way, the reply that shows the end of the ordinary stop arrives after that
     # end.
     least_s -= stop.slow_s - board.period_s + 2 * stop.grain_s
-    most_s -= stop.slow_s - board.period_s - motion.PERIOD_S - 2 * stop.grain_s
+    most_s -= stop.slow_s - board.period_s - motion.LINE_PERIOD_S - 2 * stop.grain_s
     return max(0.0, least_s), max(0.0, most_s)
 
 
@@ -194,11 +197,13 @@ def run(board: Board, motors: Sequence[int], length_s: float, instead: Iterable[
     first, second = (_share(reply, motors) for reply in board.replies[before : before + 2])
     course = motion.since(board.replies, told_s)
     slow_s = next(
-        (r.at_s - told_s for r in course if _share(r, motors) < STOPPED), motion.PATIENCE_S
+        (r.at_s - told_s for r in course if _share(r, motors) < STOPPED), motion.SLOWING_TIMEOUT_S
     )
     # If the board replies to lines, its reply to the last line contains the speeds at the moment at
     # which this line took effect. The motors run on from that moment.
-    answered = not board.own_clock and course[0].at_s < told_s + motion.PERIOD_S + 2 * board.gap_s
+    answered = (
+        not board.own_clock and course[0].at_s < told_s + motion.LINE_PERIOD_S + 2 * board.gap_s
+    )
     since_s = course[0].at_s if answered else told_s
     ran = motion.covered(board.replies, since_s, _per_turn(board, motors))
     ran_s = max(abs(ran[m] / full[m]) for m in motors if abs(full[m]) >= motion.SPEED / 2)
@@ -216,7 +221,9 @@ def _per_turn(board: Board, motors: Sequence[int]) -> float:
     Return 0 if it is not known, or if the board's counters could overflow in the longest silence.
     """
     per_turn = encoder_counts.per_turn(board.replies, motors) or 0.0
-    wraps = per_turn * motion.RUNAWAY / math.tau * motion.STOOD_S >= FIELD / 2
+    wraps = (
+        per_turn * motion.RUNAWAY_SPEED / math.tau * motion.STANDSTILL_TIMEOUT_S >= FIELD_VALUES / 2
+    )
     return 0.0 if wraps or per_turn < 1 else per_turn
 
 

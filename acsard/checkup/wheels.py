@@ -16,16 +16,16 @@ from msgspec import Struct, structs
 from acsard.checkup import motion, outcomes
 from acsard.checkup.board import Board, Operator
 from acsard.checkup.findings import Finding, motor_name, wheel_of, words
-from acsard.checkup.motion import GLANCE_S, PROBE_MOVES, SPEED, ZERO, moving
+from acsard.checkup.motion import PROBE_MOVING_SPEED, SHORT_MEASUREMENT_S, SPEED, ZERO, moving
 from acsard.core.config.settings import McuConfig
 from acsard.core.link.codec import LETTERS, Motors
 from acsard.core.values import WHEELS
 
-TOLERANCE = 0.25
+FAIL_TOLERANCE = 0.25
 """Relative error of an encoder's speed, compared with the commanded speed, above which the check
 fails."""
 
-OFF = 0.05
+WARN_TOLERANCE = 0.05
 """Relative error of an encoder's speed, compared with the commanded speed, above which the check
 warns."""
 
@@ -38,12 +38,12 @@ Kind = Literal["right", "reversed", "dead", "other", "several", "one way", "size
 - other: only the encoder of another motor moved
 - several: several encoders moved, or different encoders forward and backward
 - one way: encoders moved in only one of the two directions
-- size: the relative error of the speed is larger than `TOLERANCE`
-- off: the relative error of the speed is larger than `OFF`
+- size: the relative error of the speed is larger than `FAIL_TOLERANCE`
+- off: the relative error of the speed is larger than `WARN_TOLERANCE`
 - late: this computer was too late to judge the motor
 """
 
-FOLLOWS: tuple[Kind, ...] = ("right", "off", "size")
+FOLLOWING_KINDS: tuple[Kind, ...] = ("right", "off", "size")
 """Values of `Channel.kind` for a motor that moves only its own encoder, in the right direction."""
 
 
@@ -78,7 +78,7 @@ class Channel(Struct, frozen=True):
         """Numbers (0 to 3) of the encoders that moved while this motor was commanded to turn."""
         if not self.probed:
             return moving(self.forth) or moving(self.back)
-        return moving(self.forth, max(PROBE_MOVES, max(map(abs, self.forth)) / 4))
+        return moving(self.forth, max(PROBE_MOVING_SPEED, max(map(abs, self.forth)) / 4))
 
     @property
     def kind(self) -> Kind:
@@ -96,9 +96,9 @@ class Channel(Struct, frozen=True):
             return "other"
         if self.probed or self.forth[own] < 0 < self.back[own]:
             return "reversed"
-        if self.error > TOLERANCE:
+        if self.error > FAIL_TOLERANCE:
             return "size"
-        return "off" if self.error > OFF + self.unsure else "right"
+        return "off" if self.error > WARN_TOLERANCE + self.unsure else "right"
 
     @property
     def error(self) -> float:
@@ -114,11 +114,16 @@ def encoder_finding(mcu: McuConfig, channel: Channel) -> Finding:
     motor, moved = channel.motor, channel.moved
     forth, back = channel.forth[motor], channel.back[motor]
     there = moved[0] if moved else motor
-    # If a motor seems to stand still for half of `beyond_s` in a measurement of `GLANCE_S`, then it
-    # seems too slow by the part of the error that exceeds `TOLERANCE`. `lateness.spoilt` compares a
-    # delay of this computer with half of this margin.
-    beyond_s = 2 * GLANCE_S * (channel.error - TOLERANCE) if channel.kind == "size" else 0.0
-    loose = channel.kind in FOLLOWS and channel.wheel == ""
+    # If a motor seems to stand still for half of `beyond_s` in a measurement of
+    # `SHORT_MEASUREMENT_S`, then it seems too slow by the part of the error that exceeds
+    # `FAIL_TOLERANCE`. `lateness.spoilt` compares a delay of this computer with half of this
+    # margin.
+    beyond_s = (
+        2 * SHORT_MEASUREMENT_S * (channel.error - FAIL_TOLERANCE)
+        if channel.kind == "size"
+        else 0.0
+    )
+    loose = channel.kind in FOLLOWING_KINDS and channel.wheel == ""
     return outcomes.find(
         "motor: loose" if loose else f"motor: {channel.kind}{_whose(mcu, channel)}",
         name=motor_name(mcu, motor),
@@ -130,7 +135,7 @@ def encoder_finding(mcu: McuConfig, channel: Channel) -> Finding:
         wheel=words(wheel_of(mcu, motor)[0]),
         error=channel.error,
         which="slower" if forth - back < 2 * SPEED else "faster",
-        tolerance=TOLERANCE,
+        tolerance=FAIL_TOLERANCE,
         speed=SPEED,
         margin_s=beyond_s,
     )
@@ -171,7 +176,7 @@ def wheel_map(mcu: McuConfig, found: Sequence[Channel]) -> Finding:
     entries: dict[str, str] = {}
     for channel in found:
         wheel, sign = wheel_of(mcu, channel.motor)
-        if channel.kind in FOLLOWS and channel.wheel:
+        if channel.kind in FOLLOWING_KINDS and channel.wheel:
             wheel, sign = channel.wheel, 1 if channel.forward else -1
         if wheel in entries:
             return outcomes.find("wheel map: twice", wheel=words(wheel))
@@ -185,19 +190,20 @@ def wheel_map(mcu: McuConfig, found: Sequence[Channel]) -> Finding:
     )
 
 
-NEAR = 0.8
-"""Fraction of `OFF` above which the relative error of a speed causes a second measurement.
+REPEAT_FRACTION = 0.8
+"""Fraction of `WARN_TOLERANCE` above which the relative error of a speed causes a second
+measurement.
 
 The first measurement is then too inaccurate to decide. The second one takes longer.
 """
 
-LOOK_S = 0.75 * motion.MOTOR_S
+LONG_MEASUREMENT_S = 0.75 * motion.MOTOR_TIMEOUT_S
 """Time over which the second, longer measurement of a speed averages the speed, s."""
 
-LOOKS = 8
+MAX_MEASUREMENTS = 8
 """Largest number of short measurements that `run_up` averages to get the present speed."""
 
-ANSWERS = {
+WHEEL_ANSWERS = {
     "fr": "front_right", "fl": "front_left", "rl": "rear_left", "rr": "rear_right", "none": "",
 }  # fmt: skip
 
@@ -215,12 +221,12 @@ def turn(board: Board, motor: int, speed: float) -> tuple[Motors, float]:
     """
     means = run_up(board, one(motor, speed))
     unsure = _unsure(board, motor, 2 * _look_s(board))
-    if NEAR * OFF + unsure < abs(means[motor] / speed - 1) <= TOLERANCE:
+    if REPEAT_FRACTION * WARN_TOLERANCE + unsure < abs(means[motor] / speed - 1) <= FAIL_TOLERANCE:
         # The motor is weak, or its wheel is heavy and has not yet reached its speed. A longer
         # measurement shows which of the two is the case.
-        board.drive(one(motor, speed), motion.MOTOR_S)
-        means = motion.mean(motion.since(board.replies, board.now_s - LOOK_S))
-        unsure = _unsure(board, motor, LOOK_S)
+        board.drive(one(motor, speed), motion.MOTOR_TIMEOUT_S)
+        means = motion.mean(motion.since(board.replies, board.now_s - LONG_MEASUREMENT_S))
+        unsure = _unsure(board, motor, LONG_MEASUREMENT_S)
     return means, unsure
 
 
@@ -231,16 +237,17 @@ def _unsure(board: Board, motor: int, seconds: float) -> float:
 
 
 def _look_s(board: Board) -> float:
-    return max(motion.GLANCE_S / 2, 2.5 * board.gap_s)
+    return max(motion.SHORT_MEASUREMENT_S / 2, 2.5 * board.gap_s)
 
 
 def run_up(board: Board, motors: Motors) -> Motors:
     """Ramp up to the speeds `motors`, rad/s, and return each encoder's mean speed, rad/s.
 
     The function returns when the speeds are steady, when they are not steady after
-    `motion.MOTOR_S` (`motion.PATIENCE_S` while a motor speeds up), or earlier if no encoder moves.
+    `motion.MOTOR_TIMEOUT_S` (`motion.SLOWING_TIMEOUT_S` while a motor speeds up), or earlier if no
+    encoder moves.
     """
-    steps = max(1, int(motion.GLANCE_S / board.period_s))
+    steps = max(1, int(motion.SHORT_MEASUREMENT_S / board.period_s))
     for step in range(1, steps + 1):
         a, b, c, d = (round(speed * step / steps, 2) for speed in motors)
         board.drive((a, b, c, d), board.period_s)
@@ -251,11 +258,13 @@ def run_up(board: Board, motors: Motors) -> Motors:
         board.drive(motors, look_s)
         looks += 1
         # A coarse encoder needs more measurements than a fine one.
-        last = min(LOOKS, max(1, looks - 1))
+        last = min(MAX_MEASUREMENTS, max(1, looks - 1))
         means = motion.mean(motion.since(board.replies, board.now_s - last * look_s))
-        near = [m for m in moving(means) if abs(abs(means[m]) / motion.SPEED - 1) < 0.4 * TOLERANCE]
+        near = [
+            m for m in moving(means) if abs(abs(means[m]) / motion.SPEED - 1) < 0.4 * FAIL_TOLERANCE
+        ]
         steady = steady + 1 if len(near) >= len(told) else 0
-        if looks * look_s >= motion.CUT_S and not moving(means, motion.STANDING):
+        if looks * look_s >= motion.WATCHDOG_SILENCE_S and not moving(means, motion.STANDING_SPEED):
             # Do not go on: without an encoder, the firmware's speed control may command ever more.
             break
     return means
@@ -268,8 +277,8 @@ def _patience_s(board: Board, told: list[int]) -> float:
     one of these motors speeds up.
     """
     shares = motion.trend(board.replies, board.now_s, board.gap_s)
-    rises = any(shares[motor] > 1 / motion.FALLS for motor in told)
-    return motion.PATIENCE_S if rises else motion.MOTOR_S
+    rises = any(shares[motor] > 1 / motion.SLOWING_RATIO for motor in told)
+    return motion.SLOWING_TIMEOUT_S if rises else motion.MOTOR_TIMEOUT_S
 
 
 def channel(board: Board, motor: int) -> Channel:
@@ -298,7 +307,7 @@ def _both_ways(board: Board, motor: int) -> Channel:
         back, other = turn(board, motor, -motion.SPEED)
         unsure = max(unsure, other)
     if motor not in moving(back):
-        board.let_go(motion.CUT_S)
+        board.let_go(motion.WATCHDOG_SILENCE_S)
     board.rest()
     return Channel(motor, forth, back, unsure=unsure)
 
@@ -320,7 +329,7 @@ def probe(board: Board, motor: int) -> Motors | None:
         # Several replies show that the motor or its encoder is reversed. A second probe would make
         # the motor run away again.
         return shown
-    if not moving(shown, motion.PROBE_MOVES):
+    if not moving(shown, motion.PROBE_MOVING_SPEED):
         return _probe(board, motor, motion.SPEED)
     again = _probe(board, motor, motion.SPEED / 2)
     # If only the first probe showed a movement, a motor may have coasted during that probe.
@@ -339,22 +348,24 @@ def _probe(board: Board, motor: int, speed: float) -> Motors | None:
         seconds = board.now_s - began_s
         ran = motion.covered(board.replies, began_s)
         sure = [max(0.0, abs(ran[m]) - abs(coasting[m]) * seconds) for m in range(4)]
-        return motion.each(lambda m: math.copysign(sure[m], ran[m]) / motion.GLANCE_S)
+        return motion.each(lambda m: math.copysign(sure[m], ran[m]) / motion.SHORT_MEASUREMENT_S)
 
     own = 0.0
-    while board.now_s < began_s + motion.GLANCE_S and own > -4 * motion.PROBE_MOVES:
+    while (
+        board.now_s < began_s + motion.SHORT_MEASUREMENT_S and own > -4 * motion.PROBE_MOVING_SPEED
+    ):
         board.drive(one(motor, speed), board.period_s)
         own = shown()[motor]
-    if own >= motion.PROBE_MOVES:
+    if own >= motion.PROBE_MOVING_SPEED:
         return None
     # Without a correct encoder, the firmware may drive the motor to full speed although it receives
     # zeros. Only its watchdog stops the motor. So a motor that has moved must stand still before
     # the next zeros are sent.
-    moved = moving(shown(), motion.PROBE_MOVES)
-    board.let_go(motion.STOOD_S if moved else motion.CUT_S)
+    moved = moving(shown(), motion.PROBE_MOVING_SPEED)
+    board.let_go(motion.STANDSTILL_TIMEOUT_S if moved else motion.WATCHDOG_SILENCE_S)
     board.rest()
     seen = shown()
-    return None if seen[motor] >= motion.PROBE_MOVES else seen
+    return None if seen[motor] >= motion.PROBE_MOVING_SPEED else seen
 
 
 def _with_other_comma(board: Board, dead: Channel) -> Channel:
@@ -385,11 +396,11 @@ def seen(board: Board, operator: Operator, channel: Channel) -> Channel:
         'rear left (rl) or rear right (rr)? Type "none" if no wheel turned, or "again" to see '
         "the motor turn once more"
     )
-    while (which := operator.ask(question, (*ANSWERS, "again"))) == "again":
+    while (which := operator.ask(question, (*WHEEL_ANSWERS, "again"))) == "again":
         _both_ways(board, channel.motor)
     if which is None:
         return channel
-    if wheel := ANSWERS[which]:
+    if wheel := WHEEL_ANSWERS[which]:
         question = (
             "which way did the wheel turn first: forward (as when the robot drives ahead) or back?"
         )

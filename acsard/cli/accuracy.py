@@ -22,7 +22,7 @@ from acsard.cli.connection import add_bus, connected
 from acsard.client import Client
 from acsard.core.config.settings import Config
 from acsard.host.errors import Exit, NoAnswerError, NotPermittedError
-from acsard.terminal.output import SENTENCES, show
+from acsard.terminal.output import MAX_TEXT_WIDTH, show
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -71,7 +71,7 @@ def _config(robot: Client, path: str | None) -> Config:
 
 def _print(found: Budget, as_json: bool) -> None:
     if not as_json:
-        show(*parts(found), most=SENTENCES)
+        show(*parts(found), most=MAX_TEXT_WIDTH)
         return
     millimetres, degrees = found.total()
     told = msgspec.to_builtins(found)

@@ -49,7 +49,7 @@ from acsard.host.config_file import change, writable
 from acsard.host.errors import Exit, MendableError, UsageError
 from acsard.host.terminal_modes import one_by_one
 from acsard.terminal.json_prompt import JsonPrompt
-from acsard.terminal.output import SENTENCES, plain, show
+from acsard.terminal.output import MAX_TEXT_WIDTH, plain, show
 from acsard.terminal.prompt import NobodyError, Prompt, ended_by_signals
 from acsard.terminal.terminal_prompt import NoPrompt, TerminalPrompt
 
@@ -137,9 +137,9 @@ def _calibrate(args: argparse.Namespace, lines: JsonPrompt | None) -> int:
         if args.json:
             print(msgspec.json.encode(told).decode())
         else:
-            show(*words, most=SENTENCES)
+            show(*words, most=MAX_TEXT_WIDTH)
     else:
-        lines.result(plain(*words, width=SENTENCES))
+        lines.result(plain(*words, width=MAX_TEXT_WIDTH))
         differing = _differing(config, mine, where)
         if not args.write and lines.offer(args.config, keys(found), differing):
             written = where

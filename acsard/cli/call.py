@@ -8,7 +8,7 @@ import argparse
 import math
 from collections.abc import Sequence
 
-from acsard.cli.connection import MANY, add_bus, connected_to_many
+from acsard.cli.connection import SEVERAL_IDS, add_bus, connected_to_many
 from acsard.cli.replies import of_each, print_each
 from acsard.client import Client
 from acsard.core.formatting import json_line, lines
@@ -20,21 +20,21 @@ from acsard.daemon.bus import robot_discovery
 from acsard.daemon.bus.robot_discovery import named
 from acsard.host.errors import UsageError
 
-CALLED = tuple(service for service in SERVICES if service != "set")
+CALLABLE_SERVICES = tuple(service for service in SERVICES if service != "set")
 """Names of the services that `acsard call` can call. `acsard set` calls the service `set`."""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    fields = {service: " ".join(_fields(service)) for service in CALLED}
+    fields = {service: " ".join(_fields(service)) for service in CALLABLE_SERVICES}
     forms = [f"{service} {names.upper()}" for service, names in fields.items() if names]
     parser.add_argument(
         "service",
         # Accept `srv/stop` too, because the messages on `state` and the table of keys contain the
         # name in this form.
         type=lambda word: word.removeprefix("srv/"),
-        choices=CALLED,
+        choices=CALLABLE_SERVICES,
         metavar="SERVICE",
-        help=", ".join(CALLED),
+        help=", ".join(CALLABLE_SERVICES),
     )
     parser.add_argument(
         "values",
@@ -44,7 +44,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help=f"the numbers that the service needs: {'; '.join(forms)}",
     )
     parser.add_argument("--json", action="store_true", help="print the answer as JSON")
-    add_bus(parser, MANY + " (stop only)")
+    add_bus(parser, SEVERAL_IDS + " (stop only)")
 
 
 def main(args: argparse.Namespace) -> int:

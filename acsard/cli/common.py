@@ -13,7 +13,7 @@ from msgspec.structs import replace
 
 from acsard.core.config import parsing as configuration
 from acsard.core.config.parsing import ConfigError
-from acsard.core.config.settings import RECORD, Config
+from acsard.core.config.settings import RECORD_VARIABLE, Config
 from acsard.core.formatting import many
 from acsard.host.config_file import find
 from acsard.host.errors import Exit, ExitError, UsageError
@@ -183,6 +183,6 @@ def recorded(config: Config) -> Config:
     """
     # The path is absolute because a client that receives it over the bus may run in another working
     # directory.
-    told = config.record.directory or os.environ.get(RECORD, "")
+    told = config.record.directory or os.environ.get(RECORD_VARIABLE, "")
     directory = os.path.abspath(told) if told else ""
     return replace(config, record=replace(config.record, directory=directory))

@@ -18,8 +18,8 @@ import zenoh
 
 from acsard.cli.common import add_config, load
 from acsard.client import Client, connect
-from acsard.client.follower import FIRST_S
-from acsard.core.config.settings import TLS
+from acsard.client.follower import FIRST_STATE_TIMEOUT_S
+from acsard.core.config.settings import TLS_PREFIX
 from acsard.core.formatting import printable
 from acsard.core.messages.keys_and_roles import key_hint, row_of, unknown
 from acsard.daemon.bus.address import Address, address_of
@@ -27,7 +27,7 @@ from acsard.daemon.bus.robot_discovery import Presence, explain_silence, named, 
 from acsard.daemon.bus.tls import trouble
 from acsard.host.errors import UsageError
 
-MANY = "; several ids separated by commas, or '*' for all robots"
+SEVERAL_IDS = "; several ids separated by commas, or '*' for all robots"
 
 
 def add_bus(parser: argparse.ArgumentParser, more: str = "") -> None:
@@ -151,7 +151,7 @@ def require_asked(key: str) -> None:
 def explained(
     look: Callable[[], str],
     ceased: Callable[[], str] | None = None,
-    after_s: float = FIRST_S,
+    after_s: float = FIRST_STATE_TIMEOUT_S,
     timeout_s: float = math.inf,
 ) -> Iterator[Callable[[], None]]:
     """Print why no messages arrive, during a `with` block that receives messages.
@@ -238,9 +238,9 @@ def _ceased(robot: Client) -> str:
 
 
 def _of_link(where: Address) -> str:
-    """Return a text about the fault of the TLS connection, such as an expired certificate.
+    """Return a text about the fault of the TLS_PREFIX connection, such as an expired certificate.
 
-    Return "" if the connection to `where` has no such fault, or does not use TLS.
+    Return "" if the connection to `where` has no such fault, or does not use TLS_PREFIX.
     """
-    secured = where.tls and where.endpoint.startswith(TLS)
+    secured = where.tls and where.endpoint.startswith(TLS_PREFIX)
     return trouble(where.endpoint, where.tls) if secured else ""

@@ -20,7 +20,7 @@ from acsard.host.config_file import find
 from acsard.machine.examination import examine
 from acsard.terminal.output import show_whole
 
-MARKS = {"ok": ("ok  ", "green"), "warning": ("warn", "yellow"), "failure": ("FAIL", "red")}
+LEVEL_MARKS = {"ok": ("ok  ", "green"), "warning": ("warn", "yellow"), "failure": ("FAIL", "red")}
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -37,5 +37,5 @@ def main(args: argparse.Namespace) -> int:
     else:
         for one in findings:
             mend = f"\n      -> {one.mend}" if one.mend else ""
-            show_whole(Text.assemble(MARKS[one.level], f"  {one.subject}: {one.text}{mend}"))
+            show_whole(Text.assemble(LEVEL_MARKS[one.level], f"  {one.subject}: {one.text}{mend}"))
     return 1 if any(finding.level == "failure" for finding in findings) else 0

@@ -18,7 +18,7 @@ import zenoh
 from acsard.calibration.log_table import HEADER, KEYS, row
 from acsard.cli.common import between, count
 from acsard.cli.connection import (
-    MANY,
+    SEVERAL_IDS,
     add_bus,
     connected,
     connected_to_many,
@@ -32,8 +32,8 @@ from acsard.core import formatting
 from acsard.core.messages.encodings import DecodeError, Decoder
 from acsard.core.messages.keys_and_roles import TOPICS, by_key
 from acsard.core.messages.schema import MESSAGES
-from acsard.core.messages.short_texts import SHORT, short
-from acsard.daemon.bus.robot_discovery import ALL, follow, named, present, robot_of
+from acsard.core.messages.short_texts import SHORT_TEXTS, short
+from acsard.daemon.bus.robot_discovery import ALL_ROBOTS, follow, named, present, robot_of
 from acsard.daemon.bus.subscription import encoded
 from acsard.host import clock
 from acsard.host.errors import Exit, NoAnswerError, UsageError
@@ -62,7 +62,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         metavar="S",
         help="end with exit code 1 if nothing is printed for S seconds (0.01 to 86400)",
     )
-    add_bus(parser, MANY)
+    add_bus(parser, SEVERAL_IDS)
 
 
 def main(args: argparse.Namespace) -> int:
@@ -159,7 +159,7 @@ def _print(
 
 
 def _shortened(key: str) -> Decoder[Any]:
-    kinds = {kind.__name__: kind for kind in SHORT}
+    kinds = {kind.__name__: kind for kind in SHORT_TEXTS}
     topic = by_key(key)
     if topic is None or topic.type not in kinds:
         known = ", ".join(one.key for one in TOPICS if one.type in kinds)
@@ -226,10 +226,10 @@ def _expected(robot: Client, ids: tuple[str, ...]) -> Collection[str]:
     there: list[str] = []
     try:
         there = present(robot.session, ids, robot.where.endpoint)
-        missing = [one for one in ids if one not in there and one != ALL]
+        missing = [one for one in ids if one not in there and one != ALL_ROBOTS]
         words = f"following {', '.join(there) or 'no robot yet'}"
         words += f"; not present: {', '.join(missing)}" if missing else ""
     except NoAnswerError as error:
         words = f"{error} Waiting."
     print(f"acsard: {words}", file=sys.stderr)
-    return there if ALL in ids else ids
+    return there if ALL_ROBOTS in ids else ids

@@ -15,9 +15,9 @@ import sys
 
 import msgspec
 
-from acsard.cli.connection import MANY, add_bus, connected_to_many
+from acsard.cli.connection import SEVERAL_IDS, add_bus, connected_to_many
 from acsard.core.formatting import json_line
-from acsard.daemon.bus.robot_discovery import ALL
+from acsard.daemon.bus.robot_discovery import ALL_ROBOTS
 from acsard.host.errors import Exit, UnreachableError
 from acsard.terminal.output import has_screen
 from acsard.top import terminal
@@ -32,12 +32,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="print one JSON list with the whole `state` of each robot, and end",
     )
-    add_bus(parser, MANY + " (the default)")
+    add_bus(parser, SEVERAL_IDS + " (the default)")
 
 
 def main(args: argparse.Namespace) -> int:
     with connected_to_many(args) as (robot, many):
-        ids = (many or (robot.where.robot_id,)) if args.id else (ALL,)
+        ids = (many or (robot.where.robot_id,)) if args.id else (ALL_ROBOTS,)
         fleet = Roster(robot, ids)
         if not (args.once or args.json) and has_screen():
             terminal.roster(fleet)
@@ -45,7 +45,7 @@ def main(args: argparse.Namespace) -> int:
         rows = fleet.gather()
         if not rows:
             # Over TLS the client's certificate may not be permitted to see any of the named robots.
-            named = robot.where.tls and ids != (ALL,)
+            named = robot.where.tls and ids != (ALL_ROBOTS,)
             silence = robot.like(ids[0]).whoami().silence if named else ""
             raise UnreachableError("; ".join(filter(None, (fleet.hint(), silence))))
         if args.json:

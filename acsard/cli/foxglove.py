@@ -16,16 +16,16 @@ from acsard.core.formatting import lines
 from acsard.host.errors import Exit, UsageError
 from acsard.host.extras import missing
 
-DEFAULT = "127.0.0.1:8765"
+DEFAULT_ADDRESS = "127.0.0.1:8765"
 """Address and port to which Foxglove and Lichtblick connect by default."""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--address",
-        default=DEFAULT,
+        default=DEFAULT_ADDRESS,
         metavar="HOST:PORT",
-        help=f"address to listen at; it must be a loopback address (default: {DEFAULT})",
+        help=f"address to listen at; it must be a loopback address (default: {DEFAULT_ADDRESS})",
     )
     parser.add_argument(
         "--drive",
@@ -67,7 +67,7 @@ def loopback(text: str) -> tuple[str, int]:
         address = ipaddress.IPv4Address("127.0.0.1" if host == "localhost" else host)
         port = int(digits)
     except ValueError:
-        raise UsageError(f"{text} is not an address: write it like {DEFAULT}") from None
+        raise UsageError(f"{text} is not an address: write it like {DEFAULT_ADDRESS}") from None
     if not 0 < port < 65536:
         raise UsageError(f"{text}: a port is a number from 1 to 65535")
     if not address.is_loopback:

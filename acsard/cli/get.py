@@ -11,18 +11,18 @@ import sys
 
 import msgspec
 
-from acsard.cli.connection import MANY, add_bus, connected_to_many, require_asked
+from acsard.cli.connection import SEVERAL_IDS, add_bus, connected_to_many, require_asked
 from acsard.cli.replies import json_line, of_robot
 from acsard.core import formatting
 from acsard.core.formatting import printable
 from acsard.core.values import AcsardError
-from acsard.daemon.bus.robot_discovery import ALL, present
+from acsard.daemon.bus.robot_discovery import ALL_ROBOTS, present
 from acsard.host.errors import Exit
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("key", help="Zenoh key, for example info, config, schema/Twist, state")
-    add_bus(parser, MANY)
+    add_bus(parser, SEVERAL_IDS)
 
 
 def main(args: argparse.Namespace) -> int:
@@ -32,7 +32,7 @@ def main(args: argparse.Namespace) -> int:
             _show(json_line(*robot.reply(args.key)))
             return 0
         silent = 0
-        wanted = present(robot.session, many, robot.where.endpoint) if ALL in many else many
+        wanted = present(robot.session, many, robot.where.endpoint) if ALL_ROBOTS in many else many
         for one in wanted:
             try:
                 line = json_line(*robot.like(one).reply(args.key))

@@ -12,7 +12,7 @@ import msgspec
 
 from acsard.machine.serial_ports import serial_devices
 
-PLUGGED_IN = (
+NO_PORT_ADVICE = (
     "check that the board is plugged in, and that its USB cable carries data, not only power; "
     "`dmesg | tail` shows the kernel's messages about USB devices"
 )
@@ -28,7 +28,7 @@ def main(args: argparse.Namespace) -> int:
         print(msgspec.json.encode(found).decode())
         return 0 if found else 1
     if not found:
-        print(f"no serial ports: {PLUGGED_IN}", file=sys.stderr)
+        print(f"no serial ports: {NO_PORT_ADVICE}", file=sys.stderr)
         return 1
     for port in found:
         kind = " ".join(filter(None, [port.usb_id, port.driver, port.description]))
@@ -41,7 +41,7 @@ def main(args: argparse.Namespace) -> int:
             print(f"    held by     {holder.name} (pid {holder.pid})")
     if not any(port.usb_id for port in found):
         print(
-            f"none of these ports is a USB port, so acsard finds no board: {PLUGGED_IN}",
+            f"none of these ports is a USB port, so acsard finds no board: {NO_PORT_ADVICE}",
             file=sys.stderr,
         )
         return 0

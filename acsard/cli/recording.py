@@ -29,7 +29,7 @@ from acsard.host.extras import missing
 from acsard.recording.atomic_output import replacing
 from acsard.recording.directory import is_being_recorded
 from acsard.recording.directory import listed as recordings_in
-from acsard.recording.end_record import CRASHES, EndRecord, how_it_ends, read_end
+from acsard.recording.end_record import CRASH_CUTS, EndRecord, how_it_ends, read_end
 from acsard.recording.export import SUFFIX, Kind, export
 from acsard.recording.file import UNFINISHED, Recording, is_part, rewrite
 from acsard.recording.file_replay import config_of, replay_file, steps
@@ -43,9 +43,9 @@ from acsard.recording.replay_text import (
 )
 from acsard.recording.series import NothingRecordedError, in_words, search
 from acsard.recording.time_span import (
-    EXAMPLES,
-    TIMES,
-    WHOLE,
+    ALL_EXAMPLES,
+    TIME_EXAMPLES,
+    WHOLE_SPAN,
     Offset,
     Span,
     TimeError,
@@ -63,11 +63,11 @@ from acsard.terminal.output import show, table
 MAX_NAMES = 10
 """Largest number of recordings, and of times without a recording, that a search prints."""
 
-SERVICE = Path("/var/lib/acsard/record")
+SERVICE_DIRECTORY = Path("/var/lib/acsard/record")
 """The directory in which the systemd service stores its recordings."""
 
 
-EXPORT = """\
+EXPORT_DESCRIPTION = """\
 Write the messages of a recorded robot as a file for Foxglove, Lichtblick, PlotJuggler and `ros2 bag
 play`. The file is MCAP with odom, tf, tf_static, joint_states, cmd_vel_out, cmd_vel_in of each
 source, diagnostics, state and log as ROS 2 messages, and with their definitions. With --config,
@@ -75,7 +75,7 @@ write the messages that the robot would have published with another configuratio
 cannot be read because of damage is left out. Exit codes: 0 complete, 65 a part is left out.
 """
 
-REPORT = """\
+REPORT_DESCRIPTION = """\
 Draw a recording as one HTML file that needs no network. Needs the library plotly; if it is missing,
 a message gives the command that installs it. A part that cannot be read because of damage is
 left out and named; the exit code stays 0.
@@ -103,7 +103,7 @@ The key is a pair: the output format, and the suffix of the typed file name.
 def add_options(parser: argparse.ArgumentParser) -> None:
     _directory(parser, None)
     _own_config(parser, None)
-    _times(parser, None, TIMES)
+    _times(parser, None, TIME_EXAMPLES)
     actions = parser.add_subparsers(title="subcommands", metavar="SUBCOMMAND")
     shown = actions.add_parser(
         "show",
@@ -141,14 +141,14 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     exported = actions.add_parser(
         "export",
         help="convert a recording to a file for Foxglove, PlotJuggler or ros2 bag, or to a table",
-        description=EXPORT,
+        description=EXPORT_DESCRIPTION,
     )
     exported.set_defaults(main=main_export)
     report = actions.add_parser(
         "report",
         help="draw the robot's path and speeds, the command sources, the serial link and the "
         "events of a recording, as one HTML file",
-        description=REPORT,
+        description=REPORT_DESCRIPTION,
     )
     report.set_defaults(main=main_report)
     number = "the recording's number in the list of `acsard recording`"
@@ -178,7 +178,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     for action in (recover, exported, report):
         action.add_argument("--force", action="store_true", help="overwrite an existing file")
     for action in (shown, exported, report):
-        _times(action, argparse.SUPPRESS, f"{EXAMPLES} (not with FILE `all`)")
+        _times(action, argparse.SUPPRESS, f"{ALL_EXAMPLES} (not with FILE `all`)")
     for action in (shown, replay, recover, exported, report):
         _directory(action, argparse.SUPPRESS)
     # `replay` and `export` do not get this option. Their own option --config names a configuration
@@ -212,7 +212,7 @@ def _directory(parser: argparse.ArgumentParser, default: object) -> None:
         "--directory",
         default=default,
         metavar="DIRECTORY",
-        help=f"directory of the recordings (default: record.directory, or {SERVICE})",
+        help=f"directory of the recordings (default: record.directory, or {SERVICE_DIRECTORY})",
     )
 
 
@@ -272,7 +272,7 @@ def main(args: argparse.Namespace) -> int:
 def _row(path: Path, end: EndRecord, note: str) -> tuple[str, ...]:
     began = clock(end.wall_ns / 1e9, day=True)
     seconds, size = (end.last_ns - end.wall_ns) / 1e9, path.stat().st_size / 1000
-    mark = "! " if is_serious(end.said) or end.cut in CRASHES else "  "
+    mark = "! " if is_serious(end.said) or end.cut in CRASH_CUTS else "  "
     said = end.said + _bracketed(how_it_ends(end.cut, end.why)) + _bracketed(note)
     return path.name, began, f"{seconds:.0f} s", f"{size:.0f} kB", mark + printable(said).strip()
 
@@ -283,7 +283,7 @@ def _bracketed(text: str) -> str:
 
 def main_show(args: argparse.Namespace) -> int:
     for recording, part in _parts(args):
-        if not _show(recording, part, args.json) and part != WHOLE:
+        if not _show(recording, part, args.json) and part != WHOLE_SPAN:
             raise RecordingError(
                 f"{recording.path} has no step in that span of time: correct --from and --to"
             )
@@ -504,7 +504,8 @@ def _range(args: argparse.Namespace) -> tuple[float, float]:
         raise UsageError(
             "--from and --to in seconds count from the beginning of one recording, but "
             "`acsard recording` and FILE `all` search all recordings: either name one recording, "
-            f"as in `acsard recording show 12 --from 30`, or write a time, for example {TIMES}"
+            f"as in `acsard recording show 12 --from 30`, or write a time, for example "
+            f"{TIME_EXAMPLES}"
         )
     try:
         return resolve(args.begin, args.end, time.time())
@@ -537,7 +538,7 @@ def _search(args: argparse.Namespace) -> list[tuple[Recording, Span]]:
 
 
 def _files(args: argparse.Namespace) -> tuple[Path, list[Path]]:
-    where = Path(args.directory or load(args.own_config)[1].record.directory or SERVICE)
+    where = Path(args.directory or load(args.own_config)[1].record.directory or SERVICE_DIRECTORY)
     try:
         return where, recordings_in(where)
     except FileNotFoundError:

@@ -14,7 +14,7 @@ from acsard.core.formatting import printable
 from acsard.core.messages.encodings import DecodeError, detect, encode
 from acsard.core.messages.schema import ServiceReply
 from acsard.core.values import AcsardError
-from acsard.daemon.bus.robot_discovery import ALL, present, seen
+from acsard.daemon.bus.robot_discovery import ALL_ROBOTS, present, seen
 from acsard.host.errors import Exit
 
 
@@ -61,7 +61,7 @@ def of_each(
         ids: the ids of the robots. An id "*" stands for all robots that are present.
         call: function that gets a client of one robot, and calls the service of this robot.
     """
-    wanted = present(robot.session, ids, robot.where.endpoint) if ALL in ids else list(ids)
+    wanted = present(robot.session, ids, robot.where.endpoint) if ALL_ROBOTS in ids else list(ids)
 
     def called(one: str) -> ServiceReply | AcsardError:
         try:
@@ -93,7 +93,7 @@ def print_each(
             reply = ServiceReply(False, silence.format(error=reply))
         line = encode(reply, "json").decode()
         print(of_robot(one, line) if as_json else printable(f"{one}: {reply.message}"))
-    if ALL in ids:
+    if ALL_ROBOTS in ids:
         print(f"acsard: {seen(robot.where.endpoint, len(replies))}", file=sys.stderr)
     if any(isinstance(reply, AcsardError) for reply in replies.values()):
         return int(Exit.UNREACHABLE)

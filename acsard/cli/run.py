@@ -17,7 +17,7 @@ from acsard.cli.common import add_config, by_environment, load, recorded, tables
 from acsard.core.config.contradictions import warnings
 from acsard.core.config.parsing import parse
 from acsard.core.config.settings import Config
-from acsard.core.values import ROOT, Event
+from acsard.core.values import ROOT_KEY, Event
 from acsard.daemon import daemon
 from acsard.daemon.bus.zenoh_sessions import reachable
 from acsard.daemon.settings_file import SettingsFile
@@ -225,7 +225,7 @@ def banner(
         robot=config.robot.id,
         port=port,
         listen=_bus(config),
-        root=ROOT,
+        root=ROOT_KEY,
         page=_PAGE.format(where=", ".join(config.web.address)) if served else "",
         where=where,
         reach=reach,

@@ -64,14 +64,14 @@ def main_install(args: argparse.Namespace) -> int:
 
 def main_uninstall(args: argparse.Namespace) -> int:
     _ready(args)
-    files = [*service.files(), *map(service.lan_drop_in, service.ALL)]
+    files = [*service.files(), *map(service.lan_drop_in, service.ALL_UNITS)]
     steps = service.uninstalling(
         files,
         service.present(files),
         service.strangers(files, service.own_places()),
         force=args.force or args.purge,
         purge=args.purge,
-        stateful=[unit for unit, (where, _) in service.STATES.items() if where.exists()],
+        stateful=[unit for unit, (where, _) in service.STATE_DIRECTORIES.items() if where.exists()],
     )
     _do(steps, args.dry_run)
     # Give this advice only in a venv, because outside of it the directory is the system's Python.
@@ -92,7 +92,7 @@ def main_status(args: argparse.Namespace) -> int:
     state = service.state(service.UNIT)
     print(state or "systemd does not answer: check that this machine runs systemd")
     if state:
-        for unit in service.ALL[1:]:
+        for unit in service.ALL_UNITS[1:]:
             print(f"\n{unit}:\n{service.state(unit)}")
     return 0 if "ActiveState=active" in state else 1
 

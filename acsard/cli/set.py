@@ -21,11 +21,11 @@ from pathlib import Path
 
 import msgspec
 
-from acsard.cli.connection import MANY, add_bus, connected_to_many
+from acsard.cli.connection import SEVERAL_IDS, add_bus, connected_to_many
 from acsard.cli.replies import of_each, print_each
 from acsard.client import Client
 from acsard.core.config.live import flat, live
-from acsard.core.config.lowered import TABLE, lowered, stays
+from acsard.core.config.lowered import LIMITS_PREFIX, lowered, stays
 from acsard.core.config.settings import LimitsConfig
 from acsard.core.config.validation import finite, show
 from acsard.core.formatting import json_line, lines
@@ -65,7 +65,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         f"stay (needs the library tomlkit: {install('write')})",
     )
     parser.add_argument("--json", action="store_true", help="print the answer or the list as JSON")
-    add_bus(parser, MANY + " (to change settings)")
+    add_bus(parser, SEVERAL_IDS + " (to change settings)")
 
 
 def main(args: argparse.Namespace) -> int:
@@ -167,7 +167,9 @@ def _limits(pairs: Mapping[str, Sequence[str]], at: int) -> LimitsConfig:
     `pairs` maps each changed key to a pair: the new value and the old value. `at` is 0 to use the
     new values, and 1 to use the old values. All other limits have their default values.
     """
-    return LimitsConfig(**{key.removeprefix(TABLE): float(pair[at]) for key, pair in pairs.items()})
+    return LimitsConfig(
+        **{key.removeprefix(LIMITS_PREFIX): float(pair[at]) for key, pair in pairs.items()}
+    )
 
 
 def _set_all(

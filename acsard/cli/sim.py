@@ -13,7 +13,14 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from acsard.cli.common import add_config, load
-from acsard.core.config.named_faults import FAULTS, INPUTS, RESET, NamedFault, forms, named
+from acsard.core.config.named_faults import (
+    FAULTS,
+    INPUT_FAULTS,
+    RESET_FAULT,
+    NamedFault,
+    forms,
+    named,
+)
 from acsard.core.config.settings import Config
 from acsard.core.simulator.fake_mcu import FakeMcu
 from acsard.daemon.serial.simulator_pty import SimPty
@@ -25,7 +32,7 @@ NUMBERS = {
     "wrong_baud": "RATE",
     "pushed": "M/S",
     "stalls": "EVERY:SECONDS",
-    **dict.fromkeys(INPUTS, "START:SECONDS"),
+    **dict.fromkeys(INPUT_FAULTS, "START:SECONDS"),
     "bumper_pressed": "BUMPER:START:SECONDS",
     "battery": "PERCENT:MINUTES",
 }
@@ -114,7 +121,7 @@ async def _play(config: Config, args: argparse.Namespace) -> int:
     mcu = FakeMcu(config, clock.now().mono_ns)
     with ExitStack() as stack:
         for fault in args.fault:
-            if fault.name == RESET:
+            if fault.name == RESET_FAULT:
                 _reset_again(mcu, fault.values[0])
             else:
                 stack.enter_context(mcu.having(fault))

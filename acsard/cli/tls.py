@@ -22,7 +22,7 @@ from acsard.host.config_file import change, require_changeable, require_tomlkit
 from acsard.host.errors import UsageError
 from acsard.machine import certificates
 from acsard.machine import service_installation as service
-from acsard.machine.service_installation import TLS, source
+from acsard.machine.service_installation import TLS_DIRECTORY, source
 
 NAME = re.compile(r"(?!@)[A-Za-z0-9_ .:@+-]{1,64}")
 
@@ -113,7 +113,11 @@ def _add_router(actions: argparse._SubParsersAction[argparse.ArgumentParser]) ->
 
 def _add_common(action: argparse.ArgumentParser) -> None:
     action.add_argument(
-        "--directory", type=Path, default=Path(TLS), metavar="DIR", help=f"default {TLS}"
+        "--directory",
+        type=Path,
+        default=Path(TLS_DIRECTORY),
+        metavar="DIR",
+        help=f"default {TLS_DIRECTORY}",
     )
     action.add_argument(
         "--days",
@@ -204,10 +208,10 @@ def main_renew(args: argparse.Namespace) -> int:
         place = certificates.renew_client(args.directory, args.name, args.address, args.days)
         files = ", ".join((CA, CERTIFICATE, KEY))
         print(f"{place} has a new certificate. Copy {files} from there over the old files.\n")
-        print(TAKEN)
+        print(COMMAND_NAMES_WARNING)
         return 0
     print(_certified(certificates.renew(args.directory, args.address, args.days)))
-    print(f"{args.directory / CERTIFICATE} is the new certificate.\n\n{TAKEN}")
+    print(f"{args.directory / CERTIFICATE} is the new certificate.\n\n{COMMAND_NAMES_WARNING}")
     return 0
 
 
@@ -225,7 +229,8 @@ def _certified(names: list[str]) -> str:
 
 
 def _admit_service(directory: Path) -> None:
-    """Write a systemd drop-in that lets the TLS gateway use the certificates in `directory`.
+    """Write a systemd drop-in that lets the TLS_DIRECTORY gateway use the certificates in
+    `directory`.
 
     Do nothing if the service is not installed, or if the user of this program is not root.
     """
@@ -261,7 +266,7 @@ changes the file for you. If the robot connects to a fleet's router, leave the l
 router.json5 has the roles.
 """
 
-TAKEN = """\
+COMMAND_NAMES_WARNING = """\
 `acsard router`, `acsard web` and the gateway of `acsard run` use the new certificate within 5 s by
 themselves. For this, the gateway and the router disconnect their clients for about a second, and a
 robot that one of those clients drives ramps to zero. If you started `acsard gateway` by hand, it

@@ -11,7 +11,7 @@ from acsard.core.messages.encodings import encode
 from acsard.core.messages.keys_and_roles import COMMANDS, by_key, source_keys
 from acsard.core.messages.schema import TopicInfo, Topics
 from acsard.core.ros.names import full_name
-from acsard.core.ros.parameters import SETTING
+from acsard.core.ros.parameters import SETTING_SERVICES
 from acsard.core.ros.transports import left_out, ros_names
 from acsard.terminal.output import show, table
 
@@ -45,7 +45,7 @@ def ros_table(config: Config) -> Topics:
         native = by_key(row.native)
         note = f"as {row.native}" + (f": {note_of(config, native)}" if native else "")
         if row.direction == "query":
-            sets = row.name.endswith(SETTING)
+            sets = row.name.endswith(SETTING_SERVICES)
             note = (
                 "changes the settings that `acsard set` lists"
                 if sets

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 MOST_DAYS, MOST_HOURS = 3650, 72
 
-USUAL_DAYS = 30
+DEFAULT_DAYS = 30
 
 NAME = re.compile(r"[A-Za-z0-9_.-]{1,32}\Z")
 
@@ -74,7 +74,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--days",
         type=whole("days", MOST_DAYS, "; for less than a day use --hours"),
         metavar="N",
-        help=f"days until the token expires (default: {USUAL_DAYS})",
+        help=f"days until the token expires (default: {DEFAULT_DAYS})",
     )
     lasting.add_argument(
         "--hours",
@@ -167,7 +167,7 @@ def _invite(args: argparse.Namespace, config: Config, where: str) -> int:
             "certificate"
         )
     vault = _vault(args, config)
-    days = 0 if args.hours else args.days or USUAL_DAYS
+    days = 0 if args.hours else args.days or DEFAULT_DAYS
     text, token = vault.invite(args.invite, args.name or args.invite, days, args.hours or 0)
     until = f"{_clock(token.ends)}, for {lasting(token.ends - token.made)}"
     print(f"{token.name} is {token.role} until {until}; the link is not shown again:\n")

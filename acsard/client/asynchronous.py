@@ -8,7 +8,7 @@ from contextlib import aclosing, asynccontextmanager, closing
 from functools import partial
 from typing import Any
 
-from acsard.client.commander import AGAIN_S
+from acsard.client.commander import REPEAT_ZERO_S
 from acsard.client.driving import UnheardError, drive
 from acsard.client.synchronous import REPLY_TIMEOUT_S, Client, close, decoder
 from acsard.core.messages import schema
@@ -62,7 +62,7 @@ class AsyncClient:
             found = await in_thread(partial(self._client.unheard, error), 2 * REPLY_TIMEOUT_S)
             raise found from None
         except BaseException:
-            await asyncio.sleep(AGAIN_S)
+            await asyncio.sleep(REPEAT_ZERO_S)
             self._client.zero_again()
             raise
 

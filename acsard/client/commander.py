@@ -21,11 +21,11 @@ SEND_PERIOD_S = 0.05
 """Pause between two commands of a drive, s. At 20 Hz, a source sends five commands within its
 default timeout of 0.25 s."""
 
-SPACING_S = 0.003
+MIN_SPACING_S = 0.003
 """Shortest pause between two commands on one connection, s. The daemon drops commands at rates
 above 1000 per second."""
 
-AGAIN_S = 0.02
+REPEAT_ZERO_S = 0.02
 """Pause before a zero is sent a second time, s. The first zero may be lost: a busy daemon may
 receive several commands in a burst, and drops some because they seem to come too fast."""
 
@@ -34,7 +34,7 @@ OPENING_S, OPENING_PERIOD_S = 0.4, 0.01
 checks for 0.25 s whether the commands of a new sender are late. With many zeros in this time, the
 jitter of a busy machine does not prolong the check."""
 
-OPENED_S = 4.0
+OPEN_TIMEOUT_S = 4.0
 """Time within which the daemon must accept the zeros at the beginning of a drive, s. Otherwise the
 drive fails. If the source has a long timeout, the daemon checks the delay of a new sender for up to
 2 s. In the rest of the time, another sender can finish its drive."""
@@ -58,27 +58,27 @@ silence may be a pause of the network. A panel that publishes once a second, as 
 does by default, must not seem released between its messages. But the daemon forgets the zero of a
 new sender that is then silent for 2 s, so this time must be shorter."""
 
-GATHER_NS = NS_PER_S // 25
+BURST_WINDOW_NS = NS_PER_S // 25
 """Time for which the first command after a silence waits to be sent, ns. The wait shows whether a
 burst follows: a panel that sends at 20 Hz sends at most one command in this time. After a burst of
-more than `CROWD` commands, the next command waits too."""
+more than `MAX_BURST_COMMANDS` commands, the next command waits too."""
 
-CROWD = 5
-"""Largest number of commands that a panel is assumed to send within `GATHER_NS` (125 Hz). If more
-commands arrive, these commands have waited in a queue, which may contain further commands."""
+MAX_BURST_COMMANDS = 5
+"""Largest number of commands that a panel is assumed to send within `BURST_WINDOW_NS` (125 Hz). If
+more commands arrive, these commands have waited in a queue, which may contain further commands."""
 
 STALE_NS = NS_PER_S // 10
 """Largest age of a nonzero command that is still sent, ns. An older one is dropped, because the
 operator may no longer want it."""
 
-DRIVES_NS = NS_PER_S // 2
+DRIVING_TIMEOUT_NS = NS_PER_S // 2
 """Time for which a sender still counts as driving after its last nonzero command, ns."""
 
-LONGEST_S = 10.0
+MAX_OPEN_TIMEOUT_S = 10.0
 """Longest timeout that a command source may have, s. The robot follows no command older than
 this."""
 
-NEVER = ("inactive", "stopped", "fault", "shutdown")
+NEVER_DRIVING_MODES = ("inactive", "stopped", "fault", "shutdown")
 """Modes in which no command moves the robot, and which do not end by themselves."""
 
 
@@ -105,7 +105,7 @@ class Commander:
             each silence longer than `RELEASED_NS`. Set this for a sender that sends no zeros of its
             own. There is no zero after a shorter silence: with such a zero, a button that was held
             through a stop and a `clear` could drive the robot.
-        gathers: whether the first command after a silence waits for `GATHER_NS`. If several
+        gathers: whether the first command after a silence waits for `BURST_WINDOW_NS`. If several
             commands arrive in this time, a congested link or a stalled process has delayed these
             commands. In this case they are dropped, except the last one if it is a zero. Set this
             for a sender without stamps, because the daemon cannot measure the delay of its
@@ -116,7 +116,7 @@ class Commander:
         self.replaced = self.stale = 0
         """Two counters of commands that were not sent. `replaced` counts the commands that a newer
         command replaced, and `stale` counts the commands that were too old or came in a burst."""
-        self._leads, self._gather_ns = leads, GATHER_NS if gathers else 0
+        self._leads, self._gather_ns = leads, BURST_WINDOW_NS if gathers else 0
         self._wish: Wish | None = None
         self._last = Wish(REST)
         """The newest command, sent or not."""
@@ -126,9 +126,9 @@ class Commander:
         self._hold_until_ns = 0
         self._burst = 0
         """Number of commands that have arrived while the first of these commands waits (see
-        `GATHER_NS`). The method `send()` resets this number."""
+        `BURST_WINDOW_NS`). The method `send()` resets this number."""
         self._crowded = False
-        """Whether the last burst had more than `CROWD` commands."""
+        """Whether the last burst had more than `MAX_BURST_COMMANDS` commands."""
         self._moved_ns: int | None = None
         """Monotonic time at which a nonzero command was last sent, ns; None after a zero."""
         self._asked_ns: int | None = None
@@ -181,7 +181,7 @@ class Commander:
             return None
         wish, self._wish = self._wish, None
         burst, self._burst = self._burst, 0
-        self._crowded = burst > CROWD
+        self._crowded = burst > MAX_BURST_COMMANDS
         moves = wish.twist != REST
         if moves and (burst > 1 or now_ns - self._came_ns > STALE_NS):
             self.stale += 1
@@ -189,7 +189,7 @@ class Commander:
         self._moved_ns = now_ns if moves else None
         return wish
 
-    def end(self, now_ns: int, timeout_s: float = LONGEST_S) -> Wish | None:
+    def end(self, now_ns: int, timeout_s: float = MAX_OPEN_TIMEOUT_S) -> Wish | None:
         """End the drive of this sender, and return a zero to send, or None.
 
         The command that waits to be sent is discarded. The result is a zero if the robot may still
@@ -223,11 +223,12 @@ class Commander:
         return self._asked_ns is not None
 
     def drives(self, now_ns: int) -> bool:
-        """Return whether the last command was not zero and arrived within the last `DRIVES_NS`.
+        """Return whether the last command was not zero and arrived within the last
+        `DRIVING_TIMEOUT_NS`.
 
         `now_ns` is the monotonic time, ns.
         """
-        return self._asked_ns is not None and now_ns - self._asked_ns <= DRIVES_NS
+        return self._asked_ns is not None and now_ns - self._asked_ns <= DRIVING_TIMEOUT_NS
 
 
 class Sender:
@@ -265,7 +266,7 @@ def objection(state: RobotState, source: str, sender: str) -> str:
         source: the command source of the sender's commands.
         sender: the public name of the sender.
     """
-    if state.mode in NEVER:
+    if state.mode in NEVER_DRIVING_MODES:
         return state.reason
     ours = next((one for one in state.sources if one.name == source), None)
     if ours is None:
@@ -302,13 +303,13 @@ def no_command(source: str) -> str:
 def ends_hold(state: RobotState, source: str) -> bool:
     """Return whether the operator must release a held key and press it again to drive.
 
-    This is so if the robot cannot drive in its present mode (a mode in `NEVER`, or "waiting"), or
-    if `source` must first send a zero. When the robot can drive again, an operator who still holds
-    the key may not expect it to move.
+    This is so if the robot cannot drive in its present mode (a mode in `NEVER_DRIVING_MODES`, or
+    "waiting"), or if `source` must first send a zero. When the robot can drive again, an operator
+    who still holds the key may not expect it to move.
     """
     ours = next((one for one in state.sources if one.name == source), None)
     zero_first = ours is not None and "must send a zero" in ours.waits_for
-    return state.mode in NEVER or state.mode == "waiting" or zero_first
+    return state.mode in NEVER_DRIVING_MODES or state.mode == "waiting" or zero_first
 
 
 def heard(state: RobotState, source: str) -> bool:
@@ -325,4 +326,4 @@ def hopeless(state: RobotState, source: str) -> bool:
     If so, waiting cannot help: no command moves the robot in its present mode, or the source is not
     configured.
     """
-    return state.mode in NEVER or all(one.name != source for one in state.sources)
+    return state.mode in NEVER_DRIVING_MODES or all(one.name != source for one in state.sources)

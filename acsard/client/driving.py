@@ -18,7 +18,7 @@ import zenoh
 
 from acsard.client.commander import (
     GRACE_S,
-    OPENED_S,
+    OPEN_TIMEOUT_S,
     OPENING_PERIOD_S,
     OPENING_S,
     SEND_PERIOD_S,
@@ -34,7 +34,7 @@ SETTLED_S = 0.2
 """Longest time that a message on `state` takes to arrive, s. If a state arrives later than this
 after an action, the daemon sent it after the action."""
 
-STANDS = 0.01, 0.02
+STANDSTILL = 0.01, 0.02
 """Linear speed, m/s, and turn rate, rad/s. The robot counts as standing still if both of its speeds
 are below these values."""
 
@@ -43,7 +43,7 @@ SLOWER, SLOWS_S = 0.97, 1.0
 times the lowest speed since the end of the drive."""
 
 
-CLOSED = "the connection to the daemon was closed while the robot was driving"
+CONNECTION_CLOSED = "the connection to the daemon was closed while the robot was driving"
 
 
 class UnheardError(NotDrivenError):
@@ -125,7 +125,7 @@ def _opening(checks: _Drive) -> Iterator[float]:
         yield OPENING_PERIOD_S
         checks.require_no_pause()
         checks.look()
-        if passed >= OPENED_S or (passed >= SETTLED_S and checks.hopeless):
+        if passed >= OPEN_TIMEOUT_S or (passed >= SETTLED_S and checks.hopeless):
             checks.require(0.0)
 
 
@@ -153,7 +153,7 @@ def _stopping(checks: _Drive) -> Iterator[float]:
         if linear is None or angular is None:
             # Without feedback from the board, it is unknown whether the robot stands.
             continue
-        speed = max(abs(linear) / STANDS[0], abs(angular) / STANDS[1])
+        speed = max(abs(linear) / STANDSTILL[0], abs(angular) / STANDSTILL[1])
         if speed < 1.0:
             return
         if speed < SLOWER * slowest:
@@ -183,7 +183,7 @@ class _Drive:
         try:
             self._robot.send(linear, angular)
         except zenoh.ZError:
-            raise NoAnswerError(CLOSED) from None
+            raise NoAnswerError(CONNECTION_CLOSED) from None
 
     def require_no_pause(self) -> None:
         """Raise `NotDrivenError` if the previous call was more than `GRACE_S` s ago."""
@@ -208,7 +208,7 @@ class _Drive:
         try:
             news = watch.look(now)
         except zenoh.ZError:
-            raise NoAnswerError(CLOSED) from None
+            raise NoAnswerError(CONNECTION_CLOSED) from None
         for state in news:
             self.objection = objection(state, self._robot.source, self._robot.sender)
             if not self.objection:

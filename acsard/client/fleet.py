@@ -15,17 +15,17 @@ from typing import Any
 import zenoh
 from msgspec import Struct
 
-from acsard.client.follower import FLEET_ASK_S, Follower
+from acsard.client.follower import FLEET_QUERY_PERIOD_S, Follower
 from acsard.client.synchronous import Client
 from acsard.core.messages.encodings import DecodeError, Decoder
 from acsard.core.messages.keys_and_roles import full_key
 from acsard.core.messages.schema import Info, RobotState
-from acsard.daemon.bus.robot_discovery import ALL, robot_of
+from acsard.daemon.bus.robot_discovery import ALL_ROBOTS, robot_of
 from acsard.daemon.bus.subscription import encoded
 from acsard.host import clock
 from acsard.host.mailbox import Mailbox
 
-MOST = 1000
+MAX_ROBOTS = 1000
 """Default of the maximum number of robots. It is limited because any client of the bus can invent
 robot ids."""
 
@@ -59,7 +59,7 @@ class _Known:
         The queries of its keys `state` and `info` are then due immediately.
         """
         self.since = self.info_due = clock.steady_s()
-        self.follower = Follower(self.since, FLEET_ASK_S)
+        self.follower = Follower(self.since, FLEET_QUERY_PERIOD_S)
         self.follower.due = self.since
 
 
@@ -67,7 +67,7 @@ class Fleet:
     """Follows several robots, or all robots on the bus, and returns a row for each."""
 
     def __init__(
-        self, robot: Client, ids: Sequence[str], most: int = MOST, forget_s: float = math.inf
+        self, robot: Client, ids: Sequence[str], most: int = MAX_ROBOTS, forget_s: float = math.inf
     ) -> None:
         """Subscribe to the states and liveliness tokens of the robots. This may wait for the bus.
 
@@ -85,7 +85,7 @@ class Fleet:
         self._lock = Lock()
         self.left_out = False
         """Whether a robot was left out because there were already `most` robots."""
-        self._known = {one: _Known() for one in ids if one != ALL}
+        self._known = {one: _Known() for one in ids if one != ALL_ROBOTS}
         self._states, self._infos = Decoder(RobotState), Decoder(Info)
         self._declared: list[Any] = []
         session, liveliness = robot.session, robot.session.liveliness()
@@ -126,7 +126,7 @@ class Fleet:
                 if one.follower.asks(now):
                     due.append((name, "state"))
                 if one.here and not one.version and now >= one.info_due:
-                    one.info_due = now + FLEET_ASK_S
+                    one.info_due = now + FLEET_QUERY_PERIOD_S
                     due.append((name, "info"))
         return due
 

@@ -18,10 +18,10 @@ import zenoh
 from acsard.client.commander import objection
 from acsard.core.messages.encodings import DecodeError, Decoder
 from acsard.core.messages.schema import RobotState
-from acsard.daemon.bus.subscription import QUEUED, Subscription, encoded
+from acsard.daemon.bus.subscription import MAX_QUEUED_SAMPLES, Subscription, encoded
 from acsard.host.mailbox import Mailbox
 
-ASK_S = 0.3
+QUERY_PERIOD_S = 0.3
 """Time without a new state after which the client queries `state`, s. Such queries are necessary if
 the robot is configured to publish its state seldom."""
 
@@ -31,20 +31,21 @@ QUIET_S = 0.5
 SILENT_S = 1.0
 """Age of the last state above which the robot counts as silent and a drive ends, s."""
 
-FIRST_S = 2.0
+FIRST_STATE_TIMEOUT_S = 2.0
 """Time within which the first message on a key arrives if the robot works normally, s."""
 
-FLEET_ASK_S = 2.0
+FLEET_QUERY_PERIOD_S = 2.0
 """Time without a new state of a robot after which a program that follows many robots queries the
-robot's `state`, s. It is longer than `ASK_S`, because such a program sends many queries."""
+robot's `state`, s. It is longer than `QUERY_PERIOD_S`, because such a program sends many
+queries."""
 
-STATE = "state"
+STATE_KEY = "state"
 
-ANSWERS = 16
+MAX_WAITING_ANSWERS = 16
 """Maximum number of replies that wait to be processed. The daemon and each storage send one reply
 to a query."""
 
-STEADY = ("lines", "lines_sent", "commands")
+STEADY_COUNTERS = ("lines", "lines_sent", "commands")
 """Names of counters in `state` that decrease only when the daemon restarts."""
 
 
@@ -54,7 +55,7 @@ class Follower:
     This clock must also advance while the computer is suspended, as `clock.steady_s` does.
     """
 
-    def __init__(self, now: float, ask_s: float = ASK_S) -> None:
+    def __init__(self, now: float, ask_s: float = QUERY_PERIOD_S) -> None:
         self.state: RobotState | None = None
         """The newest state; None before the first state. Until `heard` is true, it may be an old
         state from the storage of a router."""
@@ -117,7 +118,7 @@ class Follower:
     def patience_s(self) -> float:
         """Age of the last state above which the robot counts as silent, s."""
         # If a robot publishes seldom, only answers arrive, at intervals of `ask_s`.
-        return (SILENT_S if self.heard else FIRST_S) + self._ask_s - ASK_S
+        return (SILENT_S if self.heard else FIRST_STATE_TIMEOUT_S) + self._ask_s - QUERY_PERIOD_S
 
     def silent(self, now: float) -> bool:
         """Return whether the robot counts as silent at the time `now`, s."""
@@ -127,11 +128,11 @@ class Follower:
 def restarted(before: RobotState | None, state: RobotState) -> bool:
     """Return whether the daemon restarted between the states `before` and `state`.
 
-    The sign of a restart is that a counter in `STEADY` is lower in `state` than in `before`.
-    Returns False if `before` is None.
+    The sign of a restart is that a counter in `STEADY_COUNTERS` is lower in `state` than in
+    `before`. Returns False if `before` is None.
     """
     return before is not None and any(
-        state.counters.get(name, 0) < before.counters.get(name, 0) for name in STEADY
+        state.counters.get(name, 0) < before.counters.get(name, 0) for name in STEADY_COUNTERS
     )
 
 
@@ -157,10 +158,10 @@ class Watch(Follower):
         """
         super().__init__(now)
         self._robot, self._decoder = robot, Decoder(RobotState)
-        self._states = robot.subscribe(STATE)
+        self._states = robot.subscribe(STATE_KEY)
         if wake is not None:
             self._states.wakes(wake)
-        self._answers = Mailbox[zenoh.Sample](ANSWERS)
+        self._answers = Mailbox[zenoh.Sample](MAX_WAITING_ANSWERS)
         """Replies to queries, which a thread of Zenoh adds."""
 
     def look(self, now: float) -> list[RobotState]:
@@ -170,7 +171,7 @@ class Watch(Follower):
         `now` is the present time, s. Raises `ZError` if the session was closed.
         """
         news = []
-        for _ in range(QUEUED):  # bounded, so that a flood cannot block the caller
+        for _ in range(MAX_QUEUED_SAMPLES):  # bounded, so that a flood cannot block the caller
             sample = self._states.try_recv()
             if sample is None:
                 break
@@ -185,7 +186,7 @@ class Watch(Follower):
             if state is not None and self.answered(state, now):
                 news.append(state)
         if self.asks(now):
-            self._robot.ask(STATE, self._answers.put)
+            self._robot.ask(STATE_KEY, self._answers.put)
         return news
 
     def _read(self, sample: zenoh.Sample) -> RobotState | None:

@@ -14,7 +14,13 @@ from typing import Any
 import msgspec
 import zenoh
 
-from acsard.client.commander import AGAIN_S, LONGEST_S, SPACING_S, Sender, no_command
+from acsard.client.commander import (
+    MAX_OPEN_TIMEOUT_S,
+    MIN_SPACING_S,
+    REPEAT_ZERO_S,
+    Sender,
+    no_command,
+)
 from acsard.client.driving import UnheardError, drive
 from acsard.core.incoming.queries import BUSY
 from acsard.core.messages import schema
@@ -120,15 +126,15 @@ class _Puts:
         # sends without end would take the lock again and again before the others.
         with self._lock:
             at_s = max(self._next_s, time.monotonic())
-            self._next_s = at_s + SPACING_S
+            self._next_s = at_s + MIN_SPACING_S
         time.sleep(max(0.0, at_s - time.monotonic()))
         with self._lock:
             # A busy machine may wake another thread late, or a signal handler may just have sent.
-            while (left_s := self._last_s + SPACING_S - time.monotonic()) > 0:
+            while (left_s := self._last_s + MIN_SPACING_S - time.monotonic()) > 0:
                 time.sleep(left_s)
             yield
             self._last_s = time.monotonic()
-            self._next_s = max(self._next_s, self._last_s + SPACING_S)
+            self._next_s = max(self._next_s, self._last_s + MIN_SPACING_S)
 
 
 class Client:
@@ -222,9 +228,9 @@ class Client:
         begun_s = clock.steady_s()
         # When the longest timeout has passed, a zero would only stop the next sender that drives.
         known = list(self._puts.moving.items())
-        moving = [one for one, at_s in known if begun_s - at_s < LONGEST_S]
+        moving = [one for one, at_s in known if begun_s - at_s < MAX_OPEN_TIMEOUT_S]
         try:
-            for pause_s in (AGAIN_S, 0.0) if moving else ():
+            for pause_s in (REPEAT_ZERO_S, 0.0) if moving else ():
                 for client in moving:
                     with suppress(zenoh.ZError):  # the program has closed the session itself
                         client.send(0.0)
@@ -254,7 +260,7 @@ class Client:
         except (UnheardError, NoAnswerError) as error:
             raise self.unheard(error) from None
         except BaseException:
-            time.sleep(AGAIN_S)
+            time.sleep(REPEAT_ZERO_S)
             self.zero_again()
             raise
 

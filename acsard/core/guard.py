@@ -11,7 +11,8 @@ bytes in the same way as the MCU, and passes a line only if all of these conditi
 - Without a link, all wheel speeds are zero.
 - All wheel speeds are zero if the robot has had enough time to brake to rest. This is the case if
   the last fresh command is older than the longest ramp to rest, or if a stop, a fault or a shutdown
-  began longer ago than the longest stop takes. `MARGIN_NS` is added to each of these two durations.
+  began longer ago than the longest stop takes. `RAMP_MARGIN_NS` is added to each of these two
+  durations.
 
 If a condition does not hold, the guard replaces the line with the stop line, and the robot latches
 a fault. The guard keeps the times of the last fresh command and of the last stop in its `Memory`. A
@@ -38,7 +39,7 @@ _SEAL = re.compile(rb"#[0-9A-F]{2}[SH]?\*[0-9A-F]{4}\r\n")
 HALTED = ("stopped", "fault", "shutdown")
 """Modes in which the robot brakes at the stop deceleration."""
 
-MARGIN_NS = 300_000_000
+RAMP_MARGIN_NS = 300_000_000
 """Extra time after the computed end of a ramp to rest, ns. During this time, the guard still passes
 lines that move a wheel. The time equals the watchdog time of the board: a board that receives no
 line for longer stops the motors by itself."""
@@ -154,10 +155,10 @@ class Guard:
 
     def _late(self, now_ns: int) -> bool:
         (ramp_ns, stop_ramp_ns), since_ns = self._longest, self._commanded_ns
-        if since_ns is None or now_ns - since_ns > ramp_ns + MARGIN_NS:
+        if since_ns is None or now_ns - since_ns > ramp_ns + RAMP_MARGIN_NS:
             return True
         halted_ns = self._halted_ns
-        return halted_ns is not None and now_ns - halted_ns > stop_ramp_ns + MARGIN_NS
+        return halted_ns is not None and now_ns - halted_ns > stop_ramp_ns + RAMP_MARGIN_NS
 
     def _commanded(self, outputs: Outputs) -> bool:
         timeout, arrived = self._timeouts.get(outputs.source), outputs.command_ns

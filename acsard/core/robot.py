@@ -27,21 +27,21 @@ from acsard.core.link.link_state import WATCHDOG_S
 from acsard.core.link.session import McuSession
 from acsard.core.motion.arbiter import Arbiter, Choice
 from acsard.core.motion.arbiter_text import REFUSED, CommandEvents, chosen, missed, refused
-from acsard.core.motion.battery import EMPTY, Battery
+from acsard.core.motion.battery import EMPTY_REASON, Battery
 from acsard.core.motion.bumpers import Bumpers, missing
 from acsard.core.motion.emergency_stop import (
-    DRIVER_FAULT,
-    DRIVER_MEND,
-    MISSING,
-    PRESSED,
-    SILENT,
+    DRIVER_FAULT_ADVICE,
+    DRIVER_FAULT_REASON,
+    MISSING_REASON,
+    PRESSED_REASON,
+    SILENT_REASON,
     EmergencyStop,
 )
 from acsard.core.motion.event_throttle import EventThrottle
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.lifecycle import Lifecycle
 from acsard.core.motion.limits import Limiter
-from acsard.core.motion.modes import GOING_DOWN, Mode, RefusedError
+from acsard.core.motion.modes import SHUTDOWN_REASON, Mode, RefusedError
 from acsard.core.motion.odometry import Odometry
 from acsard.core.motion.sanity import Sanity
 from acsard.core.values import (
@@ -68,12 +68,12 @@ MAX_DT = 0.05
 longer, the rest of the time is ignored, so that the speed does not jump. If 1.5 control periods
 are longer than this constant, they are the limit."""
 
-UNHEARD_S = WATCHDOG_S - 0.05
+WRITE_PAUSE_S = WATCHDOG_S - 0.05
 """Time without a line written to the port, s, after which the next acceleration starts from rest.
 The board stops the motors if it receives no line for `WATCHDOG_S`. The margin of 0.05 s allows for
 a board whose clock is slightly fast."""
 
-REPORTS = {
+INPUT_NAMES = {
     "estop": "its emergency stop",
     "bumpers": "its bumpers",
     "driver": "its motor drivers",
@@ -86,7 +86,7 @@ HALTED = (Mode.STOPPED, Mode.FAULT, Mode.SHUTDOWN)
 
 NS_PER_MS = 1_000_000
 
-MAX_TEXT = 200
+MAX_REFUSAL_LENGTH = 200
 """Largest number of characters of the text in `state` about a refused message. The text may quote
 the message of a client, which can be long."""
 
@@ -154,13 +154,13 @@ class Robot:
         self._sanity = Sanity(config.feedback)
         stops = () if latches.stop is None else latches.stop.causes
         causes = [latch.why for latch in (latches.fault, *stops) if latch and not latch.by]
-        self._estop = EmergencyStop(config.safety.estop, PRESSED in causes)
+        self._estop = EmergencyStop(config.safety.estop, PRESSED_REASON in causes)
         self._bumpers = Bumpers(config.safety)
-        self._battery = Battery(config.battery, any(why.startswith(EMPTY) for why in causes))
+        self._battery = Battery(config.battery, any(why.startswith(EMPTY_REASON) for why in causes))
         self._unreported = {name: why for why in causes if (name := _input(why))}
         """Inputs of the board that have caused a latch in an earlier run of the daemon and that
-        the board has not reported since. The keys are those of `REPORTS`, and the values are the
-        causes in words. While the map is not empty, a `clear` is refused."""
+        the board has not reported since. The keys are those of `INPUT_NAMES`, and the values are
+        the causes in words. While the map is not empty, a `clear` is refused."""
         self._answered = UnansweredLines(config.mcu.reply_period)
         self._tally = EventThrottle()
         self._asked: tuple[str, str, int | None] = ("", "", None)
@@ -378,7 +378,7 @@ class Robot:
             self._speeds, self._made_of = STILL, None
             self._made = self._said = (self._limiter.state, self._made_ns)
         if estop.driver_fault:
-            self._fault(DRIVER_FAULT, now, events)
+            self._fault(DRIVER_FAULT_REASON, now, events)
             self._life.caused_again(now.mono_ns)
         battery = self._battery
         events += battery.look(statuses, now.mono_ns)
@@ -394,7 +394,7 @@ class Robot:
         elif bumpers.held:
             held = bumpers.held, bumpers.mend
         elif self.session.status.driver_fault:
-            held = DRIVER_FAULT, DRIVER_MEND
+            held = DRIVER_FAULT_REASON, DRIVER_FAULT_ADVICE
         elif battery.held:
             held = battery.why, battery.mend
         self._life.hold(*held, now.mono_ns)
@@ -414,7 +414,7 @@ class Robot:
         for name in [name for name in self._unreported if reported[name]]:
             del self._unreported[name]
         for name, why in self._unreported.items():
-            return why, f"wait until the board has reported {REPORTS[name]}"
+            return why, f"wait until the board has reported {INPUT_NAMES[name]}"
         return "", ""
 
     def _keep_away(self, now_ns: int) -> None:
@@ -481,7 +481,7 @@ class Robot:
         # While the emergency stop counts as pressed, the motors may have no power, so wheels that
         # do not follow the commanded speeds are not a sign of a fault.
         pressed = self._estop.why or self._estop.pressed_now
-        if self.session.lateness.step_s > UNHEARD_S and not pressed:
+        if self.session.lateness.step_s > WRITE_PAUSE_S and not pressed:
             # This computer was late, and the board may have stopped the motors meanwhile. So the
             # feedback lines that waited to be read say nothing about faults of the wheels.
             fault = ""
@@ -616,7 +616,7 @@ class Robot:
             self.counters["commands_of_new_senders"] += 1
             return
         self.counters[f"command_{refusal.reason}"] += 1
-        self._refused_ns, self._refused = now_ns, refusal.text[:MAX_TEXT]
+        self._refused_ns, self._refused = now_ns, refusal.text[:MAX_REFUSAL_LENGTH]
 
     # Limits and kinematics.
 
@@ -625,7 +625,7 @@ class Robot:
         self._made_of = (self._choice.arrived_ns, self._life.mode)
         limiter.state, said_ns = self._said
         since = (now_ns - said_ns) / NS_PER_S
-        if self.session.link != "up" or since > UNHEARD_S:
+        if self.session.link != "up" or since > WRITE_PAUSE_S:
             limiter.cut()
         elif self._life.mode is Mode.DRIVING and twist is not None:
             limiter.follow(twist, min(since, self._max_dt))
@@ -659,24 +659,24 @@ class Robot:
                 return f"{chosen(self._choice)}{self.session.note}"
             case Mode.WAITING:
                 if self.session.link == "up":
-                    return MISSING if self._estop.missing else missing(self.config.safety)
+                    return MISSING_REASON if self._estop.missing else missing(self.config.safety)
                 return self.session.words(self._port_trouble)
             case Mode.STOPPED | Mode.FAULT | Mode.INACTIVE:
                 return self._life.why
             case Mode.SHUTDOWN:
-                return GOING_DOWN
+                return SHUTDOWN_REASON
             case _:
                 assert_never(self._life.mode)
 
 
 def _input(why: str) -> str:
-    """Return the input of the board that caused a latch, as a key of `REPORTS`.
+    """Return the input of the board that caused a latch, as a key of `INPUT_NAMES`.
 
     `why` is the cause of the latch, in words. The result is "" if an input of the board is not the
     cause.
     """
-    if why in (PRESSED, SILENT):
+    if why in (PRESSED_REASON, SILENT_REASON):
         return "estop"
-    if why == DRIVER_FAULT:
+    if why == DRIVER_FAULT_REASON:
         return "driver"
     return "bumpers" if "bumper" in why else ""

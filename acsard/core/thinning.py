@@ -13,7 +13,7 @@ from collections.abc import Iterator, Sequence
 from itertools import islice
 from typing import NamedTuple
 
-MOST_BINS = 1500
+MAX_BINS = 1500
 """Largest number of bins of a curve. A bin is a time interval. The number is twice the width of a
 picture in pixels."""
 
@@ -21,9 +21,9 @@ FIRST_WIDTH = 0.001
 """Width of a bin in a new curve, s. It is shorter than the interval between the robot's steps, so
 a short recording is not thinned."""
 
-MOST_SPANS = 1500
+MAX_SPANS = 1500
 
-MOST_PLACES = 4000
+MAX_PLACES = 4000
 
 FIRST_STRIDE = 0.001
 """Smallest distance between neighboring places in a new path, m. It doubles when the path is
@@ -49,7 +49,7 @@ class Curve:
     A bin is a time interval of which only the lowest and the highest value are kept.
     """
 
-    def __init__(self, most: int = MOST_BINS) -> None:
+    def __init__(self, most: int = MAX_BINS) -> None:
         self._most, self._bins = most, list[_Bin]()
         self.width = FIRST_WIDTH
         """Width of a bin, s. It doubles when the curve has too many bins."""
@@ -124,7 +124,7 @@ class Band:
     If there are too many spans, short spans are merged with their neighbors.
     """
 
-    def __init__(self, ranks: Sequence[str], most: int = MOST_SPANS) -> None:
+    def __init__(self, ranks: Sequence[str], most: int = MAX_SPANS) -> None:
         """Create an empty band that keeps at most `most` spans.
 
         `ranks` lists the kinds of state, the most important first. If two spans are merged, the
@@ -194,7 +194,7 @@ class Track:
 
     def __init__(
         self,
-        most: int = MOST_PLACES,
+        most: int = MAX_PLACES,
         stride: float = FIRST_STRIDE,
         lasts: float = math.inf,
         jump: float = math.inf,

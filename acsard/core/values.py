@@ -17,7 +17,7 @@ WHEELS = ("front_right", "front_left", "rear_left", "rear_right")
 
 NS_PER_S = 1_000_000_000
 
-ROOT = "acsard"
+ROOT_KEY = "acsard"
 """The first part of every native (non-ROS) key: `acsard/<robot.id>/...`."""
 
 Role = Literal["viewer", "operator", "maintainer"]

@@ -18,7 +18,7 @@ from acsard.core.config.wire_time import wire_ns
 from acsard.core.guard import Guard
 from acsard.core.incoming.bus_interface import GATEWAY_KEY as GATEWAY
 from acsard.core.incoming.bus_interface import (
-    NOTHING,
+    NO_INPUT,
     Bus,
     BusInput,
     GatewayFollower,
@@ -50,14 +50,14 @@ from acsard.core.values import (
     Request,
     Snapshot,
 )
-from acsard.daemon.latch_rules import ANSWER_NS, Handover, LatchKeeper
+from acsard.daemon.latch_rules import MAX_ANSWER_DELAY_NS, Handover, LatchKeeper
 from acsard.daemon.late_watch import LateWatch
 from acsard.daemon.latencies import Stopwatch
 from acsard.daemon.pacing import NO_PERIOD, Pace, Period
 from acsard.daemon.settings_file import SettingsFile, keeps
 from acsard.recording.recorded_steps import BlackBox, count_superseded
 
-FEEDBACK = ("odom", "tf", "wheel_states")
+FEEDBACK_TOPICS = ("odom", "tf", "wheel_states")
 """Topics whose messages are made from the feedback lines of the board."""
 
 QUERIES_PER_STEP = 8
@@ -65,7 +65,7 @@ QUERIES_PER_STEP = 8
 this limit. Further queries wait for the next step, so that a flood of queries does not make the
 control loop miss a period."""
 
-LATE_NS = 1_000_000
+MIN_WRITE_DELAY_NS = 1_000_000
 """Shortest delay from the start of a step to the write of its line that is reported to the robot,
 ns. For a shorter delay the robot gets 0, because the estimated sample times are less accurate
 anyway."""
@@ -152,7 +152,7 @@ class ControlLoop:
         self._answers: deque[tuple[int, Answer]] = deque()
         """Answers that are not sent yet, because the latch file does not contain the newest
         latches. Each answer is paired with the monotonic time at which it was queued, ns."""
-        self._got = NOTHING
+        self._got = NO_INPUT
         """The input that the present step has taken from the bus."""
         stop = self.robot.session.codec.stop
         self._guard = Guard(stop, config)
@@ -170,7 +170,7 @@ class ControlLoop:
         """Three facts about the last line to the board. `_superseded` is true if the port did not
         send the line, so that a newer line must replace it. `_trip` is the reason why the guard
         replaced the line with zeros, or "". `_late_ns` is the delay from the start of the step to
-        the write of the line, ns, or 0 if the delay is below `LATE_NS`."""
+        the write of the line, ns, or 0 if the delay is below `MIN_WRITE_DELAY_NS`."""
         # Use the longest line of both directions, because answers must not queue in the MCU either.
         period_ns = int(NS_PER_S / config.rate_hz)
         self._pace = Pace(wire_ns(config.mcu.line_bytes, config.mcu.baud_rate), period_ns)
@@ -217,7 +217,7 @@ class ControlLoop:
         `period` says how many periods have ended since the last step. For an extra step between the
         ends of two periods, it is `NO_PERIOD`.
         """
-        self._got = NOTHING
+        self._got = NO_INPUT
         try:
             return self._step(now, period)
         except Exception:
@@ -359,7 +359,7 @@ class ControlLoop:
         # Before the first step there are no outputs with which to answer queries. The bus then
         # returns at most one slow query, whose answer needs no outputs.
         got = self._got = self._bus.take(QUERIES_PER_STEP if self.outputs else 0)
-        if got is NOTHING:
+        if got is NO_INPUT:
             return (), (), ()
         commands: list[Command] = []
         refusals: list[Refusal] = []
@@ -496,7 +496,7 @@ class ControlLoop:
             sent_ns = self._port.sent_ns
             self._stopwatch.line(outputs, sent_ns, before_ns)
             late_ns = sent_ns - now.mono_ns
-            self._late_ns = late_ns if late_ns >= LATE_NS else 0
+            self._late_ns = late_ns if late_ns >= MIN_WRITE_DELAY_NS else 0
             self.robot.counters["lines_sent"] += 1
             return line
         self._superseded = True
@@ -510,7 +510,7 @@ class ControlLoop:
         bus, told_ns = self._bus, None
         for key, message in self.report.due(outputs, bus.wanted, self._look):
             bus.publish(key, message)
-            if key in FEEDBACK:
+            if key in FEEDBACK_TOPICS:
                 told_ns = self._mono_ns()
         for estimate in outputs.estimates:
             self._stopwatch.feedback(estimate, told_ns)
@@ -527,10 +527,10 @@ class ControlLoop:
     def _answer(self, now: Instant, *, last: bool = False) -> None:
         """Send each queued answer that need not wait any longer.
 
-        An answer waits until the newest latches are stored, but at most `ANSWER_NS`. If `last` is
-        true, no answer waits. `now` is the time of the step.
+        An answer waits until the newest latches are stored, but at most `MAX_ANSWER_DELAY_NS`. If
+        `last` is true, no answer waits. `now` is the time of the step.
         """
-        held, before_ns = self._handover.held, now.mono_ns - ANSWER_NS
+        held, before_ns = self._handover.held, now.mono_ns - MAX_ANSWER_DELAY_NS
         trouble = "" if held else self._handover.trouble or NOT_STORED
         while self._answers and (held or last or self._answers[0][0] < before_ns):
             _, answer = self._answers.popleft()

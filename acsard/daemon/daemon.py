@@ -17,7 +17,7 @@ from collections.abc import AsyncIterator, Callable, Coroutine, Iterable, Sequen
 from contextlib import AsyncExitStack, ExitStack, asynccontextmanager
 from typing import Any, Self
 
-from acsard.core.config.settings import TLS, Config
+from acsard.core.config.settings import TLS_PREFIX, Config
 from acsard.core.link.codec import Codec
 from acsard.core.messages.keys_and_roles import DESCRIPTION
 from acsard.core.messages.schema import Info
@@ -38,11 +38,11 @@ from acsard.daemon.supervisor import GATEWAY, PAGE, keep_running
 from acsard.daemon.wakeup import Next, Ticker, Wakeup
 from acsard.host import clock, real_time
 from acsard.host.logs import Log
-from acsard.host.systemd import PATIENCE_S, Systemd
+from acsard.host.systemd import START_EXTENSION_S, Systemd
 from acsard.host.version import version
 from acsard.recording.recorder import Recorder
 
-EXIT_RAMP_S = 0.6
+MAX_EXIT_RAMP_S = 0.6
 """Longest time for the ramp to zero speed at the shutdown, s. After this time the daemon sends STOP
 even if the robot still moves."""
 
@@ -93,7 +93,7 @@ class Departure:
         """Return whether the daemon may end now.
 
         Before the first signal, return False. Afterwards return True if the last step commanded
-        zero speed, if a second signal has arrived, or if the ramp has lasted for `EXIT_RAMP_S`.
+        zero speed, if a second signal has arrived, or if the ramp has lasted for `MAX_EXIT_RAMP_S`.
 
         Args:
             now_ns: the present monotonic time, ns.
@@ -101,7 +101,7 @@ class Departure:
         """
         if self.begun_ns is None:
             return False
-        return at_rest or self.hurried or now_ns - self.begun_ns > EXIT_RAMP_S * NS_PER_S
+        return at_rest or self.hurried or now_ns - self.begun_ns > MAX_EXIT_RAMP_S * NS_PER_S
 
 
 SWITCH_INTERVAL_S = 0.0005
@@ -264,10 +264,10 @@ def _certificates(config: Config, ours: bool) -> dict[str, int]:
     In the returned dict, the key "" stands for the daemon's own certificate, and `tls.AUTHORITY`
     for the certificate of its authority. Return {} if the daemon uses no certificate. Raises a
     `MendableError` if the certificate files cannot be used. `ours` says whether this daemon itself
-    starts the TLS gateway.
+    starts the TLS_PREFIX gateway.
     """
     bus = config.bus
-    if not (any(e.startswith(TLS) for e in bus.connect) or (ours and bus.outside)):
+    if not (any(e.startswith(TLS_PREFIX) for e in bus.connect) or (ours and bus.outside)):
         return {}
     require_usable(bus.tls)
     return ends_of(bus.tls)
@@ -316,7 +316,7 @@ async def _patience(config: Config, log: Log, manager: Systemd) -> AsyncIterator
     async def repeat() -> None:
         while True:
             manager.waiting(why)
-            await asyncio.sleep(PATIENCE_S / 3)
+            await asyncio.sleep(START_EXTENSION_S / 3)
 
     task = asyncio.create_task(repeat())
     try:

@@ -43,28 +43,28 @@ from acsard.host.errors import InUseError
 from acsard.host.mailbox import Mailbox
 from acsard.host.threads import NoThreadError, in_thread
 
-START_S = 2.0
+HANG_TIMEOUT_S = 2.0
 """Time limit for the disk, s. If a write or a sync of the latch file takes longer, the daemon
 reports that the disk hangs. At the start of the daemon, the first read and the first write together
 must not take longer."""
 
-PACE_S = 0.05
+MIN_WRITE_PAUSE_S = 0.05
 """Pause after each successful write, s. Each stop is a new latch, so without this pause a flood of
 stops would wear out an SD card."""
 
-RETRY_S = 1.0
+RETRY_PAUSE_S = 1.0
 """Pause between two attempts to write a file that could not be written, s."""
 
-CLOSE_S = 0.3
+CLOSE_TIMEOUT_S = 0.3
 """Longest time that the daemon waits at its end for the last write and its sync, s."""
 
-HANGS = f"the disk did not answer within {START_S:g} s"
+DISK_HANGS = f"the disk did not answer within {HANG_TIMEOUT_S:g} s"
 
-EVENTS = 64
+MAX_EVENTS = 64
 """Largest number of events that wait for the next control step. A newer event displaces the
 oldest."""
 
-NO_PLACE = "no directory"
+NO_DIRECTORY = "no directory"
 """Text that messages show in place of the file's path if no directory for the latch file is
 found."""
 
@@ -104,8 +104,8 @@ class LatchFile:
     """
 
     def __init__(self, config: Config, environ: Mapping[str, str]) -> None:
-        self.where = NO_PLACE
-        """Path of the file as messages show it, or `NO_PLACE`."""
+        self.where = NO_DIRECTORY
+        """Path of the file as messages show it, or `NO_DIRECTORY`."""
         self._path: Path | None = None
         self._robot = config.robot.id
         self._barred = ""
@@ -133,7 +133,7 @@ class LatchFile:
         in time. Each write adds these latches to the file again."""
         self._box = Mailbox[Latches](1)
         """Passes the latches of the last call of `keep` to the writing thread."""
-        self._news = Mailbox[Event](EVENTS)
+        self._news = Mailbox[Event](MAX_EVENTS)
         self._held: Latches | None = None
         """The latches that this process wrote last. None before the first write."""
         self._failed = ""
@@ -160,10 +160,10 @@ class LatchFile:
         time of that stop. Raises `InUseError` if another daemon uses this file.
         """
         try:
-            latches = await in_thread(lambda: self._look(now), START_S)
+            latches = await in_thread(lambda: self._look(now), HANG_TIMEOUT_S)
         except TimeoutError as error:
             self._abandoned = True
-            why = str(error) if isinstance(error, NoThreadError) else HANGS
+            why = str(error) if isinstance(error, NoThreadError) else DISK_HANGS
             self._fail(why)
             found = self._found
             if found is None:
@@ -283,7 +283,7 @@ class LatchFile:
         if self._hangs is not self._hung:
             self._hung = not self._hung
             if self._hung:
-                text = unwritable(self.where, HANGS)
+                text = unwritable(self.where, DISK_HANGS)
                 self._news.put(Event("latch_file", text, "warning"))
             elif not self._failed:
                 self._news.put(self._again)
@@ -294,12 +294,12 @@ class LatchFile:
         """Reason why the latches would not survive a restart, in words, or "" if they would."""
         if not all(thread.is_alive() for thread in self._threads):
             return "the thread that writes stops to the latch file has ended; restart the daemon"
-        failed = self._failed or (HANGS if self._hangs else "")
+        failed = self._failed or (DISK_HANGS if self._hangs else "")
         return unwritable(self.where, failed) if failed else ""
 
     @property
     def _hangs(self) -> bool:
-        """True if the disk hangs: a sync or a needed write has lasted longer than `START_S`.
+        """True if the disk hangs: a sync or a needed write has lasted longer than `HANG_TIMEOUT_S`.
 
         A write is needed if the file does not contain the newest latches.
         """
@@ -307,7 +307,7 @@ class LatchFile:
             return False
         busy_ns = None if self._held is self._handed else self._busy_ns
         begun_ns = [one for one in (busy_ns, self._syncing_ns) if one is not None]
-        return any(clock.mono_ns() - one > START_S * NS_PER_S for one in begun_ns)
+        return any(clock.mono_ns() - one > HANG_TIMEOUT_S * NS_PER_S for one in begun_ns)
 
     @property
     def _again(self) -> Event:
@@ -319,9 +319,9 @@ class LatchFile:
     def close(self) -> None:
         """Wait until the newest latches are written and synced, and end both threads.
 
-        The wait takes at most `CLOSE_S`.
+        The wait takes at most `CLOSE_TIMEOUT_S`.
         """
-        end_ns = clock.mono_ns() + CLOSE_S * NS_PER_S
+        end_ns = clock.mono_ns() + CLOSE_TIMEOUT_S * NS_PER_S
         for box, thread in zip((self._box, self._renamed), self._threads, strict=False):
             box.close()
             thread.join(max(0.0, (end_ns - clock.mono_ns()) / NS_PER_S))
@@ -337,10 +337,10 @@ class LatchFile:
             if latches is not None and not self._try(latches, now):
                 latches = None
                 if not over:
-                    time.sleep(PACE_S)
+                    time.sleep(MIN_WRITE_PAUSE_S)
             if over:
                 return
-            self._box.wait(None if latches is None else RETRY_S)
+            self._box.wait(None if latches is None else RETRY_PAUSE_S)
 
     def _try(self, latches: Latches, now: Instant) -> str:
         """Write these latches, and return "" on success.
@@ -413,7 +413,7 @@ class LatchFile:
                     self._recover()
             if over:
                 return
-            self._renamed.wait(RETRY_S if failed else None)
+            self._renamed.wait(RETRY_PAUSE_S if failed else None)
 
     def _sync(self) -> str:
         """Sync the file that `_replace` has written; return the reason of a failure, or ""."""
@@ -449,7 +449,7 @@ class LatchFile:
         if reason == self._failed:
             return
         self._failed = reason
-        text = f"{unwritable(self.where, reason)}; the daemon tries again every {RETRY_S:g} s"
+        text = f"{unwritable(self.where, reason)}; the daemon tries again every {RETRY_PAUSE_S:g} s"
         self._news.put(Event("latch_file", text, "warning"))
 
     def _recover(self) -> None:

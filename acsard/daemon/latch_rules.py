@@ -23,18 +23,18 @@ MAX_BYTES = 65_536
 """Largest size of a latch file, bytes. A larger file counts as unreadable. Three latches and all
 limits take about 1 kB."""
 
-MAX_TEXT = 500
+MAX_TEXT_LENGTH = 500
 """Largest length of a name or a reason in the latch file, characters. The rest is cut off."""
 
-ANSWER_NS = NS_PER_S // 5
+MAX_ANSWER_DELAY_NS = NS_PER_S // 5
 """Longest time for which the answer to a stop waits for the latch file, ns. A longer wait would
 make a client believe that the robot did not receive the stop."""
 
-BY = "acsard"
+DAEMON_NAME = "acsard"
 """Name of the sender in a stop that the daemon itself sets."""
 
 
-EMPTY = ("earlier", ())
+NO_EARLIER = ("earlier", ())
 """Name and value of the field `earlier` of a latch with only one cause. The file leaves this field
 out, because most latches have only one cause."""
 
@@ -52,7 +52,7 @@ class _Content(Struct, frozen=True):
 def encode(robot: str, latches: Latches) -> bytes:
     """Return the content of a robot's latch file, as indented JSON.
 
-    `robot` is the robot's id. Names and reasons longer than `MAX_TEXT` are cut off.
+    `robot` is the robot's id. Names and reasons longer than `MAX_TEXT_LENGTH` are cut off.
     """
     stop, fault, inactive = (
         None if latch is None else latch.each(_with_safe_text)
@@ -122,14 +122,16 @@ def unwritable(where: str, reason: str) -> str:
     )
 
 
-def stopped(latches: Latches, why: str, now: Instant, by: str = BY, before: int = -1) -> Latches:
+def stopped(
+    latches: Latches, why: str, now: Instant, by: str = DAEMON_NAME, before: int = -1
+) -> Latches:
     """Return `latches` with a stop added, or unchanged if `latches` already contains a stop.
 
     Args:
         latches: the latches in force.
         why: the reason of the stop, in words.
         now: the time of the stop.
-        by: the name of the client that requested the stop, or `BY` for the daemon itself.
+        by: the name of the client that requested the stop, or `DAEMON_NAME` for the daemon itself.
         before: the number of the previous stop, or -1 without a previous stop. The new stop gets a
             higher number.
     """
@@ -191,8 +193,8 @@ class Handover:
     """Hands the latches of the control loop to their keeper, and says whether they are stored.
 
     The robot stops immediately, but the answer to a stop waits until the stop would survive a kill
-    of the process. After `ANSWER_NS` the answer is sent in any case. It then says that the stop is
-    not stored yet.
+    of the process. After `MAX_ANSWER_DELAY_NS` the answer is sent in any case. It then says that
+    the stop is not stored yet.
     """
 
     def __init__(self, latches: Latches, keeper: LatchKeeper | None) -> None:
@@ -241,12 +243,12 @@ class Handover:
         return self._keeper is None or self._keeper.holds(self.latches)
 
     def wait(self) -> None:
-        """Block until the latches are stored, but at most `ANSWER_NS`.
+        """Block until the latches are stored, but at most `MAX_ANSWER_DELAY_NS`.
 
         Call this method only after the last control step, because it would delay a step.
         """
         if self._keeper is not None:
-            self._keeper.wait(self.latches, ANSWER_NS / NS_PER_S)
+            self._keeper.wait(self.latches, MAX_ANSWER_DELAY_NS / NS_PER_S)
 
     def news(self) -> list[Event]:
         return [] if self._keeper is None else self._keeper.news()
@@ -265,7 +267,7 @@ def _plain(content: Any) -> Any:
     match msgspec.to_builtins(content):
         case dict() as fields:
             pairs = fields.items()
-            return {name: _plain(value) for name, value in pairs if (name, value) != EMPTY}
+            return {name: _plain(value) for name, value in pairs if (name, value) != NO_EARLIER}
         case tuple() as items:
             return [_plain(item) for item in items]
         case value:
@@ -277,4 +279,4 @@ def _with_safe_text(latch: Latch) -> Latch:
 
 
 def _safe(text: str) -> str:
-    return text[:MAX_TEXT].encode(errors="replace").decode()
+    return text[:MAX_TEXT_LENGTH].encode(errors="replace").decode()

@@ -6,7 +6,7 @@ counters from after the lateness. A rule returns its cause in words, or "" if th
 show this cause. Several causes may apply to one lateness, or none.
 
 A delay counts as a cause only if it lasted for at least a certain share of the lateness, usually
-`SHARE`. Otherwise the small delays of normal load would count as causes.
+`CAUSE_FRACTION`. Otherwise the small delays of normal load would count as causes.
 
 The kernel also reports how the control loop's thread spent the lateness: it ran, it was ready and
 waited for a processor, or it slept. A slow processor delays only a thread that runs or waits for a
@@ -23,26 +23,26 @@ from acsard.core.formatting import many
 from acsard.core.values import NS_PER_S, Event
 from acsard.host.kernel_counters import Conditions, Program, Reading, Scheduled
 
-SHARE = 0.5
+CAUSE_FRACTION = 0.5
 """Usual limit for a cause: a delay counts as a cause only if it lasted for at least this share of
-the lateness. Some causes have another limit, such as `DISK_SHARE`."""
+the lateness. Some causes have another limit, such as `DISK_FRACTION`."""
 
-SLEPT_SHARE = 0.3
+SLEPT_FRACTION = 0.3
 """Limit for the disk as a cause: it counts only if the control loop's thread slept for at least
 this share of the lateness. The limit is low, because in a test with a fast virtual disk, a thread
 that read pages from the disk ran on the processor for as long as it slept."""
 
-DISK_SHARE = 0.25
+DISK_FRACTION = 0.25
 """Limit for the time in which any program waited for a disk: it counts as a cause only if it is at
 least this share of the lateness. The limit is low, because in a test a thread wrote to a disk all
 the time, and the kernel counted only 0.28 to 0.45 of this time as waiting."""
 
-LEAST_STOLEN_NS = 3 * NS_PER_S // 100
+MIN_STOLEN_NS = 3 * NS_PER_S // 100
 """Shortest steal time that counts as a cause, ns: three of the kernel's ticks. Steal time is time
 in which the host of a virtual machine took the processor away. In a test with 607 late periods that
 had another cause, the kernel counted one tick of steal time in 24 of them, and two ticks in one."""
 
-SUSPENDED_NS = NS_PER_S // 10
+MIN_SUSPEND_NS = NS_PER_S // 10
 """Shortest time that counts as a suspend, ns. A suspend is measured as a change of the difference
 between CLOCK_BOOTTIME and CLOCK_MONOTONIC. These clocks are not read at the same moment, so the
 difference varies a little even without a suspend."""
@@ -63,7 +63,7 @@ class Lateness(Struct, frozen=True, omit_defaults=True):
     """The process that used the most processor time. None if no process used much processor time,
     or if no search was made."""
 
-    def explains(self, duration_ns: int, share: float = SHARE) -> bool:
+    def explains(self, duration_ns: int, share: float = CAUSE_FRACTION) -> bool:
         """Return whether a duration is at least the share `share` of the lateness."""
         return duration_ns >= share * self.late_ns
 
@@ -74,8 +74,8 @@ class Lateness(Struct, frozen=True, omit_defaults=True):
 
     @property
     def slept(self) -> bool:
-        """Whether the control loop's thread slept for at least `SLEPT_SHARE` of the lateness."""
-        return self.explains(self.late_ns - self.loop.ran_ns - self.loop.waited_ns, SLEPT_SHARE)
+        """Whether the control loop's thread slept for at least `SLEPT_FRACTION` of the lateness."""
+        return self.explains(self.late_ns - self.loop.ran_ns - self.loop.waited_ns, SLEPT_FRACTION)
 
 
 class Cause(Struct, frozen=True):
@@ -92,7 +92,7 @@ def suspended(late: Lateness) -> str:
     asleep_ns = late.after.asleep_ns - late.before.asleep_ns
     return (
         f"this computer was suspended for {_seconds(asleep_ns)}"
-        if asleep_ns >= SUSPENDED_NS
+        if asleep_ns >= MIN_SUSPEND_NS
         else ""
     )
 
@@ -159,7 +159,7 @@ def cgroup_quota(late: Lateness) -> str:
 def stolen(late: Lateness) -> str:
     """Return the cause in words if the host took the processor away (steal time), else ""."""
     stolen_ns = most_stolen(late.before, late.after)
-    if stolen_ns < LEAST_STOLEN_NS or not late.explains(stolen_ns):
+    if stolen_ns < MIN_STOLEN_NS or not late.explains(stolen_ns):
         return ""
     return f"the host gave this virtual machine no processor for {_seconds(stolen_ns)}"
 
@@ -193,7 +193,7 @@ def disk(late: Lateness) -> str:
     """
     before, after = late.before, late.after
     own_ns, all_ns = after.own_disk_ns - before.own_disk_ns, after.disk_ns - before.disk_ns
-    ours = after.own_bytes > before.own_bytes and late.explains(all_ns, DISK_SHARE)
+    ours = after.own_bytes > before.own_bytes and late.explains(all_ns, DISK_FRACTION)
     if memory(late) or not (late.slept and (ours or late.explains(own_ns))):
         return ""
     return "the daemon waited for the disk"
@@ -272,7 +272,7 @@ def cause_in(text: str) -> str:
     return begin.rpartition(": ")[2] + because + clause if because else ""
 
 
-STOLEN_SHARE = 0.02
+STOLEN_FRACTION = 0.02
 """Limit for the steal time in `present`, which reports it only if it exceeds this share of the time
 between the two readings."""
 
@@ -291,7 +291,7 @@ def present(before: Reading, after: Reading, within_ns: int) -> list[tuple[str, 
         "undervoltage": low_voltage(now),
         "heat": hot(now, hotter),
         "governor": slow(now),
-        "steal": host if stolen_ns > STOLEN_SHARE * within_ns else "",
+        "steal": host if stolen_ns > STOLEN_FRACTION * within_ns else "",
     }
     return [(clauses[one.name], one.advice) for one in CAUSES if clauses.get(one.name)]
 

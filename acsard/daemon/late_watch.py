@@ -27,14 +27,14 @@ from acsard.host import clock
 from acsard.host.kernel_counters import Kernel, Program, Reading, Scheduled, scheduled
 from acsard.host.mailbox import Mailbox
 
-OWN_TIMES = "/proc/thread-self/schedstat"
+THREAD_TIMES_FILE = "/proc/thread-self/schedstat"
 """File with the processor times of the thread that opens it."""
 
-EVERY_S = 0.25
+READ_PERIOD_S = 0.25
 """Time between two readings of the kernel's counters while no period is late, s. If this time were
 longer, the comparison would include delays from long before the late period."""
 
-HISTORY = 12
+MAX_READINGS = 12
 """Number of readings of the kernel's counters that are kept. They cover the last 3 s, so the oldest
 one is from before the lateness, unless the lateness was longer than 3 s."""
 
@@ -46,23 +46,23 @@ PAUSE_NS = NS_PER_S
 """Shortest time between two reports of causes, ns. For each event name, the log shows at most one
 line a second."""
 
-CONDITIONS_NS = 10 * NS_PER_S
+CONDITIONS_PERIOD_NS = 10 * NS_PER_S
 """Time after which the conditions of the processor, such as its voltage, are read again, ns. They
 are not read more often, because on some computers each reading is a request to the firmware."""
 
-LOOK_S = 0.2
+SEARCH_S = 0.2
 """Time between two readings of the processor times of all processes, s. A search for the busiest
 process compares these two readings."""
 
-LOOK_AGAIN_NS = 10 * NS_PER_S
+MIN_SEARCH_INTERVAL_NS = 10 * NS_PER_S
 """Shortest time between two searches for the busiest process, ns. A search takes 20 us per
 process."""
 
-NEWS_NS = 60 * NS_PER_S
+REPEAT_EVENT_NS = 60 * NS_PER_S
 """Time after an event, ns, in which a further event with the same causes is not logged immediately.
 The further event waits for the next log line about missed periods (`Event.news`)."""
 
-MOST = 16
+MAX_QUEUED = 16
 """Size of two queues: the late periods that wait for the thread, and the events that wait for a
 call of `news`. A newer item displaces the oldest one."""
 
@@ -75,9 +75,9 @@ class Late(Struct, frozen=True):
     late_ns: int
     """Time from the due time of the first missed period to `now_ns`, ns."""
     before: bytes
-    """Content of `OWN_TIMES` in the period before the late period; b"" if it is unknown."""
+    """Content of `THREAD_TIMES_FILE` in the period before the late period; b"" if it is unknown."""
     after: bytes
-    """Content of `OWN_TIMES` in the late period; b"" if it is unknown."""
+    """Content of `THREAD_TIMES_FILE` in the late period; b"" if it is unknown."""
 
     @property
     def loop(self) -> Scheduled:
@@ -103,16 +103,16 @@ class LateWatch:
         `kernel` reads the kernel's files. Only tests pass this argument.
         """
         self._kernel = kernel
-        self._box = Mailbox[Late](MOST)
-        self._news = Mailbox[Event](MOST, lambda: None)
+        self._box = Mailbox[Late](MAX_QUEUED)
+        self._news = Mailbox[Event](MAX_QUEUED, lambda: None)
         self._thread = threading.Thread(target=self._work, name="lateness", daemon=True)
         self._times = b""
         try:
-            self._file = os.open(OWN_TIMES, os.O_RDONLY | os.O_CLOEXEC)
+            self._file = os.open(THREAD_TIMES_FILE, os.O_RDONLY | os.O_CLOEXEC)
         except OSError:
             # This kernel does not measure the times of threads.
             self._file = -1
-        self._readings: deque[tuple[int, Reading]] = deque(maxlen=HISTORY)
+        self._readings: deque[tuple[int, Reading]] = deque(maxlen=MAX_READINGS)
         """The last readings, each with the monotonic time at which it was complete, ns."""
         self._reported: dict[tuple[str, ...], int] = {}
         """Maps each combination of causes to the monotonic time of its last event that was logged
@@ -168,8 +168,8 @@ class LateWatch:
         free_ns = looked_ns
         self._keep(kernel.read(conditions))
         while not self._box.closed:
-            if not self._box.wait(EVERY_S):
-                if clock.mono_ns() - looked_ns >= CONDITIONS_NS:
+            if not self._box.wait(READ_PERIOD_S):
+                if clock.mono_ns() - looked_ns >= CONDITIONS_PERIOD_NS:
                     conditions, looked_ns = kernel.conditions(), clock.mono_ns()
                 self._keep(kernel.read(conditions))
                 continue
@@ -203,7 +203,7 @@ class LateWatch:
             return
         now_ns = clock.mono_ns()
         reported_ns = self._reported.get(names)
-        news = reported_ns is None or now_ns - reported_ns >= NEWS_NS
+        news = reported_ns is None or now_ns - reported_ns >= REPEAT_EVENT_NS
         if news:
             self._reported[names] = now_ns
         self._news.put(event_of(late, clause, news=news))
@@ -211,10 +211,10 @@ class LateWatch:
     def _busiest_of(self, kernel: Kernel) -> Program | None:
         """Return the process that uses the most processor time, or None if no process uses much.
 
-        If the last search is not older than `LOOK_AGAIN_NS`, return the result of that search
-        again.
+        If the last search is not older than `MIN_SEARCH_INTERVAL_NS`, return the result of that
+        search again.
         """
         now_ns = clock.mono_ns()
-        if self._searched_ns is None or now_ns - self._searched_ns >= LOOK_AGAIN_NS:
-            self._busiest, self._searched_ns = kernel.busiest(LOOK_S), now_ns
+        if self._searched_ns is None or now_ns - self._searched_ns >= MIN_SEARCH_INTERVAL_NS:
+            self._busiest, self._searched_ns = kernel.busiest(SEARCH_S), now_ns
         return self._busiest

@@ -23,7 +23,7 @@ DECADES = 7
 """Number of factors of ten that the buckets of a histogram cover: from 1 us to 10 s. The first
 bucket also counts shorter durations, and the last bucket also counts longer ones."""
 
-LAST = PER_DECADE * DECADES
+LAST_BUCKET = PER_DECADE * DECADES
 """Index of the last bucket of a histogram."""
 
 
@@ -34,13 +34,13 @@ class Histogram:
     """
 
     def __init__(self) -> None:
-        self._buckets = [0] * (LAST + 1)
+        self._buckets = [0] * (LAST_BUCKET + 1)
         self._max = 0.0
 
     def add(self, value: float) -> None:
         # Compute the index, because a search in a table would fetch a dozen cold cache lines.
         index = math.ceil(PER_DECADE * math.log10(value)) if value > 1.0 else 0
-        self._buckets[index if index < LAST else LAST] += 1
+        self._buckets[index if index < LAST_BUCKET else LAST_BUCKET] += 1
         if value > self._max:
             self._max = value
 

@@ -3,7 +3,8 @@
 An early line is written between two periods: for a new command or mode, or after a press of the
 emergency stop or a bumper. It replaces the line of the next period, so a flood of commands does not
 cause more lines. The time from the previous line to an early line must be at least the wire time of
-a line plus `BREATH_NS`. In each period, the control loop may try only once to write an early line.
+a line plus `REPLY_TIME_NS`. In each period, the control loop may try only once to write an early
+line.
 """
 
 from __future__ import annotations
@@ -25,11 +26,11 @@ class Period(Struct, frozen=True):
 NO_PERIOD = Period(0, 0)
 
 
-BREATH_NS = 1_000_000
+REPLY_TIME_NS = 1_000_000
 """Shortest time from the end of a line on the wire to an early line after it, ns. The board can
 reply in this time."""
 
-IDLE_WAKES = 3
+MAX_IDLE_WAKES = 3
 """Limit on the steps in one period in which the bus had input, but the input brought no new command
 or mode. After more than this number of such steps, further input waits for the next period, so that
 a flood of messages takes little processor time."""
@@ -46,7 +47,7 @@ class Pace:
     """
 
     def __init__(self, line_ns: int, period_ns: int) -> None:
-        self._gap_ns = line_ns + BREATH_NS
+        self._gap_ns = line_ns + REPLY_TIME_NS
         self._possible = self._gap_ns < period_ns
         """Whether a period is long enough for an early line."""
         self._ahead = False
@@ -95,7 +96,7 @@ class Pace:
 
         If this is False, the next command waits for the next step that another event runs.
         """
-        return self._possible and not (self._tried or self._waiting or self._idle > IDLE_WAKES)
+        return self._possible and not (self._tried or self._waiting or self._idle > MAX_IDLE_WAKES)
 
     @property
     def waits(self) -> bool:

@@ -11,18 +11,18 @@ from pathlib import Path
 
 from acsard.core.messages.encodings import encode
 from acsard.core.messages.schema import String
-from acsard.daemon.bus.zenoh_sessions import MESSAGE_BYTES
+from acsard.daemon.bus.zenoh_sessions import MAX_MESSAGE_BYTES
 from acsard.host.errors import Exit, ExitError
 
 MAX_BYTES = 50_000
-"""Largest size of the URDF file, bytes. It is smaller than `MESSAGE_BYTES`, because JSON needs two
-bytes for each quotation mark and each line end."""
+"""Largest size of the URDF file, bytes. It is smaller than `MAX_MESSAGE_BYTES`, because JSON needs
+two bytes for each quotation mark and each line end."""
 
-MAX_JSON = MESSAGE_BYTES - 1024
-"""Largest size of the URDF as a JSON message, bytes. The remaining 1024 bytes of `MESSAGE_BYTES`
-are for the Zenoh key and Zenoh's headers."""
+MAX_JSON_BYTES = MAX_MESSAGE_BYTES - 1024
+"""Largest size of the URDF as a JSON message, bytes. The remaining 1024 bytes of
+`MAX_MESSAGE_BYTES` are for the Zenoh key and Zenoh's headers."""
 
-XACRO = "/xacro}"
+XACRO_TAG = "/xacro}"
 """Text that shows that an element is a xacro element, if the tag of the element contains it.
 ElementTree writes the tag as "{NAMESPACE}NAME", with a namespace such as
 http://www.ros.org/wiki/xacro."""
@@ -74,13 +74,13 @@ def robot_description(path: str) -> str:
         raise _error(path, f"it is not XML ({error}); name the robot's URDF") from None
     if root.tag != "robot":
         raise _error(path, f"its outermost element is <{root.tag}>, but a URDF begins with <robot>")
-    if any(XACRO in element.tag for element in root.iter()):
+    if any(XACRO_TAG in element.tag for element in root.iter()):
         raise _error(
             path,
             f"it is a xacro file: convert it with `xacro {path} > robot.urdf`, and set [ros] urdf "
             "to the new file",
         )
-    if len(encode(String(text), "json")) > MAX_JSON:
+    if len(encode(String(text), "json")) > MAX_JSON_BYTES:
         raise _too_large(path)
     return text
 
@@ -88,7 +88,8 @@ def robot_description(path: str) -> str:
 def _too_large(path: str) -> ExitError:
     return _error(
         path,
-        f"it has more than {MAX_BYTES} bytes, or more than {MAX_JSON} as JSON, which is too long "
+        f"it has more than {MAX_BYTES} bytes, or more than {MAX_JSON_BYTES} as JSON, which is too "
+        f"long "
         "for a message on the bus; shorten the URDF, or let robot_state_publisher publish it",
     )
 

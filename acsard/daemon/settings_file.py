@@ -19,7 +19,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from acsard.core.config.live import changed, differences
-from acsard.core.config.lowered import TABLE, lowered
+from acsard.core.config.lowered import LIMITS_PREFIX, lowered
 from acsard.core.config.parsing import ConfigError
 from acsard.core.config.settings import Config, LimitsConfig
 from acsard.core.formatting import listed, printable
@@ -30,21 +30,21 @@ from acsard.host.config_file import Edit, keep, keepable
 from acsard.host.errors import MendableError
 from acsard.host.mailbox import Mailbox
 
-LOOK_S = 2.0
+CHECK_PERIOD_S = 2.0
 """Time between two checks whether the configuration file has changed, s."""
 
-NAMED = 3
+MAX_NAMED = 3
 """Largest number of settings that `SettingsFile.differ` names. The text must stay short, because
 the message `state` contains it."""
 
-MAX_TEXT = 200
+MAX_TEXT_LENGTH = 200
 """Largest length of `SettingsFile.differ`, characters. The rest is cut off."""
 
-PATIENCE_NS = 5 * NS_PER_S // 2
+REPLY_TIMEOUT_NS = 5 * NS_PER_S // 2
 """Longest time from the arrival of a `set` request with `keep` to the daemon's reply, ns. It is
 shorter than the 3 s for which a client waits for a reply."""
 
-JOBS = 32
+MAX_JOBS = 32
 """Largest number of `set` requests with `keep` that wait for their reply. Further requests are
 refused immediately."""
 
@@ -106,13 +106,13 @@ class SettingsFile:
         self._file, self._parse = file, parse
         self._in_force = self._written = started
         self._signature: Signature | None = None
-        self._box = Mailbox[Request | Literal["look"]](JOBS)
+        self._box = Mailbox[Request | Literal["look"]](MAX_JOBS)
         """Queue of the thread: the requests that it must check. The item "look" only wakes the
         thread, which then writes the changes and compares the file."""
         self._changes = deque[tuple[Edit, Answer]]()
         """The changes that the thread must write to the file before it checks another request. Each
         change is paired with the robot's answer to the client."""
-        self._results = Mailbox[_Checked | Answer](JOBS)
+        self._results = Mailbox[_Checked | Answer](MAX_JOBS)
         self._pending: dict[int, _Pending] = {}
         self._started = self._limits = started.limits
         """`_started` contains the limits at the start of the daemon. `_limits` contains the limits
@@ -151,10 +151,12 @@ class SettingsFile:
         `results` later returns the request, if the robot must use its settings, or an answer for
         the client. `now_ns` is the present monotonic time, ns.
         """
-        full = len(self._pending) >= JOBS
+        full = len(self._pending) >= MAX_JOBS
         # A request beyond the limit is overdue from the start, so that `results` refuses it in this
         # step.
-        self._pending[request.id] = _Pending(request, now_ns - 1 if full else now_ns + PATIENCE_NS)
+        self._pending[request.id] = _Pending(
+            request, now_ns - 1 if full else now_ns + REPLY_TIMEOUT_NS
+        )
         if not full:
             self._box.put(request)
 
@@ -267,14 +269,14 @@ class SettingsFile:
 
     def _work(self) -> None:
         while not self._box.closed:
-            self._box.wait(LOOK_S)
+            self._box.wait(CHECK_PERIOD_S)
             for job in self._box.take():
                 self._write()
                 # A request that is overdue has its answer already.
                 if isinstance(job, Request) and job.id in self._pending:
                     self._results.put(self._checked(job))
             self._write()
-            self.differ = printable(self._difference())[:MAX_TEXT]
+            self.differ = printable(self._difference())[:MAX_TEXT_LENGTH]
 
     def _write(self) -> None:
         while self._changes:
@@ -300,9 +302,9 @@ class SettingsFile:
                 answer.id, False, f"{told}, but only until the daemon's next start, because {error}"
             )
         limits = {
-            key.removeprefix(TABLE): float(value)  # type: ignore[arg-type]
+            key.removeprefix(LIMITS_PREFIX): float(value)  # type: ignore[arg-type]
             for key, value in edit.keys.items()
-            if key.startswith(TABLE)
+            if key.startswith(LIMITS_PREFIX)
         }
         if limits:
             self._limits = replace(self._limits, **limits)
@@ -322,7 +324,7 @@ class SettingsFile:
             )
         found = differences(self._in_force, self._written)
         told = [one.words(key) for key, one in found.items()]
-        return listed(told, NAMED)
+        return listed(told, MAX_NAMED)
 
     def _read(self) -> None:
         if self._file is None:
@@ -338,9 +340,10 @@ class SettingsFile:
 
 
 def _overdue(pending: _Pending) -> Answer:
-    """Return the answer to a request that took too long, or that exceeded the limit `JOBS`."""
+    """Return the answer to a request that took too long, or that exceeded the limit `MAX_JOBS`."""
     why = (
-        f"the disk did not answer within {PATIENCE_NS / NS_PER_S:g} s, or too many changes came at "
+        f"the disk did not answer within {REPLY_TIMEOUT_NS / NS_PER_S:g} s, or too many changes "
+        f"came at "
         "once"
     )
     answer = pending.answer

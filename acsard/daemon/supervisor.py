@@ -17,10 +17,10 @@ from acsard.host.child import Child, acsard, how_it_ended
 from acsard.host.errors import Exit
 from acsard.host.threads import in_thread
 
-AGAIN_S = 0.1
+RESTART_PAUSE_S = 0.1
 """Usual pause between the end of a process and its restart, s."""
 
-LATER_S = 2.0
+LONG_RESTART_PAUSE_S = 2.0
 """Longer pause before a restart, s. It applies if the process has ended with an exit code above 1,
 or could not be started."""
 
@@ -33,8 +33,11 @@ class Kind(Struct, frozen=True):
     """Name of the log event that reports the end of the process."""
     final: frozenset[int] = frozenset()
     """Exit codes after which the process is not started again."""
-    again_s: float = AGAIN_S
-    """Pause before a restart, s. After an exit code above 1 the pause is `LATER_S` instead."""
+    again_s: float = RESTART_PAUSE_S
+    """Pause before a restart, s.
+
+    After an exit code above 1 the pause is `LONG_RESTART_PAUSE_S` instead.
+    """
     final_at_first: frozenset[int] = frozenset()
     """Exit codes after which the process is not started again if it has never been restarted. A
     restarted process may end with such a code because a person is changing its files, so it is
@@ -57,7 +60,7 @@ PAGE = Kind(
     "the robot's page",
     "page_ended",
     frozenset({Exit.OK, Exit.USAGE, Exit.IN_USE, Exit.NO_PERMISSION, Exit.BAD_CONFIG}),
-    LATER_S,
+    LONG_RESTART_PAUSE_S,
 )
 """The process of the web page, which itself reports why it ends. The pause before its restart is
 longer, because a page that fails again and again must not take processor time from the robot."""
@@ -87,4 +90,4 @@ async def keep_running(
         finally:
             child.release()
         log(Event(kind.ended, f"{kind.name} {why}; it is restarted", "warning"))
-        await asyncio.sleep(kind.again_s if code <= Exit.FAILURE else LATER_S)
+        await asyncio.sleep(kind.again_s if code <= Exit.FAILURE else LONG_RESTART_PAUSE_S)

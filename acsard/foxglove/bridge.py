@@ -12,7 +12,7 @@ import foxglove
 import zenoh
 
 from acsard.client import Client
-from acsard.client.commander import LONGEST_S
+from acsard.client.commander import MAX_OPEN_TIMEOUT_S
 from acsard.client.follower import Watch
 from acsard.core.ros.names import full_name
 from acsard.core.values import NS_PER_S, AcsardError
@@ -21,8 +21,8 @@ from acsard.foxglove.notices import Notices, Objections
 from acsard.foxglove.relay import Relay
 from acsard.foxglove.robot_facts import Facts, learn
 from acsard.foxglove.server import (
-    CALLED,
-    STOPS,
+    DRIVE_SERVICES,
+    OPEN_SERVICES,
     Listener,
     Refusals,
     Settings,
@@ -33,11 +33,11 @@ from acsard.foxglove.server import (
 )
 from acsard.host import clock
 
-GONE = "daemon"
+DAEMON_GONE_ID = "daemon"
 """Id of the status message that tells the viewers that the daemon is gone."""
 
 
-RELEASE = "release the button for two seconds, and press it again"
+RELEASE_ADVICE = "release the button for two seconds, and press it again"
 """Advice to an operator whose panel must send a zero command (see `commander.RELEASED_NS`)."""
 
 
@@ -79,7 +79,7 @@ class Bridge:
         they can see these commands, or after the reason has been sent to the viewers."""
         logging.getLogger("foxglove").addHandler(Refusals(self._notices))
         listener = Listener(self._shown, self._drives, self._settings)
-        offered = services(robot, ros, CALLED if acts else STOPS)
+        offered = services(robot, ros, DRIVE_SERVICES if acts else OPEN_SERVICES)
         self._server = start(f"acsard {self._id}", address, listener, offered, context, acts=acts)
         self._objections: dict[int, Objections] = {}
         self._watch: Watch | None = None
@@ -145,7 +145,7 @@ class Bridge:
 
     def _went(self) -> bool:
         words = f"the daemon of robot {self._id} is gone; `acsard foxglove` waits for it"
-        self._notices.say("error", "daemon", words, stays=GONE)
+        self._notices.say("error", "daemon", words, stays=DAEMON_GONE_ID)
         return True
 
     def _came_back(self) -> bool:
@@ -156,10 +156,10 @@ class Bridge:
         try:
             facts = learn(self._robot)
         except AcsardError as error:
-            self._notices.say("error", "daemon", str(error), stays=GONE)
+            self._notices.say("error", "daemon", str(error), stays=DAEMON_GONE_ID)
             return False
         self._learn(facts)
-        self._notices.over(GONE)
+        self._notices.over(DAEMON_GONE_ID)
         self._notices.say("info", "daemon", f"the daemon of robot {self._id} is back")
         return True
 
@@ -171,7 +171,9 @@ class Bridge:
 
     def _timeout_s(self, facts: Facts) -> float:
         sources = facts.config.commands.sources
-        return next((one.timeout for one in sources if one.name == self._robot.source), LONGEST_S)
+        return next(
+            (one.timeout for one in sources if one.name == self._robot.source), MAX_OPEN_TIMEOUT_S
+        )
 
     def _follow(self, driving: bool) -> None:
         now = clock.steady_s()
@@ -200,7 +202,7 @@ class Bridge:
                 stays = f"drive {client}"
                 if told.told:
                     zero_first = "must send a zero" in told.told
-                    mend = f" ({RELEASE})" if zero_first else ""
+                    mend = f" ({RELEASE_ADVICE})" if zero_first else ""
                     words = f"your commands do not drive the robot: {told.told}{mend}"
                     self._notices.say("warning", "drive", words, stays=stays)
                 else:

@@ -17,7 +17,7 @@ from threading import Lock
 import zenoh
 
 from acsard.client import Client
-from acsard.client.commander import LONGEST_S, Commander, Wish
+from acsard.client.commander import MAX_OPEN_TIMEOUT_S, Commander, Wish
 from acsard.client.outbox import Outbox
 from acsard.core.config.settings import DriveConfig, JointsConfig
 from acsard.core.incoming.commands import STAMPED_TWISTS, TWISTS, Arrival, Receiver
@@ -113,7 +113,7 @@ class Drives:
         self._viewers: dict[int, Viewer] = {}
         self._lock = Lock()
         self.outbox = Outbox()
-        self.timeout_s = LONGEST_S
+        self.timeout_s = MAX_OPEN_TIMEOUT_S
         """Timeout of the command source that the viewers use, s."""
 
     # The server's threads call the methods below.

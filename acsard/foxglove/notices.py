@@ -17,16 +17,16 @@ from acsard.host import clock
 from acsard.host.mailbox import Mailbox
 from acsard.host.rate_limits import Buckets, Rate
 
-STATUS: dict[Level, StatusLevel] = {
+STATUS_LEVELS: dict[Level, StatusLevel] = {
     "info": StatusLevel.Info,
     "warning": StatusLevel.Warning,
     "error": StatusLevel.Error,
 }
 
-AGAIN = Rate(0.5)
+REPEAT_RATE = Rate(0.5)
 """Largest rate of notices with the same text: one per two seconds."""
 
-WAITING = 100
+MAX_WAITING = 100
 """Largest number of notices that wait to be sent. A newer notice displaces the oldest one."""
 
 
@@ -49,8 +49,8 @@ class Notices:
     def __init__(self, tell: Callable[[str], None], wake: Callable[[], None]) -> None:
         self._tell = tell
         self._lock = Lock()
-        self._waiting = Mailbox[Notice](WAITING, wake)
-        self._texts = Buckets(AGAIN)
+        self._waiting = Mailbox[Notice](MAX_WAITING, wake)
+        self._texts = Buckets(REPEAT_RATE)
         self._staying: dict[str, Notice] = {}
 
     def say(self, level: Level, name: str, text: str, stays: str = "") -> None:
@@ -61,7 +61,8 @@ class Notices:
             name: the subject of the message on the topic `log`.
             text: the message.
             stays: id of a message that remains visible until `over` is called with this id. With
-                "", the message is dropped if its text is repeated faster than `AGAIN` permits.
+                "", the message is dropped if its text is repeated faster than `REPEAT_RATE`
+                permits.
         """
         now_ns = clock.mono_ns()
         with self._lock:
@@ -84,7 +85,7 @@ class Notices:
         """
         if newcomers:
             for one in self._staying.values():
-                server.publish_status(one.text, STATUS[one.level], one.stays)
+                server.publish_status(one.text, STATUS_LEVELS[one.level], one.stays)
         for one in self._waiting.take():
             if not one.text:
                 if self._staying.pop(one.stays, None):
@@ -92,7 +93,7 @@ class Notices:
                 continue
             if one.stays:
                 self._staying[one.stays] = one
-            server.publish_status(one.text, STATUS[one.level], one.stays or None)
+            server.publish_status(one.text, STATUS_LEVELS[one.level], one.stays or None)
             stamp = Time.from_ns(clock.now().wall_ns)
             log(Log(stamp, LEVELS[one.level], f"foxglove.{one.name}", one.text))
             self._tell(one.text)

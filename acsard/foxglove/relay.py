@@ -22,7 +22,7 @@ from acsard.core.messages.encodings import DecodeError
 from acsard.core.messages.keys_and_roles import by_key, source_keys
 from acsard.core.messages.schema import Events, LogEvent, Time, TwistStamped
 from acsard.core.motion.kinematics import Kinematics
-from acsard.core.ros.channels import CMD_VEL_IN, ENCODING, LOG, SCHEMA_ENCODING, Channel
+from acsard.core.ros.channels import CMD_VEL_IN, ENCODING, LOG_CHANNEL, SCHEMA_ENCODING, Channel
 from acsard.core.ros.shapes import Log, asked, log
 from acsard.core.ros.transports import endpoints
 from acsard.daemon.bus.subscription import Subscription, encoded, queue_on
@@ -30,7 +30,7 @@ from acsard.foxglove.robot_facts import Facts, key_of
 from acsard.host import clock
 from acsard.host.mailbox import Mailbox
 
-EVENTS = "events"
+EVENTS_KEY = "events"
 
 
 class News:
@@ -236,7 +236,7 @@ class Relay:
         self._commanders.use(facts)
         for row, source in facts.rows():
             topic = row.topic(facts.config.ros.namespace, source)
-            if row is LOG:
+            if row is LOG_CHANNEL:
                 self.log_topic = topic
             if topic not in self._outs:
                 schema = foxglove.Schema(
@@ -275,8 +275,8 @@ class Relay:
             out = self._outs.get(topic)
             if out is None or out.key not in self._followed:
                 continue
-            if out.key == EVENTS:
-                self._robot.ask(EVENTS, self._followed[EVENTS].add)
+            if out.key == EVENTS_KEY:
+                self._robot.ask(EVENTS_KEY, self._followed[EVENTS_KEY].add)
             elif out.key in ("tf_static", "diagnostics", "state") and out.last:
                 # These keys are published rarely, so a new viewer receives the last message.
                 out.channel.log(out.last)

@@ -10,7 +10,7 @@ from acsard.core.config.parsing import from_builtins
 from acsard.core.config.settings import Config
 from acsard.core.messages.encodings import DecodeError
 from acsard.core.messages.permissions import COMMAND_ROLE, has, least_role
-from acsard.core.ros.channels import CMD_VEL_IN, SOURCE, Channel, published_channels
+from acsard.core.ros.channels import CMD_VEL_IN, SOURCE_PLACEHOLDER, Channel, published_channels
 from acsard.core.ros.transports import left_out
 from acsard.host.errors import ReplyError
 
@@ -56,7 +56,7 @@ def key_of(row: Channel, source: str) -> str:
         source: the name of the command source whose commands the key carries. Only the topic
             `CMD_VEL_IN` has a key for each source. All other topics ignore `source`.
     """
-    return row.native.replace(SOURCE, source)
+    return row.native.replace(SOURCE_PLACEHOLDER, source)
 
 
 def learn(robot: Client) -> Facts:

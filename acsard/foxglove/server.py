@@ -32,10 +32,10 @@ from acsard.host import clock
 from acsard.host.errors import InUseError, NotPermittedError
 from acsard.host.mailbox import Mailbox
 
-WISHES = 16
+MAX_WAITING_CHANGES = 16
 """Largest number of requested changes of settings that wait until they are sent to the daemon."""
 
-POLL_NS = 5 * NS_PER_S
+POLL_PERIOD_NS = 5 * NS_PER_S
 """Time between two queries for the robot's settings while a viewer shows them, ns. The queries are
 needed because other clients may change the settings."""
 
@@ -86,7 +86,7 @@ class Settings:
     ) -> None:
         self._robot, self._notices = robot, notices
         self._lock = Lock()
-        self._wishes = Mailbox[dict[str, Any]](WISHES, wake)
+        self._wishes = Mailbox[dict[str, Any]](MAX_WAITING_CHANGES, wake)
         self._known: dict[str, Any] = {}
         self._read_ns = clock.mono_ns()
         self._asked = False
@@ -127,18 +127,18 @@ class Settings:
         """Queue a change of settings, and return the present values of these settings.
 
         `refresh` makes the change later. A notice then tells all viewers whether the change
-        succeeded. If `WISHES` changes wait already, the new change is dropped, and a notice says
-        so.
+        succeeded. If `MAX_WAITING_CHANGES` changes wait already, the new change is dropped, and a
+        notice says so.
 
         Args:
             wishes: maps settings to their new values.
         """
         with self._lock:
-            full = len(self._wishes.waiting) >= WISHES
+            full = len(self._wishes.waiting) >= MAX_WAITING_CHANGES
             if not full:
                 self._wishes.put(wishes)
         if full:
-            text = f"not set: {WISHES} earlier changes wait for the daemon; try again"
+            text = f"not set: {MAX_WAITING_CHANGES} earlier changes wait for the daemon; try again"
             self._notices.say("error", "set", text)
         with self._lock:
             return asked(self._known, wishes.keys()) if wishes else {}
@@ -176,7 +176,9 @@ class Settings:
             return self._change(wishes)
         with self._lock:
             age_ns = clock.mono_ns() - self._read_ns
-            due = (self._asked and age_ns > NS_PER_S) or (self._followed and age_ns > POLL_NS)
+            due = (self._asked and age_ns > NS_PER_S) or (
+                self._followed and age_ns > POLL_PERIOD_NS
+            )
         if not (due and here and self._readable):
             return {}
         try:
@@ -319,15 +321,15 @@ class Refusals(logging.Handler):
             )
 
 
-CALLED: tuple[Verb, ...] = tuple(verb for verb in SERVICES if verb != "set")
+DRIVE_SERVICES: tuple[Verb, ...] = tuple(verb for verb in SERVICES if verb != "set")
 """Services that viewers may call with the option `--drive`: all except `set`. Viewers change
 settings through the parameters of Foxglove instead."""
 
-STOPS: tuple[Verb, ...] = ("stop",)
+OPEN_SERVICES: tuple[Verb, ...] = ("stop",)
 """Services that viewers may call without the option `--drive`. Only a stop is safe, because any web
 page in a local browser can connect, and this server cannot tell which page it is."""
 
-NOTHING = {"type": "object", "title": "std_srvs/srv/Trigger_Request", "properties": {}}
+EMPTY_SCHEMA = {"type": "object", "title": "std_srvs/srv/Trigger_Request", "properties": {}}
 
 
 def services(robot: Robot, ros: RosConfig, verbs: Iterable[Verb]) -> list[foxglove.Service]:
@@ -343,7 +345,7 @@ def _service(robot: Robot, verb: Verb, name: str) -> foxglove.Service:
 
     schema = foxglove.ServiceSchema(
         f"acsard/srv/{payload}" if payload else "std_srvs/srv/Trigger",
-        request=_schema(SCHEMAS[payload] if payload else NOTHING),
+        request=_schema(SCHEMAS[payload] if payload else EMPTY_SCHEMA),
         response=_schema(SCHEMAS["ServiceReply"]),
     )
     return foxglove.Service(name, schema=schema, handler=answer)

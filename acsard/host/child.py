@@ -30,19 +30,19 @@ from msgspec import Struct
 from acsard.core.values import NS_PER_S
 from acsard.host import clock
 
-OUR_UNIT = ("NOTIFY_SOCKET", "INVOCATION_ID")
+SYSTEMD_VARIABLES = ("NOTIFY_SOCKET", "INVOCATION_ID")
 """Environment variables of systemd that a child does not get from its parent. With them, a child
 could send notifications to systemd in its parent's name."""
 
-BEAT_S = 0.5
+HEARTBEAT_S = 0.5
 """Longest interval, s, at which a child sends a sign of life and its parent looks for one."""
 
-SILENT_NS = 3 * NS_PER_S
+SILENCE_TIMEOUT_NS = 3 * NS_PER_S
 """If a child gives no sign of life for this time, ns, its parent kills it. The TLS gateway already
 ends itself after 1 s without progress, so this limit is for a process that cannot even end
 itself."""
 
-START_NS = 15 * NS_PER_S
+START_TIMEOUT_NS = 15 * NS_PER_S
 """Longest time for which the parent waits for a child's first sign of life, ns. Python starts
 slowly on a busy machine."""
 
@@ -79,9 +79,12 @@ def acsard(*words: str) -> list[str]:
 def environment(hidden: Collection[str] = ()) -> dict[str, str]:
     """Return the environment variables for a child.
 
-    They are those of this process, without the variables that `hidden` and `OUR_UNIT` name.
+    They are those of this process, without the variables that `hidden` and `SYSTEMD_VARIABLES`
+    name.
     """
-    return {key: value for key, value in os.environ.items() if key not in (*OUR_UNIT, *hidden)}
+    return {
+        key: value for key, value in os.environ.items() if key not in (*SYSTEMD_VARIABLES, *hidden)
+    }
 
 
 class Limits(Struct, frozen=True):
@@ -201,13 +204,13 @@ class Child:
         Also return, with False, after `release` was called. `ours` is the parent's end of the
         socket to the child.
         """
-        silence, before_ns, alive = Silence(START_NS), clock.mono_ns(), False
+        silence, before_ns, alive = Silence(START_TIMEOUT_NS), clock.mono_ns(), False
         while True:
-            beat = ours.recv(4096) if select.select([ours], [], [], BEAT_S)[0] else None
+            beat = ours.recv(4096) if select.select([ours], [], [], HEARTBEAT_S)[0] else None
             if beat == b"":
                 return False
             if beat and not alive:
-                alive, silence = True, Silence(SILENT_NS)
+                alive, silence = True, Silence(SILENCE_TIMEOUT_NS)
             now_ns = clock.mono_ns()
             if silence.too_long(bool(beat), now_ns - before_ns):
                 self.silent = "no longer reported that it is alive (stopped or hung), and was ended"

@@ -58,7 +58,7 @@ def now() -> Instant:
     return Instant(mono - mono % NS_PER_US, wall - wall % NS_PER_US)
 
 
-MOMENT_NS = 100_000_000
+MIN_SUSPEND_NS = 100_000_000
 """Shortest time that counts as a suspend, ns. Every real suspend takes longer."""
 
 
@@ -75,12 +75,13 @@ class Asleep:
     def was(self) -> bool:
         """Return whether this computer has been suspended since the last call.
 
-        A suspend of less than 0.1 s (`MOMENT_NS`) is added to the time that the next call examines.
+        A suspend of less than 0.1 s (`MIN_SUSPEND_NS`) is added to the time that the next call
+        examines.
         """
-        if self._read() - self._known_ns < MOMENT_NS:
+        if self._read() - self._known_ns < MIN_SUSPEND_NS:
             return False
         # `read` reads two clocks, and the difference is wrong if another process ran in between. So
         # a second reading must confirm the suspend.
         now_ns = self._read()
-        slept, self._known_ns = now_ns - self._known_ns >= MOMENT_NS, now_ns
+        slept, self._known_ns = now_ns - self._known_ns >= MIN_SUSPEND_NS, now_ns
         return slept

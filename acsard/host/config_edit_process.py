@@ -22,7 +22,7 @@ from acsard.host.child import environment
 from acsard.host.errors import MendableError
 from acsard.host.extras import install
 
-EDIT_S = 2.0
+EDIT_TIMEOUT_S = 2.0
 """Time limit for the process that computes the change, s. On an idle computer, the process takes
 0.2 s."""
 
@@ -51,18 +51,19 @@ def edited_apart(text: str, keys: Mapping[str, object]) -> str:
 
     `keys` maps dotted keys, such as "mcu.port", to their new values. Raises `MendableError` or
     `ValueError` if the text cannot be changed, and `OSError` if the process cannot be started.
-    Raises `MendableError` if the process takes longer than `EDIT_S`.
+    Raises `MendableError` if the process takes longer than `EDIT_TIMEOUT_S`.
     """
     task = msgspec.json.encode(Task(text, dict(keys)))
     # With -P Python ignores the working directory, so it runs the installed package.
     words = [sys.executable, "-P", "-m", "acsard.host.config_edit_process"]
     try:
         done = subprocess.run(
-            words, input=task, capture_output=True, env=environment(), timeout=EDIT_S
+            words, input=task, capture_output=True, env=environment(), timeout=EDIT_TIMEOUT_S
         )
     except subprocess.TimeoutExpired:
         text = (
-            f"the robot's computer was too busy to make the change within {EDIT_S:g} s: type the "
+            f"the robot's computer was too busy to make the change within {EDIT_TIMEOUT_S:g} s: "
+            f"type the "
             "command again"
         )
         raise MendableError(text) from None

@@ -19,15 +19,15 @@ from acsard.host.config_edit_process import edited_apart
 from acsard.host.errors import Exit, ExitError, MendableError
 from acsard.host.extras import install
 
-PLACES = (Path("acsard.toml"), Path("/etc/acsard/acsard.toml"))
+SEARCH_PATHS = (Path("acsard.toml"), Path("/etc/acsard/acsard.toml"))
 
 
 def find(path: str | None) -> tuple[str, bytes]:
     """Return the path and the content of the configuration file.
 
     If `path` is None or "", the file is the one that $ACSARD_CONFIG names. If this variable is not
-    set, it is the first existing file of `PLACES`. If there is no such file, return ("built-in
-    defaults", b""). Raises `ExitError` if the file cannot be read.
+    set, it is the first existing file of `SEARCH_PATHS`. If there is no such file, return
+    ("built-in defaults", b""). Raises `ExitError` if the file cannot be read.
     """
     named = path or os.environ.get("ACSARD_CONFIG")
     if named:
@@ -39,7 +39,7 @@ def find(path: str | None) -> tuple[str, bytes]:
                 f"cannot read {named}: {error.strerror}; correct --config or ACSARD_CONFIG, or the "
                 "permissions of the file",
             ) from None
-    for place in PLACES:
+    for place in SEARCH_PATHS:
         try:
             return str(place), place.read_bytes()
         except FileNotFoundError:

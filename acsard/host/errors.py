@@ -27,7 +27,7 @@ class Exit(IntEnum):
     BAD_CONFIG = 78
 
 
-WORDS: dict[int, str] = {
+EXIT_TEXTS: dict[int, str] = {
     Exit.OK: "done",
     Exit.FAILURE: "failure",
     Exit.USAGE: "wrong usage",

@@ -17,16 +17,16 @@ from msgspec.structs import replace
 from acsard.core.values import NS_PER_S
 from acsard.host import clock
 
-SLOWED_BITS = 0b1110
+THROTTLED_BITS = 0b1110
 """Mask for three bits of the Raspberry Pi's `get_throttled` that are set while the processor is
 slowed down: the clock frequency is limited, the processor is throttled, or the soft temperature
 limit is active."""
 
-OWN_SCALING = ("intel_pstate", "amd-pstate", "amd-pstate-epp")
+SELF_SCALING_DRIVERS = ("intel_pstate", "amd-pstate", "amd-pstate-epp")
 """The cpufreq drivers whose governor `powersave` adapts the frequency to the load. With every other
 driver, the governor `powersave` keeps the lowest frequency."""
 
-COOLERS = ("Processor", "cpufreq", "thermal-cpufreq", "thermal-idle", "intel_powerclamp")
+COOLING_TYPES = ("Processor", "cpufreq", "thermal-cpufreq", "thermal-idle", "intel_powerclamp")
 """A cooling device slows a processor down if its type (in sysfs) begins with one of these texts."""
 
 
@@ -221,7 +221,7 @@ def slow_clock(policy: Mapping[str, str]) -> SlowClock | None:
     slowly anyway.
     """
     governor, limit = policy.get("scaling_governor", ""), policy.get("scaling_max_freq", "")
-    if governor == "powersave" and policy.get("scaling_driver") not in OWN_SCALING:
+    if governor == "powersave" and policy.get("scaling_driver") not in SELF_SCALING_DRIVERS:
         limit = policy.get("scaling_min_freq", limit)
     if governor == "userspace":
         limit = policy.get("scaling_setspeed", limit)
@@ -251,7 +251,7 @@ class Kernel:
         self._coolers = [
             device / "cur_state"
             for device in sorted((root / "sys/class/thermal").glob("cooling_device*"))
-            if _text(device / "type").startswith(COOLERS)
+            if _text(device / "type").startswith(COOLING_TYPES)
         ]
         self._policies = sorted(cpu.glob("cpufreq/policy*"))
         # Without pressure stall information, these files are missing or cannot be read.
@@ -290,7 +290,7 @@ class Kernel:
         return Conditions(
             low,
             # At a low voltage the firmware also sets the other bits, so they do not prove heat.
-            cooled or (bool(bits & SLOWED_BITS) and not low),
+            cooled or (bool(bits & THROTTLED_BITS) and not low),
             sum(map(_number, self._throttle_counts)),
             next((one for one in slow if one is not None), None),
         )

@@ -93,7 +93,7 @@ class JournalStream(io.StringIO):
 
 Form = Literal["console", "json", "logfmt", "journal"]
 
-MAX_VALUE = 500
+MAX_VALUE_LENGTH = 500
 """Largest number of characters of a logged value. The rest of a longer value is cut off, because a
 value from another program may have any length."""
 
@@ -236,8 +236,8 @@ def _printable(
     Cut long values, and replace characters that would move the cursor or begin a new line.
     """
     for key, value in line.items():
-        if isinstance(value, str) and not (value.isprintable() and len(value) <= MAX_VALUE):
-            line[key] = printable(value[:MAX_VALUE])
+        if isinstance(value, str) and not (value.isprintable() and len(value) <= MAX_VALUE_LENGTH):
+            line[key] = printable(value[:MAX_VALUE_LENGTH])
     return line
 
 

@@ -11,7 +11,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from acsard.core.messages.signature import MAX_NAME
+from acsard.core.messages.signature import MAX_NAME_LENGTH
 from acsard.host.processes import called
 
 
@@ -32,7 +32,7 @@ def sender_id(name: str, secret: str = "") -> str:
 
     If `secret` is "", the id contains a new random secret. A long name is cut off.
     """
-    return f"{name[:MAX_NAME]}/{secret or new_secret()}"
+    return f"{name[:MAX_NAME_LENGTH]}/{secret or new_secret()}"
 
 
 def new_secret() -> str:

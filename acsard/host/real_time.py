@@ -15,13 +15,13 @@ PRIORITY = 10
 """Real-time priority of the control loop. The kernel's interrupt threads have the higher priority
 50."""
 
-SPIN_S = 1
+MAX_SPIN_S = 1
 """If the control loop runs for longer than this without a pause, s, the kernel ends the process.
 Otherwise a loop that hangs would block all ordinary programs, because the loop has priority over
 them. A step takes a thousandth of this time. The systemd service has no such limit: systemd's
 watchdog ends a daemon that hangs."""
 
-DOZE = "/dev/cpu_dma_latency"
+WAKE_UP_LATENCY = "/dev/cpu_dma_latency"
 """Device file with which a process limits the time that a processor takes to wake up."""
 
 _CAP_IPC_LOCK, _CAP_SYS_NICE = 14, 23
@@ -84,7 +84,7 @@ def _schedule() -> bool:
         return True
     try:
         policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
-        resource.setrlimit(resource.RLIMIT_RTTIME, (SPIN_S * 1_000_000, SPIN_S * 1_000_000))
+        resource.setrlimit(resource.RLIMIT_RTTIME, (MAX_SPIN_S * 1_000_000, MAX_SPIN_S * 1_000_000))
         os.sched_setscheduler(0, policy, os.sched_param(PRIORITY))
     except OSError:
         return False
@@ -97,7 +97,7 @@ def _stay_awake() -> bool:
     From deep sleep, a processor wakes late and with cold caches.
     """
     try:
-        wish = os.open(DOZE, os.O_WRONLY | os.O_CLOEXEC)
+        wish = os.open(WAKE_UP_LATENCY, os.O_WRONLY | os.O_CLOEXEC)
     except FileNotFoundError:
         # This kernel does not offer the device.
         return True

@@ -15,7 +15,7 @@ FEEDS_PER_WATCHDOG = 4
 """Number of times that the control loop feeds systemd's watchdog in each timeout of the
 watchdog."""
 
-PATIENCE_S = 30
+START_EXTENSION_S = 30
 """Time that each call of `waiting` adds before systemd ends a process that is still starting, s."""
 
 
@@ -54,10 +54,10 @@ class Systemd:
     def waiting(self, why: str) -> None:
         """Report why the start takes longer, so that systemd goes on waiting.
 
-        Call this again within `PATIENCE_S`. Otherwise systemd ends this process. `why` is the
-        reason, in words.
+        Call this again within `START_EXTENSION_S`. Otherwise systemd ends this process. `why` is
+        the reason, in words.
         """
-        self._send(f"EXTEND_TIMEOUT_USEC={PATIENCE_S * 1_000_000}\nSTATUS={why}")
+        self._send(f"EXTEND_TIMEOUT_USEC={START_EXTENSION_S * 1_000_000}\nSTATUS={why}")
 
     def status(self, text: str) -> None:
         self._send(f"STATUS={text}")

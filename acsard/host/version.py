@@ -15,7 +15,7 @@ _PACKAGE = Path(__file__).parents[1]
 COMMIT_FILE = "commit"
 """Name of a file that `deploy/build_hook.py` adds to the package. It contains the git commit."""
 
-DIGITS = 9
+HASH_DIGITS = 9
 """The version contains this number of hexadecimal digits of the commit's hash."""
 
 
@@ -26,7 +26,7 @@ def version() -> str:
     If the commit of the source is not known, the version is like `0.1.0`.
     """
     commit = _text(_PACKAGE / COMMIT_FILE) or commit_of(_PACKAGE.parent)
-    return f"{__version__}+g{commit[:DIGITS]}" if commit else __version__
+    return f"{__version__}+g{commit[:HASH_DIGITS]}" if commit else __version__
 
 
 def commit_of(clone: Path) -> str:

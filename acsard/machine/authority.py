@@ -23,11 +23,11 @@ from acsard.daemon.bus.tls import CA, CERTIFICATE, KEY
 from acsard.host.atomic_file import replace
 from acsard.machine.certificates import CA_KEY
 
-LOCAL = ("local", "localhost")
+LOCAL_NAMES = ("local", "localhost")
 """Host names for which every authority may sign certificates. An authority may also sign for all
 names below these names, such as `robot.local`."""
 
-PRIVATE = (
+PRIVATE_NETWORKS = (
     "10.0.0.0/8", "100.64.0.0/10", "127.0.0.0/8", "169.254.0.0/16", "172.16.0.0/12",
     "192.168.0.0/16", "::1/128", "fc00::/7", "fe80::/10",
 )  # fmt: skip
@@ -58,8 +58,8 @@ class Authority:
             days: usual validity of the certificates that the authority signs, days. The authority's
                 own certificate is valid for five times as long.
             addresses: host names and IP addresses for which the authority may sign, in addition to
-                `LOCAL` and `PRIVATE`. A host name also permits all names below it, and an IPv6
-                address also permits its /64 network.
+                `LOCAL_NAMES` and `PRIVATE_NETWORKS`. A host name also permits all names below it,
+                and an IPv6 address also permits its /64 network.
         """
         directory.mkdir(mode=0o755, parents=True, exist_ok=True)
         key = ec.generate_private_key(ec.SECP256R1())
@@ -197,7 +197,7 @@ def _usage(signs: bool) -> x509.KeyUsage:
 
 
 def _constraints(addresses: Sequence[str]) -> x509.NameConstraints:
-    hosts, networks = list(LOCAL), [ipaddress.ip_network(one) for one in PRIVATE]
+    hosts, networks = list(LOCAL_NAMES), [ipaddress.ip_network(one) for one in PRIVATE_NETWORKS]
     for address in addresses:
         named = _general_name(address)
         if not isinstance(named, x509.IPAddress):

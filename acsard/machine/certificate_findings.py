@@ -9,7 +9,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-from acsard.core.config.settings import TLS, Config
+from acsard.core.config.settings import TLS_PREFIX, Config
 from acsard.core.messages.certificate_expiry import expiry, first
 from acsard.daemon.bus.certificate_watch import ends_of
 from acsard.daemon.bus.tls import (
@@ -25,7 +25,7 @@ from acsard.daemon.bus.tls import (
 from acsard.host.clock import now
 from acsard.host.errors import MendableError
 from acsard.host.extras import install
-from acsard.machine.certificates import CA_KEY, OWN
+from acsard.machine.certificates import CA_KEY, ROBOT_NAME
 from acsard.machine.finding import LEVELS, Finding
 
 
@@ -77,7 +77,7 @@ def renewal(tls: str, whose: str) -> str:
             "init --force --directory .`; then make a new certificate for each client, and copy it "
             "to that client"
         )
-    if not whose and name == OWN:
+    if not whose and name == ROBOT_NAME:
         there = (
             ""
             if (directory / CA_KEY).exists()
@@ -124,9 +124,10 @@ def _command(action: str, directory: Path) -> str:
 
 
 def router_certificates(config: Config) -> Iterator[Finding]:
-    """Yield a finding about the certificate of each configured router that answers over TLS."""
+    """Yield a finding about the certificate of each configured router that answers over
+    TLS_PREFIX."""
     tls = config.bus.tls
-    routers = [endpoint for endpoint in config.bus.connect if endpoint.startswith(TLS)]
+    routers = [endpoint for endpoint in config.bus.connect if endpoint.startswith(TLS_PREFIX)]
     for whose, ends_ns in ends_of(routers, tls).items():
         level, words = expiry({whose: ends_ns}, now().wall_ns)
         yield Finding("router", LEVELS[level], words, renewal(tls, whose) if level else "")

@@ -30,7 +30,7 @@ PORT = 7449
 CA_KEY = "ca-key.pem"
 """Name of the file with the authority's private key. This file is never copied to a client."""
 
-OWN = "robot"
+ROBOT_NAME = "robot"
 """Common name of the certificate that `tls init` makes for the robot itself."""
 
 ADDRESS = re.compile(r"[A-Za-z0-9:]([A-Za-z0-9.:-]{0,251}[A-Za-z0-9:])?\Z")
@@ -66,7 +66,7 @@ def init(directory: Path, addresses: Sequence[str], days: int, *, force: bool) -
     _writable(directory)
     names = _robot_names(addresses)
     authority = maker.make(directory, f"acsard at {socket.gethostname()}", days, names)
-    authority.issue(directory, OWN, names, days)
+    authority.issue(directory, ROBOT_NAME, names, days)
     for role in ROLES:
         authority.issue(directory / "clients" / role, role, [], days)
     return names
@@ -134,7 +134,7 @@ def renew(directory: Path, addresses: Sequence[str], days: int) -> list[str]:
     # The name or address of this machine may have changed since the authority was made. The
     # authority may not sign for the new one then.
     names = [*filter(authority.permits, known), *addresses]
-    authority.issue(directory, OWN, names, days)
+    authority.issue(directory, ROBOT_NAME, names, days)
     return list(dict.fromkeys(names))
 
 

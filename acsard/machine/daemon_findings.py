@@ -21,7 +21,7 @@ from acsard.core.config.parsing import from_builtins
 from acsard.core.config.settings import SIMULATOR, BatteryConfig, Config
 from acsard.core.config.validation import write
 from acsard.core.formatting import listed, many
-from acsard.core.link.link_diagnosis import BUSY, LOST, is_ours
+from acsard.core.link.link_diagnosis import BUSY_ADVICE, MAX_UNANSWERED_FRACTION, is_ours
 from acsard.core.messages.diagnostics import NO_ROUTER
 from acsard.core.messages.schema import (
     BatterySummary,
@@ -31,11 +31,17 @@ from acsard.core.messages.schema import (
     RobotState,
 )
 from acsard.core.motion import bumpers
-from acsard.core.motion.battery import MISSING as NO_BATTERY
+from acsard.core.motion.battery import MISSING_REASON as NO_BATTERY
 from acsard.core.motion.battery import Battery
 from acsard.core.motion.battery import words as battery_words
-from acsard.core.motion.emergency_stop import CHECK, MISSING, PRESSED, RELEASE, SILENT
-from acsard.core.motion.gyro import WORDS
+from acsard.core.motion.emergency_stop import (
+    CHECK,
+    MISSING_REASON,
+    PRESSED_REASON,
+    RELEASE,
+    SILENT_REASON,
+)
+from acsard.core.motion.gyro import STATUS_TEXTS
 from acsard.core.motion.lifecycle import utc
 from acsard.core.values import NS_PER_S, AcsardError, BatteryLevel, BatteryStatus, GyroDoes
 from acsard.daemon.bus.address import Address
@@ -46,27 +52,27 @@ from acsard.host.errors import MendableError, NoAnswerError
 from acsard.host.processes import name_of
 from acsard.machine.finding import LEVELS, Finding, Level
 
-SHOWN = 6
+MAX_KEYS = 6
 """Maximum number of configuration keys that one finding of `compared` names."""
 
 
-OPTIONS = (
+OPTION_KEYS = (
     "mcu.port", "mcu.baud_rate", "robot.id", "bus.listen", "bus.connect", "record.directory",
     "ros.namespace",
 )  # fmt: skip
 """Configuration keys that options of `acsard run` can set. If the daemon's value of such a key
 differs from the value in the file, the user has probably intended this."""
 
-WAYS: tuple[tuple[Callable[[str], bool], Level, str, str], ...] = (
+DIFFERENCE_REASONS: tuple[tuple[Callable[[str], bool], Level, str, str], ...] = (
     (
-        lambda key: key in OPTIONS,
+        lambda key: key in OPTION_KEYS,
         "ok",
         "these values come from the options of `acsard run` or from another file, or the file has "
         "changed since the daemon started",
         "to keep {which} after a restart, write these lines into the configuration file: {lines}",
     ),
     (
-        lambda key: key not in OPTIONS and live(key) is None,
+        lambda key: key not in OPTION_KEYS and live(key) is None,
         "warning",
         "these values come from another file or from the daemon's environment, or the file has "
         "changed since the daemon started",
@@ -150,8 +156,9 @@ def _configuration(robot: Client, info: Info, file: Config) -> Config:
 def compared(running: Running, file: Config) -> Iterator[Finding]:
     """Yield findings about configuration keys with different values in the daemon and in the file.
 
-    `file` is the configuration in the file. There is one finding for each row of `WAYS` that
-    applies to any of these keys. If no value differs, there is one finding with the level "ok".
+    `file` is the configuration in the file. There is one finding for each row of
+    `DIFFERENCE_REASONS` that applies to any of these keys. If no value differs, there is one
+    finding with the level "ok".
     """
     info, others = running.info, differences(running.config, file)
     who = f"acsard {info.version}, pid {info.pid}"
@@ -162,13 +169,13 @@ def compared(running: Running, file: Config) -> Iterator[Finding]:
             f"the running daemon ({who}) uses the configuration file's values",
         )
         return
-    for belongs, level, how, mend in WAYS:
+    for belongs, level, how, mend in DIFFERENCE_REASONS:
         its = {key: one for key, one in others.items() if belongs(key)}
         if not its:
             continue
         told = [one.words(key) for key, one in its.items()]
         text = f"the running daemon ({who}) has other values than the file ({how}): "
-        text += listed(told, SHOWN, "; ")
+        text += listed(told, MAX_KEYS, "; ")
         mend = mend.format(
             which="these values" if len(its) > 1 else "this value", lines=_tables(its)
         )
@@ -208,7 +215,7 @@ def link(running: Running) -> Iterator[Finding]:
                 else "run `acsard doctor` on the daemon's machine, where it checks the serial port"
             )
         if config.mcu.simulated or is_ours(state.reason):
-            mend = BUSY
+            mend = BUSY_ADVICE
         text = f"{state.link}: {state.reason}" if state.mode == "waiting" else state.link
         yield Finding("link", "failure", text, mend)
         return
@@ -226,7 +233,7 @@ def link(running: Running) -> Iterator[Finding]:
             f"the link was lost {late_times} since the daemon's start because the daemon's "
             "computer did not run the daemon in time"
         )
-        yield Finding("link", "warning" if late > often else "ok", text, BUSY)
+        yield Finding("link", "warning" if late > often else "ok", text, BUSY_ADVICE)
     problems = [*lost(passed, config), *(refused(passed) or refused(state.counters))]
     for text in problems:
         yield Finding("link", "warning", text, mend)
@@ -244,15 +251,17 @@ def link(running: Running) -> Iterator[Finding]:
 
 def _emergency_stop(config: Config, state: RobotState, mend: str) -> Iterator[Finding]:
     if state.emergency_stop == "pressed":
-        yield Finding("emergency stop", "warning", PRESSED, f"{RELEASE}, then `acsard call clear`")
+        yield Finding(
+            "emergency stop", "warning", PRESSED_REASON, f"{RELEASE}, then `acsard call clear`"
+        )
     elif state.emergency_stop == "silent":
-        yield Finding("emergency stop", "failure", SILENT, CHECK)
+        yield Finding("emergency stop", "failure", SILENT_REASON, CHECK)
     elif state.emergency_stop:
         yield Finding(
             "emergency stop", "ok", "the board reports that the emergency stop is released"
         )
     elif config.safety.estop == "required":
-        yield Finding("emergency stop", "failure", MISSING, mend)
+        yield Finding("emergency stop", "failure", MISSING_REASON, mend)
 
 
 def _bumpers(config: Config, state: RobotState, mend: str) -> Iterator[Finding]:
@@ -297,7 +306,7 @@ def lost(passed: Mapping[str, int], config: Config) -> Iterator[str]:
     """
     sent, came = passed.get("lines_sent", 0), passed.get("lines", 0)
     # With fewer than 40 lines, the share of lost lines is not significant.
-    if config.mcu.reply_period or sent < 40 or came >= (1 - LOST) * sent - 1:
+    if config.mcu.reply_period or sent < 40 or came >= (1 - MAX_UNANSWERED_FRACTION) * sent - 1:
         return
     yield (
         f"the board answered only {came} of the {sent} lines that the daemon sent in a second: "
@@ -316,7 +325,7 @@ def refused(counters: Mapping[str, int]) -> list[str]:
         for name, count in counters.items()
         if name.startswith("line_") and count
     }
-    if sum(kinds.values()) <= LOST * max(1, counters.get("lines", 0)):
+    if sum(kinds.values()) <= MAX_UNANSWERED_FRACTION * max(1, counters.get("lines", 0)):
         return []
     told = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in kinds.items())
     return [f"the daemon rejected lines from the microcontroller, by reason: {told}"]
@@ -362,40 +371,42 @@ GYRO_MENDS: dict[GyroDoes, str] = {
 }
 """Advice to the user for each status of the gyro in the message `state`; "" if none is needed."""
 
-CAUSES_SHOWN = 3
+MAX_CAUSES = 3
 """Maximum number of causes of late control periods that the doctor shows: the latest causes."""
 
 CAUSES_PAGE = "deploy/systemd/README.md explains each cause of lateness"
 
-START = (
+START_ADVICE = (
     "if the daemon is a systemd service, `systemctl status acsard` shows why it does not run; "
     "otherwise start it with `acsard run`. If the daemon was started with --listen ADDRESS, give "
     "this command the same address with --connect"
 )
 
-ANOTHER = (
+OTHER_DAEMON_ADVICE = (
     "if the daemon has another robot id, name that id with --id (`acsard fleet` lists the robots); "
     "otherwise check whether another program listens at that address"
 )
 
-OTHER_VERSION = "if the daemon has another version of acsard, run this tool from the same version"
+OTHER_VERSION_ADVICE = (
+    "if the daemon has another version of acsard, run this tool from the same version"
+)
 
-GUARD = "the daemon's guard"
+GUARD_FAULT = "the daemon's guard"
 """Words in the reason of a fault that the guard has found. Such a fault is a defect of acsard."""
 
-SIGN = (
+SIGN_ADVICE = (
     "or let the clients sign their commands (deploy/clients/README.md): signed commands do not "
     "need a common clock"
 )
 
 
-START_ROUTER = (
+START_ROUTER_ADVICE = (
     "start the Zenoh router at that address (rmw_zenohd, zenohd or `acsard router`): the daemon "
     "then connects by itself"
 )
 
 
-PUT_ROUTER = (
+PUT_ROUTER_ADVICE = (
     "a daemon does not forward the messages of other daemons, so `acsard fleet` and `acsard call "
     "stop --id '*'` do not reach a robot that is connected only to another daemon: connect all "
     "robots to a Zenoh router (deploy/zenoh/README.md)"
@@ -410,7 +421,9 @@ def routers(config: Config) -> Iterator[Finding]:
     """
     for endpoint in config.bus.connect:
         if not answers(endpoint):
-            yield Finding("router", "warning", f"no program listens at {endpoint}", START_ROUTER)
+            yield Finding(
+                "router", "warning", f"no program listens at {endpoint}", START_ROUTER_ADVICE
+            )
         if endpoint.startswith("tls/"):
             continue
         text = (
@@ -443,16 +456,16 @@ def found(config: Config, address: Address) -> Running | Finding:
                 "doctor` again; until then, `systemctl status acsard` shows the state of the daemon"
             )
             return Finding("daemon", "warning", text, mend)
-        return Finding("daemon", "warning", f"no program listens at {endpoint}", START)
+        return Finding("daemon", "warning", f"no program listens at {endpoint}", START_ADVICE)
     try:
         return asked(config, address)
     except NoAnswerError as error:
-        return Finding("daemon", "failure", str(error), ANOTHER)
+        return Finding("daemon", "failure", str(error), OTHER_DAEMON_ADVICE)
     except MendableError as error:
         # The text of such an error contains the advice.
         return Finding("daemon", "failure", str(error))
     except AcsardError as error:
-        return Finding("daemon", "failure", str(error), OTHER_VERSION)
+        return Finding("daemon", "failure", str(error), OTHER_VERSION_ADVICE)
 
 
 def daemon(running: Running) -> Iterator[Finding]:
@@ -463,7 +476,7 @@ def daemon(running: Running) -> Iterator[Finding]:
         "correct the cause that this reason names, then release the fault with `acsard call "
         f"clear`; {check(running)}"
     )
-    if GUARD in state.reason:
+    if GUARD_FAULT in state.reason:
         mend = (
             "this is a defect of acsard: report it with the newest recording (`acsard recording` "
             "lists the recordings), then release the fault with `acsard call clear`"
@@ -526,7 +539,7 @@ def late(running: Running) -> Iterator[Finding]:
 
     There is a warning if the daemon has missed more than 1 % of the periods since its start, or if
     its diagnostics report recently missed periods. There is also a finding for each of the latest
-    `CAUSES_SHOWN` known causes.
+    `MAX_CAUSES` known causes.
     """
     counters = running.state.counters
     missed, lines = counters.get("missed_periods", 0), counters.get("lines_sent", 0)
@@ -544,7 +557,7 @@ def late(running: Running) -> Iterator[Finding]:
         for event in running.events
         if event.name == "missed_periods" and (cause := cause_in(event.text))
     ]
-    for event, cause in causes[-CAUSES_SHOWN:]:
+    for event, cause in causes[-MAX_CAUSES:]:
         level: Level = "warning" if told else "ok"
         text = f"the daemon missed control periods just before {utc(event.stamp.to_ns())}: {cause}"
         yield Finding("daemon", level, text, CAUSES_PAGE)
@@ -569,7 +582,7 @@ def clocks(running: Running) -> Iterator[Finding]:
             "clock",
             "warning",
             text,
-            f"let NTP set the clocks of both machines (timedatectl), {SIGN}",
+            f"let NTP set the clocks of both machines (timedatectl), {SIGN_ADVICE}",
         )
     replaced = counters.get("stamps_replaced", 0)
     if replaced:
@@ -578,7 +591,7 @@ def clocks(running: Running) -> Iterator[Finding]:
             "replaced the time stamps of these commands"
         )
         yield Finding(
-            "clock", "warning", text, f"let NTP set the clocks of daemon and clients, {SIGN}"
+            "clock", "warning", text, f"let NTP set the clocks of daemon and clients, {SIGN_ADVICE}"
         )
 
 
@@ -589,11 +602,11 @@ def gyro(does: str, counters: Mapping[str, int]) -> Iterator[Finding]:
     if the daemon has rejected gyro samples. `does` is the gyro's status in the message `state`, and
     `counters` are the daemon's counters.
     """
-    words = next((text for name, text in WORDS.items() if name == does), does)
+    words = next((text for name, text in STATUS_TEXTS.items() if name == does), does)
     if does != "off":
         mend = next(
             (text for name, text in GYRO_MENDS.items() if name == does),
-            f"this tool does not know this status of the gyro: {OTHER_VERSION}",
+            f"this tool does not know this status of the gyro: {OTHER_VERSION_ADVICE}",
         )
         yield Finding("gyro", "warning" if mend else "ok", words, mend)
     refused = {n.removeprefix("imu_"): c for n, c in counters.items() if n.startswith("imu_") and c}
@@ -620,9 +633,9 @@ def linked(rows: Mapping[str, DiagnosticStatus]) -> Iterator[Finding]:
     """
     row = rows.get("acsard: router")
     if row is not None:
-        mend = START_ROUTER if row.level else ""
+        mend = START_ROUTER_ADVICE if row.level else ""
         if any(one.value == NO_ROUTER for one in row.values):
-            mend = PUT_ROUTER
+            mend = PUT_ROUTER_ADVICE
         yield Finding("router", LEVELS[min(row.level, 2)], f"the daemon is {row.message}", mend)
 
 

@@ -31,7 +31,7 @@ from acsard.machine.daemon_findings import Running, compared, daemon, found, gat
 from acsard.machine.finding import Finding, Level
 from acsard.machine.serial_ports import BOARDS, serial_devices
 
-REAL = (
+REAL_TIME_ADVICE = (
     "run the daemon as the systemd service (deploy/systemd), which has real-time priority; without "
     "this priority, other programs on a busy computer make the daemon late"
 )
@@ -92,17 +92,20 @@ def scheduling(wanted: bool, pid: int | None) -> Iterator[Finding]:
             "real time",
             "warning",
             f"the running daemon (pid {pid}) does not have real-time scheduling",
-            REAL,
+            REAL_TIME_ADVICE,
         )
     elif real_time.allowed():
         yield Finding("real time", "ok", "a daemon of this user gets real-time scheduling")
     else:
         yield Finding(
-            "real time", "warning", "a daemon of this user gets no real-time scheduling", REAL
+            "real time",
+            "warning",
+            "a daemon of this user gets no real-time scheduling",
+            REAL_TIME_ADVICE,
         )
 
 
-LOOK_S = 0.3
+MEASUREMENT_S = 0.3
 """Time between the two readings of the kernel's counters, s. The kernel updates its counters at
 each clock tick, and there are 30 ticks in this time."""
 
@@ -115,7 +118,7 @@ def slowness(kernel: Kernel | None = None) -> Iterator[Finding]:
     """
     kernel = kernel or Kernel()
     before, began_ns = kernel.read(), clock.mono_ns()
-    time.sleep(LOOK_S)
+    time.sleep(MEASUREMENT_S)
     after, passed_ns = kernel.read(), clock.mono_ns() - began_ns
     causes = present(before, after, passed_ns)
     for clause, advice in causes:

@@ -32,7 +32,7 @@ GROUP, SETPRIV = "dialout", "/usr/bin/setpriv"
 """`GROUP` is the group of the service in the unit files. `SETPRIV` is the program with which the
 daemon's unit runs `acsard-stop`."""
 
-OUT_OF_SIGHT = ("/home", "/root", "/run/user", "/tmp", "/var/tmp")
+HIDDEN_DIRECTORIES = ("/home", "/root", "/run/user", "/tmp", "/var/tmp")
 """Directories that systemd hides from the service."""
 
 
@@ -40,7 +40,7 @@ def misplaced(
     prefix: str = sys.prefix,
     base: str = sys.base_prefix,
     executable: str = sys.executable,
-    hidden: Sequence[str] = OUT_OF_SIGHT,
+    hidden: Sequence[str] = HIDDEN_DIRECTORIES,
 ) -> str:
     """Return the reason why a service cannot run this installation of acsard, or "" if it can.
 
@@ -122,7 +122,13 @@ def _closed(path: Path) -> Path | None:
     return None
 
 
-OURS = ("bin", "acsard", "acsard.service.d", "acsard-gateway.service.d", "acsard-web.service.d")
+OWN_DIRECTORIES = (
+    "bin",
+    "acsard",
+    "acsard.service.d",
+    "acsard-gateway.service.d",
+    "acsard-web.service.d",
+)
 """Names of acsard's own directories. The removal of the service also deletes such a directory if
 the directory has become empty."""
 
@@ -220,7 +226,7 @@ class Remove(Struct, frozen=True):
         else:
             self.path.unlink()
         for place in self.path.parents:
-            if place.name not in OURS:
+            if place.name not in OWN_DIRECTORIES:
                 return
             try:
                 place.rmdir()
@@ -275,14 +281,14 @@ def _unreadable(path: Path, error: OSError) -> MendableError:
 
 
 UNIT, GATEWAY, PAGE = "acsard.service", "acsard-gateway.service", "acsard-web.service"
-ALL = (UNIT, GATEWAY, PAGE)
-STOP = "acsard-stop"
-UNITS = Path("/etc/systemd/system")
-ETC = Path("/etc/acsard")
-LAN = "lan.conf"
-TLS = "/etc/acsard/tls"
+ALL_UNITS = (UNIT, GATEWAY, PAGE)
+STOP_PROGRAM = "acsard-stop"
+UNIT_DIRECTORY = Path("/etc/systemd/system")
+CONFIG_DIRECTORY = Path("/etc/acsard")
+LAN_DROP_IN = "lan.conf"
+TLS_DIRECTORY = "/etc/acsard/tls"
 """Directory of the certificates in the drop-in file `lan.conf`."""
-STATES = {
+STATE_DIRECTORIES = {
     UNIT: (
         Path("/var/lib/acsard"),
         "the daemon's recordings, and the stop that survives a restart",
@@ -294,36 +300,43 @@ STATES = {
 Found = Mapping[Path, bytes | None]
 """Maps the path of a file to its present content, or to None if the file does not exist."""
 
-RELOAD = (
+RELOAD_COMMANDS = (
     Run(("systemctl", "daemon-reload")),
     Run(("udevadm", "control", "--reload"), may_fail=True),
 )
-AGAIN = ("tty", "usb-serial", "misc")
+TRIGGERED_SUBSYSTEMS = ("tty", "usb-serial", "misc")
 """Kernel subsystems. `udevadm trigger` applies the new udev rules to the devices in them."""
 
-INSTALLED = (
-    *RELOAD,
-    Run(("udevadm", "trigger", *(f"--subsystem-match={one}" for one in AGAIN)), may_fail=True),
+INSTALL_COMMANDS = (
+    *RELOAD_COMMANDS,
+    Run(
+        ("udevadm", "trigger", *(f"--subsystem-match={one}" for one in TRIGGERED_SUBSYSTEMS)),
+        may_fail=True,
+    ),
     # Start the daemon first, because the page's unit mounts a directory that systemd creates when
     # the daemon starts. A failure is ignored, because the next command starts the daemon again.
     Run(("systemctl", "start", UNIT), may_fail=True),
-    Run(("systemctl", "enable", "--now", *ALL)),
+    Run(("systemctl", "enable", "--now", *ALL_UNITS)),
 )
-GONE = (*RELOAD, Run(("systemctl", "reset-failed", *ALL), may_fail=True))
+REMOVE_COMMANDS = (*RELOAD_COMMANDS, Run(("systemctl", "reset-failed", *ALL_UNITS), may_fail=True))
 
 
 def files() -> list[File]:
     """Return all files that the installation of the service writes."""
     reference = _reference().read_text(encoding="utf-8")
     return [
-        *(_unit(name) for name in ALL),
-        File(Path("/opt/acsard/bin") / STOP, (source() / "systemd" / STOP).read_bytes(), 0o755),
+        *(_unit(name) for name in ALL_UNITS),
+        File(
+            Path("/opt/acsard/bin") / STOP_PROGRAM,
+            (source() / "systemd" / STOP_PROGRAM).read_bytes(),
+            0o755,
+        ),
         File(
             Path("/etc/udev/rules.d/70-acsar.rules"),
             (source() / "udev" / "70-acsar.rules").read_bytes(),
         ),
         File(
-            ETC / "acsard.toml",
+            CONFIG_DIRECTORY / "acsard.toml",
             reference.replace('port = "sim"', 'port = "/dev/acsar"').encode(),
             kept=True,
         ),
@@ -332,7 +345,7 @@ def files() -> list[File]:
 
 def _unit(name: str) -> File:
     text = (source() / "systemd" / name).read_text(encoding="utf-8")
-    return File(UNITS / name, text.replace(HOME, sys.prefix).encode())
+    return File(UNIT_DIRECTORY / name, text.replace(HOME, sys.prefix).encode())
 
 
 def lan_drop_in(unit: str) -> File:
@@ -340,18 +353,22 @@ def lan_drop_in(unit: str) -> File:
 
     It lets the unit use the local network and the certificates. `unit` is the unit's file name.
     """
-    return File(UNITS / f"{unit}.d" / LAN, (source() / "systemd" / LAN).read_bytes())
+    return File(
+        UNIT_DIRECTORY / f"{unit}.d" / LAN_DROP_IN,
+        (source() / "systemd" / LAN_DROP_IN).read_bytes(),
+    )
 
 
 def admitting(directory: Path) -> Write | Keep | None:
-    """Return the step that lets the service's TLS gateway use the certificates in `directory`.
+    """Return the step that lets the service's TLS_DIRECTORY gateway use the certificates in
+    `directory`.
 
     The step writes a drop-in file for the gateway's unit. Without this file, the gateway may use
     only loopback, and cannot read root's files. If the drop-in file exists, the step changes only
     the paths in it. The networks in it stay, because the user may have restricted them. Return None
     if the service is not installed, or if this program does not run as root.
     """
-    if os.geteuid() != 0 or not (UNITS / GATEWAY).exists():
+    if os.geteuid() != 0 or not (UNIT_DIRECTORY / GATEWAY).exists():
         return None
     file = lan_drop_in(GATEWAY)
     return admitted(file, file.found(), directory)
@@ -424,12 +441,12 @@ def installing(
             "these files differ from the files that this version of acsard installs: "
             f"{paths}; look at the differences, and replace the files with --force"
         )
-    return [*steps, *INSTALLED]
+    return [*steps, *INSTALL_COMMANDS]
 
 
 def own_places() -> list[Path]:
     """Return the directories of the service in /etc, which may also contain the user's files."""
-    return [*(UNITS / f"{unit}.d" for unit in reversed(ALL)), ETC]
+    return [*(UNIT_DIRECTORY / f"{unit}.d" for unit in reversed(ALL_UNITS)), CONFIG_DIRECTORY]
 
 
 def strangers(files: Iterable[File], places: Iterable[Path]) -> list[Path]:
@@ -482,21 +499,29 @@ def uninstalling(
     if any(path.name == UNIT for path in why):
         # The daemon's unit stays, so the daemon may start again. The unit then needs `acsard-stop`,
         # which sends zeros after the daemon's end.
-        why |= {f.path: f"{UNIT} stays and needs this file" for f in there if f.path.name == STOP}
+        why |= {
+            f.path: f"{UNIT} stays and needs this file"
+            for f in there
+            if f.path.name == STOP_PROGRAM
+        }
     steps: list[Step] = [
         Keep(file.path, why[file.path]) if file.path in why else Remove(file.path) for file in there
     ]
     for path in others:
-        what = "certificates and their authority" if path == Path(TLS) else "not the service's own"
+        what = (
+            "certificates and their authority"
+            if path == Path(TLS_DIRECTORY)
+            else "not the service's own"
+        )
         steps.append(Remove(path) if purge else Keep(path, f"{what}; --purge removes it"))
     for unit in stateful:
-        where, what = STATES[unit]
+        where, what = STATE_DIRECTORIES[unit]
         clean = Run(("systemctl", "clean", "--what=state", unit))
         steps.insert(0, clean if purge else Keep(where, f"{what}; --purge removes it"))
-    units = [name for name in reversed(ALL) if any(file.path.name == name for file in there)]
+    units = [name for name in reversed(ALL_UNITS) if any(file.path.name == name for file in there)]
     leaving = [Run(("systemctl", "disable", "--now", *units))] if units else []
-    back: list[Step] = [*map(Write, again), RELOAD[0]] if again else []
-    return [*back, *leaving, *steps, *GONE]
+    back: list[Step] = [*map(Write, again), RELOAD_COMMANDS[0]] if again else []
+    return [*back, *leaving, *steps, *REMOVE_COMMANDS]
 
 
 def state(unit: str) -> str:

@@ -26,14 +26,14 @@ from typing import Literal
 
 from msgspec import Struct, field
 
-from acsard.core.config.settings import RECORD, RecordConfig
+from acsard.core.config.settings import RECORD_VARIABLE, RecordConfig
 from acsard.core.values import NS_PER_S, Instant
 from acsard.host.atomic_file import sync
-from acsard.recording.end_record import CUTS
-from acsard.recording.file import MODE, About, Writing
+from acsard.recording.end_record import CUT_TEXTS
+from acsard.recording.file import FILE_MODE, About, Writing
 from acsard.recording.recovery import recover
 from acsard.recording.retention import (
-    AROUND_NS,
+    INCIDENT_MARGIN_NS,
     Bounds,
     ClockWatch,
     Disk,
@@ -45,26 +45,26 @@ from acsard.recording.retention import (
 
 DIRECTORY_MODE = 0o750
 
-# Every user may read the files, but only root can enter the parent directory `PRIVATE`. The service
-# of the robot's web page reads the files through a read-only mount. Group permissions cannot give
-# this service access: a dynamic group has no name, and systemd 257 makes the user `nobody` the
-# owner of state directories.
+# Every user may read the files, but only root can enter the parent directory `PRIVATE_STATE`. The
+# service of the robot's web page reads the files through a read-only mount. Group permissions
+# cannot give this service access: a dynamic group has no name, and systemd 257 makes the user
+# `nobody` the owner of state directories.
 OPEN_DIRECTORY_MODE, OPEN_MODE = 0o755, 0o644
 """File modes of the directory (0o755) and of its files (0o644) if the daemon is a systemd service
 with a dynamic user. Every user who can enter the parent directory may then read the files."""
 
-PRIVATE = Path("/var/lib/private")
+PRIVATE_STATE = Path("/var/lib/private")
 """Parent of the state directories of services with a dynamic user. Only root can enter it."""
 
-KEPT = ".kept.mcap"
-NEAR = ".near.mcap"
-WHOLE = ".mcap"
-PART = ".mcap.part"
+KEPT_SUFFIX = ".kept.mcap"
+NEAR_SUFFIX = ".near.mcap"
+MCAP_SUFFIX = ".mcap"
+PART_SUFFIX = ".mcap.part"
 
-MARKER = ".left"
+MARKER_SUFFIX = ".left"
 """Suffix of a marker file. It shows that a `.part` file was cut off by the disk, not by a crash."""
 
-ENDINGS: dict[Kind, str] = {"plain": WHOLE, "near": NEAR, "kept": KEPT}
+SUFFIX_OF_KIND: dict[Kind, str] = {"plain": MCAP_SUFFIX, "near": NEAR_SUFFIX, "kept": KEPT_SUFFIX}
 """Maps each retention class to the end of the name of a finished file."""
 
 # `Ring.tend` is called once a second, so there is a search every ten minutes. More searches are not
@@ -74,11 +74,11 @@ TRIM_ROUNDS = 600
 
 S_PER_DAY = 86400
 
-FRESH_S = 10.0
+BEING_RECORDED_S = 10.0
 """If a `.part` file was not written for this time, s, it does not count as being recorded. A daemon
 writes once a second."""
 
-STAMP = "%Y%m%dT%H%M%SZ"
+NAME_TIME_FORMAT = "%Y%m%dT%H%M%SZ"
 """Format of the time in a file's name: the time at which the file began, in UTC."""
 
 
@@ -102,16 +102,22 @@ def is_being_recorded(path: Path, now_s: float) -> bool:
     `now_s` is the present time, s since 1970. Raises `OSError` if the file does not exist or cannot
     be examined.
     """
-    return path.name.endswith(PART) and abs(now_s - path.stat().st_mtime) < FRESH_S
+    return path.name.endswith(PART_SUFFIX) and abs(now_s - path.stat().st_mtime) < BEING_RECORDED_S
 
 
 def _number(path: Path) -> int | None:
     head, _, rest = path.name.partition("-")
-    return int(head) if head.isdecimal() and rest.endswith((WHOLE, PART)) else None
+    return int(head) if head.isdecimal() and rest.endswith((MCAP_SUFFIX, PART_SUFFIX)) else None
 
 
 def _kind(path: Path) -> Kind:
-    return "kept" if path.name.endswith(KEPT) else "near" if path.name.endswith(NEAR) else "plain"
+    return (
+        "kept"
+        if path.name.endswith(KEPT_SUFFIX)
+        else "near"
+        if path.name.endswith(NEAR_SUFFIX)
+        else "plain"
+    )
 
 
 def _stem(path: Path) -> str:
@@ -131,19 +137,19 @@ def mark_cut(part: Path, kind: Kind, cut: Literal["late", "disk"]) -> None:
     """
     # The marker is empty and has `kind` and `cut` in its name, because even a full disk usually
     # accepts a new name.
-    part.with_name(f".{part.name}.{kind}.{cut}{MARKER}").touch()
+    part.with_name(f".{part.name}.{kind}.{cut}{MARKER_SUFFIX}").touch()
 
 
 def _marked(part: Path) -> tuple[Kind, str] | None:
     """Return the pair (retention class, cause) from the name of the marker of a `.part` file.
 
-    The cause is a key of `CUTS`. Return None if the file has no marker.
+    The cause is a key of `CUT_TEXTS`. Return None if the file has no marker.
     """
-    for marker in part.parent.glob(f".{part.name}.*{MARKER}"):
-        words = marker.name.removeprefix(f".{part.name}.").removesuffix(MARKER)
+    for marker in part.parent.glob(f".{part.name}.*{MARKER_SUFFIX}"):
+        words = marker.name.removeprefix(f".{part.name}.").removesuffix(MARKER_SUFFIX)
         first, _, cut = words.partition(".")
-        for kind in ENDINGS:
-            if kind == first and cut in CUTS:
+        for kind in SUFFIX_OF_KIND:
+            if kind == first and cut in CUT_TEXTS:
                 return kind, cut
     return None
 
@@ -200,15 +206,15 @@ class Ring:
         None if there was no crash. If several files were cut off, the newest file counts.
         """
         here = self._directory.resolve()
-        as_service = os.environ.get(RECORD) == settings.directory
-        self._open_to_all = as_service and here.is_relative_to(PRIVATE)
+        as_service = os.environ.get(RECORD_VARIABLE) == settings.directory
+        self._open_to_all = as_service and here.is_relative_to(PRIVATE_STATE)
         if not self._directory.is_dir():
             self._directory.mkdir(parents=True)
             # The umask may have removed bits of the mode.
             self._directory.chmod(DIRECTORY_MODE)
         # Other users may not open the lock file, because every process that can open the file can
         # also lock it.
-        self._lock = os.open(self._directory / ".lock", os.O_RDWR | os.O_CREAT, MODE)
+        self._lock = os.open(self._directory / ".lock", os.O_RDWR | os.O_CREAT, FILE_MODE)
         try:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
@@ -218,15 +224,15 @@ class Ring:
                 "another daemon records into this directory: choose another record.directory",
             ) from None
         try:
-            for copy in self._directory.glob(f".*{PART}.new"):
+            for copy in self._directory.glob(f".*{PART_SUFFIX}.new"):
                 # A crash interrupted the writing of this copy.
                 copy.unlink()
             # Make room first, because finishing a file needs disk space.
             self.trim(None, refused)
             self._recover()
-            for marker in self._directory.glob(f".*{PART}.*{MARKER}"):
-                stem = marker.name[1:].partition(PART)[0]
-                if not marker.with_name(f"{stem}{PART}").exists():
+            for marker in self._directory.glob(f".*{PART_SUFFIX}.*{MARKER_SUFFIX}"):
+                stem = marker.name[1:].partition(PART_SUFFIX)[0]
+                if not marker.with_name(f"{stem}{PART_SUFFIX}").exists():
                     # The recording of this marker is finished.
                     marker.unlink()
         except OSError:
@@ -236,7 +242,7 @@ class Ring:
             self._open_files()
 
     def _recover(self) -> None:
-        for part in [path for path in listed(self._directory) if path.name.endswith(PART)]:
+        for part in [path for path in listed(self._directory) if path.name.endswith(PART_SUFFIX)]:
             try:
                 found, marked, disk = part.stat(), _marked(part), self._disk()
             except FileNotFoundError:
@@ -244,7 +250,7 @@ class Ring:
                 continue
             ours = self._run.cut.get(part.name)
             kind, cut = (ours, "disk") if ours else marked or ("kept", "crash")
-            whole = part.with_name(_stem(part) + ENDINGS[kind])
+            whole = part.with_name(_stem(part) + SUFFIX_OF_KIND[kind])
             try:
                 message = recover(part, whole, cut, disk.free - found.st_size > disk.spare)
             # Recording new steps is more important than finishing an old file.
@@ -266,7 +272,7 @@ class Ring:
                 earlier = (_number(path) or 0) < (_number(part) or 0)
                 # A computer without a battery-backed clock starts with a time in the past. Then all
                 # older files seem to have ended long after the crash. They must not match.
-                if earlier and abs(before_ns) < AROUND_NS:
+                if earlier and abs(before_ns) < INCIDENT_MARGIN_NS:
                     self.retain(path)
 
     def _open_files(self) -> None:
@@ -289,9 +295,9 @@ class Ring:
         """
         files = listed(self._directory)
         number = 1 + max([_number(path) or 0 for path in files], default=0)
-        stamp = time.strftime(STAMP, time.gmtime(about.wall_ns // 1_000_000_000))
-        path = self._directory / f"{number:06}-{stamp}{PART}"
-        writing = Writing(path, about, OPEN_MODE if self._open_to_all else MODE)
+        stamp = time.strftime(NAME_TIME_FORMAT, time.gmtime(about.wall_ns // 1_000_000_000))
+        path = self._directory / f"{number:06}-{stamp}{PART_SUFFIX}"
+        writing = Writing(path, about, OPEN_MODE if self._open_to_all else FILE_MODE)
         # The name of the new file must reach the disk as well as its content.
         sync(self._directory)
         return writing
@@ -302,11 +308,11 @@ class Ring:
         Args:
             writing: the file that is being written.
             kind: the retention class of the file, which becomes a part of the new name.
-            cut: the cause that cut off the recording, a key of `CUTS`; "" for an ordinary end.
+            cut: the cause that cut off the recording, a key of `CUT_TEXTS`; "" for an ordinary end.
             why: an explanation of this cause in words, or "".
         """
         writing.finish(cut, why)
-        path = writing.path.with_name(_stem(writing.path) + ENDINGS[kind])
+        path = writing.path.with_name(_stem(writing.path) + SUFFIX_OF_KIND[kind])
         writing.path.rename(path)
         self._run.numbers.add(_number(path) or 0)
         sync(self._directory)
@@ -320,7 +326,7 @@ class Ring:
         """
         for file in self._ended():
             ago_ns = now.wall_ns - int(file.at_s * NS_PER_S)
-            if 0 <= ago_ns < AROUND_NS:
+            if 0 <= ago_ns < INCIDENT_MARGIN_NS:
                 yield self._directory / file.name, file.kind, now.mono_ns - ago_ns
 
     def retain(self, path: Path) -> None:
@@ -329,10 +335,10 @@ class Ring:
         Call this method for a file that ended less than a minute before an incident. A file of
         another class keeps its name.
         """
-        if path.name.endswith(WHOLE) and _kind(path) == "plain":
+        if path.name.endswith(MCAP_SUFFIX) and _kind(path) == "plain":
             # Another process may have removed the file.
             with suppress(FileNotFoundError):
-                path.rename(path.with_name(_stem(path) + NEAR))
+                path.rename(path.with_name(_stem(path) + NEAR_SUFFIX))
             sync(self._directory)
 
     def tend(self, now: Instant) -> None:
@@ -384,7 +390,7 @@ class Ring:
     def _ended(self) -> list[Ended]:
         ended = []
         for path in listed(self._directory):
-            if path.name.endswith(PART):
+            if path.name.endswith(PART_SUFFIX):
                 continue
             # Another process may have just removed the file.
             with suppress(FileNotFoundError):

@@ -19,29 +19,29 @@ from mcap.records import Metadata
 from msgspec import Meta, Struct
 
 from acsard.core.formatting import printable
-from acsard.recording.mcap_records import DAMAGE, HEAD, MAGIC
+from acsard.recording.mcap_records import DAMAGE_ERRORS, MAGIC, RECORD_HEAD
 
-END = "acsard end"
+END_RECORD_NAME = "acsard end"
 """Name of the MCAP metadata record that holds the `EndRecord`."""
 
 TAIL_BYTES = 1 << 16
 """Number of bytes at the end of a file in which `read_end` searches for the end record. The end
 record typically begins 1960 bytes before the end of the file."""
 
-_NAMED = struct.pack("<I", len(END)) + END.encode()
+_NAMED = struct.pack("<I", len(END_RECORD_NAME)) + END_RECORD_NAME.encode()
 """Bytes that follow the header of the end record in a file: the length of the record's name, and
 this name."""
 
-_FOOTER = HEAD.pack(Opcode.FOOTER, 20)
+_FOOTER = RECORD_HEAD.pack(Opcode.FOOTER, 20)
 """Header of the MCAP footer record, whose content has 20 bytes."""
 
-_DATA_END = HEAD.pack(Opcode.DATA_END, 4)
+_DATA_END = RECORD_HEAD.pack(Opcode.DATA_END, 4)
 """Header of the MCAP record `DataEnd`, which directly follows the end record."""
 
 Ns = Annotated[int, Meta(ge=-(1 << 63), le=(1 << 63) - 1)]
 """Time in ns that fits in a signed 64-bit integer."""
 
-CUTS = {
+CUT_TEXTS = {
     "bug": "cut: an internal error ended the daemon",
     "crash": "cut: the daemon or the computer stopped suddenly",
     "disk": "cut: the disk accepted no more data",
@@ -64,7 +64,7 @@ class EndRecord(Struct, frozen=True):
     said: str
     """Summary of the events in a few words, from `timeline.summary`."""
     cut: str = ""
-    """Cause that cut off the recording, a key of `CUTS`; "" if the daemon ended normally."""
+    """Cause that cut off the recording, a key of `CUT_TEXTS`; "" if the daemon ended normally."""
     why: str = ""
     """If `cut` is "bug", text that names the failed step and the exception; otherwise ""."""
     earliest_ns: Ns | None = None
@@ -72,15 +72,15 @@ class EndRecord(Struct, frozen=True):
     this time. It is earlier than `wall_ns` if the clock was set back during the recording."""
 
 
-CRASHES = frozenset({"bug", "crash"})
-"""The keys of `CUTS` that stand for a failure of the daemon or of its computer."""
+CRASH_CUTS = frozenset({"bug", "crash"})
+"""The keys of `CUT_TEXTS` that stand for a failure of the daemon or of its computer."""
 
 
 def how_it_ends(cut: str, why: str = "") -> str:
     """Return a text that says how a recording was cut off; "" if the daemon ended normally.
 
-    If another version of acsard recorded a cause that is not in `CUTS`, the text contains only the
-    word "cut" and `why`.
+    If another version of acsard recorded a cause that is not in `CUT_TEXTS`, the text contains only
+    the word "cut" and `why`.
 
     Args:
         cut: the field `EndRecord.cut`; "" if the daemon ended normally.
@@ -88,7 +88,7 @@ def how_it_ends(cut: str, why: str = "") -> str:
     """
     if not cut:
         return ""
-    words = CUTS.get(cut, "cut")
+    words = CUT_TEXTS.get(cut, "cut")
     return f"{words}: {printable(why)}" if why else words
 
 
@@ -126,7 +126,7 @@ def end_in(data: bytes) -> EndRecord | None:
     try:
         metadata = _last(data[-TAIL_BYTES:])
         return msgspec.convert(metadata, EndRecord, strict=False) if metadata else None
-    except DAMAGE:
+    except DAMAGE_ERRORS:
         # A caller that reads the whole file reports the damage.
         return None
 
@@ -136,15 +136,15 @@ def _last(tail: bytes) -> dict[str, str] | None:
 
     Return None if the file is not finished.
     """
-    footer_at = len(tail) - len(MAGIC) - 20 - HEAD.size
+    footer_at = len(tail) - len(MAGIC) - 20 - RECORD_HEAD.size
     if footer_at < 0 or not (tail.startswith(_FOOTER, footer_at) and tail.endswith(MAGIC)):
         return None
-    at = tail.rfind(_NAMED, HEAD.size, footer_at)
+    at = tail.rfind(_NAMED, RECORD_HEAD.size, footer_at)
     while at >= 0:
-        begin = at - HEAD.size
-        opcode, length = HEAD.unpack_from(tail, begin)
+        begin = at - RECORD_HEAD.size
+        opcode, length = RECORD_HEAD.unpack_from(tail, begin)
         if opcode == Opcode.METADATA and tail.startswith(_DATA_END, at + length):
             record: Metadata = Metadata.read(ReadDataStream(io.BytesIO(tail[at : at + length])))
             return record.metadata
-        at = tail.rfind(_NAMED, HEAD.size, at)
+        at = tail.rfind(_NAMED, RECORD_HEAD.size, at)
     return None

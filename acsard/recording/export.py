@@ -34,7 +34,7 @@ from acsard.recording.file_replay import (
 from acsard.recording.published import Published, Publisher
 from acsard.recording.recorded_steps import Step
 from acsard.recording.replay import replay_step
-from acsard.recording.time_span import WHOLE, Span
+from acsard.recording.time_span import WHOLE_SPAN, Span
 
 BAG_VERSION = 5
 
@@ -122,7 +122,14 @@ def _quoted(text: str) -> str:
     return msgspec.json.encode(text).decode()
 
 
-MEASURED = ("t [s]", "fr [rad/s]", "fl [rad/s]", "rl [rad/s]", "rr [rad/s]", "yaw_rate [rad/s]")
+MEASURED_COLUMNS = (
+    "t [s]",
+    "fr [rad/s]",
+    "fl [rad/s]",
+    "rl [rad/s]",
+    "rr [rad/s]",
+    "yaw_rate [rad/s]",
+)
 """Columns that a calibration reads: the wall-clock time (s since 1970), the speeds of the front
 right, front left, rear left and rear right wheel, and the yaw rate from a gyro."""
 
@@ -132,8 +139,10 @@ OUTPUT_COLUMNS = (
 )  # fmt: skip
 """Columns with outputs of the robot. The row of a gyro sample has no values in these columns."""
 
-CSV_HEADER = ",".join([*MEASURED, *OUTPUT_COLUMNS])
-MEASURED_CSV_HEADER = ",".join([*MEASURED, "applied_linear [m/s]", "applied_angular [rad/s]"])
+CSV_HEADER = ",".join([*MEASURED_COLUMNS, *OUTPUT_COLUMNS])
+MEASURED_CSV_HEADER = ",".join(
+    [*MEASURED_COLUMNS, "applied_linear [m/s]", "applied_angular [rad/s]"]
+)
 
 _NO_WHEELS = "," * 4
 _NO_OUTPUTS = "," * len(OUTPUT_COLUMNS)
@@ -170,7 +179,7 @@ def measured_csv_rows(step: Step, outputs: Outputs) -> Iterator[str]:
 
 
 def wheel_columns(estimate: Estimate) -> str:
-    """Return the CSV fields of a feedback line of the board for the columns `MEASURED`.
+    """Return the CSV fields of a feedback line of the board for the columns `MEASURED_COLUMNS`.
 
     The field for the yaw rate is empty.
     """
@@ -179,7 +188,7 @@ def wheel_columns(estimate: Estimate) -> str:
 
 
 def gyro_columns(sample: GyroSample, now: Instant) -> str:
-    """Return the CSV fields of a gyro sample for the columns `MEASURED`.
+    """Return the CSV fields of a gyro sample for the columns `MEASURED_COLUMNS`.
 
     The fields for the wheel speeds are empty. The time is the stamp of the sample. A sample without
     a stamp gets the wall-clock time at which it arrived. `now` is the time of the step.
@@ -320,7 +329,7 @@ def export(
     new: Path,
     kind: Kind,
     other: Config | None = None,
-    span: Span = WHOLE,
+    span: Span = WHOLE_SPAN,
     progress: Progress = no_progress,
     force: bool = False,
 ) -> ExportResult:

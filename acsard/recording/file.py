@@ -49,7 +49,14 @@ from msgspec import Struct
 from acsard.core.formatting import many
 from acsard.core.values import NS_PER_S
 from acsard.host.errors import RecordingError
-from acsard.recording.end_record import END, EndRecord, Ns, as_metadata, end_in, how_it_ends
+from acsard.recording.end_record import (
+    END_RECORD_NAME,
+    EndRecord,
+    Ns,
+    as_metadata,
+    end_in,
+    how_it_ends,
+)
 from acsard.recording.mcap_records import GROWING_HEAD, MAGIC, GrowingChunk, Message, encoded, walk
 from acsard.recording.recorded_steps import Unfinished, UnfinishedError, unfinished
 from acsard.recording.rows import FORMAT, Batch, Row, first_of
@@ -63,7 +70,7 @@ save little space, and damage to a single chunk would destroy more data."""
 CHUNK_BYTES = 1 << 20
 """Uncompressed size at which a chunk ends, bytes. Ten seconds of driving take 160 000 bytes."""
 
-MODE = 0o640
+FILE_MODE = 0o640
 """File mode of a recording: 0o640. The group of the daemon's service may read the file."""
 
 Topic = Literal["steps", "events", "state", "unfinished"]
@@ -72,7 +79,7 @@ CHANNELS: tuple[Topic, ...] = ("steps", "state", "events", "unfinished")
 """Channels in the order of their MCAP channel numbers, which begin with 1. The reader relies on
 this order, because the records that define the channels may be damaged."""
 
-NUMBERS = {topic: number for number, topic in enumerate(CHANNELS, 1)}
+CHANNEL_NUMBERS = {topic: number for number, topic in enumerate(CHANNELS, 1)}
 
 HOW_TO_READ = Metadata(
     "how to read this file",
@@ -87,7 +94,7 @@ HOW_TO_READ = Metadata(
 )
 """Metadata record for people who open a recording with another MCAP program."""
 
-CONTENTS: dict[Topic, str] = {
+CHANNEL_DESCRIPTIONS: dict[Topic, str] = {
     "steps": "the inputs and outputs of the control steps of about a second, in MessagePack: an "
     f"array of {', '.join(Batch.__struct_fields__)}; each of the rows is a step, an array of "
     f"{', '.join(Row.__struct_fields__)}; the module acsard.recording.rows documents each field",
@@ -173,7 +180,7 @@ class Index:
         self._totals = Statistics(
             attachment_count=0,
             channel_count=len(CHANNELS),
-            channel_message_counts=dict.fromkeys(NUMBERS.values(), 0),
+            channel_message_counts=dict.fromkeys(CHANNEL_NUMBERS.values(), 0),
             chunk_count=0,
             message_count=0,
             message_start_time=0,
@@ -224,7 +231,7 @@ class Writing:
     If the disk refuses to write, a method raises `OSError`. After that, call only `close`.
     """
 
-    def __init__(self, path: Path, about: About, mode: int = MODE) -> None:
+    def __init__(self, path: Path, about: About, mode: int = FILE_MODE) -> None:
         self.path, self._mode = path, mode
         self._end_builder = EndRecordBuilder(about)
         self._about = _about_records(about)
@@ -274,8 +281,8 @@ class Writing:
         ):
             self.end_chunk()
         self._chunk = self._chunk or GrowingChunk()
-        self._chunk.add(Message(NUMBERS[topic], wall_ns, data))
-        self._index.message(NUMBERS[topic], wall_ns)
+        self._chunk.add(Message(CHANNEL_NUMBERS[topic], wall_ns, data))
+        self._index.message(CHANNEL_NUMBERS[topic], wall_ns)
         if topic == "state":
             self.end_chunk()
 
@@ -332,7 +339,7 @@ class Writing:
         self.end_chunk()
         for record in self._about:
             self._write(record)
-        self._write(Metadata(END, as_metadata(self._end_builder.end_record(cut, why))))
+        self._write(Metadata(END_RECORD_NAME, as_metadata(self._end_builder.end_record(cut, why))))
         self._write(DataEnd(0))
         summary_at = self._file.tell()
         for record in (*_definitions(), *self._index.records()):
@@ -376,10 +383,10 @@ def _definitions() -> Iterator[McapRecord]:
     """Yield the records that define the schema and the channels."""
     schema = msgspec.json.encode(msgspec.json.schema(TimelineEntry))
     yield Schema(EVENTS_SCHEMA, schema, "jsonschema", "acsard.TimelineEntry")
-    for topic, number in NUMBERS.items():
+    for topic, number in CHANNEL_NUMBERS.items():
         events = topic == "events"
         encoding, schema_id = ("json", EVENTS_SCHEMA) if events else (f"acsard-{topic}", 0)
-        yield Channel(number, topic, encoding, {"content": CONTENTS[topic]}, schema_id)
+        yield Channel(number, topic, encoding, {"content": CHANNEL_DESCRIPTIONS[topic]}, schema_id)
 
 
 class Recording:
@@ -461,12 +468,12 @@ class Recording:
         """
         self.ended, self.damaged, self.cut, self.why = False, 0, "", ""
         self.unfinished = None
-        topics = {number: topic for topic, number in NUMBERS.items()}
+        topics = {number: topic for topic, number in CHANNEL_NUMBERS.items()}
         for place in walk(self._data):
             record = place.record
             if isinstance(record, Footer):
                 self.ended = True
-            elif isinstance(record, Metadata) and record.name == END:
+            elif isinstance(record, Metadata) and record.name == END_RECORD_NAME:
                 self.cut, self.why = (record.metadata.get(key, "") for key in ("cut", "why"))
             for channel, wall_ns, data in place.messages:
                 if channel in topics:

@@ -31,11 +31,11 @@ from zstandard import COMPRESSOBJ_FLUSH_BLOCK, ZstdCompressionParameters
 
 # At this level, ten seconds of steps are compressed in 2 to 8 ms. The result is 13 to 16 % smaller
 # than at level 3.
-LEVEL = 9
+ZSTD_LEVEL = 9
 """Compression level of zstd."""
 
-PARAMETERS = ZstdCompressionParameters.from_level(
-    LEVEL, source_size=1 << 18, write_content_size=False
+ZSTD_PARAMETERS = ZstdCompressionParameters.from_level(
+    ZSTD_LEVEL, source_size=1 << 18, write_content_size=False
 )
 """Parameters of the zstd compressor for chunks of 256 KiB. The compressor then needs 3 MB of
 memory."""
@@ -63,9 +63,9 @@ _AFTER_LENGTH = _HEAD.size - 9
 field includes these bytes."""
 
 _NAME_AT = 37
-"""Offset of the bytes `ZSTD` from the beginning of a chunk's header, bytes."""
+"""Offset of the bytes `ZSTD_NAME_FIELD` from the beginning of a chunk's header, bytes."""
 
-ZSTD = struct.pack("<I4s", 4, b"zstd")
+ZSTD_NAME_FIELD = struct.pack("<I4s", 4, b"zstd")
 """Bytes that every chunk's header contains: the length of the compression's name, and the name."""
 
 _ENDLESS = (1 << 63) - 1
@@ -128,7 +128,9 @@ class GrowingChunk:
     """A chunk that is being written. It takes messages, and returns compressed bytes."""
 
     def __init__(self) -> None:
-        self._compressor = zstandard.ZstdCompressor(compression_params=PARAMETERS).compressobj()
+        self._compressor = zstandard.ZstdCompressor(
+            compression_params=ZSTD_PARAMETERS
+        ).compressobj()
         self.size = 0
         """Uncompressed size of the messages so far, in bytes."""
         self._crc = self._length = 0
@@ -207,10 +209,10 @@ def chunk_places(data: bytes, begin: int) -> Iterator[int]:
 
     `data` is the content of the whole file. The offsets are at least `begin`.
     """
-    at = data.find(ZSTD, begin + _NAME_AT)
+    at = data.find(ZSTD_NAME_FIELD, begin + _NAME_AT)
     while at >= 0:
         yield at - _NAME_AT
-        at = data.find(ZSTD, at + 1)
+        at = data.find(ZSTD_NAME_FIELD, at + 1)
 
 
 def read_chunk(data: bytes, begin: int) -> ReadChunk | None:
@@ -219,7 +221,7 @@ def read_chunk(data: bytes, begin: int) -> ReadChunk | None:
     Return None if no chunk begins at this offset. `data` is the content of the whole file.
     """
     at = begin + _HEAD.size
-    named = data.startswith(ZSTD, begin + _NAME_AT)
+    named = data.startswith(ZSTD_NAME_FIELD, begin + _NAME_AT)
     if at > len(data) or not (named or data[begin] == Opcode.CHUNK):
         return None
     messages: list[Message] = []
@@ -261,7 +263,7 @@ def _blocks(data: bytes, at: int) -> Iterator[tuple[int, bytes, bool]]:
     `ZstdError` for a damaged block.
     """
     begin = at + zstandard.frame_header_size(data[at : at + _LONGEST_FRAME_HEAD])
-    unpacker = zstandard.ZstdDecompressor(max_window_size=1 << PARAMETERS.window_log)
+    unpacker = zstandard.ZstdDecompressor(max_window_size=1 << ZSTD_PARAMETERS.window_log)
     stream = unpacker.decompressobj()
     stream.decompress(data[at:begin])
     last = False
@@ -301,7 +303,7 @@ def _messages(data: bytearray) -> tuple[list[Message], int, int]:
     return messages, at, _MESSAGE.size
 
 
-DAMAGE = (
+DAMAGE_ERRORS = (
     McapError, msgspec.MsgspecError, zstandard.ZstdError, struct.error,
     ValueError, OverflowError, EOFError, MemoryError,
 )  # fmt: skip
@@ -314,10 +316,10 @@ MAGIC = b"\x89MCAP0\r\n"
 MAX_EFFORT = 256
 """Limit on the work for damaged chunks, in unpacked bytes for each byte of the file."""
 
-HEAD = struct.Struct("<BQ")
+RECORD_HEAD = struct.Struct("<BQ")
 """Layout of the header of an MCAP record: opcode, and number of bytes that follow the header."""
 
-READ: dict[int, Callable[[ReadDataStream], McapRecord]] = {
+READ_RECORDS: dict[int, Callable[[ReadDataStream], McapRecord]] = {
     Opcode.ATTACHMENT: Attachment.read,
     Opcode.DATA_END: DataEnd.read,
     Opcode.FOOTER: Footer.read,
@@ -327,7 +329,7 @@ READ: dict[int, Callable[[ReadDataStream], McapRecord]] = {
 """Maps the opcodes of the MCAP records that are read to their decoders. Chunks have a decoder of
 their own, `read_chunk`."""
 
-OTHERS = frozenset(Opcode) - READ.keys() - {Opcode.CHUNK}
+SKIPPED_RECORDS = frozenset(Opcode) - READ_RECORDS.keys() - {Opcode.CHUNK}
 """Opcodes of the MCAP records that the reader skips."""
 
 
@@ -367,14 +369,14 @@ def walk(data: bytes) -> Iterator[Found]:
     # If the first bytes of a finished file are damaged, its last bytes still identify it.
     if not (data.startswith(MAGIC) or data.endswith(MAGIC)):
         return
-    while at + HEAD.size <= len(data):
-        opcode, length = HEAD.unpack_from(data, at)
-        claimed = at + HEAD.size + length
+    while at + RECORD_HEAD.size <= len(data):
+        opcode, length = RECORD_HEAD.unpack_from(data, at)
+        claimed = at + RECORD_HEAD.size + length
         chunk = chunks.read(at)
         found = _read(stream, at, opcode, claimed, len(data)) if chunk is None else None
         if chunk is not None and chunk.complete:
             found = Found(None, chunk, chunk.end)
-        elif found is None and opcode in OTHERS and claimed <= len(data):
+        elif found is None and opcode in SKIPPED_RECORDS and claimed <= len(data):
             at = claimed
             continue
         if found is None:
@@ -396,17 +398,17 @@ def walk(data: bytes) -> Iterator[Found]:
 def _read(stream: io.BytesIO, at: int, opcode: int, claimed: int, size: int) -> Found | None:
     """Decode the record at the offset `at`.
 
-    Return None if the opcode is not a key of `READ`, or if the record is damaged or cut off.
-    `claimed` is the offset at which the record ends according to its length field. `size` is the
-    size of the file, bytes.
+    Return None if the opcode is not a key of `READ_RECORDS`, or if the record is damaged or cut
+    off. `claimed` is the offset at which the record ends according to its length field. `size` is
+    the size of the file, bytes.
     """
-    read = READ.get(opcode)
+    read = READ_RECORDS.get(opcode)
     if read is None:
         return None
-    stream.seek(at + HEAD.size)
+    stream.seek(at + RECORD_HEAD.size)
     try:
         record = read(ReadDataStream(stream))
-    except DAMAGE:
+    except DAMAGE_ERRORS:
         return None
     end = stream.tell()
     if isinstance(record, Attachment) and not _is_intact(stream, at, end):
@@ -422,7 +424,7 @@ def _is_intact(stream: io.BytesIO, at: int, end: int) -> bool:
     stream.seek(at)
     record = stream.read(end - at)
     crc = int.from_bytes(record[-4:], "little")
-    return crc in (0, zlib.crc32(record[HEAD.size : -4]))
+    return crc in (0, zlib.crc32(record[RECORD_HEAD.size : -4]))
 
 
 class _Chunks:

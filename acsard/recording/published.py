@@ -16,19 +16,19 @@ from msgspec.structs import replace
 from acsard.core.messages.report import Look, Report
 from acsard.core.messages.schema import DiagnosticArray, RobotState, TFMessage, Time
 from acsard.core.robot import Robot
-from acsard.core.ros.channels import BY_KEY, CMD_VEL_IN, LOG, Channel, published_channels
+from acsard.core.ros.channels import BY_KEY, CMD_VEL_IN, LOG_CHANNEL, Channel, published_channels
 from acsard.core.ros.shapes import LEVELS, Log, asked
 from acsard.core.ros.transports import left_out
 from acsard.core.values import NS_PER_S, Command, Instant, Outputs
 from acsard.recording.recorded_steps import Step
 from acsard.recording.timeline import TimelineEntry, TimelineWriter
 
-MEASURED = frozenset({"acsard: control loop", "acsard: certificate"})
+MEASURED_ROWS = frozenset({"acsard: control loop", "acsard: certificate"})
 """Names of the rows that are omitted from `diagnostics`, because a recording does not contain their
 values."""
 
 
-ROUNDED_NS = 1000
+MAX_ROUNDING_NS = 1000
 """Upper bound of the rounding error of `TimelineEntry.seconds`, ns. The time between two steps is
 always longer."""
 
@@ -109,10 +109,10 @@ class Publisher:
         wall_ns = round(entry.seconds * NS_PER_S)
         # The time of an entry is rounded to a fraction of a us. Use the exact time of the step
         # instead, so that the log agrees with the stamps of the other messages.
-        if abs(wall_ns - self._now.wall_ns) < ROUNDED_NS:
+        if abs(wall_ns - self._now.wall_ns) < MAX_ROUNDING_NS:
             wall_ns = self._now.wall_ns
         line = Log(Time.from_ns(wall_ns), LEVELS[entry.level], entry.name, entry.sentence)
-        return Published(LOG, "", wall_ns, line)
+        return Published(LOG_CHANNEL, "", wall_ns, line)
 
     def _snapshot(self, now: Instant) -> Look:
         return lambda: self.robot.snapshot(now.mono_ns)
@@ -138,6 +138,6 @@ def _without_measurements(message: Any) -> Any:
         case RobotState():
             return replace(message, certificate_expiry="", certificate_days=None, latencies={})
         case DiagnosticArray():
-            rows = [row for row in message.status if row.name not in MEASURED]
+            rows = [row for row in message.status if row.name not in MEASURED_ROWS]
             return DiagnosticArray(message.header, rows)
     return message

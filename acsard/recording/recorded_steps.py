@@ -27,7 +27,7 @@ from acsard.core.values import (
     Recording,
 )
 
-MICRO = 1e6
+US_PER_S = 1e6
 
 Status = tuple[str, str, str, str]
 """Tuple: the robot's mode, the reason of this mode in words, the state of the link to the board,
@@ -227,4 +227,4 @@ def status_of(outputs: Outputs) -> Status:
 
 def micropose(estimate: Estimate) -> Micropose:
     pose = estimate.pose
-    return round(pose.x * MICRO), round(pose.y * MICRO), round(pose.yaw * MICRO)
+    return round(pose.x * US_PER_S), round(pose.y * US_PER_S), round(pose.yaw * US_PER_S)

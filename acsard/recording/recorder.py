@@ -25,24 +25,24 @@ from acsard.recording.step_writer import Bug, StepWriter
 MAX_QUEUED_STEPS = 4096
 """Largest number of queued steps. At 400 steps a second, the queue is full after 10 s."""
 
-SLOW_NS = 3 * NS_PER_S
+SLOW_SYNC_NS = 3 * NS_PER_S
 """If a sync of the file to the disk takes longer than this, ns, the log reports that the disk
 hangs."""
 
-SLOW = "the disk has accepted no data for 3 s"
+SLOW_DISK = "the disk has accepted no data for 3 s"
 
-PAUSE_NS = NS_PER_S // 4
+MAX_DISK_WAIT_NS = NS_PER_S // 4
 """Largest part of the time between two steps that counts as duration of a sync, ns.
 
 If the time between two steps is longer, the whole process was stopped, and the disk is not the
 cause.
 """
 
-FLUSH_S = 0.98
+SYNC_PAUSE_S = 0.98
 """Pause between two syncs of the file to the disk, s. The pause and one sync together take about a
 second."""
 
-MAX_TEXT = 200
+MAX_ERROR_LENGTH = 200
 """Number of characters to which the text of an exception is cut."""
 
 CLOSE_S, MARK_S = 0.5, 0.1
@@ -158,7 +158,7 @@ class Recorder:
         passed = self._syncs - before
         if passed:
             ended = before % 2 == 1 or passed > 1
-            if self._slow and ended and self._waited_ns <= SLOW_NS:
+            if self._slow and ended and self._waited_ns <= SLOW_SYNC_NS:
                 self._slow = False
                 missing = many(self._lost - self._lost_before, "step is", "steps are")
                 self._report(
@@ -169,10 +169,10 @@ class Recorder:
                 )
             self._waited_ns = 0
         elif before % 2:
-            self._waited_ns += min(now_ns - self._now_ns, PAUSE_NS)
-            if self._waited_ns > SLOW_NS and not self._slow:
+            self._waited_ns += min(now_ns - self._now_ns, MAX_DISK_WAIT_NS)
+            if self._waited_ns > SLOW_SYNC_NS and not self._slow:
                 self._hangs()
-                self._report(Event("recording", f"{SLOW}; driving goes on", "warning"))
+                self._report(Event("recording", f"{SLOW_DISK}; driving goes on", "warning"))
         self._now_ns = now_ns
 
     def _hangs(self) -> None:
@@ -185,7 +185,7 @@ class Recorder:
 
     @property
     def status(self) -> Recording:
-        trouble = self._writer.trouble or (SLOW if self._slow else "")
+        trouble = self._writer.trouble or (SLOW_DISK if self._slow else "")
         if self._full:
             trouble = "the disk is too slow, so steps of the recording are lost"
         if not self._thread.is_alive():
@@ -222,7 +222,7 @@ class Recorder:
         why = type(error).__name__
         # Python may fail to produce the text of an exception. Then only its type is recorded.
         with suppress(Exception):
-            why = f"{why}: {error}"[:MAX_TEXT].encode(errors="replace").decode()
+            why = f"{why}: {error}"[:MAX_ERROR_LENGTH].encode(errors="replace").decode()
         if self._failed_inputs is None:
             return Bug(why, None, b"")
         number, data = self._number, b""
@@ -239,7 +239,7 @@ class Recorder:
     def _work(self) -> None:
         over = False
         while not over:
-            over = self._over.wait(FLUSH_S)
+            over = self._over.wait(SYNC_PAUSE_S)
             self._writer.write(self._taken(), over)
 
     def _taken(self) -> list[Taken | Start]:

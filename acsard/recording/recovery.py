@@ -18,13 +18,13 @@ from mcap.records import Attachment, DataEnd, Footer, Metadata
 
 from acsard.core.formatting import many
 from acsard.host.errors import RecordingError
-from acsard.recording.end_record import END, EndRecord, as_metadata
+from acsard.recording.end_record import END_RECORD_NAME, EndRecord, as_metadata
 from acsard.recording.file import EndRecordBuilder, Index, Recording, event_of, rewrite
 from acsard.recording.mcap_records import LAST_BLOCK, MAGIC, chunk_places, encoded, walk
 
-FULL = (errno.ENOSPC, errno.EDQUOT)
+DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
 
-NOTHING_BYTES = 64 << 10
+MAX_DELETED_BYTES = 64 << 10
 """Size limit below which a file without readable data is deleted, bytes.
 
 A larger file contains more than a header and one second of steps. It is never deleted.
@@ -56,13 +56,13 @@ def recover(part: Path, whole: Path, cut: str, room: bool) -> str:
     before, message = part.stat(), ""
     try:
         if not _has_configuration(part):
-            if before.st_size > NOTHING_BYTES or _has_chunks(part):
+            if before.st_size > MAX_DELETED_BYTES or _has_chunks(part):
                 raise RecordingError(f"{part} has no readable beginning: nothing can be recovered")
             part.unlink()
             return f"{part.name} was deleted: its beginning is missing" if before.st_size else ""
         recording = Recording(part)
         if not any(True for _ in recording.messages()):
-            if recording.damaged or before.st_size > NOTHING_BYTES or _has_chunks(part):
+            if recording.damaged or before.st_size > MAX_DELETED_BYTES or _has_chunks(part):
                 raise RecordingError(f"{part} has no intact data: nothing can be recovered")
             part.unlink()
             return ""
@@ -110,7 +110,7 @@ def _copy(recording: Recording, part: Path, whole: Path, cut: str) -> bool:
     try:
         rewrite(recording, written, cut)
     except OSError as error:
-        if error.errno not in FULL:
+        if error.errno not in DISK_FULL:
             raise
         return False
     written.rename(whole)
@@ -146,7 +146,7 @@ def _finish_in_place(recording: Recording, part: Path, cut: str) -> bool:
                 stream.truncate(len(before))
                 for at, data in writes:
                     _put(stream, at, before[at : at + len(data)])
-            if error.errno not in FULL:
+            if error.errno not in DISK_FULL:
                 raise
             return False
         stream.truncate(size)
@@ -214,7 +214,7 @@ def _end(last: EndRecord, index: Index, at: int) -> bytes:
     # The summary section does not repeat the schema and the channels, because the disk may be
     # nearly full. It has the statistics, because some readers treat a file without statistics as
     # empty.
-    record = Metadata(END, as_metadata(last))
+    record = Metadata(END_RECORD_NAME, as_metadata(last))
     data = encoded(record)
     index.record(record, at, len(data))
     data += encoded(DataEnd(0))

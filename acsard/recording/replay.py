@@ -21,7 +21,7 @@ from acsard.core.guard import Guard, Memory
 from acsard.core.robot import Robot
 from acsard.core.values import Event, Instant, Outputs
 from acsard.recording.recorded_steps import (
-    MICRO,
+    US_PER_S,
     Micropose,
     RecordedOutputs,
     Step,
@@ -57,7 +57,7 @@ Output = Literal[
   difference is reported at the last step of the batch.
 """
 
-WORDING: frozenset[Output] = frozenset({"reason", "event text"})
+TEXT_OUTPUTS: frozenset[Output] = frozenset({"reason", "event text"})
 """Outputs that are text for people. Another version of acsard may use other words in such a
 text."""
 
@@ -126,7 +126,7 @@ class Comparison(Struct):
     @property
     def only_words(self) -> bool:
         """True if outputs differ, but all differences are in the texts of reasons and events."""
-        return not self.same and self.first_by_output.keys() <= WORDING
+        return not self.same and self.first_by_output.keys() <= TEXT_OUTPUTS
 
 
 def replay_step(robot: Robot, step: Step) -> Outputs:
@@ -263,7 +263,7 @@ class Replay:
             pose = recorded.poses[-1]
             comparison.end = pose, self._pose
             if pose != self._pose:
-                apart = math.hypot(pose[0] - self._pose[0], pose[1] - self._pose[1]) / MICRO
+                apart = math.hypot(pose[0] - self._pose[0], pose[1] - self._pose[1]) / US_PER_S
                 comparison.apart = max(comparison.apart, apart)
 
 

@@ -11,10 +11,10 @@ from acsard.core.config.validation import show
 from acsard.core.formatting import listed, many, printable
 from acsard.core.values import NS_PER_S, Event
 from acsard.recording.file_replay import Gap
-from acsard.recording.recorded_steps import MICRO, RecordedOutputs
+from acsard.recording.recorded_steps import US_PER_S, RecordedOutputs
 from acsard.recording.replay import Comparison, Difference, fastest
 
-HUNDREDTHS = 100.0
+SPEED_DIVISOR = 100.0
 """Divisor that converts a wheel speed in 0.01 rad/s to rad/s."""
 
 LINE_SETTINGS = ("limits.", "drive.", "mcu.wheels.")
@@ -105,7 +105,7 @@ def describe_difference(difference: Difference, began_ns: int) -> list[str]:
 def _side(name: str, seen: RecordedOutputs) -> list[str]:
     mode, reason, link, source = map(printable, seen.status)
     line = "no line" if seen.line is None else printable(seen.line.decode(errors="replace").strip())
-    poses = [[f"{value / MICRO:.6f}" for value in pose] for pose in seen.poses]
+    poses = [[f"{value / US_PER_S:.6f}" for value in pose] for pose in seen.poses]
     return [
         f"  {name:8}  {line}",
         f"            mode {mode} ({reason}), link {link}, source {source or 'none'}",
@@ -168,7 +168,10 @@ def _value(key: str, settings: Mapping[str, object]) -> str:
 
 
 def _speeds(recorded: int, replayed: int) -> str:
-    return f"{recorded / HUNDREDTHS:.2f} rad/s recorded, {replayed / HUNDREDTHS:.2f} rad/s replayed"
+    return (
+        f"{recorded / SPEED_DIVISOR:.2f} rad/s recorded, {replayed / SPEED_DIVISOR:.2f} rad/s "
+        f"replayed"
+    )
 
 
 def describe_outcome(comparison: Comparison) -> list[str]:
@@ -186,8 +189,8 @@ def describe_outcome(comparison: Comparison) -> list[str]:
     if comparison.end is not None:
         (x, y, _), (new_x, new_y, _) = comparison.end
         rows.append(
-            f"the last odometry pose: x {x / MICRO:.3f} y {y / MICRO:.3f} recorded, "
-            f"x {new_x / MICRO:.3f} y {new_y / MICRO:.3f} replayed; "
+            f"the last odometry pose: x {x / US_PER_S:.3f} y {y / US_PER_S:.3f} recorded, "
+            f"x {new_x / US_PER_S:.3f} y {new_y / US_PER_S:.3f} replayed; "
             "the recorded and the replayed path are at most "
             f"{comparison.apart:.3f} m apart"
         )

@@ -1,7 +1,7 @@
 """Decides which recordings are deleted, and which are retained because of an incident.
 
 A recording is protected if an incident, such as a fault, happened in the recording or within a
-minute of it. Only the newest `KEPT_FILES` recordings with an incident are protected.
+minute of it. Only the newest `MAX_KEPT_FILES` recordings with an incident are protected.
 
 - An unprotected recording is deleted when it is too old.
 - Recordings leave some free space to other programs (`Disk.spare`). If less space is free,
@@ -29,38 +29,38 @@ Kind = Literal["plain", "near", "kept"]
 - plain: No incident happened in the recording or near it.
 """
 
-AROUND_NS = 60 * NS_PER_S
+INCIDENT_MARGIN_NS = 60 * NS_PER_S
 """Time before and after an incident, ns. Recordings that ended or began in this time are
 protected."""
 
-KEPT_FILES = 50
+MAX_KEPT_FILES = 50
 """Largest number of `kept` recordings that are protected. If there are more, only the newest
 recordings are protected."""
 
-FILES = 100
+FILES_PER_LIMIT = 100
 """Divisor that gives the size limit of one file from the limit on the total size. With this number,
 50 protected files take about half of the total size."""
 
-LEAST_BYTES = 100_000
+MIN_FILE_BYTES = 100_000
 """Size to which a recording file may always grow, even if the disk is nearly full, bytes."""
 
-SPARE = 0.05
+SPARE_FRACTION = 0.05
 """Fraction of the disk's size that recordings leave free for other programs, but at most
-`SPARE_BYTES`."""
+`MAX_SPARE_BYTES`."""
 
-SPARE_BYTES = 1_000_000_000
+MAX_SPARE_BYTES = 1_000_000_000
 """Largest space that recordings leave free for other programs, bytes. On a disk of less than 20 GB,
-they leave the fraction `SPARE`, which is less."""
+they leave the fraction `SPARE_FRACTION`, which is less."""
 
-NEEDED = 0.2
+NEEDED_FRACTION = 0.2
 """Fraction of `Disk.spare`. If less space than this is free, protected recordings are deleted
 too."""
 
-JUMP_NS = 60 * NS_PER_S
+MAX_CORRECTION_NS = 60 * NS_PER_S
 """Largest change of the wall clock that counts as a correction and not as a jump, ns. The change is
 measured against the monotonic clock, between two calls of `ClockWatch.jump_ns()`."""
 
-STEADY_NS = 600 * NS_PER_S
+STEADY_CLOCK_NS = 600 * NS_PER_S
 """Time without a jump of the wall clock, ns, after which the wall clock is trusted. Recordings are
 deleted because of their age only while the clock is trusted."""
 
@@ -74,7 +74,7 @@ class Disk(NamedTuple):
     @property
     def spare(self) -> int:
         """Number of bytes that recordings leave free for other programs."""
-        return min(int(self.total * SPARE), SPARE_BYTES)
+        return min(int(self.total * SPARE_FRACTION), MAX_SPARE_BYTES)
 
     @property
     def low(self) -> bool:
@@ -117,7 +117,7 @@ def share(bound: int, own: int, disk: Disk) -> int:
         own: the present total size of all recordings, bytes.
         disk: the size and the free space of the disk.
     """
-    return max(LEAST_BYTES, min(bound, own + disk.free - disk.spare) // FILES)
+    return max(MIN_FILE_BYTES, min(bound, own + disk.free - disk.spare) // FILES_PER_LIMIT)
 
 
 def to_delete(
@@ -135,9 +135,10 @@ def to_delete(
     A disk may refuse to write although it reports free space. So a refusal alone has these effects:
 
     - If `freed` is 0, at least one recording is deleted, even if all recordings are protected.
-    - If `freed` is less than `LEAST_BYTES`, at least one unprotected recording is deleted, if any
+    - If `freed` is less than `MIN_FILE_BYTES`, at least one unprotected recording is deleted, if
+    any
       exists.
-    - If `freed` is `LEAST_BYTES` or more, the refusal has no effect.
+    - If `freed` is `MIN_FILE_BYTES` or more, the refusal has no effect.
     """
     protected = _protected(ended)
     plain = [file for file in ended if file.name not in protected]
@@ -146,14 +147,14 @@ def to_delete(
     own = sum(file.size for file in ended if file.name not in names)
     free = disk.free + sum(file.size for file in old)
     most = bounds.size - share(bounds.size, own, disk)
-    needed = int(disk.spare * NEEDED)
+    needed = int(disk.spare * NEEDED_FRACTION)
     for file in plain + [file for file in ended if file.name in protected]:
         if file.name in names:
             continue
         is_plain = file.name not in protected
         required = disk.spare if is_plain and file is not ended[-1] else needed
         must_free = freed is not None and not names
-        may_help = not freed or (is_plain and freed < LEAST_BYTES)
+        may_help = not freed or (is_plain and freed < MIN_FILE_BYTES)
         if own > most or free < required or (must_free and may_help):
             names.add(file.name)
             own, free = own - file.size, free + file.size
@@ -163,10 +164,10 @@ def to_delete(
 def _protected(ended: Sequence[Ended]) -> set[str]:
     """Return the names of the protected recordings.
 
-    These are the newest `KEPT_FILES` recordings of the class `kept`, and all `near` recordings that
-    are in a group with one of these (see `_groups`).
+    These are the newest `MAX_KEPT_FILES` recordings of the class `kept`, and all `near` recordings
+    that are in a group with one of these (see `_groups`).
     """
-    kept = {file.name for file in [file for file in ended if file.kind == "kept"][-KEPT_FILES:]}
+    kept = {file.name for file in [file for file in ended if file.kind == "kept"][-MAX_KEPT_FILES:]}
     return {
         file.name
         for group in _groups(ended)
@@ -195,7 +196,7 @@ def _groups(ended: Sequence[Ended]) -> Iterator[list[Ended]]:
 class ClockWatch(Struct):
     """Detects jumps of the wall clock.
 
-    The clock is trusted if it has not jumped for `STEADY_NS`.
+    The clock is trusted if it has not jumped for `STEADY_CLOCK_NS`.
     """
 
     _since_ns: int | None = None
@@ -208,19 +209,19 @@ class ClockWatch(Struct):
         """Return the size of a jump of the wall clock since the last call, ns.
 
         The result is positive if the clock was set forward, and negative if it was set back. It is
-        0 at the first call, and if the clock changed by at most `JUMP_NS`.
+        0 at the first call, and if the clock changed by at most `MAX_CORRECTION_NS`.
         """
         ahead_ns = now.wall_ns - now.mono_ns
         jumped_ns = 0 if self._since_ns is None else ahead_ns - self._ahead_ns
         self._ahead_ns = ahead_ns
-        if self._since_ns is None or abs(jumped_ns) > JUMP_NS:
+        if self._since_ns is None or abs(jumped_ns) > MAX_CORRECTION_NS:
             self._since_ns = now.mono_ns
             return jumped_ns
         return 0
 
     def trusted(self, now: Instant) -> bool:
-        """Return True if the wall clock has been watched for `STEADY_NS` without a jump."""
-        return self._since_ns is not None and now.mono_ns - self._since_ns >= STEADY_NS
+        """Return True if the wall clock has been watched for `STEADY_CLOCK_NS` without a jump."""
+        return self._since_ns is not None and now.mono_ns - self._since_ns >= STEADY_CLOCK_NS
 
 
 class IncidentWindow(Generic[File]):
@@ -235,7 +236,7 @@ class IncidentWindow(Generic[File]):
         """Retention class of the file that is being written."""
         self._recent: list[tuple[File, int]] = []
         """Recent `plain` files, each with the monotonic time of its end, ns."""
-        self._happened_ns = -AROUND_NS
+        self._happened_ns = -INCIDENT_MARGIN_NS
         """Monotonic time of the last incident, ns."""
 
     def begin(self, now_ns: int) -> None:
@@ -243,7 +244,7 @@ class IncidentWindow(Generic[File]):
 
         `now_ns` is the present monotonic time, ns.
         """
-        self.kind = "near" if now_ns - self._happened_ns < AROUND_NS else "plain"
+        self.kind = "near" if now_ns - self._happened_ns < INCIDENT_MARGIN_NS else "plain"
 
     def happened(self, now_ns: int) -> list[File]:
         """Register an incident in the current file, at the monotonic time `now_ns`, ns.
@@ -252,7 +253,7 @@ class IncidentWindow(Generic[File]):
         ago. The caller must give them the class `near`.
         """
         self.kind, self._happened_ns = "kept", now_ns
-        close = [file for file, ended_ns in self._recent if now_ns - ended_ns < AROUND_NS]
+        close = [file for file, ended_ns in self._recent if now_ns - ended_ns < INCIDENT_MARGIN_NS]
         self._recent.clear()
         return close
 
@@ -261,7 +262,9 @@ class IncidentWindow(Generic[File]):
 
         `last_ns` is the monotonic time of the last step in the file, ns.
         """
-        self._recent = [(older, ns) for older, ns in self._recent if last_ns - ns < AROUND_NS]
+        self._recent = [
+            (older, ns) for older, ns in self._recent if last_ns - ns < INCIDENT_MARGIN_NS
+        ]
         if self.kind == "plain":
             self._recent.append((file, last_ns))
 

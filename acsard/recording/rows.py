@@ -85,7 +85,7 @@ class Rare(Struct, frozen=True, omit_defaults=True):
     events_out: tuple[Event, ...] = ()
 
 
-NOTHING = Rare()
+NO_RARE = Rare()
 
 
 class Read(NamedTuple):
@@ -189,7 +189,7 @@ def encode(first: int, taken: Sequence[Taken]) -> bytes:
                 line=outputs.line,
                 sent=False if sent is None else (sent == outputs.line or sent),
                 poses=tuple(poses),
-                rare=None if rare == NOTHING else rare,
+                rare=None if rare == NO_RARE else rare,
             )
         )
     crc = checksum([e for t in taken for e in t.outputs.estimates], 0)
@@ -264,11 +264,11 @@ def first_of(data: bytes) -> int | None:
 
 
 def _steps(batch: Batch) -> Iterator[Step]:
-    first = batch.rows[0].rare or NOTHING
+    first = batch.rows[0].rare or NO_RARE
     opened, trouble, status = first.opened, first.trouble, first.status
     tick_ns, pose, last = batch.mono_ns, (0, 0, 0), len(batch.rows) - 1
     for index, row in enumerate(batch.rows):
-        rare = row.rare or NOTHING
+        rare = row.rare or NO_RARE
         _require_finite(rare)
         opened = opened if rare.opened is None else rare.opened
         trouble = trouble if rare.trouble is None else rare.trouble

@@ -21,7 +21,7 @@ from acsard.recording.end_record import read_end
 from acsard.recording.file import Recording, Topic
 from acsard.recording.time_span import Contents, Span, clock, part_between, read_contents
 
-MARGIN_S = 60.0
+TIME_TOLERANCE_S = 60.0
 """Tolerance of a search, s.
 
 - A file is read if the times in its end record are at most this far from the searched range. The
@@ -31,7 +31,7 @@ MARGIN_S = 60.0
   previous file.
 """
 
-GAP_S = 2.0
+MIN_GAP_S = 2.0
 """Longest time without a recording that does not count as a gap, s."""
 
 
@@ -88,7 +88,7 @@ class Search(Struct):
     gaps: list[tuple[float, float]] = field(default_factory=list)
     """Pairs: the beginning and the end of each part of the range without a recording, s since 1970.
 
-    Parts of at most `GAP_S` are left out.
+    Parts of at most `MIN_GAP_S` are left out.
     """
 
 
@@ -128,7 +128,7 @@ def search(files: Sequence[Path], first: float, last: float) -> Search:
     for number, path in enumerate(files):
         try:
             covered = _covered(path)
-            if covered.begin - MARGIN_S > last or covered.end + MARGIN_S < first:
+            if covered.begin - TIME_TOLERANCE_S > last or covered.end + TIME_TOLERANCE_S < first:
                 pieces.append(covered)
                 continue
             contents = read_contents(Recording(_present(path)))
@@ -156,7 +156,7 @@ def search(files: Sequence[Path], first: float, last: float) -> Search:
 def _gaps(pieces: Sequence[_Piece], first: float, last: float) -> list[tuple[float, float]]:
     """Return the gaps: the parts of the range from `first` to `last` that no piece covers.
 
-    A gap is a pair (beginning, end), s since 1970. Gaps of at most `GAP_S` are left out.
+    A gap is a pair (beginning, end), s since 1970. Gaps of at most `MIN_GAP_S` are left out.
     """
     inside = sorted(piece for piece in pieces if piece.begin <= last and first <= piece.end)
     ends = [first]
@@ -164,7 +164,7 @@ def _gaps(pieces: Sequence[_Piece], first: float, last: float) -> list[tuple[flo
         ends.append(max(ends[-1], piece.end))
     begins = [*(piece.begin for piece in inside), last]
     pairs = zip(ends, begins, strict=True)
-    return [(end, begin) for end, begin in pairs if GAP_S < begin - end < math.inf]
+    return [(end, begin) for end, begin in pairs if MIN_GAP_S < begin - end < math.inf]
 
 
 def _groups(files: Sequence[Path], chosen: dict[int, Contents]) -> list[list[int]]:
@@ -209,7 +209,7 @@ def _continues(before: Contents, contents: Contents) -> bool:
     """
     follows = contents.first.number == before.last.number + 1
     mono_ns = contents.first.inputs.now.mono_ns - before.last.inputs.now.mono_ns
-    return follows and 0 <= mono_ns < MARGIN_S * NS_PER_S
+    return follows and 0 <= mono_ns < TIME_TOLERANCE_S * NS_PER_S
 
 
 def _covered(path: Path) -> _Piece:

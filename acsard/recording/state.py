@@ -40,15 +40,15 @@ OTHER_PARTS: dict[tuple[str, str], type] = {
 }
 """Maps the pair (module name, class name) to each further class that may be a part of a robot."""
 
-PROTOCOL = 5
+PICKLE_PROTOCOL = 5
 """Version of the pickle format that `unpickling.py` reads."""
 
-MAX_TEXT = 200
+MAX_ERROR_LENGTH = 200
 """Number of characters to which the text of an error is cut."""
 
 # Without this table, Python 3.11 before 3.11.4, as in Debian 12, would encode a mode as a call of
 # `getattr`, which `unpickling.py` refuses.
-TABLE = copyreg.dispatch_table | {
+DISPATCH_TABLE = copyreg.dispatch_table | {
     Mode: lambda mode: (Mode, (mode.value,)),
 }
 """Dispatch table with which pickle encodes a mode as a call of `Mode` with the mode's value."""
@@ -106,8 +106,8 @@ def checkpoint(data: bytes) -> Checkpoint:
 def freeze(robot: Robot, memory: Memory) -> bytes:
     """Encode the present state of a robot and of its guard's memory. `thaw` decodes the result."""
     written = io.BytesIO()
-    pickler = pickle.Pickler(written, PROTOCOL)
-    pickler.dispatch_table = TABLE
+    pickler = pickle.Pickler(written, PICKLE_PROTOCOL)
+    pickler.dispatch_table = DISPATCH_TABLE
     pickler.dump((robot, memory))
     return written.getvalue()
 
@@ -133,9 +133,10 @@ def thaw(data: bytes) -> State:
 
 
 def short(error: Exception) -> str:
-    """Return the text of an error, cut to `MAX_TEXT` characters and without control characters."""
+    """Return the text of an error, cut to `MAX_ERROR_LENGTH` characters and without control
+    characters."""
     # The text may quote a forged file.
-    return printable(str(error))[:MAX_TEXT]
+    return printable(str(error))[:MAX_ERROR_LENGTH]
 
 
 def part_class(module: str, name: str) -> type:
@@ -156,7 +157,7 @@ def part_class(module: str, name: str) -> type:
     return found
 
 
-PLAIN = (bool, int, float, str, bytes, type(None))
+PLAIN_TYPES = (bool, int, float, str, bytes, type(None))
 
 
 def adopt(robot: Robot, begun: Robot, other: Robot) -> None:
@@ -223,7 +224,7 @@ class _Walk:
                 return parts if isinstance(now, list) else type(now)(parts)
             case list() | tuple() | set() | frozenset() | deque() | msgspec.Struct():
                 return other if now == begun else now
-            case _ if isinstance(now, PLAIN):
+            case _ if isinstance(now, PLAIN_TYPES):
                 return other if _same(now, begun) else now
         if _names(now):
             self.into(now, begun, other)

@@ -23,7 +23,7 @@ from acsard.recording.directory import Ring, Run, mark_cut
 from acsard.recording.file import About, Writing
 from acsard.recording.mcap_records import MAX_DATA_BYTES
 from acsard.recording.recorded_steps import Start, Taken, runs
-from acsard.recording.recovery import FULL
+from acsard.recording.recovery import DISK_FULL
 from acsard.recording.retention import IncidentWindow
 from acsard.recording.rows import encode
 from acsard.recording.state import Checkpoint
@@ -33,7 +33,7 @@ RETRY_ROUNDS = 5
 """Number of calls of `StepWriter.write()` that write nothing after an error of the disk. There is
 about one call each second."""
 
-BATCH = 256
+MAX_BATCH_STEPS = 256
 """Largest number of steps in one message of the channel `steps`. Usually all steps of a second fit
 in one message, unless many commands arrive."""
 
@@ -197,8 +197,8 @@ class StepWriter:
                 return
             self._begin(ring, self._start, steps[0].inputs.now)
         assert self._writing is not None
-        for at in range(0, len(steps), BATCH):
-            self._add(ring, self._writing, steps[at : at + BATCH])
+        for at in range(0, len(steps), MAX_BATCH_STEPS):
+            self._add(ring, self._writing, steps[at : at + MAX_BATCH_STEPS])
 
     def _goes_on(self, ring: Ring, start: Start) -> bool:
         """Return whether the steps after `start` may follow in the current file.
@@ -339,6 +339,6 @@ class StepWriter:
         for resource in (self._writing, self._ring):
             if resource is not None:
                 resource.close()
-        self._refused = error.errno in FULL
+        self._refused = error.errno in DISK_FULL
         self._writing = self._ring = None
         self._pause = RETRY_ROUNDS

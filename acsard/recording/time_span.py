@@ -17,7 +17,7 @@ from acsard.core.values import NS_PER_S, AcsardError, Instant
 from acsard.recording.file import Recording
 from acsard.recording.recorded_steps import Step
 from acsard.recording.rows import BatchError, decode
-from acsard.recording.timeline import SET_NS
+from acsard.recording.timeline import MIN_CLOCK_CHANGE_NS
 
 
 class Span(NamedTuple):
@@ -30,7 +30,7 @@ class Span(NamedTuple):
     end: float = math.inf
 
 
-WHOLE = Span()
+WHOLE_SPAN = Span()
 """The part that contains the whole recording."""
 
 
@@ -66,11 +66,13 @@ class Moment(NamedTuple):
 When = Offset | TimeOfDay | Moment
 """A time that a person typed, after parsing."""
 
-TIMES = '14:05, 14:05:30, today, "yesterday 14:05", "2026-11-21 14:05", 2026-11-21 or "2 h ago"'
+TIME_EXAMPLES = (
+    '14:05, 14:05:30, today, "yesterday 14:05", "2026-11-21 14:05", 2026-11-21 or "2 h ago"'
+)
 """Examples of times, for messages to the user. A number of seconds after the beginning of a
 recording is not included."""
 
-EXAMPLES = f"{TIMES}; for one recording also a number of seconds after its beginning"
+ALL_EXAMPLES = f"{TIME_EXAMPLES}; for one recording also a number of seconds after its beginning"
 
 _CLOCK = re.compile(r"(\d\d):(\d\d)(?::(\d\d(?:\.\d+)?))?")
 _AGO = re.compile(r"(\d+(?:\.\d+)?) ?(s|min|h|d)\w* ago")
@@ -83,7 +85,7 @@ class TimeError(AcsardError):
 
 
 def parse_when(text: str, now_s: float) -> When:
-    """Parse a time that a person typed. `EXAMPLES` shows the permitted forms.
+    """Parse a time that a person typed. `ALL_EXAMPLES` shows the permitted forms.
 
     `now_s` is the present time, s since 1970. Raises `TimeError` with advice if `text` is not a
     time.
@@ -113,7 +115,7 @@ def _time_of_day(words: str, text: str) -> TimeOfDay:
     if clock.hours > 23 or clock.minutes > 59 or clock.seconds >= 60:
         raise TimeError(
             f"{words} is not a time of day: a day goes from 00:00 to 23:59:59; write for example "
-            f"{EXAMPLES}"
+            f"{ALL_EXAMPLES}"
         )
     return clock
 
@@ -157,7 +159,7 @@ def _moment(date: tuple[int, int, int], when: TimeOfDay = MIDNIGHT, days: int = 
 
 
 def _unknown(text: str) -> TimeError:
-    return TimeError(f"{text} is not a time; write for example {EXAMPLES}")
+    return TimeError(f"{text} is not a time; write for example {ALL_EXAMPLES}")
 
 
 def resolve(begin: When | None, end: When | None, now_s: float) -> tuple[float, float]:
@@ -320,7 +322,7 @@ def read_contents(recording: Recording) -> Contents | None:
     for topic, wall_ns, data in recording.messages():
         if topic != "steps":
             continue
-        if first is not None and 0 <= wall_ns - last_ns < SET_NS:
+        if first is not None and 0 <= wall_ns - last_ns < MIN_CLOCK_CHANGE_NS:
             found[-1] = found[-1]._replace(end=wall_ns / NS_PER_S)
         else:
             batch = _steps(data)
@@ -330,7 +332,7 @@ def read_contents(recording: Recording) -> Contents | None:
                 found.append(_from(recording, first.inputs.now))
             for one, other in pairwise(times):
                 ahead_ns = other.wall_ns - other.mono_ns - one.wall_ns + one.mono_ns
-                if abs(ahead_ns) >= SET_NS:
+                if abs(ahead_ns) >= MIN_CLOCK_CHANGE_NS:
                     found[-1] = found[-1]._replace(end=one.wall_ns / NS_PER_S)
                     found.append(_from(recording, other))
         last_ns, before = wall_ns, data

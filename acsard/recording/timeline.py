@@ -20,38 +20,38 @@ from acsard.core.config.settings import Config
 from acsard.core.formatting import lasting, many, printable_bytes
 from acsard.core.link.link_diagnosis import is_ours
 from acsard.core.link.session import IDENTITY
-from acsard.core.motion.arbiter_text import MAX_SENDER
+from acsard.core.motion.arbiter_text import MAX_SENDER_LENGTH
 from acsard.core.ros.shapes import how_often
 from acsard.core.values import NS_PER_S, Command, Event, Instant
-from acsard.recording.recorded_steps import MICRO, Step
+from acsard.recording.recorded_steps import US_PER_S, Step
 
-FURTHEST_S = 2**63 / 1e9
+MAX_TIME_S = 2**63 / 1e9
 """Largest time between 1970 and an entry of the timeline, s. It is 292 years, because a time in ns
 must fit in 64 bits."""
 
 
-REASON_NS = NS_PER_S
+MIN_REASON_NS = NS_PER_S
 """Shortest time between two `reason` entries, two `waits` entries or two `board` entries, ns.
 
 Without this limit, two sources that alternate in every step would fill the timeline.
 """
 
-POSE_NS = NS_PER_S
+MIN_POSE_INTERVAL_NS = NS_PER_S
 """Longest delay of the entry `continues`, ns. The entry is delayed until the first pose, because it
 contains this pose. Without a link to the board there is no pose."""
 
-SET_NS = 5 * NS_PER_S
+MIN_CLOCK_CHANGE_NS = 5 * NS_PER_S
 """Smallest change of the wall clock that gives an entry `clock`, ns. The change is measured against
 the monotonic clock."""
 
-WAITS_NS = NS_PER_S
+MIN_WAIT_NS = NS_PER_S
 """Time for which a sender must send speeds without effect before it gets an entry `waits`, ns.
 
 While an operator changes from one sender to another, both senders may send, but for less than this
 time.
 """
 
-SILENT_NS = NS_PER_S
+MIN_SILENCE_NS = NS_PER_S
 """If a waiting sender sends nothing for longer than this, ns, its waiting time restarts at 0."""
 
 MAX_IDENTITY_BYTES = 256
@@ -70,7 +70,7 @@ numbers count as equal."""
 class TimelineEntry(Struct, frozen=True, omit_defaults=True):
     """Entry of the timeline."""
 
-    seconds: Annotated[float, Meta(ge=-FURTHEST_S, le=FURTHEST_S)]
+    seconds: Annotated[float, Meta(ge=-MAX_TIME_S, le=MAX_TIME_S)]
     """Wall-clock time, s since 1970."""
     name: str
     """Name of the event, or one of the names that only the timeline uses:
@@ -140,7 +140,7 @@ class ReasonChanges:
         self._mode = self._reason = ""
         """The last mode and reason that the timeline shows. Each number in the reason is replaced
         by `#`."""
-        self._reported_ns = -REASON_NS
+        self._reported_ns = -MIN_REASON_NS
         """Monotonic time of the last entry, ns. An event that reports the mode `waiting` counts
         like an entry."""
         self._sender = ("", "")
@@ -165,7 +165,7 @@ class ReasonChanges:
             # If a link was lost for less than a second, the event about the loss is sufficient.
             self._reported_ns = now.mono_ns
         elif not reported and mode != "driving":
-            if now.mono_ns - self._reported_ns < REASON_NS:
+            if now.mono_ns - self._reported_ns < MIN_REASON_NS:
                 return
             self._reported_ns = now.mono_ns
             by = _named(*self._sender) if source and source == self._sender[0] else source
@@ -188,7 +188,7 @@ class BoardIdentity:
         self._data = b""
         """The last received bytes, if they may be the beginning of the line with the board's name;
         otherwise empty."""
-        self._reported_ns = -REASON_NS
+        self._reported_ns = -MIN_REASON_NS
         """Monotonic time of the last entry, ns."""
 
     def step(self, step: Step) -> Iterator[TimelineEntry]:
@@ -207,7 +207,7 @@ class BoardIdentity:
                 continue
             self._data = self._data[found.end() :]
             reported = any(event.name == "mcu_restarted" for event in step.recorded.events)
-            if reported or now.mono_ns - self._reported_ns < REASON_NS:
+            if reported or now.mono_ns - self._reported_ns < MIN_REASON_NS:
                 continue
             self._reported_ns = now.mono_ns
             words = printable_bytes(found[1], MAX_IDENTITY_BYTES)
@@ -240,11 +240,11 @@ class WaitingSenders:
         `commander`."""
         self._waiting: dict[tuple[str, str], _Waiting] = {}
         """Maps the pair (source, sender) to each waiting sender."""
-        self._reported_ns = -REASON_NS
+        self._reported_ns = -MIN_REASON_NS
         """Monotonic time of the last entry, ns."""
 
     def step(self, step: Step) -> Iterator[TimelineEntry]:
-        """Yield an entry for each sender that has waited for `WAITS_NS` and has no entry yet."""
+        """Yield an entry for each sender that has waited for `MIN_WAIT_NS` and has no entry yet."""
         for event in step.recorded.events:
             if event.name == "commander":
                 # If the log combined several changes of the sender, `by` contains several names.
@@ -265,12 +265,12 @@ class WaitingSenders:
             self._waiting.pop(key, None)
             return
         waiting = self._waiting.get(key)
-        if waiting is None or now.mono_ns - waiting.last_ns > SILENT_NS:
+        if waiting is None or now.mono_ns - waiting.last_ns > MIN_SILENCE_NS:
             if waiting is None and not self._has_room(now):
                 return
             waiting = self._waiting[key] = _Waiting(now.mono_ns, now.mono_ns)
         waiting.last_ns = now.mono_ns
-        since_ns = max(waiting.since_ns + WAITS_NS, self._reported_ns + REASON_NS)
+        since_ns = max(waiting.since_ns + MIN_WAIT_NS, self._reported_ns + MIN_REASON_NS)
         if waiting.reported or now.mono_ns < since_ns:
             return
         waiting.reported, self._reported_ns = True, now.mono_ns
@@ -281,7 +281,7 @@ class WaitingSenders:
     def _has_room(self, now: Instant) -> bool:
         """Return whether another sender can be watched. If needed, first forget silent senders."""
         if len(self._waiting) >= MAX_WAITING:
-            oldest_ns = now.mono_ns - SILENT_NS
+            oldest_ns = now.mono_ns - MIN_SILENCE_NS
             kept = {key: one for key, one in self._waiting.items() if one.last_ns >= oldest_ns}
             self._waiting = kept
         return len(self._waiting) < MAX_WAITING
@@ -303,7 +303,7 @@ class WaitingSenders:
 
 
 def _named(source: str, sender: str) -> str:
-    return f"{source} ({sender[:MAX_SENDER]})"
+    return f"{source} ({sender[:MAX_SENDER_LENGTH]})"
 
 
 class TimelineWriter:
@@ -343,7 +343,7 @@ class TimelineWriter:
         entries, first = list(self._entries(step)), self._continued
         if first is not None:
             waited_ns = step.inputs.now.mono_ns - first.inputs.now.mono_ns
-            if entries or step.recorded.poses or waited_ns > POSE_NS:
+            if entries or step.recorded.poses or waited_ns > MIN_POSE_INTERVAL_NS:
                 yield from self._continues()
         yield from entries
 
@@ -356,7 +356,7 @@ class TimelineWriter:
         does = mode if mode == "driving" else f"{mode} ({reason})"
         at = "the pose of the robot is not known"
         if self._pose is not None:
-            x, y, yaw = [value / MICRO for value in self._pose]
+            x, y, yaw = [value / US_PER_S for value in self._pose]
             at = f"at x {x:.2f} m, y {y:.2f} m, yaw {math.degrees(yaw):.1f} deg"
         text = (
             "this recording continues an earlier one; at the start of this recording, the robot "
@@ -396,7 +396,7 @@ class TimelineWriter:
         if last is None:
             return
         ahead_ns = now.wall_ns - now.mono_ns - last.wall_ns + last.mono_ns
-        if abs(ahead_ns) < SET_NS:
+        if abs(ahead_ns) < MIN_CLOCK_CHANGE_NS:
             return
         way = "forward" if ahead_ns > 0 else "back"
         # The monotonic clock does not advance while the computer is suspended.
@@ -412,7 +412,7 @@ class TimelineWriter:
         for pose in step.recorded.poses:
             if self._pose is not None and self._began_ns is not None:
                 moved = math.hypot(pose[0] - self._pose[0], pose[1] - self._pose[1])
-                self._distance_m += moved / MICRO
+                self._distance_m += moved / US_PER_S
             self._pose = pose
         mode, _, _, source = step.recorded.status
         now_ns = step.inputs.now.mono_ns
@@ -469,7 +469,7 @@ INCIDENT_WORDS = {
 event `link_up` has no word: it is not counted, but shows where a loss of the link ends."""
 
 
-SERIOUS = re.compile(r"(^|, )\d+ (emergency stop|bumper hit|battery stop|stop|fault)s?\b")
+SERIOUS_SUMMARY = re.compile(r"(^|, )\d+ (emergency stop|bumper hit|battery stop|stop|fault)s?\b")
 """Pattern for the number of stops, bumper hits or faults in a summary. A stop may also be an
 emergency stop or a battery stop. A wheel fault does not count as a fault."""
 
@@ -480,7 +480,7 @@ def is_serious(text: str) -> bool:
     `text` is the result of `summary`. A stop may also be an emergency stop or a battery stop.
     """
     # Ignore the names of the clients, because a name may look like a fault.
-    return SERIOUS.search(text.partition(" (stopped by ")[0]) is not None
+    return SERIOUS_SUMMARY.search(text.partition(" (stopped by ")[0]) is not None
 
 
 def summary(events: Iterable[TimelineEntry], starts: bool = False) -> str:

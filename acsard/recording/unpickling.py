@@ -41,7 +41,7 @@ MAX_OPCODES = 1 << 17
 MAX_PARTS = 1 << 19
 """Largest number of values in a robot. A value that occurs several times counts each time."""
 
-MAX_COPIED = 4 * MAX_PARTS
+MAX_COPIED_PARTS = 4 * MAX_PARTS
 """Largest total number of values that are copied when objects are made and attributes are set.
 Without this limit, a few bytes could copy a large value again and again."""
 
@@ -83,7 +83,7 @@ TUPLES = {"TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3}
 """Maps each opcode that makes a tuple of the top values of the stack to the number of these
 values."""
 
-SIMPLE = (str, int, float, bool, bytes, type(None))
+KEY_TYPES = (str, int, float, bool, bytes, type(None))
 """Allowed types of dict keys and set elements. Members of an Enum are allowed too, and also short
 tuples of allowed values."""
 
@@ -237,10 +237,10 @@ class _Machine:
     def _copies(self, entry: _Entry) -> None:
         """Add the size of `entry` to the number of copied values.
 
-        Raises `ValueError` if this number exceeds `MAX_COPIED`.
+        Raises `ValueError` if this number exceeds `MAX_COPIED_PARTS`.
         """
         self._copied += entry.size
-        if self._copied > MAX_COPIED:
+        if self._copied > MAX_COPIED_PARTS:
             raise ValueError(
                 "the robot state copies more values than the state of any real robot: the file is "
                 "damaged or forged"
@@ -387,7 +387,7 @@ def _keys(entries: Sequence[_Entry]) -> None:
     for entry in entries:
         value = entry.value
         parts = value if type(value) is tuple and len(value) <= MAX_KEY_PARTS else (value,)
-        if not all(type(part) in SIMPLE or isinstance(part, Enum) for part in parts):
+        if not all(type(part) in KEY_TYPES or isinstance(part, Enum) for part in parts):
             raise ValueError(
                 f"the robot state uses a {type(value).__name__} as a key, which this acsard never "
                 "writes"

@@ -17,26 +17,26 @@ from acsard.core.thinning import Band
 from acsard.core.values import NS_PER_S, Command, Outputs, Twist
 from acsard.recording.recorded_steps import Step
 
-STATES = ("refused", "waits", "sends", "drives")
+SOURCE_STATES = ("refused", "waits", "sends", "drives")
 """States of a command source that is not silent, the most important state first.
 
 In the state `sends`, the robot accepts the source's commands, but the source does not drive the
 robot. If spans of time with different states are merged, the result has the most important state.
 """
 
-MOVES = ("ready", "driving")
+FOLLOWING_MODES = ("ready", "driving")
 """Modes in which the robot can follow a command source. In any other mode it follows no source."""
 
-OTHERS = "others"
+OTHER_SOURCES = "others"
 """Common name in a report for all command sources that are not in the configuration."""
 
-SAMPLE_S = 0.1
+SAMPLE_PERIOD_S = 0.1
 """Longest time between two samples of the sources' states, s.
 
 A change of the mode, its reason, the link or the driving source causes an additional sample.
 """
 
-MAX_TEXT = 300
+MAX_TEXT_LENGTH = 300
 """Maximum length of a sentence or name from a recording, characters. The rest is cut off."""
 
 MAX_SENDERS = 256
@@ -51,7 +51,7 @@ class CommandSources:
         self._timeouts = {
             source.name: source.timeout for source in sorted(sources, key=lambda s: -s.priority)
         }
-        self.bands = {name: Band(STATES) for name in (*self._timeouts, OTHERS)}
+        self.bands = {name: Band(SOURCE_STATES) for name in (*self._timeouts, OTHER_SOURCES)}
         """Maps the name of each source to its states over time. Sources with a higher priority come
         first."""
         self._newest: dict[tuple[str, str], Command] = {}
@@ -65,8 +65,8 @@ class CommandSources:
         refused, s, and the reason in words."""
 
     def name(self, source: str) -> str:
-        """Return the name of a source, or `OTHERS` if the source is not configured."""
-        return source if source in self._timeouts else OTHERS
+        """Return the name of a source, or `OTHER_SOURCES` if the source is not configured."""
+        return source if source in self._timeouts else OTHER_SOURCES
 
     def take_commands(self, step: Step, t: float, robot: Robot) -> bool:
         """Process the commands of a step.
@@ -108,8 +108,8 @@ class CommandSources:
                 self._refuse(command.source, t, words)
 
     def _refuse(self, source: str, t: float, words: str) -> None:
-        until = t + self._timeouts.get(source, SAMPLE_S)
-        self._refused[self.name(source)] = until, words[:MAX_TEXT]
+        until = t + self._timeouts.get(source, SAMPLE_PERIOD_S)
+        self._refused[self.name(source)] = until, words[:MAX_TEXT_LENGTH]
 
     def commanded(self, outputs: Outputs) -> Twist | None:
         """Return the twist of the command that the robot follows, or None if it follows none."""
@@ -145,12 +145,12 @@ class CommandSources:
                 yield source.name, "refused", refusal
             elif wait.what == "command":
                 yield source.name, "", ""
-            elif mode not in MOVES or wait.what in ("nothing", "senders"):
-                yield source.name, "sends", f"{mode}: {reason}"[:MAX_TEXT]
+            elif mode not in FOLLOWING_MODES or wait.what in ("nothing", "senders"):
+                yield source.name, "sends", f"{mode}: {reason}"[:MAX_TEXT_LENGTH]
             else:
                 yield source.name, "waits", waiting(wait)
-        refusal = self._refusal(OTHERS, t)
-        yield OTHERS, "refused" if refusal else "", refusal
+        refusal = self._refusal(OTHER_SOURCES, t)
+        yield OTHER_SOURCES, "refused" if refusal else "", refusal
 
     def _refusal(self, name: str, t: float) -> str:
         """Return why the source `name` counts as refused at the time `t`, s.

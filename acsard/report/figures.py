@@ -12,14 +12,14 @@ from typing import Any, NamedTuple
 
 from acsard.core.thinning import Place, Point, Span
 from acsard.core.values import WHEELS
-from acsard.report.command_sources import OTHERS
+from acsard.report.command_sources import OTHER_SOURCES
 from acsard.report.plot_elements import (
     COLOURS,
     COMMANDED,
-    END,
+    END_COLOUR,
     LIMITED,
     MEASURED,
-    UNKNOWN,
+    UNKNOWN_COLOUR,
     Figure,
     Key,
     Trace,
@@ -60,7 +60,7 @@ LEAST_LINEAR, LEAST_ANGULAR = 0.1, 0.2
 """Smallest spans of the scales in the diagrams of the forward speed, m/s, and of the turn rate,
 rad/s. Without them the scale would be empty if the robot never moves."""
 
-BENEATH = 3.4
+UNDER_CURVE_PX = 3.4
 """Width of a curve that is drawn under another curve, px.
 
 It is larger than the width of the other curve, so that the lower curve stays visible on both sides.
@@ -82,7 +82,7 @@ class Clip(NamedTuple):
     edge."""
 
 
-MARKS_APART = 0.02
+MIN_MARK_DISTANCE = 0.02
 """Smallest distance between two excursions, as a fraction of the diagram's width.
 
 Excursions beyond the same edge that are closer count as a single excursion with one triangle.
@@ -141,7 +141,7 @@ Row = tuple[str, list[Span]]
 """A row in the picture of the command sources: its name, and the spans of time that are drawn as
 bands."""
 
-DRIVES = "drives"
+DRIVES_STATE = "drives"
 
 
 class BandStyle(NamedTuple):
@@ -171,13 +171,13 @@ class BandStyle(NamedTuple):
 
 
 def _styles(rows: list[Row]) -> Iterator[BandStyle]:
-    drivers = [name for name, spans in rows if any(span.kind == DRIVES for span in spans)]
+    drivers = [name for name, spans in rows if any(span.kind == DRIVES_STATE for span in spans)]
     for kind in dict.fromkeys(span.kind for _, spans in rows for span in spans):
-        if kind == DRIVES:
+        if kind == DRIVES_STATE:
             for number, name in enumerate(drivers):
                 yield BandStyle(kind, name, *source_style(number))
         else:
-            yield BandStyle(kind, "", COLOURS.get(kind, UNKNOWN))
+            yield BandStyle(kind, "", COLOURS.get(kind, UNKNOWN_COLOUR))
 
 
 def _keys(styles: list[BandStyle]) -> list[Key]:
@@ -191,10 +191,10 @@ def _keys(styles: list[BandStyle]) -> list[Key]:
     ]
 
 
-HEADINGS = 12
+HEADING_ARROWS = 12
 """Approximate number of arrows along the path that show the robot's heading."""
 
-NOTED = {
+EVENT_MARKS = {
     "fault": ("✖", "x", COLOURS["error"]),
     "stop": ("◆", "diamond", COLOURS["warning"]),
     "emergency_stop": ("⬢", "hexagon", COLOURS["error"]),
@@ -209,7 +209,7 @@ plotly's name for this symbol, and the color."""
 
 
 def path_figure(data: ReportData) -> Figure:
-    """Return the picture of the robot's path, with the positions of the events in `NOTED`."""
+    """Return the picture of the robot's path, with the positions of the events in `EVENT_MARKS`."""
     places = data.path.places()
     keys: list[Key] = []
     traces: list[Trace] = []
@@ -219,10 +219,14 @@ def path_figure(data: ReportData) -> Figure:
             _places("path", _with_gaps(places), "lines", line={"color": LIMITED, "width": 2.5}),
             _places("heading", arrows, "markers", marker=_arrows(arrows)),
             _places("start", places[:1], "markers", marker=_dot("circle", MEASURED, 14)),
-            _places("end", places[-1:], "markers", marker=_dot("square", END, 13)),
+            _places("end", places[-1:], "markers", marker=_dot("square", END_COLOUR, 13)),
         ]
-        keys = [Key("▶", LIMITED, "heading"), Key("●", MEASURED, "start"), Key("■", END, "end")]
-    for name, (sign, symbol, colour) in NOTED.items():
+        keys = [
+            Key("▶", LIMITED, "heading"),
+            Key("●", MEASURED, "start"),
+            Key("■", END_COLOUR, "end"),
+        ]
+    for name, (sign, symbol, colour) in EVENT_MARKS.items():
         trace = _events(name, data.marks, _dot(symbol, colour, 12))
         if trace:
             traces.append(trace)
@@ -268,12 +272,12 @@ def _with_gaps(places: list[Place]) -> list[Place]:
 
 
 def _spread(places: list[Place]) -> list[Place]:
-    """Return about `HEADINGS` places of the path, at about equal distances along the path."""
+    """Return about `HEADING_ARROWS` places of the path, at about equal distances along the path."""
     distances = [0.0]
     for before, after in pairwise(places):
         metres = 0.0 if after.new else math.hypot(after.x - before.x, after.y - before.y)
         distances.append(distances[-1] + metres)
-    spacing, found, due = distances[-1] / HEADINGS, list[Place](), 0.0
+    spacing, found, due = distances[-1] / HEADING_ARROWS, list[Place](), 0.0
     for place, distance in zip(places, distances, strict=True):
         if distance >= due and (not found or distance > 0):
             found.append(place)
@@ -310,7 +314,7 @@ class TimeFigures:
     def speeds(self) -> Figure:
         """Return the picture of the commanded, limited and measured speeds."""
         data, parts = self._data, list[Part]()
-        gap = MARKS_APART * data.seconds
+        gap = MIN_MARK_DISTANCE * data.seconds
         for title, curves, least in (
             ("forward, m/s", data.linear, LEAST_LINEAR),
             ("turning, rad/s", data.angular, LEAST_ANGULAR),
@@ -322,7 +326,7 @@ class TimeFigures:
             values = [point.value for point in wished] if clips else ()
             lines = [
                 Line("commanded", COMMANDED, drawn, "hv", values=values),
-                Line("limited", LIMITED, limited, "hv", BENEATH),
+                Line("limited", LIMITED, limited, "hv", UNDER_CURVE_PX),
                 Line("measured", MEASURED, measured),
             ]
             parts.append(Part(title, lines, clips))
@@ -351,7 +355,7 @@ class TimeFigures:
             Part(
                 f"{name.replace('_', ' ')}, rad/s",
                 [
-                    Line("commanded", LIMITED, commanded.points(), "hv", BENEATH),
+                    Line("commanded", LIMITED, commanded.points(), "hv", UNDER_CURVE_PX),
                     Line("measured", MEASURED, measured.points()),
                 ],
             )
@@ -370,7 +374,7 @@ class TimeFigures:
             Part(
                 "lines per second",
                 [
-                    Line("sent", LIMITED, counts.sent.curve.points(), "hvh", BENEATH),
+                    Line("sent", LIMITED, counts.sent.curve.points(), "hvh", UNDER_CURVE_PX),
                     Line("answered", MEASURED, counts.good.curve.points(), "hvh"),
                 ],
             ),
@@ -401,7 +405,7 @@ class TimeFigures:
         for name, band in data.sources.bands.items():
             if band.spans():
                 rows.append((name, band.spans()))
-            elif name != OTHERS:
+            elif name != OTHER_SOURCES:
                 silent.append(name)
         styles = list(_styles(rows))
         traces = [

@@ -23,7 +23,7 @@ from acsard.host.errors import RecordingError
 from acsard.recording.file import Recording
 from acsard.recording.file_replay import PROGRESS_STEPS, DisplayReplay, Progress, no_progress
 from acsard.recording.replay_text import verdict
-from acsard.recording.time_span import WHOLE, Span, clock, date
+from acsard.recording.time_span import WHOLE_SPAN, Span, clock, date
 from acsard.report.figures import TimeFigures
 from acsard.report.plot_elements import Figure
 from acsard.report.report_data import Mark, ReportData
@@ -184,7 +184,7 @@ def page(
 
 
 def drawn(
-    recording: Recording, library: str, span: Span = WHOLE, progress: Progress = no_progress
+    recording: Recording, library: str, span: Span = WHOLE_SPAN, progress: Progress = no_progress
 ) -> tuple[str, list[str]]:
     """Replay a recording, and make the report of a part of it.
 

@@ -19,24 +19,24 @@ from acsard.report.report_data import Mark
 
 COMMANDED, LIMITED, MEASURED = "#e08600", "#2f7ed8", "#159a6b"
 
-END = "#8668b8"
+END_COLOUR = "#8668b8"
 
 COLOURS = {
     "driving": "#159a6b", "ready": "#8fb8de", "waiting": "#e0b400", "stopped": "#e08600",
-    "fault": "#d43d3d", "inactive": "#9a9a9a", "shutdown": END,
+    "fault": "#d43d3d", "inactive": "#9a9a9a", "shutdown": END_COLOUR,
     "up": "#8fb8de", "booting": "#e0b400", "stale": "#e08600", "down": "#d43d3d",
     "drives": "#159a6b", "sends": "#8fb8de", "waits": "#e0b400", "refused": "#d43d3d",
     "info": "#2f7ed8", "warning": "#e08600", "error": "#d43d3d",
 }  # fmt: skip
 
-UNKNOWN = "#9a9a9a"
+UNKNOWN_COLOUR = "#9a9a9a"
 
 SOURCE_COLOURS = (
     "#159a6b", "#2f6fd8", "#b04fc4", "#8f4f22", "#1ab2d2", "#8a8f00", "#e0588c", "#4a2f8f",
 )  # fmt: skip
 """Colors of the command sources that drive the robot. Successive colors are easy to distinguish."""
 
-PATTERNS = ("", "/", "x", ".", "-")
+FILL_PATTERNS = ("", "/", "x", ".", "-")
 """Fill patterns of the bands of the command sources that drive the robot.
 
 The first sources have the first pattern and different colors. When all colors are used, they are
@@ -50,10 +50,10 @@ def source_style(number: int) -> tuple[str, str]:
     `number` counts the sources that drive, from 0.
     """
     beyond, place = divmod(number, len(SOURCE_COLOURS))
-    return SOURCE_COLOURS[place], PATTERNS[beyond % len(PATTERNS)]
+    return SOURCE_COLOURS[place], FILL_PATTERNS[beyond % len(FILL_PATTERNS)]
 
 
-WRAP = 42
+WRAP_COLUMNS = 42
 """Maximum length of a line in the text that appears at the pointer, characters. A line of this
 length fits on a phone."""
 
@@ -94,8 +94,9 @@ class Figure(NamedTuple):
 
 
 def label(text: str) -> str:
-    """Return a text for plotly: escaped, and wrapped to lines of at most `WRAP` characters."""
-    lines = textwrap.wrap(printable(text), WRAP) or [""]
+    """Return a text for plotly: escaped, and wrapped to lines of at most `WRAP_COLUMNS`
+    characters."""
+    lines = textwrap.wrap(printable(text), WRAP_COLUMNS) or [""]
     return "<br>".join(html.escape(line) for line in lines)
 
 

@@ -19,9 +19,9 @@ from acsard.core.robot import Robot
 from acsard.core.ros.shapes import how_often
 from acsard.core.thinning import Band, Curve, Place, Point, Track
 from acsard.core.values import NS_PER_S, Outputs, Twist
-from acsard.recording.recorded_steps import MICRO, Step
+from acsard.recording.recorded_steps import US_PER_S, Step
 from acsard.recording.timeline import TimelineEntry, TimelineWriter
-from acsard.report.command_sources import MAX_TEXT, SAMPLE_S, CommandSources
+from acsard.report.command_sources import MAX_TEXT_LENGTH, SAMPLE_PERIOD_S, CommandSources
 
 NS_PER_MS = 1_000_000
 
@@ -432,7 +432,7 @@ class ReportData:
         if driven is not None and t > self.seconds:
             driven.seconds += t - self.seconds
         for x, y, yaw in step.recorded.poses:
-            place = Place(t, x / MICRO, y / MICRO, yaw / MICRO, self._jumps)
+            place = Place(t, x / US_PER_S, y / US_PER_S, yaw / US_PER_S, self._jumps)
             if self._place is not None and not self._jumps and inside:
                 metres = math.hypot(place.x - self._place.x, place.y - self._place.y)
                 self.metres += metres
@@ -497,13 +497,13 @@ class ReportData:
     def _sample(self, step: Step, t: float, robot: Robot, refused: bool) -> None:
         """Sample the mode, the link and the sources if a sample is due.
 
-        A sample is due every `SAMPLE_S`, after a change of the status, and if `refused` is true.
-        `refused` says whether a command was refused in this step.
+        A sample is due every `SAMPLE_PERIOD_S`, after a change of the status, and if `refused` is
+        true. `refused` says whether a command was refused in this step.
         """
         mode, reason, link, _ = status = step.recorded.status
-        if status == self._status and t - self._sampled < SAMPLE_S and not refused:
+        if status == self._status and t - self._sampled < SAMPLE_PERIOD_S and not refused:
             return
         self._status, self._sampled = status, t
-        self.modes.add(t, mode[:MAX_TEXT], reason[:MAX_TEXT])
-        self.links.add(t, link[:MAX_TEXT])
+        self.modes.add(t, mode[:MAX_TEXT_LENGTH], reason[:MAX_TEXT_LENGTH])
+        self.links.add(t, link[:MAX_TEXT_LENGTH])
         self.sources.sample(step, t, robot)

@@ -32,7 +32,7 @@ MAX_REASONS = 8
 NUMBER = re.compile(r"\d+(\.\d+)?")
 """Pattern for a number in a reason. Reasons that differ only in numbers share a row."""
 
-FINE_S = 0.05
+MAX_POINT_S = 0.05
 """Resolution of the pictures, s. If one point of a picture covers more time, the report has a note
 about this."""
 
@@ -62,7 +62,7 @@ class Setting(NamedTuple):
     """Default value; "-" if the default configuration lacks the setting."""
 
 
-OF_THE_BOARD = {
+BOARD_INPUTS = {
     "emergency_stop": "emergency stop",
     "bumper_pressed": "bumper hit",
     "battery_stop": "battery stop",
@@ -108,7 +108,7 @@ def summary(data: ReportData) -> str:
     stops = many(counts["stop"], "stop")
     by = _names([mark for mark in data.marks.all() if mark.name == "stop"])
     faults = many(counts["fault"], "fault")
-    for name, word in OF_THE_BOARD.items():
+    for name, word in BOARD_INPUTS.items():
         by += f", {many(counts[name], word)}" if counts[name] else ""
     lost = counts["link_down"] + counts["link_stale"]
     link = f", {many(lost, 'loss', 'losses')} of the link to the board" if lost else ""
@@ -194,7 +194,7 @@ def notes(data: ReportData, origin: Origin) -> list[str]:
         )
     curves = [*data.linear.values(), *data.angular.values()]
     width = max(curve.width for curve in curves)
-    if width > FINE_S:
+    if width > MAX_POINT_S:
         found.append(
             f"Each point of a picture covers up to {width:.2g} s, and shows the lowest and the "
             "highest value in that time. To see more detail, choose a shorter time with --from and "
@@ -216,13 +216,13 @@ def rows(data: ReportData, origin: Origin, clock: Clock) -> Iterator[tuple[str, 
         for name, driven in data.driven.items()
     ]
     yield "Driven by", ", ".join(drivers) or "no source"
-    titles = {name: f"{word.capitalize()}s" for name, word in OF_THE_BOARD.items()}
+    titles = {name: f"{word.capitalize()}s" for name, word in BOARD_INPUTS.items()}
     for name, title in {"fault": "Faults", "stop": "Stops", **titles}.items():
         marks = [mark for mark in data.marks.all() if mark.name == name]
         count = data.marks.counts[name]
-        # Few boards can report the events in `OF_THE_BOARD`. Such an event has a row only if it
+        # Few boards can report the events in `BOARD_INPUTS`. Such an event has a row only if it
         # happened.
-        if count or name not in OF_THE_BOARD:
+        if count or name not in BOARD_INPUTS:
             yield title, f"{count}: {_first_of_each(marks, clock)}" if count else "none"
     lines = data.serial
     told = (

@@ -2,8 +2,8 @@
 
 This module writes texts and questions to standard output as JSON objects, one per line. It reads
 answers, key presses and signs of life from standard input. It interrupts the subcommand, as Ctrl-C
-does, if the input ends. It does the same if the other program sends no line for `HEARD_S` while
-something may move.
+does, if the input ends. It does the same if the other program sends no line for
+`MAX_INPUT_SILENCE_S` while something may move.
 
 deploy/web/README.md describes the fields. The docstrings of the classes below become part of the
 OpenAPI document (`web/openapi.py`).
@@ -37,16 +37,16 @@ T = TypeVar("T")
 # within this time. If this computer is too busy to keep the limit, a guided drive ends because it
 # receives nothing from the daemon for 0.5 s (calibration/guided/leg_driver.py). When a person
 # drives by hand, the timeout of the command source replaces this limit.
-HEARD_S = 0.9
+MAX_INPUT_SILENCE_S = 0.9
 """Longest time without a line from the other program while something may move, s.
 
 After a longer time the subcommand is interrupted and sends zero speeds. So the robot begins to stop
 within a second of the other program's last line.
 """
 
-LISTEN_S = 0.05
+POLL_S = 0.05
 
-LINE_BYTES = 65536
+MAX_LINE_BYTES = 65536
 """Maximum length of an input line, bytes. A longer line interrupts the subcommand."""
 
 
@@ -268,7 +268,7 @@ class JsonPrompt:
                 while self._open:
                     # Wait with a time limit, because a signal that arrives just before the wait
                     # begins does not end it.
-                    self._news.wait(LISTEN_S)
+                    self._news.wait(POLL_S)
             try:
                 got = read(self._answer.value)
             except ValueError as error:
@@ -294,23 +294,30 @@ class JsonPrompt:
     def _heard_out(self) -> str:
         """Read standard input, and return the reason why the subcommand must be interrupted.
 
-        The reason is the end of the input, a line that is too long, or no line for `HEARD_S` while
-        something may move. Return "" after the end of the `with` block.
+        The reason is the end of the input, a line that is too long, or no line for
+        `MAX_INPUT_SILENCE_S` while something may move. Return "" after the end of the `with` block.
         """
         held, heard_s = b"", time.monotonic()
         while not self._left:
-            if self._readable(LISTEN_S):
+            if self._readable(POLL_S):
                 read = os.read(self._input, 4096)
                 *whole, held = (held + read).split(b"\n")
                 if not read:
                     return "the program that shows the questions to the operator has ended"
-                if len(held) > LINE_BYTES:
-                    return f"a line on standard input has more than {LINE_BYTES} bytes"
+                if len(held) > MAX_LINE_BYTES:
+                    return f"a line on standard input has more than {MAX_LINE_BYTES} bytes"
                 for line in whole:
                     self._take(line)
                 heard_s = time.monotonic()
-            elif self._moves and time.monotonic() - heard_s > HEARD_S and not self._readable(0.0):
-                return f"the operator's page or program sent no sign of life for {HEARD_S:g} s"
+            elif (
+                self._moves
+                and time.monotonic() - heard_s > MAX_INPUT_SILENCE_S
+                and not self._readable(0.0)
+            ):
+                return (
+                    f"the operator's page or program sent no sign of life for "
+                    f"{MAX_INPUT_SILENCE_S:g} s"
+                )
         return ""
 
     def _readable(self, wait_s: float) -> bool:

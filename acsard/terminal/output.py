@@ -16,13 +16,13 @@ from rich.console import Console, Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-WHOLE = 10_000
+UNLIMITED_WIDTH = 10_000
 """Width that is larger than any row of a table, characters.
 
 With this width, no row is wrapped, so that a person can copy a row from the terminal.
 """
 
-SENTENCES = 100
+MAX_TEXT_WIDTH = 100
 """Largest width of the lines of output that contains sentences, characters."""
 
 
@@ -55,14 +55,14 @@ def has_screen() -> bool:
     return sys.stdout.isatty() and os.environ.get("TERM", "") not in ("", "dumb", "unknown")
 
 
-def show(*parts: RenderableType, most: int = WHOLE) -> None:
+def show(*parts: RenderableType, most: int = UNLIMITED_WIDTH) -> None:
     """Print each part, such as a table or a text, on its own lines.
 
     A line has at most `most` characters; longer text is wrapped. With the default, no row of a
     table is wrapped.
     """
     console = _console(sys.stdout)
-    if console.is_terminal and most < WHOLE:
+    if console.is_terminal and most < UNLIMITED_WIDTH:
         console.print(Group(*parts), width=min(most, console.width))
     else:
         print(plain(*parts, width=most), flush=True)
@@ -77,7 +77,7 @@ def show_whole(text: Text) -> None:
         print(text.plain, flush=True)
 
 
-def plain(*parts: RenderableType, width: int = WHOLE) -> str:
+def plain(*parts: RenderableType, width: int = UNLIMITED_WIDTH) -> str:
     file = io.StringIO()
     _console(file, width).print(Group(*parts))
     return "\n".join(line.rstrip() for line in file.getvalue().splitlines())

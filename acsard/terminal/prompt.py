@@ -108,7 +108,7 @@ class Prompt(Protocol):
         """Wait up to `wait_s` s for a key press. Return the pressed keys, or "" without a press."""
 
 
-SIGNALS = signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP
+END_SIGNALS = signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP
 """The signals that end a subcommand that moves something.
 
 The signal of Ctrl-Z (SIGTSTP) is one of them, because a suspended subcommand would leave a wheel
@@ -118,16 +118,16 @@ turning.
 
 @contextmanager
 def ended_by_signals(says: str = "", *, exits: bool = False) -> Iterator[None]:
-    """Raise `KeyboardInterrupt` in the `with` block when one of `SIGNALS` arrives.
+    """Raise `KeyboardInterrupt` in the `with` block when one of `END_SIGNALS` arrives.
 
     Further signals are then ignored until the end of the block, so that its cleanup can send zero
     speeds. `says` is printed when the signal arrives. If `exits` is true, a signal other than
     SIGINT raises `SystemExit` instead, with 128 plus the number of the signal.
     """
-    before = [signal.getsignal(number) for number in SIGNALS]
+    before = [signal.getsignal(number) for number in END_SIGNALS]
 
     def end(number: int, frame: FrameType | None) -> None:
-        for each in SIGNALS:
+        for each in END_SIGNALS:
             signal.signal(each, signal.SIG_IGN)
         # If the program that started this one is gone or does not read, printing would fail or
         # block. The zero speeds must not wait for that.
@@ -138,10 +138,10 @@ def ended_by_signals(says: str = "", *, exits: bool = False) -> Iterator[None]:
             raise SystemExit(128 + number)
         raise KeyboardInterrupt
 
-    for number in SIGNALS:
+    for number in END_SIGNALS:
         signal.signal(number, end)
     try:
         yield
     finally:
-        for number, handler in zip(SIGNALS, before, strict=True):
+        for number, handler in zip(END_SIGNALS, before, strict=True):
             signal.signal(number, handler)

@@ -19,12 +19,12 @@ from rich.table import Table
 from rich.text import Text
 
 from acsard.checkup.findings import Finding
-from acsard.terminal.output import SENTENCES, show, table
+from acsard.terminal.output import MAX_TEXT_WIDTH, show, table
 from acsard.terminal.prompt import Ask, NobodyError
 
-BAR = 30
+BAR_WIDTH = 30
 
-LEAVES = "q"
+QUIT_KEY = "q"
 
 
 COLOURS = {"PASS": "green", "WARN": "yellow", "FAIL": "red", "SKIPPED": "bright_black"}
@@ -66,7 +66,7 @@ class Screen:
     def found(self, finding: Finding) -> None:
         if not self._as_json:
             self._clear()
-            show(row(finding), most=SENTENCES)
+            show(row(finding), most=MAX_TEXT_WIDTH)
 
     def result(self, text: str) -> None:
         self._clear()
@@ -126,7 +126,7 @@ class TerminalPrompt(Screen):
         Raises `KeyboardInterrupt` if the person types "q", or if standard input ends.
         """
         self._clear()
-        choice = f" [{'/'.join((*answers, LEAVES))}]" if len(answers) > 1 else ""
+        choice = f" [{'/'.join((*answers, QUIT_KEY))}]" if len(answers) > 1 else ""
         at_terminal = sys.stdin.isatty()
         with _lines() if at_terminal else nullcontext():
             # A line that was typed before the question appeared must not answer it.
@@ -136,11 +136,11 @@ class TerminalPrompt(Screen):
                 self._print(f"\n{question}{choice} ")
                 line = sys.stdin.readline()
                 word = line.strip().lower()
-                if not line or word == LEAVES:
+                if not line or word == QUIT_KEY:
                     raise KeyboardInterrupt
                 if word in answers:
                     return word
-                self._print(f"   please type {' or '.join(answers)}; {LEAVES} quits\n")
+                self._print(f"   please type {' or '.join(answers)}; {QUIT_KEY} quits\n")
 
     def start(self, text: str, by_key: bool = False) -> None:
         self.say(text)
@@ -152,7 +152,7 @@ class TerminalPrompt(Screen):
             pressed = _read()
             if not pressed.strip("\r\n"):
                 return
-            if LEAVES in pressed:
+            if QUIT_KEY in pressed:
                 raise KeyboardInterrupt
 
     def number(self, ask: Ask) -> float:
@@ -161,7 +161,7 @@ class TerminalPrompt(Screen):
             while True:
                 self._print(f"\n{_wrapped(ask.words)}\n{ask.unit}: ")
                 line = _read().strip()
-                if line == LEAVES:
+                if line == QUIT_KEY:
                     raise KeyboardInterrupt
                 try:
                     return ask.number(line)
@@ -173,8 +173,8 @@ class TerminalPrompt(Screen):
 
     def progress(self, share: float) -> None:
         if sys.stderr.isatty():
-            done = round(BAR * share)
-            bar = "#" * done + "." * (BAR - done)
+            done = round(BAR_WIDTH * share)
+            bar = "#" * done + "." * (BAR_WIDTH - done)
             self._print(f"\r[{bar}] any key stops {'' if share < 1.0 else chr(10)}")
 
 

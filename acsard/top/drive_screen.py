@@ -15,7 +15,7 @@ from acsard.core.formatting import printable
 from acsard.core.messages.schema import RobotState
 from acsard.core.messages.short_texts import place, speeds
 from acsard.core.motion.modes import Mode
-from acsard.top.text import MODES, flow
+from acsard.top.text import MODE_STYLES, flow
 
 HELP = (
     " u  i  o    arrows drive, too",
@@ -61,7 +61,7 @@ def lines(seen: Teleop, width: int, height: int | None = None) -> list[Text]:
         mode = f" {printable(state.mode).upper()} "
         told = _wrapped(f"{mode} {reason(state)}", width, "bold")
         for first in told[:1]:
-            first.stylize(MODES.get(state.mode, "reverse"), 0, len(mode))
+            first.stylize(MODE_STYLES.get(state.mode, "reverse"), 0, len(mode))
         shown += told
         if seen.objection:
             shown += _wrapped(refused(seen.objection), width, "bold red")

@@ -12,20 +12,23 @@ from acsard.client.fleet import Fleet, Row
 from acsard.core.formatting import printable, rough, signed
 from acsard.core.messages.schema import RobotState
 from acsard.core.messages.state_warnings import brief, charge, warnings
-from acsard.daemon.bus.robot_discovery import ALL, nobody, seen
+from acsard.daemon.bus.robot_discovery import ALL_ROBOTS, nobody, seen
 from acsard.top.drive_screen import reason
 
-HEADS = ("ROBOT", "MODE", "M/S", "LINK", "BATTERY", "PLACE", "VERSION", "SEEN", "WHY")
+COLUMN_HEADS = ("ROBOT", "MODE", "M/S", "LINK", "BATTERY", "PLACE", "VERSION", "SEEN", "WHY")
 
-ROOM = (32, 8, 6, 7, 7, 22, 21, 6)
+COLUMN_WIDTHS = (32, 8, 6, 7, 7, 22, 21, 6)
 """Maximum widths, in characters, of all columns except the last, which gets the remaining width."""
 
 NAME, WHY = 12, 32
 """Minimum widths of the columns ROBOT (`NAME`) and WHY (`WHY`), characters. On a narrow terminal,
 ROBOT shrinks to its minimum before WHY becomes shorter than its minimum."""
 
-BATTERY = HEADS.index("BATTERY")
-"""Index of the column BATTERY. The table has this column only if any robot reports a battery."""
+BATTERY_COLUMN = COLUMN_HEADS.index("BATTERY")
+"""Index of the column BATTERY_COLUMN.
+
+The table has this column only if any robot reports a battery.
+"""
 
 URGENT = ("fault", "stopped", "GONE", "SILENT")
 """Modes and kinds of absence that need attention.
@@ -41,13 +44,13 @@ def table(rows: Sequence[Row], width: int, height: int | None = None) -> list[st
     There are at most `height` lines, or any number if `height` is None. If some robots do not fit,
     the last line says how many. A line has at most `width` characters.
     """
-    cells = [HEADS, *map(told, sorted(rows, key=_order))]
-    widest = [max(len(row[n]) for row in cells) for n in range(len(HEADS))]
-    rooms = [min(room, most) for room, most in zip(widest, (*ROOM, WHY), strict=True)]
-    powered = any(row[BATTERY] for row in cells[1:])
-    shown = [n for n in range(len(HEADS)) if n != BATTERY or powered]
+    cells = [COLUMN_HEADS, *map(told, sorted(rows, key=_order))]
+    widest = [max(len(row[n]) for row in cells) for n in range(len(COLUMN_HEADS))]
+    rooms = [min(room, most) for room, most in zip(widest, (*COLUMN_WIDTHS, WHY), strict=True)]
+    powered = any(row[BATTERY_COLUMN] for row in cells[1:])
+    shown = [n for n in range(len(COLUMN_HEADS)) if n != BATTERY_COLUMN or powered]
     # If the terminal is too narrow, these columns are left out one by one, in this order.
-    for column in map(HEADS.index, ("VERSION", "PLACE", "LINK", "BATTERY")):
+    for column in map(COLUMN_HEADS.index, ("VERSION", "PLACE", "LINK", "BATTERY")):
         if column in shown and sum(rooms[n] + 2 for n in shown) - 2 > width:
             shown.remove(column)
     rest = sum(rooms[n] + 2 for n in shown[1:])
@@ -87,7 +90,8 @@ def shortened(names: Sequence[str], room: int) -> list[str]:
 
 
 def told(row: Row) -> tuple[str, ...]:
-    """Return the texts of the table cells for a robot, in the order of the headings `HEADS`."""
+    """Return the texts of the table cells for a robot, in the order of the headings
+    `COLUMN_HEADS`."""
     name = printable(row.robot_id)
     if row.state is None:
         why = "waiting for its state" if row.here else "not there"
@@ -175,7 +179,7 @@ class Roster(Fleet):
         """Whether all robots that the user named have reported; False if the user named none."""
         with self._lock:
             known = list(self._known.values())
-        named = ALL not in self._ids
+        named = ALL_ROBOTS not in self._ids
         return named and all(one.here and one.version and one.follower.heard for one in known)
 
     @property
@@ -183,7 +187,7 @@ class Roster(Fleet):
         """A sentence with the number of visible robots, or "" if the user named the robots."""
         with self._lock:
             here = sum(bool(one.here) for one in self._known.values())
-        return seen(self._robot.where.endpoint, here) if ALL in self._ids else ""
+        return seen(self._robot.where.endpoint, here) if ALL_ROBOTS in self._ids else ""
 
     @property
     def more(self) -> str:
@@ -197,6 +201,6 @@ class Roster(Fleet):
 
     def hint(self) -> str:
         """Return a sentence for an empty table. It explains why no robot is shown."""
-        if ALL in self._ids:
+        if ALL_ROBOTS in self._ids:
             return nobody(self._robot.where.endpoint)
         return "no robot that you named with --id is present: correct --id, or start their daemons"

@@ -1,10 +1,10 @@
 """Drives the robot from the keyboard with the keys of teleop_twist_keyboard.
 
 A terminal reports a key press but never its release. Each press therefore drives the robot for
-`HOLD_S`. After the first `REPEATS` repeats of a held key, each further repeat drives the robot for
-`REPEAT_S` only. When this time is over, `acsard drive` sends three zero commands and then nothing.
-If this program was not running for more than 0.5 s, the keys that the operator typed in that time
-do not drive the robot.
+`KEY_HOLD_S`. After the first `REPEATS` repeats of a held key, each further repeat drives the robot
+for `REPEAT_S` only. When this time is over, `acsard drive` sends three zero commands and then
+nothing. If this program was not running for more than 0.5 s, the keys that the operator typed in
+that time do not drive the robot.
 
 A key that was pressed before a stop must not drive the robot after the `clear`, even if an SSH
 connection pauses and the key seems to be released. So if the robot stops following while a key is
@@ -19,7 +19,7 @@ import math
 from acsard.client import Client
 from acsard.client.commander import (
     GRACE_S,
-    NEVER,
+    NEVER_DRIVING_MODES,
     RELEASED_NS,
     ZEROS,
     Commander,
@@ -33,7 +33,7 @@ from acsard.core.values import NS_PER_S, REST, Twist
 from acsard.host import clock
 from acsard.top.drive_screen import Teleop
 
-HOLD_S = 0.6
+KEY_HOLD_S = 0.6
 """Time for which one key press drives the robot, s.
 
 This time must be longer than a keyboard's delay before the first repeat (0.25 to 0.5 s).
@@ -47,7 +47,7 @@ Presses of the same key count as repeats if they are less than `REPEAT_S` apart.
 key 10 to 30 times a second.
 """
 
-BURST = 8
+MAX_BURST_KEYS = 8
 """Largest number of keys that may arrive together and still drive the robot.
 
 If more keys arrive together, something has delayed them, usually a stalled SSH connection. The
@@ -58,7 +58,9 @@ BURST_S = 0.2
 """Time after the arrival of delayed keys, s, in which all further keys count as delayed too. One
 read from the terminal may not return all delayed keys."""
 
-OVER = "the robot did not follow while this key was held: press space, then press the key again"
+RELEASE_REASON = (
+    "the robot did not follow while this key was held: press space, then press the key again"
+)
 """Text for the operator if a held key does not drive the robot although the robot could follow."""
 
 _MOVES = {
@@ -94,12 +96,12 @@ class Keyboard:
 
         `text` contains the keys, and `now` is the time of the read (monotonic clock, s). `waited`
         is the time since the previous read, s, for which the keys may have waited. The keys count
-        as delayed if `waited` is above `GRACE_S`, or if more than `BURST` keys arrive together.
-        Delayed keys do not show what the operator wants now, so they only stop the robot. If
-        `waited` is above `GRACE_S`, an earlier press does not drive the robot any more either.
+        as delayed if `waited` is above `GRACE_S`, or if more than `MAX_BURST_KEYS` keys arrive
+        together. Delayed keys do not show what the operator wants now, so they only stop the robot.
+        If `waited` is above `GRACE_S`, an earlier press does not drive the robot any more either.
         """
         keys = split(text)
-        if len(keys) > BURST or waited > GRACE_S:
+        if len(keys) > MAX_BURST_KEYS or waited > GRACE_S:
             self._old_until = now + BURST_S
         if now < self._old_until and (keys or now < self._until):
             if not self._over:
@@ -121,7 +123,7 @@ class Keyboard:
         elif key in _MOVES:
             repeated = self._move == _MOVES[key] and now - self._pressed < REPEAT_S
             self._repeats = self._repeats + 1 if repeated else 0
-            hold = REPEAT_S if self._repeats >= REPEATS else HOLD_S
+            hold = REPEAT_S if self._repeats >= REPEATS else KEY_HOLD_S
             if not self._held(now):
                 self._begun, self._over = now, False
             self._pressed = now
@@ -224,8 +226,11 @@ class Ride:
         why = ""
         if watch.state is not None and now - self._fine > GRACE_S:
             why = objection(watch.state, robot.source, robot.sender)
-            if self._keyboard.ignores(now) and watch.state.mode not in (*NEVER, "waiting"):
-                why = OVER
+            if self._keyboard.ignores(now) and watch.state.mode not in (
+                *NEVER_DRIVING_MODES,
+                "waiting",
+            ):
+                why = RELEASE_REASON
         return Teleop(
             robot.where.robot_id,
             robot.where.endpoint,

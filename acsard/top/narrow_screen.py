@@ -32,10 +32,10 @@ from acsard.top.wide_screen import (
     wheel,
 )
 
-BELOW = 80
+MIN_WIDE_COLUMNS = 80
 """Terminals with fewer character cells per line than this number get the narrow layout."""
 
-BAR = 4
+BAR_WIDTH = 4
 
 
 def motion(state: RobotState, width: int) -> list[Text]:
@@ -51,8 +51,8 @@ def motion(state: RobotState, width: int) -> list[Text]:
     lines.append(Text("wheels rad/s", "cyan"))
     (right, left, rear_left, rear_right), scale = speeds(state)
     for axle, one, other in (("front", left, right), ("rear", rear_left, rear_right)):
-        line = Text(f"  {axle:<6}", "dim").append_text(wheel(one, scale, BAR)).append(" ")
-        lines.append(line.append_text(wheel(other, scale, BAR)))
+        line = Text(f"  {axle:<6}", "dim").append_text(wheel(one, scale, BAR_WIDTH)).append(" ")
+        lines.append(line.append_text(wheel(other, scale, BAR_WIDTH)))
     return lines
 
 
@@ -91,7 +91,7 @@ def link(seen: ScreenData, state: RobotState, width: int) -> list[Text]:
     if state.certificate_expiry:
         lines += flow([certificate(state)], width, 2)
     counted = rates(seen, state, before)
-    told = [Text(f"{what} {counted(name)}") for what, name in LINES]
+    told = [Text(f"{what} {counted(name)}") for what, name in COUNTER_LINES]
     superseded = state.counters.get("lines_superseded", 0)
     told += [Text(f"superseded {count(superseded)}"), missed(state, before), overrun(state)]
     if met := state.counters.get("commands_of_new_senders", 0):
@@ -111,7 +111,7 @@ def link(seen: ScreenData, state: RobotState, width: int) -> list[Text]:
     return [*lines, *folded(f"last one {clean(state.refused) or '-'}", width, 2)]
 
 
-LINES = (("lines in", "lines"), ("lines out", "lines_sent"), ("commands", "commands"))
+COUNTER_LINES = (("lines in", "lines"), ("lines out", "lines_sent"), ("commands", "commands"))
 
 
 def timing(state: RobotState, width: int) -> list[Text]:

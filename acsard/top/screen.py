@@ -18,34 +18,34 @@ from acsard.core.messages.schema import RobotState
 from acsard.core.messages.state_warnings import WARNING, brief, warnings
 from acsard.top import narrow_screen
 from acsard.top import wide_screen as beside
-from acsard.top.text import MODES, ScreenData, clean, ends
-from acsard.top.wide_screen import WIDEST
+from acsard.top.text import MODE_STYLES, ScreenData, clean, ends
+from acsard.top.wide_screen import MAX_COLUMNS
 
-MOST_SOURCES = 32
+MAX_SOURCES = 32
 
 
 def screen(seen: ScreenData, width: int, height: int | None = None) -> Group:
     """Return the screen of `acsard top`.
 
     The screen has at most `height` lines, or any number if `height` is None. A line has at most
-    `width` character cells. A `width` below 20 counts as 20, and a `width` above `WIDEST` counts as
-    `WIDEST`.
+    `width` character cells. A `width` below 20 counts as 20, and a `width` above `MAX_COLUMNS`
+    counts as `MAX_COLUMNS`.
     """
-    width = max(20, min(WIDEST, width))
+    width = max(20, min(MAX_COLUMNS, width))
     head = [_header(seen, width), *(_no_news(seen, width) if seen.silent else _mode(seen, width))]
     if seen.state is not None:
         head += _warnings(seen.state, width)
     sections: list[list[Text]] = []
     if seen.state is not None:
         state = seen.state
-        parts = narrow_screen if width < narrow_screen.BELOW else beside
+        parts = narrow_screen if width < narrow_screen.MIN_WIDE_COLUMNS else beside
         sections = [
             parts.motion(state if state.link == "up" else _unmeasured(state), width),
             parts.link(seen, state, width),
             parts.timing(state, width),
         ]
         used = len(head) + sum(map(len, sections)) + 1
-        room = MOST_SOURCES if height is None else max(1, min(MOST_SOURCES, height - used))
+        room = MAX_SOURCES if height is None else max(1, min(MAX_SOURCES, height - used))
         sections.insert(1, parts.sources(state, room, width))
     used = len(head) + sum(map(len, sections))
     airy = height is None or height - used >= len(sections) - 1
@@ -86,10 +86,10 @@ def _mode(seen: ScreenData, width: int) -> list[Text]:
     state = seen.state
     if state is None:
         return [Text("waiting for the first state message of the daemon", "yellow")]
-    badge = Text(f" {clean(state.mode).upper()[:12]} ", MODES.get(state.mode, "reverse"))
+    badge = Text(f" {clean(state.mode).upper()[:12]} ", MODE_STYLES.get(state.mode, "reverse"))
     words = clean(state.reason.removeprefix(f"{state.mode}: "))
     first, second = _split(words, width - badge.cell_len - 2)
-    if width < narrow_screen.BELOW:
+    if width < narrow_screen.MIN_WIDE_COLUMNS:
         return [badge, *narrow_screen.folded(words, width, 2)]
     gap = " " * (badge.cell_len + 2)
     return [Text.assemble(badge, "  ", (first, "bold")), Text.assemble(gap, (second, "bold"))]
@@ -102,7 +102,7 @@ def _warnings(state: RobotState, width: int) -> list[Text]:
     """
     found = warnings(state)
     words = clean(f"{WARNING}: {found[0]}" if len(found) == 1 else brief(found))
-    wide = width >= narrow_screen.BELOW
+    wide = width >= narrow_screen.MIN_WIDE_COLUMNS
     lines = [Text(words)] if wide and words else narrow_screen.folded(words, width, 2)
     for line in lines:
         line.stylize("yellow")

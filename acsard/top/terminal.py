@@ -32,10 +32,10 @@ from acsard.top.fleet_table import Roster, table
 from acsard.top.keyboard import Ride
 from acsard.top.screen import screen
 
-PERIOD_S = 0.25
+DRAW_PERIOD_S = 0.25
 """Time between two updates of a screen, s."""
 
-KEYS_S = 0.05
+KEY_POLL_S = 0.05
 """Longest time for which `acsard drive` waits for a key before it does its other work, s."""
 
 NEWS_S, SAME_S, QUIET_S = 0.5, 1.0, 10.0
@@ -47,7 +47,7 @@ while the robot moves, and `QUIET_S` while the robot stands still.
 
 NO_END = 10**9
 
-LEAVES = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
+END_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
 
 
 def once(feed: Feed) -> str:
@@ -101,7 +101,7 @@ def part(ride: Ride) -> None:
         if rests or took > 2.0:
             print("\n".join(parting(seen, output_size().columns)), flush=True)
             return
-        time.sleep(KEYS_S)
+        time.sleep(KEY_POLL_S)
 
 
 def roster(fleet: Roster) -> None:
@@ -129,7 +129,7 @@ def _watch(draw: Callable[[], RenderableType], console: Console, suspend: list[b
     with keys() as read, _screen(console) as shown:
         while not suspend:
             shown.update(draw(), refresh=True)
-            typed = read(PERIOD_S)
+            typed = read(DRAW_PERIOD_S)
             if typed is None or "q" in typed.lower():
                 return False
     return True
@@ -169,12 +169,12 @@ def _steer(ride: Ride, console: Console, suspend: list[bool]) -> bool:
     with keys() as read, _screen(console) as shown:
         due = 0.0
         while not suspend:
-            typed = read(KEYS_S)
+            typed = read(KEY_POLL_S)
             if typed is None:
                 return False
             ride.step(typed)
             if typed or time.monotonic() >= due:
-                due = time.monotonic() + PERIOD_S
+                due = time.monotonic() + DRAW_PERIOD_S
                 shown.update(Group(*lines(ride.seen(), *console.size)), refresh=True)
     for letter in ("k", "", ""):
         ride.step(letter)  # stop the robot, because a suspended program sends no commands
@@ -189,20 +189,20 @@ def _be_lenient() -> None:
 
 @contextmanager
 def until_told() -> Iterator[None]:
-    """End the `with` block at the first signal in `LEAVES`, or when the terminal closes.
+    """End the `with` block at the first signal in `END_SIGNALS`, or when the terminal closes.
 
     Further signals are ignored, because two signals arrive when a terminal with a shell closes.
     """
 
     def deaf() -> None:
-        for number in LEAVES:
+        for number in END_SIGNALS:
             signal.signal(number, signal.SIG_IGN)
 
     def leave(*_: object) -> None:
         deaf()
         raise KeyboardInterrupt
 
-    for number in LEAVES:
+    for number in END_SIGNALS:
         signal.signal(number, leave)
     try:
         yield
@@ -248,7 +248,7 @@ def keys() -> Iterator[Callable[[float], str | None]]:
 def _drive_in_lines(ride: Ride) -> None:
     due, page = News(), Page()
     with until_told(), keys() as read:
-        while (typed := read(KEYS_S)) is not None:
+        while (typed := read(KEY_POLL_S)) is not None:
             ride.step(typed)
             seen = ride.seen()
             if due.tell(seen, time.monotonic()):

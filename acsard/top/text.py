@@ -16,7 +16,7 @@ from rich.text import Text
 from acsard.core.formatting import printable
 from acsard.core.messages.schema import Info, RobotState
 
-MODES = {
+MODE_STYLES = {
     "driving": "bold white on green",
     "ready": "bold white on blue",
     "waiting": "bold black on yellow",

@@ -13,22 +13,22 @@ from rich.text import Text
 from acsard.core.formatting import rough, signed
 from acsard.core.messages.schema import Info, RobotState, SourceState, Spread
 from acsard.core.messages.short_texts import power
-from acsard.core.motion.gyro import WORDS
+from acsard.core.motion.gyro import STATUS_TEXTS
 from acsard.core.values import NS_PER_S
 from acsard.daemon.latencies import NAMES
 from acsard.top.text import ScreenData, bar, clean, count, rate, row, rule
 
-WIDEST = 116
+MAX_COLUMNS = 116
 """Maximum width of the screen in character cells. Longer lines are harder to read."""
 
 SHORT_WORDS, LONG_WORDS = 21, 56
-"""Widths of the two explanations in `FIGURES`, character cells: short and long."""
+"""Widths of the two explanations in `LATENCY_ROWS`, character cells: short and long."""
 
 MOST_REASONS, MOST_PORT = 16, 34
 
-LINKS = {"up": "green", "booting": "yellow"}
+LINK_STYLES = {"up": "green", "booting": "yellow"}
 
-FIGURES = {
+LATENCY_ROWS = {
     "period_lateness": (
         "period due → step",
         "from the (first missed) due time to the step's start",
@@ -189,7 +189,7 @@ def link(seen: ScreenData, state: RobotState, width: int) -> list[Text]:
 
 def title(seen: ScreenData, state: RobotState) -> Text:
     """Return the heading of the lines about the serial link: the link's state and its port."""
-    told = Text.assemble("link ", (clean(state.link), f"bold {LINKS.get(state.link, 'red')}"))
+    told = Text.assemble("link ", (clean(state.link), f"bold {LINK_STYLES.get(state.link, 'red')}"))
     if seen.info is not None:
         sim = seen.info.simulated
         told.append(" on ", "dim").append("the built-in SIMULATOR" if sim else _port(seen.info))
@@ -245,7 +245,9 @@ def overrun(state: RobotState) -> Text:
 
 def _gyro(does: str) -> Text:
     good = does in ("used", "waiting for rest")
-    told = next((f"{name}: {words}" for name, words in WORDS.items() if name == does), clean(does))
+    told = next(
+        (f"{name}: {words}" for name, words in STATUS_TEXTS.items() if name == does), clean(does)
+    )
     return row("gyro", told, "" if good else "yellow")
 
 
@@ -296,14 +298,14 @@ def refused(state: RobotState, before: RobotState) -> list[tuple[str, list[Text]
 
 
 def timing(state: RobotState, width: int) -> list[Text]:
-    long = width >= WIDEST
+    long = width >= MAX_COLUMNS
     room = LONG_WORDS if long else SHORT_WORDS
     start = 16 + room
     at = ((0, "timing"), (start + 2, "last minute"), (start + 23, "since start"))
     heads = "".join(f"{name:>7}" for name in ("p50", "p99", "max"))
     lines = [rule(width, at), Text(f"{'':{start}}{heads}{heads}", "dim")]
     for name in NAMES:
-        line = Text(f"{name:<16}").append(FIGURES[name][long].ljust(room), "dim")
+        line = Text(f"{name:<16}").append(LATENCY_ROWS[name][long].ljust(room), "dim")
         one = state.latencies.get(name)
         for figures in (one.last_minute, one.since_start) if one else (None, None):
             line.append_text(spread(figures))

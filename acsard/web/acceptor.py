@@ -31,22 +31,22 @@ from acsard.host import clock
 from acsard.host.rate_limits import Buckets
 from acsard.web.answers import HEADERS, cut, problem
 from acsard.web.callers import Who, is_loopback, network_of, unmapped
-from acsard.web.limits import HANDSHAKES, SOCKETS_HERE, UNREAD_BYTES, Sockets, sockets_for
+from acsard.web.limits import HANDSHAKE_RATE, MAX_UNREAD_BYTES, SOCKETS_HERE, Sockets, sockets_for
 from acsard.web.metrics import Counts
 
 HANDSHAKE_S, HANDSHAKES_AT_ONCE = 3.0, 32
 """Time limit for one TLS handshake, s (`HANDSHAKE_S`), and maximum number of TLS handshakes that
 run at the same time (`HANDSHAKES_AT_ONCE`)."""
 
-HURRIED_S = 0.3
+MIN_ABORT_AGE_S = 0.3
 """Minimum age, s, of a running TLS handshake that may be aborted to make room for a waiting one.
 This happens only while `HANDSHAKES_AT_ONCE` handshakes run. Without this rule, clients that stop
 sending during their handshakes would delay the handshake of a phone by up to `HANDSHAKE_S`."""
 
-REQUEST_S = 10.0
+REQUEST_TIMEOUT_S = 10.0
 """Time limit, s, from accepting a connection to the end of the headers of its first request."""
 
-UNREAD_S = 5.0
+UNREAD_TIMEOUT_S = 5.0
 """Time, s, after which the kernel ends a connection whose client acknowledges no data or keeps its
 receive window closed."""
 
@@ -54,7 +54,7 @@ READ_BYTES = 16384
 """Size of the read buffer of each TLS connection, bytes. One TLS record fits into the buffer.
 asyncio's default is 256 KiB."""
 
-PAUSE_S = 0.05
+NO_FILES_PAUSE_S = 0.05
 """Time, s, for which the server accepts no connections after the process has run out of file
 descriptors."""
 
@@ -77,7 +77,7 @@ class Acceptor:
         self._waiting: dict[str, dict[_Connection, None]] = {}
         """Connections that wait for their TLS handshake, by network. When a network's handshake
         starts, the network moves to the end of this dict, so the networks take turns."""
-        self._handshakes = Buckets(HANDSHAKES)
+        self._handshakes = Buckets(HANDSHAKE_RATE)
         self._starting: dict[_Connection, float] = {}
         """Start time of each running TLS handshake, s on the event loop's clock; oldest first."""
         self._again: asyncio.TimerHandle | None = None
@@ -111,7 +111,8 @@ class Acceptor:
                 one.cut()
 
     def spoke(self, transport: asyncio.BaseTransport | None, body: StreamReader) -> None:
-        """End the time limit `REQUEST_S` of a connection, because a request's headers have arrived.
+        """End the time limit `REQUEST_TIMEOUT_S` of a connection, because a request's headers have
+        arrived.
 
         `transport` identifies the connection. `body` is the stream from which the body of this
         request is read.
@@ -163,11 +164,11 @@ class Acceptor:
     def _no_file(self, opened: socket.socket, secure: ssl.SSLContext | None, make: Factory) -> None:
         """Close an old connection, because the process has no free file descriptor.
 
-        The listening socket `opened` accepts connections again after `PAUSE_S`.
+        The listening socket `opened` accepts connections again after `NO_FILES_PAUSE_S`.
         """
         loop = asyncio.get_running_loop()
         loop.remove_reader(opened)
-        loop.call_later(PAUSE_S, self._resume, opened, secure, make)
+        loop.call_later(NO_FILES_PAUSE_S, self._resume, opened, secure, make)
         if (gone := self._away.displaced() or self._here.displaced()) is not None:
             self.crowded(gone)
 
@@ -237,8 +238,8 @@ class Acceptor:
         """Return whether a TLS handshake may start at the time `now`, s on the event loop's clock.
 
         If `HANDSHAKES_AT_ONCE` handshakes are running, abort one to make room: the oldest handshake
-        of the network with the most handshakes. If that handshake is younger than `HURRIED_S`,
-        abort nothing and return False.
+        of the network with the most handshakes. If that handshake is younger than
+        `MIN_ABORT_AGE_S`, abort nothing and return False.
         """
         if len(self._starting) < HANDSHAKES_AT_ONCE:
             return True
@@ -249,7 +250,7 @@ class Acceptor:
         oldest, begun = next(
             item for item in self._starting.items() if networks[item[0].network] == most
         )
-        if now < begun + HURRIED_S:
+        if now < begun + MIN_ABORT_AGE_S:
             return False
         del self._starting[oldest]
         self.slow(oldest)
@@ -292,9 +293,9 @@ class _Connection(asyncio.Protocol):
         if gone is not None:
             self._acceptor.crowded(gone)
         self._socket.setblocking(False)
-        option, unread_ms = socket.TCP_USER_TIMEOUT, round(1000 * UNREAD_S)
+        option, unread_ms = socket.TCP_USER_TIMEOUT, round(1000 * UNREAD_TIMEOUT_S)
         self._socket.setsockopt(socket.IPPROTO_TCP, option, unread_ms)
-        self._timer = self._loop.call_later(REQUEST_S, self._acceptor.slow, self)
+        self._timer = self._loop.call_later(REQUEST_TIMEOUT_S, self._acceptor.slow, self)
         self._loop.add_reader(self._socket, self._first_byte)
 
     def _first_byte(self) -> None:
@@ -356,8 +357,8 @@ class _Connection(asyncio.Protocol):
     def spoke(self, body: StreamReader) -> None:
         """Record that the head of a request (request line and headers) has arrived.
 
-        This ends the time limit `REQUEST_S`, and resets the size of the head to 0 bytes. `body` is
-        the stream from which the body of this request is read.
+        This ends the time limit `REQUEST_TIMEOUT_S`, and resets the size of the head to 0 bytes.
+        `body` is the stream from which the body of this request is read.
         """
         self._head, self._body = 0, body
         self._cancel_timer()
@@ -374,7 +375,7 @@ class _Connection(asyncio.Protocol):
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self._transport = transport
-        transport.set_write_buffer_limits(UNREAD_BYTES)  # type: ignore[attr-defined]
+        transport.set_write_buffer_limits(MAX_UNREAD_BYTES)  # type: ignore[attr-defined]
         if self._secure is not None:
             transport.set_read_buffer_limits(READ_BYTES)  # type: ignore[attr-defined]
         self._inner = self._make()

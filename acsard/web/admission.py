@@ -22,9 +22,9 @@ from acsard.host import clock
 from acsard.host.rate_limits import Buckets, Rate
 from acsard.host.threads import in_thread
 from acsard.web.acceptor import Acceptor
-from acsard.web.answers import READ_S, STATUS, TroubleError, problem, secured
+from acsard.web.answers import READ_TIMEOUT_S, STATUS_CODES, TroubleError, problem, secured
 from acsard.web.callers import (
-    HERE,
+    LOCAL_NAME,
     Asked,
     Reason,
     RefusedError,
@@ -37,32 +37,32 @@ from acsard.web.callers import (
     tokens_offered,
     unmapped,
 )
-from acsard.web.limits import GUESSES, GUESSES_OF_ONE, HOLD_S, REQUESTS, STRANGERS
+from acsard.web.limits import GUESSES, GUESSES_OF_ONE, REFUSAL_DELAY_S, REQUEST_RATE, STRANGER_RATE
 from acsard.web.metrics import Counts
 from acsard.web.routes import Route
-from acsard.web.socket_messages import MAX_BYTES
+from acsard.web.socket_messages import MAX_MESSAGE_BYTES
 from acsard.web.tokens import Token, Vault, owner_in
 
 HOST = re.compile(r"([A-Za-z0-9.-]{1,253}|\[[0-9A-Fa-f:.]{2,45}\])(:[0-9]{1,5})?")
 """Pattern of a valid `Host` header. The pattern is strict, because the server copies the host into
 the content security policy of an answer."""
 
-REASONS: dict[int, Reason] = {404: "path", 405: "path", 413: "too_big"}
+STATUS_REASONS: dict[int, Reason] = {404: "path", 405: "path", 413: "too_big"}
 """Reason under which an error that aiohttp raises is counted, by the HTTP status of the error. An
 error with any other status is counted as `malformed`."""
 
-WORDS = {
+STATUS_TEXTS = {
     404: "this address does not exist; GET /api lists all addresses",
-    413: f"the request has more than {MAX_BYTES} bytes: send less",
+    413: f"the request has more than {MAX_MESSAGE_BYTES} bytes: send less",
 }
 
-WHO: web.RequestKey[Who] = web.RequestKey("who", Who)
+IDENTITY_KEY: web.RequestKey[Who] = web.RequestKey("who", Who)
 """Key under which a request object contains the client's identity. The request contains no identity
 if its path is open to every client."""
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
-READ_EVERY_S = 0.005
+MIN_READ_INTERVAL_S = 0.005
 """Shortest interval between two reads of the token file, s. Each read starts a thread. Before this
 limit existed, a flood of requests started a thread per request, and delayed a stop by 200 ms."""
 
@@ -76,7 +76,7 @@ class Lookups:
     def __init__(self, vault: Vault) -> None:
         self._vault, self._lock = vault, asyncio.Lock()
         self._next: asyncio.Task[Sequence[Token]] | None = None
-        self._read_s = -READ_EVERY_S
+        self._read_s = -MIN_READ_INTERVAL_S
 
     async def read(self) -> Sequence[Token]:
         """Read the token file, and return the robot's tokens.
@@ -92,9 +92,9 @@ class Lookups:
     async def _later(self) -> Sequence[Token]:
         loop = asyncio.get_running_loop()
         async with self._lock:
-            await asyncio.sleep(self._read_s + READ_EVERY_S - loop.time())
+            await asyncio.sleep(self._read_s + MIN_READ_INTERVAL_S - loop.time())
             self._next, self._read_s = None, loop.time()
-            return await in_thread(self._vault.all, READ_S)
+            return await in_thread(self._vault.all, READ_TIMEOUT_S)
 
 
 class Admission:
@@ -113,10 +113,10 @@ class Admission:
 
         `names` are the robot's host names and addresses, in lower case.
         """
-        self._local, self._origins = Who(rules.local, HERE), frozenset(rules.origins)
+        self._local, self._origins = Who(rules.local, LOCAL_NAME), frozenset(rules.origins)
         self._robot, self._names, self._vault = robot, names, vault
         self._acceptor, self._counts = acceptor, counts
-        self._guesses, self._strangers = Buckets(GUESSES_OF_ONE, GUESSES), Buckets(STRANGERS)
+        self._guesses, self._strangers = Buckets(GUESSES_OF_ONE, GUESSES), Buckets(STRANGER_RATE)
         self._paces: dict[Rate, Buckets] = {}
         self._lookups = Lookups(vault)
         self._rows: dict[web.AbstractRoute, Route] = {}
@@ -126,7 +126,7 @@ class Admission:
 
         Each route's handler gets `page` as its first argument.
         """
-        app = web.Application(middlewares=[self._serve], client_max_size=MAX_BYTES)
+        app = web.Application(middlewares=[self._serve], client_max_size=MAX_MESSAGE_BYTES)
         app.on_response_prepare.append(secured)
         app.on_response_prepare.append(self._shared)
         for row in rows:
@@ -168,18 +168,18 @@ class Admission:
             waits = await self._admit(request, self._rows.get(request.match_info.route))
             # For a POST, delay only the answer, so that the server sends a stop immediately.
             if waits and request.method != "POST":
-                await asyncio.sleep(HOLD_S)
+                await asyncio.sleep(REFUSAL_DELAY_S)
             answer = await handler(request)
             if waits and request.method == "POST":
-                await asyncio.sleep(HOLD_S)
+                await asyncio.sleep(REFUSAL_DELAY_S)
             return answer
         except RefusedError as error:
             if error.reason == "too_fast":
-                await asyncio.sleep(HOLD_S)
-            elif WHO not in request:
+                await asyncio.sleep(REFUSAL_DELAY_S)
+            elif IDENTITY_KEY not in request:
                 await self._pace_stranger(request)
             self._counts.refuse(error.reason, _origin(request))
-            answer = problem(STATUS.get(error.reason, 403), str(error))
+            answer = problem(STATUS_CODES.get(error.reason, 403), str(error))
             if error.reason == "too_many":
                 # A client that retries in a loop must not keep its TCP connection either.
                 answer.force_close()
@@ -191,20 +191,20 @@ class Admission:
         except web.HTTPException as error:
             if error.status < 400:
                 raise
-            self._counts.refuse(REASONS.get(error.status, "malformed"), _origin(request))
+            self._counts.refuse(STATUS_REASONS.get(error.status, "malformed"), _origin(request))
             if (methods := error.headers.get("Allow")) is not None:
                 answer = problem(error.status, f"this path accepts only {methods}")
                 answer.headers["Allow"] = methods
                 return answer
-            return problem(error.status, WORDS.get(error.status, error.reason))
+            return problem(error.status, STATUS_TEXTS.get(error.status, error.reason))
 
     async def _pace_stranger(self, request: web.Request) -> None:
-        """Wait for `HOLD_S` if the client's network exceeds the limit `STRANGERS`.
+        """Wait for `REFUSAL_DELAY_S` if the client's network exceeds the limit `STRANGER_RATE`.
 
         Call this for each request without a valid token.
         """
         if not self._strangers.take(network_of(peer_of(request)), clock.mono_ns()):
-            await asyncio.sleep(HOLD_S)
+            await asyncio.sleep(REFUSAL_DELAY_S)
 
     async def _admit(self, request: web.Request, row: Route | None) -> bool:
         """Check a request; return True if it must be delayed because it exceeds a rate limit.
@@ -235,12 +235,13 @@ class Admission:
             # token.
             shown = tokens_sent(request) if listed else tokens_shown(request, self._robot)
             who = await self.owner(said.peer, shown)
-        request[WHO] = who
+        request[IDENTITY_KEY] = who
         self._acceptor.admitted(request.transport, who)
         fast = self._too_fast(who, row)
         if fast and not (row and row.waits):
             text = (
-                f"more than {REQUESTS.hz:g} requests a second with one token: use the WebSocket "
+                f"more than {REQUEST_RATE.hz:g} requests a second with one token: use the "
+                f"WebSocket "
                 "/ws, which sends each change"
             )
             raise RefusedError("too_fast", text)
@@ -251,7 +252,7 @@ class Admission:
     def _too_fast(self, who: Who, row: Route | None) -> bool:
         if not who.token:
             return False  # clients on the robot itself have no rate limit
-        rate = row.rate if row else REQUESTS
+        rate = row.rate if row else REQUEST_RATE
         name = f"{who.token} {network_of(who.address)}" if row and row.waits else who.token
         return not self._paces.setdefault(rate, Buckets(rate)).take(name, clock.mono_ns())
 
@@ -341,5 +342,5 @@ def _reached(request: web.Request) -> tuple[str, int]:
 
 
 def _origin(request: web.Request) -> str:
-    who = request.get(WHO)
+    who = request.get(IDENTITY_KEY)
     return peer_of(request) if who is None else who.origin

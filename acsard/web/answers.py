@@ -22,13 +22,13 @@ from acsard.core.values import AcsardError
 from acsard.web.callers import Reason
 from acsard.web.routes import JSON, Problem
 
-READ_S = 10.0
+READ_TIMEOUT_S = 10.0
 """Time limit for reading from a disk, s."""
 
-PIECE = 32768
+PIECE_BYTES = 32768
 """Size of the pieces in which a large body is written to the network, bytes."""
 
-STATUS: dict[Reason, int] = {
+STATUS_CODES: dict[Reason, int] = {
     "no_token": 401,
     "bad_token": 401,
     "too_fast": 429,
@@ -103,7 +103,9 @@ async def sent_in_pieces(
         return web.Response(body=body, headers=headers)
     answer = web.StreamResponse(headers=headers)
     answer.content_length = len(body)
-    pieces = (memoryview(body)[begin : begin + PIECE] for begin in range(0, len(body), PIECE))
+    pieces = (
+        memoryview(body)[begin : begin + PIECE_BYTES] for begin in range(0, len(body), PIECE_BYTES)
+    )
     return await _sent(request, answer, pieces, within)
 
 
@@ -123,10 +125,10 @@ async def sent_unpacked(
 
 def _unpacked(packed: bytes) -> Iterator[bytes]:
     unpack = zlib.decompressobj(zlib.MAX_WBITS | 16)
-    for begin in range(0, len(packed), PIECE):
-        left = packed[begin : begin + PIECE]
+    for begin in range(0, len(packed), PIECE_BYTES):
+        left = packed[begin : begin + PIECE_BYTES]
         while left:
-            yield unpack.decompress(left, PIECE)
+            yield unpack.decompress(left, PIECE_BYTES)
             left = unpack.unconsumed_tail
     yield unpack.flush()
 
@@ -187,9 +189,9 @@ def _policy(request: web.Request, more: str = "") -> str:
     return POLICY.format(connect=f" ws://{host} wss://{host}") + more
 
 
-PAGE = Path(__file__).parent / "page"
+PAGE_DIRECTORY = Path(__file__).parent / "page"
 
-TYPES = {
+CONTENT_TYPES = {
     ".html": "text/html; charset=utf-8",
     ".js": "text/javascript; charset=utf-8",
     ".css": "text/css; charset=utf-8",
@@ -232,17 +234,17 @@ class File(Struct, frozen=True):
 class Files:
     """Cache of the page's files. A file is read again when it has changed on the disk."""
 
-    def __init__(self, directory: Path = PAGE) -> None:
+    def __init__(self, directory: Path = PAGE_DIRECTORY) -> None:
         self._directory = directory
         self._files: dict[str, File] = {}
 
     def get(self, name: str) -> File | None:
         """Return the file `name`, or None if it does not exist, is unreadable or may not be sent.
 
-        A file may be sent if its suffix is in `TYPES`, its name does not begin with a dot and
-        contains no directory, and the file is not a symbolic link.
+        A file may be sent if its suffix is in `CONTENT_TYPES`, its name does not begin with a dot
+        and contains no directory, and the file is not a symbolic link.
         """
-        kind = TYPES.get(Path(name).suffix)
+        kind = CONTENT_TYPES.get(Path(name).suffix)
         if kind is None or "/" in name or name.startswith("."):
             return None
         paths = [self._directory / one for one in (name, *INLINED.get(name, ()))]

@@ -18,7 +18,7 @@ from aiohttp import web
 from msgspec import UNSET, Meta, Struct, UnsetType, inspect
 
 from acsard import __version__
-from acsard.core.config.live import WHEN, flat, live
+from acsard.core.config.live import WHEN_TEXTS, flat, live
 from acsard.core.config.settings import WebConfig
 from acsard.core.messages.encodings import DecodeError
 from acsard.core.messages.permissions import least_role
@@ -29,9 +29,9 @@ from acsard.host.errors import MendableError, NoAnswerError
 from acsard.host.threads import NoThreadError, in_thread
 from acsard.web import metrics, openapi
 from acsard.web.acceptor import Acceptor
-from acsard.web.admission import WHO, Admission, own_port, peer_of
+from acsard.web.admission import IDENTITY_KEY, Admission, own_port, peer_of
 from acsard.web.answers import (
-    READ_S,
+    READ_TIMEOUT_S,
     File,
     Files,
     TroubleError,
@@ -42,26 +42,26 @@ from acsard.web.answers import (
     takes_gzip,
 )
 from acsard.web.callers import PROTOCOL, RefusedError, cookie_name, tokens_offered
-from acsard.web.camera import SEND_S, Camera
+from acsard.web.camera import SEND_TIMEOUT_S, Camera
 from acsard.web.guide import Choices
 from acsard.web.limits import OPENINGS, PICTURES, STOPS, Seats
 from acsard.web.recordings import POLICY, BlackBox, Recording, Reports, ReportState, State
-from acsard.web.routes import FORM, JSON, RECORDINGS, Body, Problem, Route, services, values
-from acsard.web.socket_messages import MAX_BYTES, Begin
+from acsard.web.routes import FORM, JSON, RECORDINGS_ROLE, Body, Problem, Route, services, values
+from acsard.web.socket_messages import MAX_MESSAGE_BYTES, Begin
 from acsard.web.streams import as_json
 from acsard.web.tokens import Vault
-from acsard.web.viewer import HEARTBEAT_S, Parts, Viewer
+from acsard.web.viewer import PING_INTERVAL_S, Parts, Viewer
 
-BODY_S = 5.0
+BODY_TIMEOUT_S = 5.0
 """Time limit for receiving the body of a request, s. Most bodies have a few hundred bytes."""
 
-REPORT_S = 300.0
+REPORT_TIMEOUT_S = 300.0
 """Time limit for sending a report to a client that does not accept gzip, s."""
 
-DRAWN: dict[State, int] = {"drawing": 202, "busy": 202, "ready": 200, "failed": 503}
+DRAWING_STATUS: dict[State, int] = {"drawing": 202, "busy": 202, "ready": 200, "failed": 503}
 """HTTP status of the answer to a request for a recording's report, by the state of the report."""
 
-DEFAULT = WebConfig()
+DEFAULT_CONFIG = WebConfig()
 
 
 class TokenForm(Struct, frozen=True):
@@ -103,7 +103,7 @@ class Page:
         vault: Vault,
         names: AbstractSet[str],
         acceptor: Acceptor,
-        rules: WebConfig = DEFAULT,
+        rules: WebConfig = DEFAULT_CONFIG,
     ) -> None:
         """Create the web application.
 
@@ -141,7 +141,7 @@ class Page:
         """
         self._reports.tidy()
         try:
-            counting = await in_thread(self._vault.counting, READ_S)
+            counting = await in_thread(self._vault.counting, READ_TIMEOUT_S)
         except NoThreadError:
             return  # the disk was not read, so all tokens stay valid
         except TimeoutError:
@@ -171,7 +171,7 @@ class Page:
             if file is not None:
                 # Other requests get the old file until the disk has answered.
                 self._sent[name] = file, now
-            file = await in_thread(lambda: self._files.get(name), READ_S)
+            file = await in_thread(lambda: self._files.get(name), READ_TIMEOUT_S)
             if file is None:
                 self._sent.pop(name, None)
                 raise web.HTTPNotFound
@@ -197,7 +197,7 @@ class Page:
                 f"this browser is already signed in as {present.name} ({present.role}); the link "
                 f"would sign it in as {who.name} ({who.role}), with fewer permissions",
             )
-        left_s = await in_thread(lambda: self._vault.left_s(who.token), READ_S)
+        left_s = await in_thread(lambda: self._vault.left_s(who.token), READ_TIMEOUT_S)
         response = web.Response(status=303, headers={"Location": "/"})
         response.set_cookie(
             cookie, form.token, max_age=left_s, path="/", secure=True, httponly=True,
@@ -206,7 +206,7 @@ class Page:
         return response
 
     async def socket(self, request: web.Request) -> web.StreamResponse:
-        who, peer = request[WHO], peer_of(request)
+        who, peer = request[IDENTITY_KEY], peer_of(request)
         offered = request.headers.get("Sec-WebSocket-Protocol", "")
         if tokens_offered(offered) and PROTOCOL not in map(str.strip, offered.split(",")):
             # If aiohttp knew none of the offered names, it would log all of them, and so the token.
@@ -218,8 +218,8 @@ class Page:
             raise RefusedError("too_many", full)
         try:
             served = web.WebSocketResponse(
-                max_msg_size=MAX_BYTES,
-                heartbeat=HEARTBEAT_S,
+                max_msg_size=MAX_MESSAGE_BYTES,
+                heartbeat=PING_INTERVAL_S,
                 compress=False,
                 protocols=[PROTOCOL],
                 autoping=False,  # `Viewer` limits the rate of pings too
@@ -239,7 +239,7 @@ class Page:
     # The interface for programs.
 
     async def api(self, request: web.Request) -> web.StreamResponse:
-        return web.Response(body=DOCUMENT, content_type=JSON)
+        return web.Response(body=OPENAPI_DOCUMENT, content_type=JSON)
 
     async def metrics(self, request: web.Request) -> web.StreamResponse:
         robots, counts = self._robots, self._parts.counts
@@ -250,7 +250,7 @@ class Page:
         return web.Response(body=body.encode(), headers={"Content-Type": metrics.CONTENT_TYPE})
 
     async def whoami(self, request: web.Request) -> web.StreamResponse:
-        who = request[WHO]
+        who = request[IDENTITY_KEY]
         # A browser does not report to its page why a WebSocket was refused, so `full` reports it
         # here.
         full = self._seats.missing(peer_of(request), who.token)
@@ -283,7 +283,7 @@ class Page:
             )
             raise RefusedError("malformed", text)
         verb = request.path.removeprefix("/api/srv/")
-        told = await self._parts.calls.call(request[WHO], verb, given, robot)
+        told = await self._parts.calls.call(request[IDENTITY_KEY], verb, given, robot)
         return reply(told, 200 if told.success else 409)
 
     async def picture(self, request: web.Request) -> web.StreamResponse:
@@ -298,7 +298,7 @@ class Page:
         picture = await self._camera.after(number)
         if picture is None:
             return web.Response(status=304)
-        async with self._camera.sending(request[WHO].token):
+        async with self._camera.sending(request[IDENTITY_KEY].token):
             _limit_buffer(request)
             picture = self._camera.newest or picture  # a newer one may have arrived
             now_ns = clock.steady_ns()
@@ -308,7 +308,7 @@ class Page:
                 "Age-Ms": str((now_ns - picture.at_ns) // 1_000_000),
                 "Waited-Ms": str((now_ns - begun_ns) // 1_000_000),
             }
-            return await sent_in_pieces(request, picture.body, told, SEND_S)
+            return await sent_in_pieces(request, picture.body, told, SEND_TIMEOUT_S)
 
     async def recordings(self, request: web.Request) -> web.StreamResponse:
         return reply(await self._box.rows())
@@ -320,7 +320,7 @@ class Page:
 
     async def draw(self, request: web.Request) -> web.StreamResponse:
         told = self._reports.ask(*await self._box.found(request.match_info["name"]))
-        return reply(told, DRAWN[told.report])
+        return reply(told, DRAWING_STATUS[told.report])
 
     async def report(self, request: web.Request) -> web.StreamResponse:
         """Return the finished report of a recording as an HTML page in a sandboxed origin."""
@@ -336,7 +336,7 @@ class Page:
         }
         if takes_gzip(request):
             return web.Response(body=body, headers=headers | {"Content-Encoding": "gzip"})
-        return await sent_unpacked(request, body, headers, REPORT_S)
+        return await sent_unpacked(request, body, headers, REPORT_TIMEOUT_S)
 
     async def _value(self, key: str) -> bytes:
         try:
@@ -352,7 +352,7 @@ class Page:
 def settings_in(config: Mapping[str, Any]) -> list[Setting]:
     """Return the settings that may change while the daemon runs. `config` is its configuration."""
     return [
-        Setting(key, value, told.what, WHEN[told.when], **_allowed(key))
+        Setting(key, value, told.what, WHEN_TEXTS[told.when], **_allowed(key))
         for key, value in flat(config)
         if (told := live(key)) is not None
     ]
@@ -369,12 +369,15 @@ def _allowed(key: str) -> dict[str, Any]:
 
 
 async def _body_of(request: web.Request) -> bytes:
-    """Return the whole body; raise `HTTPRequestTimeout` if it does not arrive within `BODY_S`."""
+    """Return the whole body; raise `HTTPRequestTimeout` if it does not arrive within
+    `BODY_TIMEOUT_S`."""
     try:
-        async with asyncio.timeout(BODY_S):
+        async with asyncio.timeout(BODY_TIMEOUT_S):
             return await request.read()
     except TimeoutError:
-        raise web.HTTPRequestTimeout(reason=f"no body arrived within {BODY_S:g} s") from None
+        raise web.HTTPRequestTimeout(
+            reason=f"no body arrived within {BODY_TIMEOUT_S:g} s"
+        ) from None
 
 
 async def _token_posted(request: web.Request) -> TokenForm:
@@ -433,16 +436,16 @@ ROUTES: tuple[Route, ...] = (
     Route("GET", "/api/recordings", "viewer", Page.recordings,
         "the recordings of the black box, oldest first",
         gives={200: Body("A list.", list[Recording])}),
-    Route("GET", "/api/recordings/{name}", RECORDINGS, Page.recording,
+    Route("GET", "/api/recordings/{name}", RECORDINGS_ROLE, Page.recording,
         "one recording as a file",
         gives={200: Body("MCAP.", media="application/octet-stream")}),
-    Route("POST", "/api/recordings/{name}/report", RECORDINGS, Page.draw,
+    Route("POST", "/api/recordings/{name}/report", RECORDINGS_ROLE, Page.draw,
         "starts to draw the report of a recording, or returns the progress; repeat the request "
         "until its status is 200",
         gives={200: Body("The report is ready; get it at `href`.", ReportState),
                202: Body("This report or another one is being drawn.", ReportState),
                503: Body("The report cannot be drawn; the reason is in the answer.", ReportState)}),
-    Route("GET", "/report/{name}", RECORDINGS, Page.report,
+    Route("GET", "/report/{name}", RECORDINGS_ROLE, Page.report,
         "the report of a recording, once it is drawn",
         gives={200: Body("A page.", str, "text/html")}),
     *values(Page.value),
@@ -452,5 +455,5 @@ ROUTES: tuple[Route, ...] = (
         gives={200: Body("Text.", str, "text/plain")}),
 )  # fmt: skip
 
-DOCUMENT = msgspec.json.encode(openapi.document(__version__, ROUTES))
+OPENAPI_DOCUMENT = msgspec.json.encode(openapi.document(__version__, ROUTES))
 """The body of the answer to `GET /api`: the OpenAPI document as JSON."""

@@ -18,7 +18,7 @@ from typing import Literal
 
 from msgspec import Struct
 
-from acsard.core.messages.permissions import MAY, has
+from acsard.core.messages.permissions import USE_TEXTS, has
 from acsard.core.values import AcsardError, Role
 
 Reason = Literal[
@@ -30,10 +30,10 @@ reason."""
 
 Place = Literal["here", "away"]
 
-HERE = "here"
+LOCAL_NAME = "here"
 """Name of each client on the robot itself. Any other client has the name of its token."""
 
-COOKIE = "__Host-acsard"
+COOKIE_PREFIX = "__Host-acsard"
 """Prefix of the cookie names. Browsers accept a cookie with the prefix `__Host-` only if it has the
 attributes `Secure` and `Path=/` and no attribute `Domain`."""
 
@@ -41,7 +41,7 @@ PROTOCOL, TOKEN = "acsard", "acsard.token."
 """Name of the WebSocket subprotocol (`PROTOCOL`), and prefix of a further subprotocol name that
 contains a client's token (`TOKEN`)."""
 
-MOST_TOKENS = 8
+MAX_TOKENS = 8
 """Maximum number of tokens that the server checks in one request. It ignores further tokens."""
 
 
@@ -76,7 +76,7 @@ class Who(Struct, frozen=True):
         `what` is the name of the action that requires the role `least`, for the error message.
         """
         if not self.may(least):
-            raise RefusedError("role", f"{what} is {self.barred(least)}: {MAY[self.role]}")
+            raise RefusedError("role", f"{what} is {self.barred(least)}: {USE_TEXTS[self.role]}")
 
     def barred(self, least: Role) -> str:
         """Return the reason why the client may not use an action that requires the role `least`.
@@ -170,7 +170,7 @@ def tokens_offered(protocols: str) -> list[str]:
     A script in a browser can set no other header when it opens a WebSocket.
     """
     offered = (one.strip() for one in protocols.split(","))
-    return [one.removeprefix(TOKEN) for one in offered if one.startswith(TOKEN)][:MOST_TOKENS]
+    return [one.removeprefix(TOKEN) for one in offered if one.startswith(TOKEN)][:MAX_TOKENS]
 
 
 def cookie_name(robot: str, port: int) -> str:
@@ -178,17 +178,17 @@ def cookie_name(robot: str, port: int) -> str:
 
     A browser sends the cookies of a host to all ports of the host. So each port needs another name.
     """
-    return f"{COOKIE}-{robot}-{port}"
+    return f"{COOKIE_PREFIX}-{robot}-{port}"
 
 
 def tokens_in(cookies: Mapping[str, str], robot: str, port: int) -> list[str]:
-    """Return the tokens in the cookies of the robot `robot`, at most `MOST_TOKENS`.
+    """Return the tokens in the cookies of the robot `robot`, at most `MAX_TOKENS`.
 
     The token for the page at the TCP port `port` comes first. The others are for other ports.
     """
-    own, ours = cookie_name(robot, port), f"{COOKIE}-{robot}"
+    own, ours = cookie_name(robot, port), f"{COOKIE_PREFIX}-{robot}"
     names = [name for name in cookies if name.rpartition("-")[0] == ours]
-    return [cookies[name] for name in sorted(names, key=lambda name: name != own)][:MOST_TOKENS]
+    return [cookies[name] for name in sorted(names, key=lambda name: name != own)][:MAX_TOKENS]
 
 
 def host_name(host: str) -> str:

@@ -24,21 +24,21 @@ from acsard.host.errors import MendableError, UsageError
 from acsard.host.rate_limits import Buckets, Places
 from acsard.host.threads import in_thread
 from acsard.web.callers import RefusedError, Who
-from acsard.web.limits import STOPS_ELSEWHERE
+from acsard.web.limits import REMOTE_STOP_RATE
 from acsard.web.robots import Robots
 
 AT_ONCE, STOPS_AT_ONCE = 16, 32
 """Maximum number of service calls and queries at the same time (`AT_ONCE`). Stops are not counted
 in it. `STOPS_AT_ONCE` is the maximum number of simultaneous stops of the page's own robot."""
 
-ELSEWHERE_AT_ONCE = 8
+MAX_REMOTE_STOPS = 8
 """Maximum number of other robots' replies to a stop for which the server waits at the same time.
 Beyond this number, the server sends a stop without waiting for the reply."""
 
-MERGE_S = 0.02
+MIN_STOP_INTERVAL_S = 0.02
 """Shortest interval between two stops that the server sends to one robot for one client, s."""
 
-ANSWER_S = 8.0
+ANSWER_TIMEOUT_S = 8.0
 """Time limit for an answer over the bus, s. `Client` has a shorter limit, and raises an error with
 a clear message."""
 
@@ -75,11 +75,11 @@ class Calls:
         """
         self._robots, self._ends, self._sees = robots, ends, sees
         self._stops, self._merged = Stops(), Merged()
-        self._unknown = Buckets(STOPS_ELSEWHERE)
+        self._unknown = Buckets(REMOTE_STOP_RATE)
         self._answered: set[str] = set()
         """Ids of other robots that have answered a stop, and therefore exist."""
         self._asks = Places(AT_ONCE, AT_ONCE)
-        self._elsewhere = Places(ELSEWHERE_AT_ONCE, ELSEWHERE_AT_ONCE)
+        self._elsewhere = Places(MAX_REMOTE_STOPS, MAX_REMOTE_STOPS)
 
     async def call(
         self, who: Who, verb: str, payload: Mapping[str, Any], robot: str = ""
@@ -145,7 +145,7 @@ class Calls:
 
         `robot` is the robot's id, and `name` is the key without this id. Raises `MendableError` if
         there is no connection to the bus, if no answer arrives, or if `AT_ONCE` calls and queries
-        are running already. Raises `TimeoutError` if the bus is stuck for `ANSWER_S`.
+        are running already. Raises `TimeoutError` if the bus is stuck for `ANSWER_TIMEOUT_S`.
         """
         client = self._robots.client
         if client is None:
@@ -157,13 +157,13 @@ class Calls:
     ) -> ServiceReply:
         """Stop another robot by calling `request`, and return the robot's reply.
 
-        If `ELSEWHERE_AT_ONCE` calls are waiting for a reply already, only send the stop, and return
+        If `MAX_REMOTE_STOPS` calls are waiting for a reply already, only send the stop, and return
         a failure that says so.
         """
         # A robot that does not exist never replies, so the number of waiting calls is limited.
         with self._elsewhere.held() as free:
             if free:
-                reply = await in_thread(request, ANSWER_S)
+                reply = await in_thread(request, ANSWER_TIMEOUT_S)
                 if len(self._answered) < 200:
                     self._answered.add(robot)
                 return reply
@@ -171,7 +171,7 @@ class Calls:
             lambda: robot_discovery.stop(
                 client.session, [robot], _named(client, robot, who).caller
             ),
-            ANSWER_S,
+            ANSWER_TIMEOUT_S,
         )
         return ServiceReply(
             False,
@@ -181,12 +181,12 @@ class Calls:
         )
 
     def _require_few(self, who: Who) -> None:
-        """Raise `RefusedError` if a client exceeds the limit `STOPS_ELSEWHERE`.
+        """Raise `RefusedError` if a client exceeds the limit `REMOTE_STOP_RATE`.
 
         Call this for each stop of a robot that may not exist.
         """
         if not self._unknown.take(who.token or who.name, clock.mono_ns()):
-            rate = STOPS_ELSEWHERE
+            rate = REMOTE_STOP_RATE
             raise RefusedError(
                 "too_fast",
                 "the stop was not sent: you have sent too many stops to robots that have not "
@@ -198,20 +198,20 @@ class Calls:
         with self._asks.held() as free:
             if not free:
                 raise MendableError(BUSY)
-            return await in_thread(call, ANSWER_S)
+            return await in_thread(call, ANSWER_TIMEOUT_S)
 
 
 class Merged:
-    """Sends at most one stop per `MERGE_S` for each client and robot.
+    """Sends at most one stop per `MIN_STOP_INTERVAL_S` for each client and robot.
 
-    No stop is lost: all stops that a client requests within `MERGE_S` after a sent stop share the
-    next stop.
+    No stop is lost: all stops that a client requests within `MIN_STOP_INTERVAL_S` after a sent stop
+    share the next stop.
     """
 
     def __init__(self) -> None:
         self._rests: dict[Hashable, asyncio.Event] = {}
-        """Maps (client, robot) to an event. The event is set `MERGE_S` after the last sent stop,
-        and its entry is then removed."""
+        """Maps (client, robot) to an event. The event is set `MIN_STOP_INTERVAL_S` after the last
+        sent stop, and its entry is then removed."""
         self._next: dict[Hashable, asyncio.Task[ServiceReply]] = {}
         """Maps (client, robot) to the task that waits for the event in `_rests` and then sends a
         stop."""
@@ -234,7 +234,9 @@ class Merged:
 
     def _rest(self, name: Hashable) -> None:
         self._rests[name] = asyncio.Event()
-        asyncio.get_running_loop().call_later(MERGE_S, lambda: self._rests.pop(name).set())
+        asyncio.get_running_loop().call_later(
+            MIN_STOP_INTERVAL_S, lambda: self._rests.pop(name).set()
+        )
 
     async def _later(self, name: Hashable, rest: asyncio.Event, stop: Stop) -> ServiceReply:
         # If the event loop is late, `rest` may be set and gone from `_rests` before this starts.
@@ -262,7 +264,7 @@ class Stops:
         """
         if not self._room.locked():
             async with self._room:
-                return await in_thread(call, ANSWER_S)
+                return await in_thread(call, ANSWER_TIMEOUT_S)
         if self._next is None:
             self._next = asyncio.create_task(self._later(call))
             self._next.add_done_callback(lambda done: done.cancelled() or done.exception())
@@ -271,7 +273,7 @@ class Stops:
     async def _later(self, call: Callable[[], ServiceReply]) -> ServiceReply:
         async with self._room:
             self._next = None  # later callers share the next request
-            return await in_thread(call, ANSWER_S)
+            return await in_thread(call, ANSWER_TIMEOUT_S)
 
 
 def require(who: Who, verb: str) -> None:

@@ -23,7 +23,7 @@ from acsard.host import clock
 from acsard.host.rate_limits import Places
 from acsard.web.answers import TroubleError
 
-WAIT_S = 1.0
+PICTURE_TIMEOUT_S = 1.0
 """Time limit, s, of two waits: for a new picture from the camera, and for the permission to send
 the picture (see `SENDS`)."""
 
@@ -39,7 +39,7 @@ SENDS, SENDS_OF_TOKEN = 8, 2
 """Maximum number of pictures that the server sends at the same time: in total (`SENDS`), and to the
 clients with one token (`SENDS_OF_TOKEN`)."""
 
-SEND_S = 5.0
+SEND_TIMEOUT_S = 5.0
 """Time limit for sending a picture, s. The page in the browser waits no longer than this."""
 
 _LENGTH = re.compile(rb"(?im)^content-length:[ \t]*(\d{1,8})[ \t]*\r?$")
@@ -116,8 +116,8 @@ class Camera:
         """Wait for a picture that the client does not have, and return the picture.
 
         `number` is the number of the client's last picture, or 0. Return None if the camera sends
-        no other picture within `WAIT_S`. Raises `TroubleError` if no camera is configured, if its
-        stream cannot be read, or if it has not sent any picture yet.
+        no other picture within `PICTURE_TIMEOUT_S`. Raises `TroubleError` if no camera is
+        configured, if its stream cannot be read, or if it has not sent any picture yet.
         """
         if not self._url:
             raise TroubleError(
@@ -128,7 +128,7 @@ class Camera:
         if self._reading is None or self._reading.done():
             self._reading = asyncio.create_task(self._read_again_and_again())
         with suppress(TimeoutError):
-            async with asyncio.timeout(WAIT_S):
+            async with asyncio.timeout(PICTURE_TIMEOUT_S):
                 while self.newest is None or self.newest.number == number:
                     await self._changed.wait()
         newest = self.newest
@@ -141,10 +141,11 @@ class Camera:
         """Count the `with` block as the sending of one picture, for the limits on sent pictures.
 
         If a limit is reached (`SENDS`, `SENDS_OF_TOKEN`), first wait until another picture has been
-        sent. `token` is the client's token. Raises `TroubleError` after a wait of `WAIT_S`.
+        sent. `token` is the client's token. Raises `TroubleError` after a wait of
+        `PICTURE_TIMEOUT_S`.
         """
         try:
-            async with asyncio.timeout(WAIT_S):
+            async with asyncio.timeout(PICTURE_TIMEOUT_S):
                 while not self._sends.enter(token):
                     await self._sent.wait()
         except TimeoutError:

@@ -10,22 +10,22 @@ from typing import Any
 
 from acsard.client import Client, fleet
 from acsard.core.messages.state_warnings import charge, warnings
-from acsard.daemon.bus.robot_discovery import ALL
+from acsard.daemon.bus.robot_discovery import ALL_ROBOTS
 from acsard.host.threads import in_thread
 from acsard.web.robots import Robots
 from acsard.web.socket_messages import Row
-from acsard.web.streams import DECLARE_S, STATE, UNREADY
+from acsard.web.streams import DECLARE_TIMEOUT_S, NOT_READY_ERRORS, STATE_KEY
 
-MOST = 200
+MAX_ROBOTS = 200
 
-UNROUTED = (
+NO_ROUTER_NOTE = (
     "this page sees only robots that are connected directly to the daemon of {robot}, because "
     "daemons forward no messages. To see all robots that are connected to a router, connect this "
     "page's server to that router: acsard web --connect ROUTER --id {robot}"
 )
 """Note to the page's users if the page's server is connected to a daemon instead of a router."""
 
-BY_NAME = (
+OWN_ROBOT_NOTE = (
     "{endpoint} allows only exact keys, as every TLS endpoint does, so this page sees no other "
     "robot. To see all robots of a router, run this page's server on the router's machine: "
     "acsard web --connect tcp/127.0.0.1:7447 --id {robot}"
@@ -69,7 +69,7 @@ class Fleet:
         That is the case if the robot's liveliness token is present, or if a viewer is subscribed to
         the robot's key `state` and a state has arrived.
         """
-        states = self._robots.streams.followed(robot, STATE)
+        states = self._robots.streams.followed(robot, STATE_KEY)
         here = self._tracked is not None and self._tracked.here(robot)
         return here or bool(states and states.number)
 
@@ -86,15 +86,21 @@ class Fleet:
         def declare() -> fleet.Fleet:
             robots = self._robots
             by_name = robots.endpoint.startswith("tls/")
-            why = BY_NAME if by_name else "" if client.session.info.routers_zid() else UNROUTED
+            why = (
+                OWN_ROBOT_NOTE
+                if by_name
+                else ""
+                if client.session.info.routers_zid()
+                else NO_ROUTER_NOTE
+            )
             self.note = why.format(robot=robots.id, endpoint=robots.endpoint)
             # A robot that has been silent for 30 s is dropped, unless its liveliness token is
             # present.
-            return fleet.Fleet(client, [robots.id if by_name else ALL], MOST, 30.0)
+            return fleet.Fleet(client, [robots.id if by_name else ALL_ROBOTS], MAX_ROBOTS, 30.0)
 
         try:
-            self._tracked = await in_thread(declare, DECLARE_S, lambda late: late.end())
-        except UNREADY:
+            self._tracked = await in_thread(declare, DECLARE_TIMEOUT_S, lambda late: late.end())
+        except NOT_READY_ERRORS:
             return  # the next call of `_look` retries
         self._tidy()
 
@@ -110,8 +116,8 @@ class Fleet:
 
 
 async def _within_time(call: Callable[[], None]) -> None:
-    with suppress(*UNREADY):  # the bus is stuck or closed
-        await in_thread(call, DECLARE_S)
+    with suppress(*NOT_READY_ERRORS):  # the bus is stuck or closed
+        await in_thread(call, DECLARE_TIMEOUT_S)
 
 
 def _row(one: fleet.Row) -> Row:

@@ -23,14 +23,14 @@ from acsard.calibration.guided.drive_plan import NEEDS, SIMULATED
 from acsard.core.config.settings import SIMULATOR
 from acsard.host import clock
 from acsard.host.child import acsard, running
-from acsard.host.errors import WORDS, Exit
+from acsard.host.errors import EXIT_TEXTS, Exit
 from acsard.host.rate_limits import Bucket, Rate
 from acsard.host.threads import in_thread
 from acsard.machine.serial_ports import serial_devices
 from acsard.web.calls import Ending
 from acsard.web.socket_messages import Begin, Ended, FrameError, Guided, Press, Reply, Running
 
-PATIENCE_S = 6.0
+END_TIMEOUT_S = 6.0
 """Time, s, after which an interrupted child process is killed if it has not exited. Until then it
 can send zero speeds."""
 
@@ -40,7 +40,7 @@ NO_DEVICE = (
     "check` in a terminal on the robot."
 )
 
-ABSENT = "configured, not there now"
+ABSENT_PORT = "configured, not there now"
 
 POSITIONS = "positions"
 
@@ -115,7 +115,7 @@ class Guide:
         """
         found = await self._boards()
         way, advice = SIMULATED if simulated else ("", "")
-        sees_one = any(board.port != SIMULATOR and board.what != ABSENT for board in found)
+        sees_one = any(board.port != SIMULATOR and board.what != ABSENT_PORT for board in found)
         return Choices(NEEDS, way, advice, found, "" if sees_one else NO_DEVICE)
 
     def join(self, viewer: object, say: Say) -> None:
@@ -224,7 +224,7 @@ class Guide:
             )
         finally:
             self._errand = None
-        meaning = WORDS.get(code, "ended") if not errand.left else "stopped"
+        meaning = EXIT_TEXTS.get(code, "ended") if not errand.left else "stopped"
         errand.say(Guided(Ended(code, meaning, text)))
         self._tell_all()
 
@@ -255,7 +255,7 @@ def boards(configured: str) -> list[Board]:
         told += [f"in use by {holder.name} (process {holder.pid})" for holder in device.holders]
         found[configured if own else name] = ", ".join(filter(None, told))
     if configured != SIMULATOR and configured not in found:
-        found = {configured: "configured" if os.path.exists(configured) else ABSENT, **found}
+        found = {configured: "configured" if os.path.exists(configured) else ABSENT_PORT, **found}
     found[SIMULATOR] = "the simulator: no real robot moves"
     # The wheels turn during a check, so the configured port comes first: an operator who does not
     # read the list must check the board of this robot.
@@ -362,7 +362,8 @@ class _Errand:
             self._write({})
 
     def leave(self) -> None:
-        """Interrupt the child as Ctrl-C does. Kill the child if it does not exit in `PATIENCE_S`.
+        """Interrupt the child as Ctrl-C does. Kill the child if it does not exit in
+        `END_TIMEOUT_S`.
 
         Further calls do nothing.
         """
@@ -381,7 +382,7 @@ class _Errand:
         assert self._process is not None
         if self._process.returncode is None:
             self._process.send_signal(signal.SIGINT)
-        asyncio.get_running_loop().call_later(PATIENCE_S, self.kill)
+        asyncio.get_running_loop().call_later(END_TIMEOUT_S, self.kill)
 
     def _write(self, message: object) -> None:
         # No flow control is needed, because the messages are few and small.

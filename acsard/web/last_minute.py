@@ -15,24 +15,24 @@ from msgspec import Struct
 from acsard.core.messages.schema import RobotState, Twist
 from acsard.core.values import NS_PER_S, WHEELS
 
-LASTS_NS = 60 * NS_PER_S
+MINUTE_NS = 60 * NS_PER_S
 
 STEP_NS = NS_PER_S // 5
 """Nominal time between two rows of plotted values, ns. In a plot on a phone, this time is about one
 pixel wide."""
 
-EARLY_NS = STEP_NS // 4
+MAX_EARLY_NS = STEP_NS // 4
 """Longest time, ns, by which a state may arrive before the next row is due and still become this
 row."""
 
-ROWS = LASTS_NS // (STEP_NS - EARLY_NS)
+MAX_ROWS = MINUTE_NS // (STEP_NS - MAX_EARLY_NS)
 """Maximum number of rows in a minute."""
 
-MEASURED = 2 + len(WHEELS)
+MEASURED_COUNT = 2 + len(WHEELS)
 
-WIDTH = MEASURED + 5
-"""Number of values in a row: measured speeds (`MEASURED`), commanded twist (2), lateness (2) and
-voltage (1)."""
+ROW_LENGTH = MEASURED_COUNT + 5
+"""Number of values in a row: measured speeds (`MEASURED_COUNT`), commanded twist (2), lateness (2)
+and voltage (1)."""
 
 MS = 1e-3
 
@@ -73,10 +73,10 @@ class Minute:
     """The plotted values of the last minute. All times are in ns on the same monotonic clock."""
 
     def __init__(self) -> None:
-        self._rows: deque[tuple[int, list[float | None]]] = deque(maxlen=ROWS)
+        self._rows: deque[tuple[int, list[float | None]]] = deque(maxlen=MAX_ROWS)
 
     def due(self, at_ns: int) -> bool:
-        return not self._rows or at_ns - self._rows[-1][0] >= STEP_NS - EARLY_NS
+        return not self._rows or at_ns - self._rows[-1][0] >= STEP_NS - MAX_EARLY_NS
 
     def add(self, at_ns: int, state: RobotState, wished: Twist | None) -> None:
         """Append a row with the values of `state`, which arrived at the time `at_ns`.
@@ -84,8 +84,8 @@ class Minute:
         `wished` is the commanded twist after the limits, or None if it is unknown.
         """
         measured: list[float | None] = [state.linear, state.angular, *state.wheels[: len(WHEELS)]]
-        if len(measured) != MEASURED:
-            measured = [None] * MEASURED
+        if len(measured) != MEASURED_COUNT:
+            measured = [None] * MEASURED_COUNT
         twist = [wished.linear.x, wished.angular.z] if wished else [None, None]
         figure = state.latencies.get("period_lateness")
         late = figure.last_minute if figure else None
@@ -96,8 +96,8 @@ class Minute:
 
     def plotted(self, now_ns: int) -> Plotted:
         """Return the values of the last minute before `now_ns`, as columns."""
-        rows = [row for row in self._rows if now_ns - row[0] <= LASTS_NS]
-        columns = [[values[n] for _, values in rows] for n in range(WIDTH)]
+        rows = [row for row in self._rows if now_ns - row[0] <= MINUTE_NS]
+        columns = [[values[n] for _, values in rows] for n in range(ROW_LENGTH)]
         linear, angular, *wheels, wished_linear, wished_angular, late_p99, late_max, volts = columns
         age = [(now_ns - at_ns) // 1_000_000 for at_ns, _ in rows]
         return Plotted(

@@ -21,32 +21,32 @@ SOCKETS_OF_ONE, SOCKETS_OF_TOKEN = 64, 64
 (`SOCKETS_OF_ONE`), and maximum number that have shown the same valid token (`SOCKETS_OF_TOKEN`).
 Any further connection with this token counts as a connection without a valid token."""
 
-SOCKETS_OF_BROWSER = 7
+RESERVED_CONNECTIONS = 7
 """Number of TCP connections that each token keeps even if the limit on all connections is reached.
 One browser needs this number."""
 
-SOCKETS_LEAST = 16
+MIN_CONNECTIONS = 16
 """Number of TCP connections from other machines that the server always allows, even if the process
 may open only few files."""
 
-OWN_FILES = 128
+RESERVED_FILES = 128
 """Number of open files that are reserved for uses other than TCP connections. 20 such files are
 always open. More are open while a report is drawn or a calibration runs."""
 
-UNREAD_BYTES = 32768
+MAX_UNREAD_BYTES = 32768
 """Number of bytes that the server buffers for a client that does not read them. Above this number,
 the client's next request waits, and the client's WebSocket gets no new values. asyncio's default
 for TLS is 512 KiB."""
 
-OVERRUNS = 600
-"""Number of messages beyond the rate limit `MESSAGES` after which a WebSocket is closed."""
+MAX_OVERRUNS = 600
+"""Number of messages beyond the rate limit `MESSAGE_RATE` after which a WebSocket is closed."""
 
 CONNECTIONS, CONNECTIONS_OF_ONE, CONNECTIONS_OF_TOKEN, CONNECTIONS_ALIKE = 100, 20, 30, 6
 """Maximum numbers of WebSockets from other machines: in total, per network, per token, and per
 token in one network. Because of the last limit, one program cannot lock out other tokens in its
 network."""
 
-CONNECTIONS_HERE = 20
+MAX_LOCAL_SOCKETS = 20
 """Maximum number of WebSockets from the robot itself. WebSockets from other machines do not count
 here."""
 
@@ -55,7 +55,7 @@ STREAMS, STREAMS_OF_ONE = 200, 50
 (`STREAMS_OF_ONE`). The keys of the page's own robot are few and do not count."""
 
 
-REQUESTS = Rate(50.0, 200.0)
+REQUEST_RATE = Rate(50.0, 200.0)
 """Limit on HTTP requests per token, as a rate per second and a largest burst. The page's static
 files are exempt."""
 
@@ -64,30 +64,30 @@ STOPS, PICTURES, OPENINGS = Rate(50.0, 100.0), Rate(100.0, 200.0), Rate(4.0, 20.
 second and largest bursts. Requests beyond a limit wait. A page asks for at most 20 pictures a
 second."""
 
-STRANGERS = Rate(30.0, 150.0)
+STRANGER_RATE = Rate(30.0, 150.0)
 """Limit on requests without a valid token from one network, as a rate per second and a largest
 burst. Requests beyond the limit wait. A phone loads the page with 16 requests, so eight phones
 behind one address can load the page at the same time."""
 
-HANDSHAKES = Rate(30.0, 100.0)
+HANDSHAKE_RATE = Rate(30.0, 100.0)
 """Limit on TLS handshakes per network, as a rate per second and a largest burst. Handshakes beyond
 the limit wait. A browser needs six to load the page."""
 
-HOLD_S = 0.5
+REFUSAL_DELAY_S = 0.5
 """Delay of a request beyond a rate limit, s. Refusing the request immediately would not help,
 because a refusal costs the server as much as an answer."""
 
-MESSAGES = Rate(200.0, 400.0)
+MESSAGE_RATE = Rate(200.0, 400.0)
 """Limit on messages per WebSocket, as a rate per second and a largest burst. A client sends a burst
 when its network returns."""
 
-COMMANDS = Rate(60.0, 120.0)
+COMMAND_RATE = Rate(60.0, 120.0)
 """Limit on commands per token, or per WebSocket from the robot itself, as a rate per second and a
 largest burst. The page's stick sends 20 commands a second, and the daemon accepts 1000 a second
 from this server. Before this limit existed, 24 WebSockets with 180 commands a second each made the
 daemon drop half of the commands of a client that was driving."""
 
-STOPS_ELSEWHERE = Rate(4.0, 16.0)
+REMOTE_STOP_RATE = Rate(4.0, 16.0)
 """Limit on the stops that a client with one token may send to robots that may not exist, as a rate
 per second and a largest burst. A robot certainly exists if this server has found it on the bus, or
 has received its answer to a stop."""
@@ -105,7 +105,7 @@ def sockets_for(files: int) -> int:
     `files` is the number of files that this process may open.
     """
     # A connection needs two files while it fetches a recording.
-    return max(SOCKETS_LEAST, min(SOCKETS, (files - OWN_FILES) // 2 - SOCKETS_HERE))
+    return max(MIN_CONNECTIONS, min(SOCKETS, (files - RESERVED_FILES) // 2 - SOCKETS_HERE))
 
 
 class Sockets(Generic[C]):
@@ -116,7 +116,7 @@ class Sockets(Generic[C]):
     1. If there are connections without a valid token, the network with the most of them loses its
        oldest connection without a valid token.
     2. If every connection has shown a valid token, the token with the most connections loses its
-       oldest connection. However, if this token has at most `SOCKETS_OF_BROWSER` connections, the
+       oldest connection. However, if this token has at most `RESERVED_CONNECTIONS` connections, the
        new connection is refused instead.
 
     If a network has `SOCKETS_OF_ONE` connections without a valid token, each new connection from
@@ -156,14 +156,14 @@ class Sockets(Generic[C]):
         """Remove the connection that must make room for a new connection, and return it.
 
         Return None if every connection has shown a valid token, and no token has more than
-        `SOCKETS_OF_BROWSER` connections.
+        `RESERVED_CONNECTIONS` connections.
         """
         if self._strangers:
             network = max(self._strangers, key=lambda name: len(self._strangers[name]))
             gone = next(iter(self._strangers[network]))
         else:
             token, count = max(self._tokens.items(), key=lambda item: item[1], default=("", 0))
-            if count <= SOCKETS_OF_BROWSER:
+            if count <= RESERVED_CONNECTIONS:
                 return None
             gone = next(one for one, its in self._known.items() if its == token)
         self.leave(gone)
@@ -229,7 +229,7 @@ class Seats:
     """
 
     def __init__(self) -> None:
-        self._here = Places(CONNECTIONS_HERE, CONNECTIONS_HERE)
+        self._here = Places(MAX_LOCAL_SOCKETS, MAX_LOCAL_SOCKETS)
         self._alike = Places(CONNECTIONS, CONNECTIONS_ALIKE)
         self._tokens = Places(CONNECTIONS, CONNECTIONS_OF_TOKEN)
         self._networks = Places(CONNECTIONS, CONNECTIONS_OF_ONE)
@@ -266,7 +266,7 @@ class Seats:
         the text of a refusal.
         """
         if not token:
-            here = f"{CONNECTIONS_HERE} pages are open on the robot itself: close some"
+            here = f"{MAX_LOCAL_SOCKETS} pages are open on the robot itself: close some"
             return [(self._here, address, here)]
         network = network_of(address)
         alike = (

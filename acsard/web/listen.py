@@ -12,7 +12,7 @@ from acsard.host.errors import CertificateError, InUseError, UsageError
 from acsard.host.own_identity import own_addresses
 from acsard.web.callers import is_loopback
 
-TRIES = 20
+MAX_PORTS_TRIED = 20
 """Number of TCP ports that the server tries, one after another, from the requested port on."""
 
 EVERYWHERE_4, EVERYWHERE_6 = "0.0.0.0", "::"
@@ -123,9 +123,9 @@ def require_certificate(listen: Sequence[Listen], tls: str) -> None:
 def bound(listen: Sequence[Listen], next_port: bool) -> list[tuple[Listen, socket.socket]]:
     """Open a listening socket at each address; return pairs of the used address and the socket.
 
-    If `next_port` is true and a port is in use, try the next ports, `TRIES` ports in total. The
-    used address contains the port that was free. Raises `InUseError` if no socket can be opened at
-    an address.
+    If `next_port` is true and a port is in use, try the next ports, `MAX_PORTS_TRIED` ports in
+    total. The used address contains the port that was free. Raises `InUseError` if no socket can be
+    opened at an address.
     """
     older_ports = _older_ports(listen)
     return [_bound(one, next_port, one.port not in older_ports) for one in listen]
@@ -144,7 +144,7 @@ def _bound(one: Listen, next_port: bool, both: bool) -> tuple[Listen, socket.soc
 
     If `both` is true, a socket at `::` accepts IPv4 connections too.
     """
-    ports = range(one.port, min(65536, one.port + TRIES)) if next_port else [one.port]
+    ports = range(one.port, min(65536, one.port + MAX_PORTS_TRIED)) if next_port else [one.port]
     both = both and one.host == EVERYWHERE_6 and socket.has_dualstack_ipv6()
     trouble: OSError | None = None
     for port in ports:

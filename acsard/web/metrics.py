@@ -147,10 +147,10 @@ def _escaped(word: str) -> str:
     return word.replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n")
 
 
-NAMED = 5
+MAX_NAMED = 5
 """Maximum number of clients that a log line about refusals names: those with the most refusals."""
 
-KNOWN = 1000
+MAX_COUNTED_CLIENTS = 1000
 """Maximum number of clients whose refusals are counted separately between two log lines. Without
 this limit, a client that uses many addresses could fill the memory."""
 
@@ -178,7 +178,7 @@ class Counts:
         """
         with self._lock:
             self._refused[reason] += 1
-            if origin and (origin in self._origins or len(self._origins) < KNOWN):
+            if origin and (origin in self._origins or len(self._origins) < MAX_COUNTED_CLIENTS):
                 self._origins[origin] += 1
 
     def all(self) -> dict[str, int]:
@@ -201,7 +201,7 @@ class Counts:
         if not new:
             return None
         said = ", ".join(f"{count} {why.replace('_', ' ')}" for why, count in new.most_common())
-        named = origins.most_common(NAMED)
+        named = origins.most_common(MAX_NAMED)
         whom = ", ".join(f"{count} from {origin}" for origin, count in named)
         if others := new.total() - sum(count for _, count in named):
             whom += f", {others} from others" if whom else ""

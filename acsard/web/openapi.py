@@ -17,7 +17,7 @@ from acsard.core.messages.keys_and_roles import FOLLOWED
 from acsard.terminal import json_prompt
 from acsard.web import socket_messages
 from acsard.web.routes import Body, Problem, Route
-from acsard.web.socket_messages import KINDS
+from acsard.web.socket_messages import MESSAGE_TYPES
 
 Described = dict[str, Any]
 
@@ -28,18 +28,18 @@ TO_ROBOT, FROM_ROBOT = "ToRobot", "FromRobot"
 """Names of the schemas of the WebSocket messages that clients send (`TO_ROBOT`), and of the
 WebSocket messages that the server sends (`FROM_ROBOT`)."""
 
-VALUE = "Value."
+VALUE_PREFIX = "Value."
 """Prefix of the names of the schemas that describe the values of subscribed keys."""
 
-GUIDED = "Guided"
+GUIDED_PREFIX = "Guided"
 
-SENT = (
+SENT_MESSAGES = (
     socket_messages.Hello, socket_messages.DrivenPath, socket_messages.LastMinute,
     socket_messages.Answer, socket_messages.Rows, socket_messages.Pong, socket_messages.Refused,
     socket_messages.Gone,
 )  # fmt: skip
 
-LINES = (
+GUIDE_MESSAGES = (
     socket_messages.Running, socket_messages.Ended, json_prompt.Subject,
     json_prompt.JobMessage, json_prompt.Doing, json_prompt.Progress, json_prompt.Question,
     json_prompt.Found, json_prompt.Result,
@@ -64,7 +64,7 @@ def _value(key: str, kind: str) -> type[Struct]:
     `kind` is the name of the schema of these values.
     """
     return msgspec.defstruct(
-        VALUE + key.replace("/", "."),
+        VALUE_PREFIX + key.replace("/", "."),
         [
             ("value", _raw({"anyOf": [_ref(kind), {"type": "null"}]})),
             ("age", Annotated[float, Meta(ge=0, description="ms")]),
@@ -78,7 +78,7 @@ def _value(key: str, kind: str) -> type[Struct]:
     )
 
 
-VALUES = tuple(_value(key, kind) for key, kind in KEYS.items())
+VALUE_MESSAGES = tuple(_value(key, kind) for key, kind in KEYS.items())
 
 ERRORS = {
     "401": "The token is missing or not valid.",
@@ -101,8 +101,10 @@ def document(version: str, routes: Sequence[Route]) -> Described:
     bodies = [body.kind for row in described for body in row.gives.values()]
     bodies += [row.takes for row in described if row.takes is not None]
     own = [kind for kind in bodies if not isinstance(kind, str)]
-    schemas, refs = _components([Problem, *own, *KINDS.values(), *SENT, *VALUES, *LINES])
-    for kind in KINDS.values():
+    schemas, refs = _components(
+        [Problem, *own, *MESSAGE_TYPES.values(), *SENT_MESSAGES, *VALUE_MESSAGES, *GUIDE_MESSAGES]
+    )
+    for kind in MESSAGE_TYPES.values():
         schemas[kind.__name__]["x-least-role"] = kind.least
     messages, of_the_socket = _messages(), _of_the_socket(refs)
     assert not (schemas | of_the_socket).keys() & messages.keys(), "two types have the same name"
@@ -218,13 +220,13 @@ def _of_the_socket(refs: Refs) -> Described:
     `refs` maps each message type to a reference to the schema of this type.
     """
     guided = msgspec.defstruct(
-        GUIDED,
-        [("guide", _raw({"oneOf": [refs[kind] for kind in LINES]}))],
+        GUIDED_PREFIX,
+        [("guide", _raw({"oneOf": [refs[kind] for kind in GUIDE_MESSAGES]}))],
         namespace={"__doc__": socket_messages.Guided.__doc__},
     )
     found, own = _components([guided])
-    from_robot = [*(refs[kind] for kind in (*SENT, *VALUES)), own[guided]]
-    to_robot = [refs[kind] for kind in KINDS.values()]
+    from_robot = [*(refs[kind] for kind in (*SENT_MESSAGES, *VALUE_MESSAGES)), own[guided]]
+    to_robot = [refs[kind] for kind in MESSAGE_TYPES.values()]
     return found | {
         TO_ROBOT: {"title": TO_ROBOT, "oneOf": to_robot},
         FROM_ROBOT: {"title": FROM_ROBOT, "oneOf": from_robot},

@@ -19,9 +19,9 @@ from acsard.host import clock
 from acsard.host.child import Limits, acsard, how_it_ended, running
 from acsard.host.errors import RecordingError
 from acsard.host.threads import in_thread
-from acsard.recording.directory import PART, STAMP, is_being_recorded, listed
+from acsard.recording.directory import NAME_TIME_FORMAT, PART_SUFFIX, is_being_recorded, listed
 from acsard.recording.end_record import how_it_ends, read_end
-from acsard.web.answers import READ_S, TroubleError
+from acsard.web.answers import READ_TIMEOUT_S, TroubleError
 from acsard.web.callers import RefusedError, is_loopback
 from acsard.web.robots import Robots
 
@@ -34,36 +34,38 @@ POLICY = (
 opaque origin. The browser also enforces the policy inside the report, which contains the hashes of
 the allowed scripts."""
 
-LISTED_NS = NS_PER_S // 4
+MIN_LIST_INTERVAL_NS = NS_PER_S // 4
 
-NICE = 19
+CHILD_NICE = 19
 
-DRAW_S = 600.0
+DRAW_TIMEOUT_S = 600.0
 """Time limit for drawing a report, s. The report of a full recording (one to four hours) takes
 minutes."""
 
-ALONE_NS = 60 * NS_PER_S
+ABANDONED_NS = 60 * NS_PER_S
 """Time, ns, after which the server stops drawing a report if no client requests the progress."""
 
-KEEP_NS = 900 * NS_PER_S
+KEEP_REPORT_NS = 900 * NS_PER_S
 """Time, ns, after which the server discards a finished report if no client requests it again."""
 
-BYTES = 32 << 20
+MAX_REPORT_BYTES = 32 << 20
 """Maximum size of a report, bytes; a typical one has 5 to 8 MB."""
 
-MEMORY = 256 << 20
+MAX_CHILD_MEMORY = 256 << 20
 """Maximum data memory of the child process that draws a report, bytes."""
 
 TOO_LONG = (
-    f"the drawing takes longer than {DRAW_S / 60:.0f} min here: fetch the recording, and draw its "
+    f"the drawing takes longer than {DRAW_TIMEOUT_S / 60:.0f} min here: fetch the recording, and "
+    f"draw its "
     "report on a faster machine with acsard recording report"
 )
 TOO_MUCH = (
-    f"the drawing takes over {MEMORY >> 20} MB of memory: draw the report on another machine, with "
+    f"the drawing takes over {MAX_CHILD_MEMORY >> 20} MB of memory: draw the report on another "
+    f"machine, with "
     "acsard recording report"
 )
 TOO_BIG = (
-    f"the report has over {BYTES >> 20} MB: draw a part of the recording, with "
+    f"the report has over {MAX_REPORT_BYTES >> 20} MB: draw a part of the recording, with "
     "acsard recording report --from --to"
 )
 
@@ -94,13 +96,14 @@ class BlackBox:
         """Monotonic time at which the task `_listing` was started, ns."""
 
     async def rows(self) -> list[Recording]:
-        """Return all recordings, oldest first. The list may be up to `LISTED_NS` old."""
-        # All requests within `LISTED_NS` share one list. Otherwise, a client that requests the list
-        # all the time would use so much processor time that the stops of other clients are late.
+        """Return all recordings, oldest first. The list may be up to `MIN_LIST_INTERVAL_NS` old."""
+        # All requests within `MIN_LIST_INTERVAL_NS` share one list. Otherwise, a client that
+        # requests the list all the time would use so much processor time that the stops of other
+        # clients are late.
         place, now_ns = self._place(), clock.mono_ns()
-        old = now_ns - self._listed_ns > LISTED_NS
+        old = now_ns - self._listed_ns > MIN_LIST_INTERVAL_NS
         if self._listing is None or (old and self._listing.done()):
-            self._listing = asyncio.ensure_future(in_thread(lambda: rows(place), READ_S))
+            self._listing = asyncio.ensure_future(in_thread(lambda: rows(place), READ_TIMEOUT_S))
             # All clients may have gone when the listing fails. Retrieve the error here too, because
             # asyncio logs every error that nothing retrieves.
             self._listing.add_done_callback(
@@ -128,7 +131,7 @@ class BlackBox:
             return path, (seen.st_mtime_ns, seen.st_size)
 
         try:
-            found = await in_thread(look, READ_S)
+            found = await in_thread(look, READ_TIMEOUT_S)
         except (OSError, TimeoutError) as error:
             raise _unread(place, error) from None
         if found is None:
@@ -170,7 +173,7 @@ def _files(directory: Path) -> list[Path]:
 
 def _row(path: Path) -> Recording:
     size = path.stat().st_size
-    if path.name.endswith(PART):
+    if path.name.endswith(PART_SUFFIX):
         words = (
             "being recorded" if is_being_recorded(path, time.time()) else "cut off: no end marker"
         )
@@ -192,7 +195,7 @@ def _begun(path: Path) -> float | None:
     Return None if the name contains no time.
     """
     try:
-        told = time.strptime(path.name.partition("-")[2].partition(".")[0], STAMP)
+        told = time.strptime(path.name.partition("-")[2].partition(".")[0], NAME_TIME_FORMAT)
     except ValueError:
         return None
     return float(calendar.timegm(told))
@@ -291,7 +294,7 @@ class Reports:
         """Return the report of the recording `name`, compressed by gzip.
 
         Return None if this report is not finished or not in memory. Each call restarts the time
-        `KEEP_NS` after which the report is discarded.
+        `KEEP_REPORT_NS` after which the report is discarded.
         """
         one = self._one
         if one is None or one.path.name != name or not one.packed:
@@ -302,14 +305,14 @@ class Reports:
     def tidy(self) -> None:
         """Discard the report if no client has requested it for some time.
 
-        This time is `ALONE_NS` while the report is being drawn, and `KEEP_NS` after that. Call this
-        method once a second.
+        This time is `ABANDONED_NS` while the report is being drawn, and `KEEP_REPORT_NS` after
+        that. Call this method once a second.
         """
         one = self._one
         if one is None:
             return
         old_ns = clock.mono_ns() - one.asked_ns
-        if old_ns > (KEEP_NS if one.ended else ALONE_NS):
+        if old_ns > (KEEP_REPORT_NS if one.ended else ABANDONED_NS):
             self.end()
 
     def end(self) -> None:
@@ -320,7 +323,7 @@ class Reports:
 
     async def _draw(self, one: _Drawing) -> None:
         try:
-            async with asyncio.timeout(DRAW_S):
+            async with asyncio.timeout(DRAW_TIMEOUT_S):
                 body = await self._drawn(one)
                 one.packed = await in_thread(lambda: gzip.compress(body, 6, mtime=0), None)
         except TimeoutError:
@@ -329,7 +332,7 @@ class Reports:
             one.failed = str(error)
 
     async def _drawn(self, one: _Drawing) -> bytes:
-        command, limits = [*self._command, str(one.path)], Limits(NICE, MEMORY)
+        command, limits = [*self._command, str(one.path)], Limits(CHILD_NICE, MAX_CHILD_MEMORY)
         async with running(command, limits, stdout=PIPE, stderr=PIPE) as child:
             listening = asyncio.create_task(_listened(child, one))
             try:
@@ -365,7 +368,7 @@ async def _body(child: Process) -> bytes:
     body = bytearray()
     while part := await child.stdout.read(1 << 16):
         body += part
-        if len(body) > BYTES:
+        if len(body) > MAX_REPORT_BYTES:
             raise _FailedError(TOO_BIG)
     return bytes(body)
 

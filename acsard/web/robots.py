@@ -24,12 +24,12 @@ from acsard.host.errors import MendableError, UnreachableError
 from acsard.host.threads import in_thread
 from acsard.web.last_minute import Minute, Plotted
 from acsard.web.metrics import Counts
-from acsard.web.streams import DECLARE_S, UNREADY, Stream, Streams
+from acsard.web.streams import DECLARE_TIMEOUT_S, NOT_READY_ERRORS, Stream, Streams
 
-LOOK_S = 0.1
+PROCESS_PERIOD_S = 0.1
 """Interval at which the server processes the states that have arrived, s."""
 
-AGAIN_S = 1.0
+RETRY_DELAY_S = 1.0
 """Delay before the next attempt to reach a daemon that does not answer, s."""
 
 ASK_S, ASK_SOON_S = 10.0, 1.0
@@ -85,7 +85,7 @@ class _Asking:
             self._asked = asyncio.create_task(self._ask(name, take))
 
     async def _ask(self, name: str, take: Callable[[zenoh.Sample], object]) -> None:
-        with suppress(*UNREADY):
+        with suppress(*NOT_READY_ERRORS):
             await in_thread(lambda: self._client.ask(name, take), None)
 
 
@@ -120,8 +120,8 @@ class Robots:
     async def run(self) -> None:
         """Connect to the robot's daemon, and process the robot's states until cancelled.
 
-        While the daemon is not reachable, try again every `AGAIN_S`. Raises `MendableError` if the
-        connection fails for a reason that another attempt cannot change.
+        While the daemon is not reachable, try again every `RETRY_DELAY_S`. Raises `MendableError`
+        if the connection fails for a reason that another attempt cannot change.
         """
         client = self.client = await self._reached()
         asking = asyncio.create_task(self._ask_again_and_again())
@@ -130,7 +130,9 @@ class Robots:
             return Watch(_Asking(client), clock.steady_s())
 
         try:
-            await self._follow(await self._insisted(lambda: in_thread(watch, DECLARE_S, Watch.end)))
+            await self._follow(
+                await self._insisted(lambda: in_thread(watch, DECLARE_TIMEOUT_S, Watch.end))
+            )
         finally:
             asking.cancel()
 
@@ -163,15 +165,15 @@ class Robots:
                 return await in_thread(self._connect, None)
             except UnreachableError as error:
                 self.gone = str(error)
-                await asyncio.sleep(AGAIN_S)
+                await asyncio.sleep(RETRY_DELAY_S)
 
     async def _insisted(self, call: Callable[[], Awaitable[T]]) -> T:
         while True:
             try:
                 return await call()
-            except UNREADY:
+            except NOT_READY_ERRORS:
                 self.gone = "the Zenoh bus is stuck; the page tries again by itself"
-                await asyncio.sleep(AGAIN_S)
+                await asyncio.sleep(RETRY_DELAY_S)
 
     async def _follow(self, watch: Watch) -> None:
         self._watch, truth = watch, None
@@ -202,7 +204,7 @@ class Robots:
                 truth = await self._insisted(self._truth)
             if truth is not None:
                 self._take_truth(truth, now_ns)
-            await asyncio.sleep(LOOK_S)
+            await asyncio.sleep(PROCESS_PERIOD_S)
 
     def _take(self, before: RobotState | None, state: RobotState, now_ns: int) -> None:
         if restarted(before, state):

@@ -17,12 +17,12 @@ from acsard.core.messages.keys_and_roles import SERVICES, TOPICS, VERBS, Topic
 from acsard.core.messages.permissions import SERVICE_ROLES, least_role
 from acsard.core.values import ROLES, Role
 from acsard.host.rate_limits import Rate
-from acsard.web.limits import REQUESTS, STOPS
+from acsard.web.limits import REQUEST_RATE, STOPS
 
 Handler = Callable[[Any, Any], Awaitable[Any]]
 """Coroutine function that takes the `Page` and the request, and returns the answer."""
 
-RECORDINGS: Role = "operator"
+RECORDINGS_ROLE: Role = "operator"
 """Lowest role that may download recordings, and may draw and download reports of recordings."""
 
 JSON, FORM = "application/json", "application/x-www-form-urlencoded"
@@ -78,7 +78,7 @@ class Route(Struct, frozen=True):
     gives: Mapping[int, Body] = {}
     """Maps an HTTP status to the body of the answer. An answer with any other status contains a
     `Problem`."""
-    rate: Rate = REQUESTS
+    rate: Rate = REQUEST_RATE
     """Limit on the requests with one token. All routes with the same rate share one limit."""
     waits: bool = False
     """True if the server delays a request beyond `rate`; False if it refuses the request.
@@ -131,6 +131,6 @@ def services(handler: Handler) -> Iterator[Route]:
         }
         yield Route(
             "POST", f"/api/{key}", SERVICE_ROLES[verb], handler, notes[key],
-            takes=takes, gives=gives, rate=STOPS if verb == "stop" else REQUESTS,
+            takes=takes, gives=gives, rate=STOPS if verb == "stop" else REQUEST_RATE,
             waits=verb == "stop",
         )  # fmt: skip

@@ -22,7 +22,7 @@ from acsard.daemon.bus.address import Address
 from acsard.daemon.bus.certificate_watch import CertificateFiles
 from acsard.daemon.bus.tls import CERTIFICATE, KEY, files_in, names_in
 from acsard.daemon.bus.zenoh_sessions import client_session
-from acsard.host.child import BEAT_S, Parent, end_with_parent
+from acsard.host.child import HEARTBEAT_S, Parent, end_with_parent
 from acsard.host.logs import Log
 from acsard.web.acceptor import READ_BYTES, Acceptor, Reader
 from acsard.web.app import Page
@@ -31,7 +31,7 @@ from acsard.web.guide import Guide, Reach
 from acsard.web.listen import Listen, bound, own_name, require_certificate
 from acsard.web.metrics import Counts
 from acsard.web.robots import About, Robots
-from acsard.web.socket_messages import PROGRAM
+from acsard.web.socket_messages import DEFAULT_SOURCE
 from acsard.web.tokens import Vault
 from acsard.web.viewer import Parts
 
@@ -42,7 +42,7 @@ FIELD_BYTES, FIELDS = 8190, 64
 headers in a request (`FIELDS`). A browser sends the cookies for all ports of a host in one header,
 so a lower limit on the size could lock out a browser."""
 
-LEAVE_S = 0.3
+SHUTDOWN_S = 0.3
 """Longest time, s, for which the server at its shutdown sends zero velocities for viewers that
 drive a robot. aiohttp also waits at most this long for running requests."""
 
@@ -91,7 +91,7 @@ async def serve(wanted: Wanted, announce: Callable[[Sequence[Listen]], None], lo
     page = Page(parts, vault, names, acceptor, wanted.config.web)
     runner = web.AppRunner(
         page.app, access_log=None, handle_signals=False, keepalive_timeout=20.0,
-        shutdown_timeout=LEAVE_S, max_line_size=FIELD_BYTES, max_field_size=FIELD_BYTES,
+        shutdown_timeout=SHUTDOWN_S, max_line_size=FIELD_BYTES, max_field_size=FIELD_BYTES,
         max_headers=FIELDS, read_bufsize=READ_BYTES,
     )  # fmt: skip
     async with AsyncExitStack() as stack:
@@ -111,7 +111,7 @@ async def serve(wanted: Wanted, announce: Callable[[Sequence[Listen]], None], lo
         await _until(leaving, parts, page, wanted)
         page.end_all("the page's server ends")
         await asyncio.sleep(0)
-        await asyncio.to_thread(parts.commands.outbox.flush, LEAVE_S)
+        await asyncio.to_thread(parts.commands.outbox.flush, SHUTDOWN_S)
 
 
 async def _until(leaving: asyncio.Event, parts: Parts, page: Page, wanted: Wanted) -> None:
@@ -164,14 +164,14 @@ async def _held(leaving: asyncio.Event) -> None:
     try:
         while True:
             parent.beat()
-            await asyncio.sleep(BEAT_S)
+            await asyncio.sleep(HEARTBEAT_S)
     finally:
         loop.remove_reader(parent.fd)
 
 
 def _connected(address: Address) -> Client:
     session = client_session(address.endpoint, address.tls)
-    return Client(session, address.robot_id, PROGRAM, address.tls, address.endpoint)
+    return Client(session, address.robot_id, DEFAULT_SOURCE, address.tls, address.endpoint)
 
 
 def _reach(wanted: Wanted) -> Reach:

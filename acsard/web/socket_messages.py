@@ -1,8 +1,8 @@
 """The messages of `/ws`, in both directions. This module is pure.
 
 Each message is one JSON object. A message from a client is called a frame. Exactly one of the
-fields in `KINDS` (`subscribe`, `cmd`, `call`, ...) must be in a frame, and gives its kind. A frame
-with none or several of these fields, or with an unknown field, is refused as a whole.
+fields in `MESSAGE_TYPES` (`subscribe`, `cmd`, `call`, ...) must be in a frame, and gives its kind.
+A frame with none or several of these fields, or with an unknown field, is refused as a whole.
 
 The first field of a message to a client gives its kind. The messages with the values of subscribed
 keys are built in `socket_sender.py`, because these values are JSON already.
@@ -17,23 +17,23 @@ import msgspec
 from msgspec import Meta, Struct
 
 from acsard.core.messages.permissions import COMMAND_ROLE
-from acsard.core.messages.signature import MOST
+from acsard.core.messages.signature import MAX_INT64
 from acsard.core.values import AcsardError, Role
 from acsard.web.last_minute import Plotted
 
-MAX_BYTES = 65536
+MAX_MESSAGE_BYTES = 65536
 """Maximum size of a message from a client, bytes. A command has about a hundred bytes."""
 
 MAX_RATE, USUAL_RATE = 50.0, 10.0
 """Rates at which the server sends the values of a subscribed key, Hz: the maximum (`MAX_RATE`), and
 the default (`USUAL_RATE`)."""
 
-LATEST_STAMP_MS = MOST // 1_000_000 - 86_400_000.0
+MAX_STAMP_MS = MAX_INT64 // 1_000_000 - 86_400_000.0
 """Limit below which the stamp of a command must be, ms since 1970: one day before the largest stamp
 that the daemon accepts. When a client disconnects, the server sends a zero velocity whose stamp is
 later than that of the client's last command, and the daemon must accept this stamp too."""
 
-PROGRAM = "app"
+DEFAULT_SOURCE = "app"
 """Command source of a command that names no source. The page in the browser names `teleop`."""
 
 Short = Annotated[str, Meta(max_length=80)]
@@ -43,7 +43,7 @@ Device = Annotated[str, Meta(max_length=200)]
 class FrameError(AcsardError):
     """A message of a client is not valid.
 
-    `about` is the kind of the message (see `KINDS`), or "message" if the kind is unclear.
+    `about` is the kind of the message (see `MESSAGE_TYPES`), or "message" if the kind is unclear.
     """
 
     def __init__(self, about: str, text: str) -> None:
@@ -99,7 +99,7 @@ class Command(_Frame, frozen=True):
     stamp: float
     steady: bool = False
     """True if `stamp` is from a clock that is never adjusted, such as `performance.now()`."""
-    source: Short = PROGRAM
+    source: Short = DEFAULT_SOURCE
     """Name of one of the robot's command sources."""
 
     @property
@@ -158,13 +158,15 @@ class Press(_Frame, frozen=True):
 
 Frame = Subscribe | Unsubscribe | Command | Call | Ping | Begin | Reply | Press
 
-KINDS: dict[str, type[Frame]] = {kind.__struct_fields__[0]: kind for kind in get_args(Frame)}
+MESSAGE_TYPES: dict[str, type[Frame]] = {
+    kind.__struct_fields__[0]: kind for kind in get_args(Frame)
+}
 """Maps each kind of message from a client to the type of the message. The kind is the name of the
 first field."""
 
 _heads = msgspec.json.Decoder(dict[str, msgspec.Raw])
 _decoders: dict[str, msgspec.json.Decoder[Frame]] = {
-    name: msgspec.json.Decoder(kind) for name, kind in KINDS.items()
+    name: msgspec.json.Decoder(kind) for name, kind in MESSAGE_TYPES.items()
 }
 
 
@@ -172,9 +174,11 @@ def decode(text: str) -> Frame:
     """Decode a message of a client from JSON. Raises `FrameError` if it is not valid."""
     about = "message"
     try:
-        meant = [name for name in _heads.decode(text) if name in KINDS]
+        meant = [name for name in _heads.decode(text) if name in MESSAGE_TYPES]
         if len(meant) != 1:
-            raise FrameError(about, f"a message needs exactly one of the fields {', '.join(KINDS)}")
+            raise FrameError(
+                about, f"a message needs exactly one of the fields {', '.join(MESSAGE_TYPES)}"
+            )
         about = meant[0]
         frame = _decoders[about].decode(text)
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
@@ -185,7 +189,7 @@ def decode(text: str) -> Frame:
 
 def _require(frame: Frame) -> None:
     # All numbers are finite here: JSON has no NaN, and msgspec refuses numbers that are too large.
-    if isinstance(frame, Command) and not 0.0 < frame.stamp < LATEST_STAMP_MS:
+    if isinstance(frame, Command) and not 0.0 < frame.stamp < MAX_STAMP_MS:
         raise FrameError("cmd", "`stamp` must be the time of the sender's clock in ms since 1970")
     if isinstance(frame, Subscribe) and not 0.0 < frame.rate <= MAX_RATE:
         raise FrameError(

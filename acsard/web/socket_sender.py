@@ -21,13 +21,13 @@ from acsard.host.errors import UsageError
 from acsard.host.rate_limits import Buckets, Rate
 from acsard.web.answers import cut
 from acsard.web.callers import Reason
-from acsard.web.limits import STREAMS, STREAMS_OF_ONE, UNREAD_BYTES, Shares
+from acsard.web.limits import MAX_UNREAD_BYTES, STREAMS, STREAMS_OF_ONE, Shares
 from acsard.web.metrics import Counts
-from acsard.web.robots import AGAIN_S, Robots
+from acsard.web.robots import RETRY_DELAY_S, Robots
 from acsard.web.socket_messages import Refused, Subscribe, Unsubscribe
-from acsard.web.streams import KEYS, UNREADY, Stream
+from acsard.web.streams import NOT_READY_ERRORS, VIEWER_KEYS, Stream
 
-REPORTS = Rate(1.0)
+REPORT_RATE = Rate(1.0)
 """Limit on the reports about refused messages that one client receives, as a rate per second. It
 applies to each kind of message and each reason separately."""
 
@@ -67,7 +67,7 @@ class Outgoing:
         self._pong: bytes | None = None
         """Payload of the newest ping that is not answered yet, or None."""
         self._news = asyncio.Event()
-        self._reports = Buckets(REPORTS)
+        self._reports = Buckets(REPORT_RATE)
         self._closing = False
 
     def say(self, message: object) -> None:
@@ -81,8 +81,9 @@ class Outgoing:
     def refuse(self, what: str, reason: Reason, text: str) -> None:
         """Count a refused message, and report the refusal to the client.
 
-        Reports beyond the limit `REPORTS` are left out. `what` is the kind of the refused message,
-        `reason` is the reason under which it is counted, and `text` is the reason in words.
+        Reports beyond the limit `REPORT_RATE` are left out. `what` is the kind of the refused
+        message, `reason` is the reason under which it is counted, and `text` is the reason in
+        words.
         """
         self._counts.refuse(reason, self._origin)
         if self._reports.take(f"{what} {reason}", clock.mono_ns()):
@@ -163,7 +164,7 @@ class Outgoing:
         # All keys share one time grid, so they wake the task together.
         one.due = (now // one.period + 1) * one.period
         if stream.number != one.sent:
-            if self._unread() > UNREAD_BYTES:
+            if self._unread() > MAX_UNREAD_BYTES:
                 self._counts.add("frames_left_out")
             else:
                 one.sent, value, age = stream.value()
@@ -175,9 +176,9 @@ class Outgoing:
         return 0 if self._transport is None else self._transport.get_write_buffer_size()
 
 
-MOST = 32
+MAX_QUEUED = 32
 
-FRAMES_HZ = 300.0
+MAX_FRAMES_HZ = 300.0
 """Maximum sum of the message rates of all keys of one WebSocket, Hz. A higher sum would take
 processor time from the commands."""
 
@@ -213,24 +214,26 @@ class Keys:
         except UsageError as error:
             self._out.refuse("subscribe", "malformed", str(error))
             return
-        if key not in KEYS:
-            text = f"{key!r} is not a key to follow; choose one of {', '.join(sorted(KEYS))}"
+        if key not in VIEWER_KEYS:
+            text = f"{key!r} is not a key to follow; choose one of {', '.join(sorted(VIEWER_KEYS))}"
             self._out.refuse("subscribe", "malformed", text)
             return
         known = self._out.following.get((robot, key))
         others = sum(1.0 / one.period for one in self._out.following.values() if one is not known)
-        if others + frame.rate > FRAMES_HZ:
+        if others + frame.rate > MAX_FRAMES_HZ:
             self._out.refuse(
                 "subscribe",
                 "too_many",
-                f"all keys together have over {FRAMES_HZ:g} messages a second: lower the rates",
+                f"all keys together have over {MAX_FRAMES_HZ:g} messages a second: lower the rates",
             )
         elif known is not None:
             known.period, known.due = 1.0 / frame.rate, 0.0
             self._out.wake()
-        elif len(self._out.following) >= MOST:
+        elif len(self._out.following) >= MAX_QUEUED:
             self._out.refuse(
-                "subscribe", "too_many", f"you already follow {MOST} keys: unsubscribe from some"
+                "subscribe",
+                "too_many",
+                f"you already follow {MAX_QUEUED} keys: unsubscribe from some",
             )
         elif robot != self._robots.id and not self._shares.enter(self._holder, (robot, key)):
             text = (
@@ -285,11 +288,11 @@ class Keys:
             return None
         try:
             return await self._robots.streams.follow(client, one.robot, one.name)
-        except UNREADY:
+        except NOT_READY_ERRORS:
             self._out.refuse(
                 "subscribe", "stuck", "the Zenoh bus is stuck; the page tries again by itself"
             )
-            await asyncio.sleep(AGAIN_S)
+            await asyncio.sleep(RETRY_DELAY_S)
             return None
 
     def _is_followed(self, one: Following) -> bool:

@@ -26,17 +26,17 @@ from acsard.web.limits import STREAMS, STREAMS_OF_ONE, Shares
 
 Take = Callable[[zenoh.Sample], None]
 
-KEYS = frozenset(topic.key for topic in FOLLOWED)
+VIEWER_KEYS = frozenset(topic.key for topic in FOLLOWED)
 """Keys of a robot to which a viewer may subscribe."""
 
-DECLARE_S = 3.0
+DECLARE_TIMEOUT_S = 3.0
 
-STATE = "state"
+STATE_KEY = "state"
 """Key of a robot's state. The server queries this key only for the page's own robot. For another
 robot, a router's storage could answer with an old state, even a week after the robot was switched
 off."""
 
-UNREADY = (TimeoutError, zenoh.ZError, UsageError)
+NOT_READY_ERRORS = (TimeoutError, zenoh.ZError, UsageError)
 """Errors that mean that the bus is stuck or the session is closed. A later attempt may succeed."""
 
 
@@ -111,7 +111,8 @@ class Streams:
         """Return the stream of a robot's key. Subscribe to the key if it has no user yet.
 
         The caller must call `leave` after use. `client` is this server's bus client, and `robot` is
-        the id of the robot. Raises one of the errors in `UNREADY` if the bus is stuck or closed.
+        the id of the robot. Raises one of the errors in `NOT_READY_ERRORS` if the bus is stuck or
+        closed.
         """
         name = robot, key
         stream = self._streams.get(name)
@@ -150,7 +151,7 @@ class Streams:
 
     async def _declare(self, own: Client, robot: str, key: str, stream: Stream) -> Any:
         client = own.like(robot)
-        asks = key != STATE or own.key(key) == client.key(key)
+        asks = key != STATE_KEY or own.key(key) == client.key(key)
 
         def late(subscriber: Any) -> None:
             subscriber.undeclare()
@@ -170,12 +171,12 @@ class Streams:
                 raise
             return heard
 
-        return await in_thread(declare, DECLARE_S, late)
+        return await in_thread(declare, DECLARE_TIMEOUT_S, late)
 
 
 async def _ended(subscriber: Any) -> None:
     with suppress(TimeoutError, zenoh.ZError):  # the bus is stuck or closed, so no samples arrive
-        await in_thread(subscriber.undeclare, DECLARE_S)
+        await in_thread(subscriber.undeclare, DECLARE_TIMEOUT_S)
 
 
 def as_json(encoding: str, payload: bytes) -> bytes:

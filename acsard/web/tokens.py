@@ -26,12 +26,12 @@ from acsard.web.callers import Who
 
 FILE, MODE = "tokens.json", 0o600
 
-SERVICE = Path("/var/lib/acsard-web")
+SERVICE_DIRECTORY = Path("/var/lib/acsard-web")
 """State directory of the systemd service that runs `acsard web`."""
 
 HOUR_S, DAY_S = 3600, 86400
 
-MOST = 200
+MAX_TOKENS = 200
 """Maximum number of tokens of one robot."""
 
 
@@ -104,7 +104,7 @@ class Vault:
         now_s = time.time()
         return frozenset(one.digest for one in self.all() if one.ends > now_s)
 
-    def unknown_to(self, service: Path = SERVICE) -> str:
+    def unknown_to(self, service: Path = SERVICE_DIRECTORY) -> str:
         """Return a warning if the service `acsard-web` of this machine reads another token file.
 
         Return "" if the service reads this token file or is not installed. `service` is the state
@@ -122,7 +122,7 @@ class Vault:
 
         The text is the token itself. The text is not stored, so the caller must show it to the
         user. Also delete the expired tokens of all robots. Raises `UsageError` if a token of this
-        robot has the same name, or if the robot has `MOST` tokens already.
+        robot has the same name, or if the robot has `MAX_TOKENS` tokens already.
         """
         with self._changing() as tokens:
             now_s = int(time.time())
@@ -133,9 +133,9 @@ class Vault:
                     f"the token {name} exists already: either give another --name, or revoke the "
                     f"old token with --revoke {name}"
                 )
-            if len(ours) >= MOST:
+            if len(ours) >= MAX_TOKENS:
                 raise UsageError(
-                    f"the robot already has {MOST} tokens: revoke some with --revoke NAME"
+                    f"the robot already has {MAX_TOKENS} tokens: revoke some with --revoke NAME"
                 )
             text = secrets.token_urlsafe(32)
             ends = now_s + days * DAY_S + hours * HOUR_S
@@ -204,13 +204,13 @@ def place() -> Path:
     """Return the directory of the token file.
 
     If this process is a systemd service, return the state directory of the service. If it runs as
-    root and `SERVICE` exists, return `SERVICE`. Otherwise, return a directory for the user's state,
-    usually in the home directory.
+    root and `SERVICE_DIRECTORY` exists, return `SERVICE_DIRECTORY`. Otherwise, return a directory
+    for the user's state, usually in the home directory.
     """
     if "STATE_DIRECTORY" in os.environ:
         return Path(os.environ["STATE_DIRECTORY"].partition(":")[0])
-    if os.geteuid() == 0 and SERVICE.is_dir():
-        return SERVICE
+    if os.geteuid() == 0 and SERVICE_DIRECTORY.is_dir():
+        return SERVICE_DIRECTORY
     base = os.environ.get("XDG_STATE_HOME") or str(Path.home() / ".local" / "state")
     return Path(base) / "acsard-web"
 

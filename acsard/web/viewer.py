@@ -15,7 +15,7 @@ import aiohttp
 from aiohttp import web
 
 from acsard.client import Client
-from acsard.client.commander import LONGEST_S, Commander, Sender, Wish
+from acsard.client.commander import MAX_OPEN_TIMEOUT_S, Commander, Sender, Wish
 from acsard.client.outbox import Outbox
 from acsard.core.messages import schema
 from acsard.core.messages.permissions import COMMAND_ROLE, SERVICE_ROLES
@@ -29,10 +29,10 @@ from acsard.web.callers import RefusedError, Who
 from acsard.web.calls import Calls
 from acsard.web.fleet_rows import Fleet
 from acsard.web.guide import Guide
-from acsard.web.limits import COMMANDS, MESSAGES, OVERRUNS
+from acsard.web.limits import COMMAND_RATE, MAX_OVERRUNS, MESSAGE_RATE
 from acsard.web.metrics import Counts
 from acsard.web.robots import Robots
-from acsard.web.routes import RECORDINGS
+from acsard.web.routes import RECORDINGS_ROLE
 from acsard.web.socket_messages import (
     Begin,
     Call,
@@ -51,17 +51,17 @@ from acsard.web.socket_sender import Keys, Outgoing
 ACTIONS: dict[str, Role] = {
     **{str(verb): role for verb, role in SERVICE_ROLES.items()},
     "drive": COMMAND_ROLE,
-    "recordings": RECORDINGS,
+    "recordings": RECORDINGS_ROLE,
     "begin": Begin.least,
 }
 """Maps the name of each action to the lowest role that may use the action. The page disables the
 controls of those actions that its user may not use."""
 
-HEARTBEAT_S = 10.0
+PING_INTERVAL_S = 10.0
 """Interval of the pings that the server sends, s. If a client does not answer a ping within half of
 this time, the connection ends."""
 
-CALLS_AT_ONCE = 8
+MAX_OPEN_CALLS = 8
 
 FLEET, FLEET_S, FLEET_FIRST_S = "fleet", 1.0, 0.2
 """`FLEET` is the name to which a client subscribes for the list of all robots. The server sends the
@@ -79,7 +79,7 @@ class ViewerCommands:
 
     def __init__(self, client: Callable[[], Client | None], counts: Counts) -> None:
         self._client, self._counts = client, counts
-        self._rates = Buckets(COMMANDS)
+        self._rates = Buckets(COMMAND_RATE)
         self.outbox = Outbox(partial(counts.add, "commands_dropped"))
         """Queue of commands, with the thread that sends them. If an error ends the thread, the
         server must exit. Otherwise it could not stop the robot when a viewer disconnects."""
@@ -89,8 +89,8 @@ class ViewerCommands:
     ) -> bool:
         """Queue a command and return True. It replaces an unsent command of the same commander.
 
-        If the owner exceeds the rate limit `COMMANDS`, queue nothing and return False. However, a
-        zero after a nonzero command is always queued.
+        If the owner exceeds the rate limit `COMMAND_RATE`, queue nothing and return False. However,
+        a zero after a nonzero command is always queued.
 
         Args:
             owner: the client's token, or the public name of a viewer on the robot itself.
@@ -155,7 +155,7 @@ class Viewer:
         """Public name of this client, which `state.sender` contains while the client drives. It
         does not reveal the secret sender id."""
         self._socket = socket
-        self._bucket = Bucket(MESSAGES)
+        self._bucket = Bucket(MESSAGE_RATE)
         self._overruns = self._calling = 0
         self._out = Outgoing(socket, request, parts.counts, who.origin)
         self._keys = Keys(self._out, parts.robots, self._start, who.token or who.name)
@@ -230,9 +230,9 @@ class Viewer:
                 self._obey(frame)
             else:
                 self._refuse(
-                    frame, f"you send more than {MESSAGES.hz:g} messages a second: send fewer"
+                    frame, f"you send more than {MESSAGE_RATE.hz:g} messages a second: send fewer"
                 )
-        if self._overruns >= OVERRUNS:
+        if self._overruns >= MAX_OVERRUNS:
             self.end("too many messages")
 
     def _ping(self, message: aiohttp.WSMessage) -> None:
@@ -242,7 +242,7 @@ class Viewer:
         """
         if not self._bucket.take(clock.mono_ns()):
             self._overruns += 1
-            if self._overruns >= OVERRUNS:
+            if self._overruns >= MAX_OVERRUNS:
                 self._counts.refuse("too_fast", self.who.origin)
                 self._out.cut()
         elif message.type == aiohttp.WSMsgType.PING:
@@ -298,23 +298,23 @@ class Viewer:
         commander = self._commanders.setdefault(frame.source, Commander())
         owner = self.who.token or self.sender
         if not self._commands.give(owner, frame.source, commander, self._sender, wish):
-            text = f"more than {COMMANDS.hz:g} commands a second with one token: send fewer"
+            text = f"more than {COMMAND_RATE.hz:g} commands a second with one token: send fewer"
             self._out.refuse("cmd", "too_fast", text)
 
     def _release(self) -> None:
         """Queue a zero velocity for each source with which this viewer may still be driving."""
         timeouts = self._robots.about.timeouts
         for source, commander in self._commanders.items():
-            self._commands.outbox.release(commander, timeouts.get(source, LONGEST_S))
+            self._commands.outbox.release(commander, timeouts.get(source, MAX_OPEN_TIMEOUT_S))
 
     def _call(self, frame: Call) -> None:
         if frame.call == "stop":
             # Keep stops in a separate set of tasks, which continue when the connection ends.
             self._start(self._answer(frame), self._stops)
         else:
-            if self._calling >= CALLS_AT_ONCE:
+            if self._calling >= MAX_OPEN_CALLS:
                 self._refuse(
-                    frame, f"{CALLS_AT_ONCE} calls are running already: wait for an answer"
+                    frame, f"{MAX_OPEN_CALLS} calls are running already: wait for an answer"
                 )
                 return
             self._calling += 1

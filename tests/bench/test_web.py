@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from acsard.client import connect
-from acsard.web.answers import PAGE
+from acsard.web.answers import PAGE_DIRECTORY
 from tests.system.browser import Hands, Page, hands, run
 from tests.system.chromium import CHROMIUM, PHONE, Browser, browsing
 from tests.system.harness import (
@@ -87,7 +87,7 @@ def peer(tmp_path: Path) -> Iterator[Peer]:
 
 def subscribed() -> list[tuple[str, int]]:
     """Return the subscriptions of an open page, whatever its view: keys and rates."""
-    script = (PAGE / "main.js").read_text()
+    script = (PAGE_DIRECTORY / "main.js").read_text()
     pairs = re.findall(r'\["([\w/]+)", (\d+)\]', script)
     pairs += re.findall(r'link\.subscribe\("([\w/]+)", (\d+)', script)
     assert {"state", "odom", "sim/pose"} <= {key for key, _ in pairs}, pairs

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from acsard.core.config.settings import CommandsConfig, Config, McuConfig, Source
 from acsard.core.incoming.queries import Query
 from acsard.core.values import Outputs
-from acsard.daemon.pacing import IDLE_WAKES
+from acsard.daemon.pacing import MAX_IDLE_WAKES
 from tests.scenarios.world import World
 
 MS = 1_000_000
@@ -139,7 +139,7 @@ def test_no_timing_of_commands_makes_a_ramp_steeper_or_steps_more(
         assert faster - slower <= min(after_ns - before_ns, 50 * MS) * 1e-9 + 1e-3
     periods = (world.now_ns - began_ns) / (10 * MS)
     heard = world.loop.robot.session.good_lines - heard
-    assert world.steps - steps <= (5 + IDLE_WAKES) * (periods + 1) + heard + len(happenings)
+    assert world.steps - steps <= (5 + MAX_IDLE_WAKES) * (periods + 1) + heard + len(happenings)
 
 
 def unplug(world: World) -> None:
@@ -163,7 +163,7 @@ def test_a_flood_that_no_line_can_answer_makes_few_steps(
     world.run(0.3)
     steps = world.steps
     world.hold(0.0, seconds=1.0, hz=1000.0)
-    assert world.steps - steps <= 100 * (3 + IDLE_WAKES)
+    assert world.steps - steps <= 100 * (3 + MAX_IDLE_WAKES)
 
 
 def test_after_a_stall_the_periodic_line_is_sent_even_after_an_early_line(world: World) -> None:

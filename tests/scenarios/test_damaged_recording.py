@@ -15,7 +15,7 @@ from acsard.host.errors import Exit
 from acsard.recording import recorder as module
 from acsard.recording import step_writer
 from acsard.recording.directory import listed
-from acsard.recording.file import NUMBERS, Recording, Writing, event_of, rewrite
+from acsard.recording.file import CHANNEL_NUMBERS, Recording, Writing, event_of, rewrite
 from acsard.recording.file_replay import RecordedRun, replay_file, steps
 from acsard.recording.mcap_records import walk
 from acsard.recording.recorder import Recorder
@@ -47,7 +47,7 @@ def record(where: Path, seconds: int) -> list[Path]:
         record=RecordConfig(str(where), 1000.0),
     )
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(module, "FLUSH_S", 1000.0)
+        patched.setattr(module, "SYNC_PAUSE_S", 1000.0)
         patched.setattr(module, "CLOSE_S", 20.0)
         recorder = Recorder(config, lambda event: None)
         world = World(config, recorder=recorder)
@@ -92,7 +92,7 @@ def places(path: Path, count: int, seed: int = 1) -> list[tuple[int, int]]:
 def spans_of_states(data: bytes) -> list[tuple[int, int]]:
     """Return the beginning and the end of each chunk with a state of the robot."""
     found = [place.chunk for place in walk(data) if place.chunk is not None]
-    state = NUMBERS["state"]
+    state = CHANNEL_NUMBERS["state"]
     return [(c.begin, c.end) for c in found if [m.channel for m in c.messages] == [state]]
 
 

@@ -35,12 +35,12 @@ from acsard.core.messages.schema import (
     TwistStamped,
     Vector3,
 )
-from acsard.core.ros.channels import BY_KEY, CHANNELS, CMD_VEL_IN, LOG
+from acsard.core.ros.channels import BY_KEY, CHANNELS, CMD_VEL_IN, LOG_CHANNEL
 from acsard.core.ros.shapes import log, state
 from acsard.recording.export import export
 from acsard.recording.file import Recording
 from acsard.recording.file_replay import RecordedRun
-from acsard.recording.published import MEASURED, Publisher
+from acsard.recording.published import MEASURED_ROWS, Publisher
 from acsard.recording.replay import replay_step
 from tests.each import each
 from tests.scenarios.taped import (
@@ -147,7 +147,7 @@ def test_every_exported_state_equals_the_published_one_without_latencies(both: A
 
 def test_every_exported_diagnostics_has_the_same_rows_except_measured_ones(both: Any) -> None:
     world, _, said = both
-    left_out = MEASURED | {"acsard: recording"}
+    left_out = MEASURED_ROWS | {"acsard: recording"}
     then = [
         DiagnosticArray(one.header, [row for row in one.status if row.name not in left_out])
         for one in world.bus.published["diagnostics"]
@@ -174,7 +174,7 @@ def test_every_event_is_a_line_of_the_log(both: Any) -> None:
     world, _, said = both
     told = happened(world)
     assert len(told) > 20
-    lines = [line for line in said[LOG.native] if line.name not in ADDED]
+    lines = [line for line in said[LOG_CHANNEL.native] if line.name not in ADDED]
     assert [(one.stamp, plain(one.name)) for one in told] == [
         (one.stamp, plain(one.name)) for one in lines
     ]
@@ -188,7 +188,7 @@ def test_every_event_is_a_line_of_the_log(both: Any) -> None:
 
 def test_every_line_reason_of_the_log_is_a_reason_that_the_state_has(both: Any) -> None:
     _, tape, said = both
-    lines = [line for line in said[LOG.native] if line.name == "reason"]
+    lines = [line for line in said[LOG_CHANNEL.native] if line.name == "reason"]
     steps = {step.inputs.now.wall_ns: step.recorded.status for step in tape.steps()}
     assert lines
     for line in lines:
@@ -237,7 +237,7 @@ def replay_file(world: World, tape: Tape) -> Said:
 def _as_told(message: Message) -> Any:
     """Return the message without the daemon's measurements of itself."""
     if isinstance(message, DiagnosticArray):
-        left_out = MEASURED | {"acsard: recording"}
+        left_out = MEASURED_ROWS | {"acsard: recording"}
         rows = [row for row in message.status if row.name not in left_out]
         return DiagnosticArray(message.header, rows)
     if isinstance(message, Battery):
@@ -280,7 +280,7 @@ def test_the_file_has_each_message_that_was_published_to_the_byte(
     others = {
         one.name
         for one, data in zip(events, written["/log"], strict=True)
-        if LOG.encode(replace(log(one, one.stamp), name=name_of(data))) != data
+        if LOG_CHANNEL.encode(replace(log(one, one.stamp), name=name_of(data))) != data
     }
     assert others <= COUNTED
 

@@ -18,7 +18,7 @@ from acsard.core.values import Event
 from acsard.host.errors import Exit
 from acsard.recording.end_record import read_end
 from acsard.recording.file import Recording, Topic, Writing
-from acsard.recording.rows import NOTHING, Batch, Rare, Row
+from acsard.recording.rows import NO_RARE, Batch, Rare, Row
 from acsard.recording.timeline import TimelineEntry
 from tests.each import each, more
 from tests.scenarios.taped import happenings, recorded_world
@@ -50,7 +50,7 @@ def forge_row(
     for number, (topic, _, data) in enumerate(messages):
         if topic == "steps":
             for index, row in enumerate(BATCH.decode(data).rows):
-                forged = forge(row.rare or NOTHING)
+                forged = forge(row.rare or NO_RARE)
                 if forged is not None:
                     places.append((number, index, forged))
     number, index, rare = dice.choice(places)

@@ -271,7 +271,7 @@ def test_setting_the_present_value_is_answered_with_nothing_changes(world: World
 
 
 @pytest.mark.parametrize("via", ["bridge"])
-@pytest.mark.parametrize("service", rcl.SETTING)
+@pytest.mark.parametrize("service", rcl.SETTING_SERVICES)
 def test_ros_parameters_change_the_same_settings(world: World, service: str, via: Via) -> None:
     def ask(name: str, value: float) -> rcl.SetParametersResult:
         wish = rcl.Parameter(name, rcl.ParameterValue(rcl.DOUBLE, double_value=value))

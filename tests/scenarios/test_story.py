@@ -455,7 +455,7 @@ class Story(NamedTuple):
 def story(tmp_path_factory: pytest.TempPathFactory) -> Story:
     where, here = tmp_path_factory.mktemp("story") / "record", tmp_path_factory.mktemp("here")
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(module, "FLUSH_S", 1000.0)
+        patched.setattr(module, "SYNC_PAUSE_S", 1000.0)
         patched.setattr(module, "CLOSE_S", 20.0)
         patched.setattr(protocol, "identity", identity)
         patched.chdir(here)

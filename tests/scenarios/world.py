@@ -12,9 +12,9 @@ from collections.abc import Callable, Collection, Sequence
 import msgspec
 
 from acsard.core.config.settings import Config
-from acsard.core.incoming.bus_interface import NOTHING, BusInput
+from acsard.core.incoming.bus_interface import NO_INPUT, BusInput
 from acsard.core.incoming.commands import Arrival
-from acsard.core.incoming.imu import OWN
+from acsard.core.incoming.imu import SIMULATOR_SENDER
 from acsard.core.incoming.queries import Query, Reply
 from acsard.core.link.codec import Codec
 from acsard.core.link.serial_output import Offered, SerialOutput
@@ -116,7 +116,7 @@ class MemoryBus:
 
     def take(self, queries: int) -> BusInput:
         if not (self.arrivals or self.queries):
-            return NOTHING
+            return NO_INPUT
         got = BusInput(
             tuple(self.arrivals),
             tuple(self.queries[:queries]),
@@ -208,7 +208,7 @@ class World:
         if not self.gyro_dead:
             wall_ns = sight.at_ns + self.wall_offset_ns - int(self.config.sim.gyro_delay * NS_PER_S)
             said = turn_rate(sight, "base_link", self.config.sim.gyro_noise, wall_ns)
-            payload, signed = encode(said, "msgpack"), Signature(OWN).pack()
+            payload, signed = encode(said, "msgpack"), Signature(SIMULATOR_SENDER).pack()
             self.bus.arrivals.append(
                 Arrival("imu", True, payload, "", sight.at_ns, None, "", "native", signed)
             )

@@ -103,7 +103,7 @@ CASES = (
         "case 11",
         "TX joined to RX looks like a board, and the daemon drives it",
         "core/link/echo_detector.py",
-        "REPORTS = 20",
-        "REPORTS = 1_000_000_000",
+        "MIN_REPEATED_LINES = 20",
+        "MIN_REPEATED_LINES = 1_000_000_000",
     ),
 )

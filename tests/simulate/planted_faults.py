@@ -127,8 +127,8 @@ FAULTS = (
         "guard margin",
         "the guard stops a lawful ramp before its end",
         GUARD,
-        "MARGIN_NS = 300_000_000",
-        "MARGIN_NS = -100_000_000",
+        "RAMP_MARGIN_NS = 300_000_000",
+        "RAMP_MARGIN_NS = -100_000_000",
     ),
     fault(
         "guard timeout",
@@ -316,7 +316,7 @@ FAULTS = (
         "neutral place",
         "a sender whose stamps are in doubt loses the robot",
         NEUTRAL,
-        "(now_ns - self._present_ns <= timeout_ns and now_ns - arrived_ns <= PLACE_NS)",
+        "(now_ns - self._present_ns <= timeout_ns and now_ns - arrived_ns <= CANDIDATE_NS)",
         "False",
     ),
     fault(
@@ -386,8 +386,8 @@ FAULTS = (
         "freshness drift",
         "a queue that grows by 5 % looks like the drift of a clock",
         FRESHNESS,
-        "DRIFT = 5000",
-        "DRIFT = 20",
+        "SECONDS_PER_DRIFT = 5000",
+        "SECONDS_PER_DRIFT = 20",
     ),
     Fault(
         "freshness halves",
@@ -619,7 +619,7 @@ FAULTS = (
         "lines endless",
         "a line without an end fills the memory",
         "core/link/lines.py",
-        "            if len(self._held) >= MAX_LINE:",
+        "            if len(self._held) >= MAX_LINE_BYTES:",
         "            if False:",
     ),
     fault(
@@ -671,8 +671,8 @@ FAULTS = (
         "sanity dead",
         "a healthy wheel that follows its command slowly is called dead",
         WITNESS,
-        "moving and least > SLACK and abs(seen) < 0.1 * least",
-        "moving and least > SLACK and abs(seen) < 0.97 * least",
+        "moving and least > MIN_FAULT_SPEED and abs(seen) < 0.1 * least",
+        "moving and least > MIN_FAULT_SPEED and abs(seen) < 0.97 * least",
     ),
     fault(
         "sanity blind",
@@ -814,22 +814,22 @@ FAULTS = (
         "wheel counts",
         "a wheel with few encoder counts is a runaway because its smoothed speed is late",
         WITNESS,
-        "turns > 1.5 * due + SLACK",
-        "turns > 1.5 * fastest + SLACK",
+        "turns > 1.5 * due + MIN_FAULT_SPEED",
+        "turns > 1.5 * fastest + MIN_FAULT_SPEED",
     ),
     fault(
         "wheel waited",
         "the lines of a board that stopped its motors during a stall are a wheel fault",
         ROBOT,
-        "if self.session.lateness.step_s > UNHEARD_S and not pressed:",
+        "if self.session.lateness.step_s > WRITE_PAUSE_S and not pressed:",
         "if False:",
     ),
     fault(
         "driver cut",
         "a fault of a motor driver stops the robot without a ramp",
         ROBOT,
-        "            self._fault(DRIVER_FAULT, now, events)\n",
-        "            self._fault(DRIVER_FAULT, now, events)\n"
+        "            self._fault(DRIVER_FAULT_REASON, now, events)\n",
+        "            self._fault(DRIVER_FAULT_REASON, now, events)\n"
         "            self._limiter.cut()\n            self._speeds = STILL\n"
         "            self._made = self._said = (self._limiter.state, self._made_ns)\n",
     ),
@@ -873,15 +873,15 @@ FAULTS = (
         "estop silent",
         "a robot drives for 2 s without reports of its emergency stop",
         EMERGENCY_STOP,
-        "SILENT_S = 0.5\n",
-        "SILENT_S = 2.0\n",
+        "SILENCE_TIMEOUT_S = 0.5\n",
+        "SILENCE_TIMEOUT_S = 2.0\n",
     ),
     fault(
         "estop hasty",
         "two lost status lines stop the robot",
         EMERGENCY_STOP,
-        "SILENT_S = 0.5\n",
-        "SILENT_S = 0.25\n",
+        "SILENCE_TIMEOUT_S = 0.5\n",
+        "SILENCE_TIMEOUT_S = 0.25\n",
     ),
     fault(
         "estop needed",

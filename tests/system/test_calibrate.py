@@ -20,8 +20,14 @@ import zenoh
 
 from acsard.calibration.guided import robot_on_bus
 from acsard.calibration.guided.drive_plan import GuideError, Leg, Move
-from acsard.calibration.guided.leg_driver import HELD_UP
-from acsard.calibration.guided.robot_on_bus import POSITIONS, Recorder, RobotOnBus, Sample, Sensor
+from acsard.calibration.guided.leg_driver import STALL_REASON
+from acsard.calibration.guided.robot_on_bus import (
+    POSITION_TYPES,
+    Recorder,
+    RobotOnBus,
+    Sample,
+    Sensor,
+)
 from acsard.client import Client
 from acsard.core.config.parsing import parse
 from acsard.core.config.settings import Config, JointsConfig
@@ -126,7 +132,7 @@ def tried(bus: Bus, drive: Callable[[], T]) -> T:
         except AssertionError as error:
             why = " ".join(str(error).split())
             if not left or not (
-                is_ours(why) or HELD_UP in why or lost(time.monotonic() - 5.0) > 0.2
+                is_ours(why) or STALL_REASON in why or lost(time.monotonic() - 5.0) > 0.2
             ):
                 raise
             bus.at_rest()
@@ -411,7 +417,7 @@ def test_positions_of_another_program_are_received_as_both_types_in_every_encodi
             message = msgspec.convert(value, cls)
             for form in FORMATS:
                 key = f"slam/{cls.__name__}/{form}"
-                sensor = Sensor(heard, key, POSITIONS)
+                sensor = Sensor(heard, key, POSITION_TYPES)
                 recorder = Recorder(JointsConfig().as_tuple())
 
                 def came() -> bool:
@@ -425,9 +431,9 @@ def test_positions_of_another_program_are_received_as_both_types_in_every_encodi
 def test_positions_that_are_missing_or_of_another_type_are_reported(
     free: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(robot_on_bus, "FIRST_S", 0.2)
+    monkeypatch.setattr(robot_on_bus, "FIRST_STATE_TIMEOUT_S", 0.2)
     with router(free) as said, client_session(free, "") as heard:
-        sensor = Sensor(heard, "slam/pose", POSITIONS)
+        sensor = Sensor(heard, "slam/pose", POSITION_TYPES)
         with pytest.raises(GuideError, match="does not arrive on the Zenoh key slam/pose"):
             sensor.await_first("a position")
 

@@ -15,7 +15,7 @@ import pytest
 import zenoh
 
 from acsard.core.values import NS_PER_S
-from acsard.daemon.bus.certificate_watch import FILES_LOOK_NS
+from acsard.daemon.bus.certificate_watch import FILES_CHECK_PERIOD_NS
 from acsard.daemon.bus.tls import KEY, peer_ends_ns
 from acsard.daemon.gateway.listener_process import MAX_UNANSWERED
 from acsard.machine.authority import Authority
@@ -108,7 +108,7 @@ def test_a_new_certificate_is_used_and_the_daemon_runs_on(tmp_path: Path) -> Non
         Authority.load(own, str).issue(own, "robot", ["127.0.0.1"], 0.5)
         new = (own / KEY).read_bytes()
         (own / KEY).write_bytes(key)  # as long as a person has copied only a part of the files
-        time.sleep(3 * FILES_LOOK_NS / NS_PER_S)
+        time.sleep(3 * FILES_CHECK_PERIOD_NS / NS_PER_S)
         assert len(robot.daemon.events("gateway_open")) == 1
         (own / KEY).write_bytes(new)
         robot.daemon.gateway_opens(times=3)  # the second line says that it opens again

@@ -15,7 +15,7 @@ import aiohttp
 import pytest
 
 from acsard.machine.authority import Authority
-from acsard.terminal.json_prompt import HEARD_S
+from acsard.terminal.json_prompt import MAX_INPUT_SILENCE_S
 from tests import described
 from tests.system.browser import Page, run, text
 from tests.system.bystander import lost
@@ -160,7 +160,7 @@ async def test_a_guide_client_that_sends_no_signs_of_life_loses_its_procedure(
             if "sent no sign of life" in end["text"]:
                 break
             await guided.says(lambda said: said.get("running") == "")
-        assert f"page or program sent no sign of life for {HEARD_S:g} s" in end["text"]
+        assert f"page or program sent no sign of life for {MAX_INPUT_SILENCE_S:g} s" in end["text"]
         await beside(standing.at_rest)
 
 

@@ -6,7 +6,7 @@ from functools import partial
 
 import zenoh
 
-from acsard.daemon.bus.inbox import ARRIVALS, TICKETS, Inbox, Replies
+from acsard.daemon.bus.inbox import COMMAND_BUFFER, MAX_OPEN_QUERIES, Inbox, Replies
 from tests.system.harness import Bus, client_config, free_endpoint, until
 
 
@@ -27,7 +27,9 @@ def test_a_stop_query_counts_even_if_too_many_queries_are_open_to_answer_it() ->
     with zenoh.open(client_config(endpoint, "router")) as robot, Bus(endpoint) as bus:
         topics = ("info", "srv/stop")
         held = [robot.declare_queryable(prefix + t, partial(inbox.on_query, t)) for t in topics]
-        asked = [bus.session.get(f"{prefix}info", timeout=60.0) for _ in range(TICKETS + 1)]
+        asked = [
+            bus.session.get(f"{prefix}info", timeout=60.0) for _ in range(MAX_OPEN_QUERIES + 1)
+        ]
         # One more query is dropped at once, and so is the stop itself; but the stop counts.
         assert list(bus.session.get(f"{prefix}info", timeout=60.0)) == []
         assert inbox.take(0).arrivals == ()
@@ -68,7 +70,7 @@ def test_a_flood_under_two_certificates_displaces_no_command_of_other_senders() 
 
         held = [robot.declare_subscriber(f"{prefix}{key}", take) for key in ("cmd/*", "cmd/*/*")]
         quiet = ["cmd/app", "cmd/nav", "cmd/nav/anna"]
-        flood = [f"cmd/app/{name}" for name in ("anna", "ben")] * ARRIVALS
+        flood = [f"cmd/app/{name}" for name in ("anna", "ben")] * COMMAND_BUFFER
         for key in (*quiet, *flood):
             bus.session.put(prefix + key, b"", congestion_control=zenoh.CongestionControl.BLOCK)
         until(lambda: len(came) == len(quiet) + len(flood), 5.0, "all of them")
@@ -76,5 +78,5 @@ def test_a_flood_under_two_certificates_displaces_no_command_of_other_senders() 
         kept = [one.key for one in taken.arrivals]
         assert sorted(set(kept)) == sorted({*quiet, *flood})
         assert [kept.count(key) for key in quiet] == [1, 1, 1]
-        assert (len(kept), taken.overrun) == (len(quiet) + ARRIVALS, ARRIVALS)
+        assert (len(kept), taken.overrun) == (len(quiet) + COMMAND_BUFFER, COMMAND_BUFFER)
         del held

@@ -18,7 +18,7 @@ import zenoh
 
 from acsard.cli import main
 from acsard.client import synchronous
-from acsard.daemon.bus.robot_discovery import ALL, stop
+from acsard.daemon.bus.robot_discovery import ALL_ROBOTS, stop
 from acsard.host.version import version
 from acsard.machine.authority import Authority
 from tests.pages import blocks
@@ -148,7 +148,7 @@ def test_a_robot_that_does_not_answer_hides_no_other_robot(robots: Robots) -> No
 
 def test_a_stop_to_all_reaches_each_robot_without_discovery(robots: Robots) -> None:
     with zenoh.open(client_config(robots.endpoint)) as session:
-        stop(session, [ALL], "me")
+        stop(session, [ALL_ROBOTS], "me")
         for name in (ONE, TWO):
             with Bus(robots.endpoint, robot_id=name) as bus:
                 until(lambda: bus.state()["mode"] == "stopped", 5.0, "stopped")

@@ -19,8 +19,8 @@ import aiohttp
 import pytest
 
 from acsard.machine.authority import Authority
-from acsard.web.limits import CONNECTIONS_HERE
-from acsard.web.viewer import HEARTBEAT_S
+from acsard.web.limits import MAX_LOCAL_SOCKETS
+from acsard.web.viewer import PING_INTERVAL_S
 from tests import pictures
 from tests.pictures import VIEWS
 from tests.system.browser import NAME, TRUSTING, Hands, Page, answer, hands
@@ -382,7 +382,7 @@ def test_a_page_disconnects_when_it_is_left_and_reconnects_after_going_back(
     left = time.monotonic()
     browser.open("about:blank")
     until(lambda: viewers(page) == 0, 5.0, "no page is open")
-    assert time.monotonic() - left < HEARTBEAT_S, "the server had to find out"
+    assert time.monotonic() - left < PING_INTERVAL_S, "the server had to find out"
     browser.js("history.back()")
     page.shows("age", "live")
     page.shows("mode", "READY")
@@ -1005,13 +1005,13 @@ async def test_a_page_beyond_the_connection_limit_says_why_and_can_still_stop(pa
 
     def look() -> None:
         page.browser.open(page.server.here)
-        page.shows("reason", f"{CONNECTIONS_HERE} pages are open on the robot itself")
+        page.shows("reason", f"{MAX_LOCAL_SOCKETS} pages are open on the robot itself")
         page.browser.tap("stop")
         until(lambda: page.bus.state()["mode"] == "stopped", 5.0, "it stops all the same")
 
     page.browser.open("about:blank")
     async with AsyncExitStack() as stack:
-        left = CONNECTIONS_HERE
+        left = MAX_LOCAL_SOCKETS
         while left:  # the page that was open here disappears once the server notices
             with suppress(aiohttp.WSServerHandshakeError):
                 other = await stack.enter_async_context(hands(page.server))

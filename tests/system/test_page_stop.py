@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from acsard.web.answers import INLINED, PAGE
+from acsard.web.answers import INLINED, PAGE_DIRECTORY
 from tests.system.browser import Page
 from tests.system.chromium import CHROMIUM, PHONE, Browser, browsing
 from tests.system.harness import Bus, running, until
@@ -22,7 +22,7 @@ pytestmark = [
 WHOLE = {"index.html", *INLINED["index.html"]}
 """The files that arrive as one."""
 
-FILES = sorted(path.name for path in PAGE.iterdir() if path.name not in WHOLE)
+FILES = sorted(path.name for path in PAGE_DIRECTORY.iterdir() if path.name not in WHOLE)
 
 MODULES = [name for name in FILES if name.endswith(".js")]
 
@@ -218,6 +218,6 @@ def test_on_a_slow_network_stop_latches_before_the_page_shows_the_robot(impatien
 
 def test_every_module_of_the_page_is_preloaded() -> None:
     """The browser need not read one module to learn of the next one."""
-    page = (PAGE / "index.html").read_text(encoding="utf-8")
+    page = (PAGE_DIRECTORY / "index.html").read_text(encoding="utf-8")
     loaded = {name for name in MODULES if f'<link rel="modulepreload" href="page/{name}"' in page}
     assert loaded == set(MODULES) - {"main.js"}

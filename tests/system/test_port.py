@@ -25,7 +25,7 @@ from acsard.core.link.checked_line import seal
 from acsard.core.link.session import McuSession
 from acsard.core.values import NS_PER_S, STILL, Event, Instant
 from acsard.daemon.serial.device import open_raw
-from acsard.daemon.serial.port import HUNG, SerialPort
+from acsard.daemon.serial.port import DRIVER_HUNG, SerialPort
 from acsard.host import clock
 from acsard.host.clock import Asleep
 from tests.system.harness import until
@@ -263,7 +263,7 @@ async def test_a_device_that_opened_too_late_is_not_left_exclusive(
     monkeypatch.setattr("acsard.daemon.serial.port.OPEN_TIMEOUT_S", 0.01)
     monkeypatch.setattr("acsard.daemon.serial.port.open_raw", open_late)
     async with line.port() as port:
-        assert HUNG in port.trouble
+        assert DRIVER_HUNG in port.trouble
     opens.set()
     assert opened.wait(10.0)
     until(lambda: not exclusive(), 1.0, "others may open the device")

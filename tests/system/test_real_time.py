@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from acsard.host.real_time import DOZE
+from acsard.host.real_time import WAKE_UP_LATENCY
 from tests.system.harness import Daemon, running
 
 POLICY = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
@@ -44,7 +44,7 @@ def test_the_control_loop_alone_is_real_time_and_memory_is_locked(tmp_path: Path
         assert len(policies) > 3, "the bus has threads"
         assert set(policies.values()) == {os.SCHED_OTHER}
         assert locked_kb(daemon.pid) > 0
-        assert not Path(DOZE).exists() or DOZE in held(daemon.pid)
+        assert not Path(WAKE_UP_LATENCY).exists() or WAKE_UP_LATENCY in held(daemon.pid)
         assert daemon.events("real_time") == []
 
 
@@ -53,7 +53,7 @@ def test_real_time_scheduling_can_be_switched_off(tmp_path: Path) -> None:
     with Daemon(tmp_path, config={"control": {"real_time": False}}) as daemon:
         assert os.sched_getscheduler(daemon.pid) == os.SCHED_OTHER
         assert locked_kb(daemon.pid) == 0
-        assert DOZE not in held(daemon.pid)
+        assert WAKE_UP_LATENCY not in held(daemon.pid)
         assert daemon.events("real_time") == []
 
 

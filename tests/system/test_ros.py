@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import pytest
 
-from acsard.core.motion.lifecycle import LOOK_FIRST_S
+from acsard.core.motion.lifecycle import LATCH_REQUIRED_S
 from tests.system.builds import BUILD_S
 from tests.system.harness import Bus, Daemon, until
 from tests.system.ros_clients import (
@@ -348,7 +348,7 @@ def test_a_trigger_is_answered_once_for_every_form_of_an_empty_request(
         if verb == "clear":
             bus.get("srv/stop")
             stopped = time.monotonic()
-            until(lambda: time.monotonic() > stopped + LOOK_FIRST_S, 5.0, "two seconds")  # noqa: B023
+            until(lambda: time.monotonic() > stopped + LATCH_REQUIRED_S, 5.0, "two seconds")  # noqa: B023
         called = ros.call(f"acsard/{verb}", TRIGGER, request)
         for undo in ("clear", "activate"):
             bus.get(f"srv/{undo}")

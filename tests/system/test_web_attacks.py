@@ -24,15 +24,15 @@ import pytest
 from yarl import URL
 
 from acsard.host.rate_limits import Rate
-from acsard.web.acceptor import REQUEST_S, UNREAD_S
-from acsard.web.app import BODY_S
+from acsard.web.acceptor import REQUEST_TIMEOUT_S, UNREAD_TIMEOUT_S
+from acsard.web.app import BODY_TIMEOUT_S
 from acsard.web.limits import (
-    HANDSHAKES,
-    HOLD_S,
+    HANDSHAKE_RATE,
     OPENINGS,
+    REFUSAL_DELAY_S,
     SOCKETS_OF_ONE,
     STOPS,
-    STRANGERS,
+    STRANGER_RATE,
 )
 from tests.system.browser import NAME, Hands, Page, hands
 from tests.system.harness import (
@@ -438,7 +438,7 @@ def test_answers_that_no_client_reads_cost_little_memory(
             one.connect(("127.0.0.1", place.port))
             greedy.append(stack.enter_context(trusting.wrap_socket(one)))
             greedy[-1].setblocking(False)
-        before, most, end = resident_kb(page.pid), 0, time.monotonic() + UNREAD_S - 1.0
+        before, most, end = resident_kb(page.pid), 0, time.monotonic() + UNREAD_TIMEOUT_S - 1.0
         while time.monotonic() < end:
             for one in greedy:
                 with suppress(OSError):
@@ -485,7 +485,7 @@ def test_a_slow_or_silent_client_is_disconnected(table: Table, bus: Bus) -> None
             assert says_nothing.recv(4096) == b""
         answer = keeps.recv(4096)
     assert answer.startswith(b"HTTP/1.1 408"), answer
-    assert time.monotonic() - begun < max(BODY_S, REQUEST_S) + PATIENCE_S
+    assert time.monotonic() - begun < max(BODY_TIMEOUT_S, REQUEST_TIMEOUT_S) + PATIENCE_S
 
 
 def test_a_client_that_does_not_read_its_answers_is_disconnected_soon(
@@ -510,13 +510,13 @@ def test_a_client_that_does_not_read_its_answers_is_disconnected_soon(
             for _ in range(100_000):
                 greedy.send(b"GET /page/main.js HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
         until(held, PATIENCE_S, "it is accepted")
-        until(lambda: not held(), UNREAD_S + PATIENCE_S / 3, "it is disconnected")
+        until(lambda: not held(), UNREAD_TIMEOUT_S + PATIENCE_S / 3, "it is disconnected")
     assert "Traceback" not in table.page.stderr
 
 
 ENDLESS: dict[str, tuple[str, int, Rate, str]] = {
-    "files": ("GET /page/main.js", 30, STRANGERS, "200"),
-    "no token": ("GET /api/state", 30, STRANGERS, "401"),
+    "files": ("GET /page/main.js", 30, STRANGER_RATE, "200"),
+    "no token": ("GET /api/state", 30, STRANGER_RATE, "401"),
     "whoami": ("GET /api/whoami", 30, STOPS, "200"),
     "sockets": ("GET /ws", 5, OPENINGS, "101"),
     "stops": ("POST /api/srv/stop", 30, STOPS, "200"),
@@ -532,7 +532,7 @@ async def test_a_client_that_pipelines_requests_without_end_is_delayed_and_not_r
     said, clients, rate, status = ENDLESS[what]
     place, lasts_s = URL(table.page.away), 3.0
     headers = {"Host": f"{place.host}:{place.port}", "Content-Length": "0"}
-    if rate != STRANGERS:
+    if rate != STRANGER_RATE:
         headers["Authorization"] = f"Bearer {tokens['viewer']}"
     if said.endswith("/ws"):
         headers |= UPGRADE
@@ -560,8 +560,8 @@ async def test_a_client_that_pipelines_requests_without_end_is_delayed_and_not_r
     await asyncio.gather(*(asks(end) for _ in range(clients)))
     print(f"\n{what}: {answers.total() / lasts_s:.0f} answers a second to {clients} clients")
     assert set(answers) == {status}
-    lasts_s += HOLD_S  # an answer may come after the end
-    assert answers.total() <= rate.most + (rate.hz + clients / HOLD_S) * lasts_s
+    lasts_s += REFUSAL_DELAY_S  # an answer may come after the end
+    assert answers.total() <= rate.most + (rate.hz + clients / REFUSAL_DELAY_S) * lasts_s
 
 
 async def test_a_stop_beyond_the_rate_is_sent_immediately_and_only_its_answer_waits(
@@ -591,10 +591,10 @@ async def test_a_stop_beyond_the_rate_is_sent_immediately_and_only_its_answer_wa
                 until, lambda: bus.state()["mode"] == "stopped", PATIENCE_S, "it stops"
             )
             early = not asking.done()
-            if (took := await asking) >= HOLD_S:
+            if (took := await asking) >= REFUSAL_DELAY_S:
                 assert early
                 break
-        assert took >= HOLD_S
+        assert took >= REFUSAL_DELAY_S
         for one in others:
             one.cancel()
 
@@ -619,7 +619,7 @@ async def test_handshakes_from_one_network_are_delayed_beyond_their_rate(
     end = time.monotonic() + lasts_s
     await asyncio.gather(*(shakes(end) for _ in range(30)))
     print(f"\n{done / lasts_s:.0f} handshakes a second")
-    assert done <= HANDSHAKES.most + HANDSHAKES.hz * lasts_s + 5
+    assert done <= HANDSHAKE_RATE.most + HANDSHAKE_RATE.hz * lasts_s + 5
 
 
 async def test_a_connection_with_a_valid_cookie_is_kept_from_its_first_file_on(

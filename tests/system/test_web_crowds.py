@@ -20,8 +20,8 @@ from pathlib import Path
 import pytest
 
 from acsard.machine.authority import Authority
-from acsard.web.acceptor import PAUSE_S
-from acsard.web.calls import MERGE_S
+from acsard.web.acceptor import NO_FILES_PAUSE_S
+from acsard.web.calls import MIN_STOP_INTERVAL_S
 from tests.system.browser import Hands, Page
 from tests.system.bystander import lost
 from tests.system.harness import PATIENCE_S, Daemon, Program, free_endpoint, resident_kb, until
@@ -226,7 +226,7 @@ def test_a_page_that_runs_out_of_files_stops_the_robot_and_recovers(
         times = [f"{1000 * nine_of_ten(took):.0f} ms" for took in (alone, crowded, after)]
         print("\nno file: a stop from here before, meanwhile and after:", ", ".join(times))
         # Each turn without a file displaces one connection, and the listeners rest after it.
-        assert nine_of_ten(crowded) < HERE_S + 4 * PAUSE_S
+        assert nine_of_ten(crowded) < HERE_S + 4 * NO_FILES_PAUSE_S
         assert nine_of_ten(after) < HERE_S
         assert away < PHONE_S
         with inside(hosts.robot):
@@ -252,7 +252,7 @@ async def _stops(stop: Callable[[], float]) -> list[float]:
     took = []
     for _ in range(STOPS):
         took.append(await asyncio.to_thread(stop))
-        await asyncio.sleep(2 * MERGE_S)
+        await asyncio.sleep(2 * MIN_STOP_INTERVAL_S)
     return took
 
 

@@ -14,14 +14,14 @@ from aiohttp.test_utils import TestServer
 
 from acsard.client import Client
 from acsard.core.config.settings import Config, WebConfig
-from acsard.core.messages.signature import MOST
+from acsard.core.messages.signature import MAX_INT64
 from acsard.daemon.bus.address import Address
 from acsard.daemon.bus.zenoh_sessions import client_session
 from acsard.host.errors import UnreachableError
 from acsard.web.acceptor import Acceptor
-from acsard.web.app import DEFAULT, Page
+from acsard.web.app import DEFAULT_CONFIG, Page
 from acsard.web.guide import Guide, Reach
-from acsard.web.limits import OVERRUNS, UNREAD_BYTES
+from acsard.web.limits import MAX_OVERRUNS, MAX_UNREAD_BYTES
 from acsard.web.metrics import Counts
 from acsard.web.robots import About, Robots
 from acsard.web.server import Wanted, _until
@@ -41,7 +41,7 @@ ABOUT = About("1", True, 1.0, 4.0, 10.0, "", {"teleop": 0.25, "app": 0.25})
 class Inside:
     """The whole server without a connection to a robot, which a test opens if it needs one."""
 
-    def __init__(self, where: Path, rules: WebConfig = DEFAULT) -> None:
+    def __init__(self, where: Path, rules: WebConfig = DEFAULT_CONFIG) -> None:
         self.counts = Counts()
 
         def connect() -> Client:
@@ -114,7 +114,7 @@ async def test_a_client_that_stops_reading_later_gets_only_the_newest_message(
             wire = cast(Any, ours.socket)._response.connection.transport
             wire.pause_reading()
             (viewer,) = inside.page._viewers
-            while viewer._out._unread() <= UNREAD_BYTES:  # more than the kernels hold
+            while viewer._out._unread() <= MAX_UNREAD_BYTES:  # more than the kernels hold
                 viewer._out.say("x" * 4096)
                 await asyncio.sleep(0)
             await eventually(lambda: left_out() >= MISSED)
@@ -137,7 +137,7 @@ async def test_a_stamp_too_large_to_sign_is_refused_and_the_next_command_is_acce
 ) -> None:
     async with inside.hands() as ours:
         wish = {"linear_x": 0.2, "angular_z": 0.0}
-        await ours.say(cmd=wish, stamp=MOST / 1e6)
+        await ours.say(cmd=wish, stamp=MAX_INT64 / 1e6)
         refused = await ours.find(lambda said: said.get("refused") == "cmd")
         assert "ms since 1970" in refused["reason"]
         await ours.drive(0.0)
@@ -146,7 +146,7 @@ async def test_a_stamp_too_large_to_sign_is_refused_and_the_next_command_is_acce
 
 async def test_a_flood_of_stops_ends_its_connection(inside: Inside) -> None:
     async with inside.hands() as ours:
-        for n in range(3 * OVERRUNS):
+        for n in range(3 * MAX_OVERRUNS):
             await ours.say(call="stop", id=n)
         async with asyncio.timeout(PATIENCE_S):
             while (await ours.socket.receive()).type == aiohttp.WSMsgType.TEXT:
@@ -197,7 +197,7 @@ async def test_a_client_that_pings_without_reading_gets_one_answer_to_all_pings(
         wire.pause_reading()
         (viewer,) = inside.page._viewers
         viewer._out.say({"more than a kernel holds": "x" * 3_000_000})
-        await eventually(lambda: viewer._out._unread() > UNREAD_BYTES)
+        await eventually(lambda: viewer._out._unread() > MAX_UNREAD_BYTES)
         for n in range(300):
             await ours.socket.ping(b"%0125d" % n)
         await ours.drive(0.0)

@@ -24,8 +24,8 @@ from acsard.daemon.bus.tls import peer_ends_ns
 from acsard.machine.authority import Authority
 from acsard.web.limits import (
     CONNECTIONS_ALIKE,
-    CONNECTIONS_HERE,
     CONNECTIONS_OF_ONE,
+    MAX_LOCAL_SOCKETS,
 )
 from acsard.web.server import TIDY_S
 from tests.system.browser import NAME, Page, hands, run
@@ -255,7 +255,7 @@ async def test_a_client_with_too_many_connections_shuts_out_no_other_at_its_addr
         rest = [await taken(stack, one) for one in others]
         assert rest[:-1] == [CONNECTIONS_ALIKE] * (few - 2)
         assert sum(rest) == CONNECTIONS_OF_ONE - CONNECTIONS_ALIKE
-        for _ in range(CONNECTIONS_HERE):
+        for _ in range(MAX_LOCAL_SOCKETS):
             ours = await stack.enter_async_context(hands(page))
         assert (await ours.call("stop"))["ok"]
     refused = few * CONNECTIONS_OF_ONE - CONNECTIONS_OF_ONE

@@ -24,10 +24,10 @@ from msgspec.structs import replace
 
 from acsard.calibration.error_budget.measured_errors import Driving, Line, Steps, motion, rounding
 from acsard.core.config.settings import Config, OdometryConfig
-from acsard.core.motion.error_model import DECIMAL, ErrorModel, TwistUncertainty, columns
+from acsard.core.motion.error_model import SPEED_RESOLUTION, ErrorModel, TwistUncertainty, columns
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.path import Path
-from acsard.core.motion.uncertainty import GYRO_SCALE, PoseUncertainty
+from acsard.core.motion.uncertainty import GYRO_SCALE_STD, PoseUncertainty
 from acsard.core.values import REST, PoseCovariance
 
 Cause = Literal["time", "quantization", "gaps", "slip", "parameters", "gyro"]
@@ -38,7 +38,7 @@ Basis = Literal["measured", "settings", "unknown"]
 The size is measured, or taken from the settings in `[odometry]`, or unknown.
 """
 
-METRES = 100.0
+BUDGET_DISTANCE_M = 100.0
 """Distance of driving after which the budget gives the position error, m."""
 
 LEAST_M, LEAST_RAD = 0.2, 0.2
@@ -48,7 +48,7 @@ A drive that is shorter than `LEAST_M` gives no position errors. A drive that tu
 `LEAST_RAD` gives no heading errors.
 """
 
-LEAST_LINES = 20
+MIN_LINES = 20
 """Minimum number of feedback lines.
 
 If there are fewer lines, the robot is assumed to stand still.
@@ -57,7 +57,7 @@ If there are fewer lines, the robot is assumed to stand still.
 STEP_S = 0.1
 """Minimum duration of the steps into which a measured drive is divided, s."""
 
-MOST_STEPS = 20_000
+MAX_STEPS = 20_000
 """Maximum number of steps in 100 m of driving. A slow drive has longer steps than `STEP_S`."""
 
 STRAIGHT = Steps(np.array([[0.05, 0.0] + [0.0] * 7]))
@@ -184,14 +184,14 @@ class Received(Struct, frozen=True):
     """True if the encoders are coarse and the daemon does not know their counts per wheel turn."""
 
 
-def budget(received: Received, config: Config, metres: float = METRES) -> Budget:
+def budget(received: Received, config: Config, metres: float = BUDGET_DISTANCE_M) -> Budget:
     """Return the error budget of a drive.
 
     `metres` is the distance after which the budget gives the position error, m.
     """
     model, lines = _Model(config, metres), received.lines
     still = _standing(received, config, model)
-    if len(lines) < LEAST_LINES:
+    if len(lines) < MIN_LINES:
         return still
     moved = motion(lines, np.array(received.sent), model.kinematics, received.whole)
     rolled, turned = float(np.abs(moved.distance).sum()), float(np.abs(moved.turn).sum())
@@ -199,7 +199,7 @@ def budget(received: Received, config: Config, metres: float = METRES) -> Budget
         return still
     found = rounding(np.array([line.speeds for line in lines]), moved.period)
     counts = still.counts or (round(math.tau / found.count) if found.count else 0)
-    creeping = metres / max(rolled, LEAST_M) * moved.seconds / MOST_STEPS
+    creeping = metres / max(rolled, LEAST_M) * moved.seconds / MAX_STEPS
     driving = Driving(lines, moved, found, model.kinematics, max(STEP_S, creeping), received.gyro)
     model.rolls, model.turns = rolled >= LEAST_M, turned >= LEAST_RAD
     return replace(
@@ -223,7 +223,8 @@ def _standing(received: Received, config: Config, model: _Model) -> Budget:
     configured = model.kinematics.multipliers[2]
     learned = None if received.learned is None else received.learned * configured
     return Budget(
-        lines[-1].at - lines[0].at if lines else 0.0, 0.0, 0.0, len(lines), 0, 0.0, 0.0, DECIMAL,
+        lines[-1].at - lines[0].at if lines else 0.0, 0.0, 0.0, len(lines), 0, 0.0, 0.0,
+        SPEED_RESOLUTION,
         config.mcu.encoder_counts if received.counted else 0, received.gyro, still=True,
         at_rest=(math.sqrt(spread.linear), math.sqrt(spread.angular)), shares=shares,
         multiplier=configured, learned=learned, learned_std=(learned or 0.0) * received.deviation,
@@ -267,7 +268,7 @@ def _causes(received: Received, model: _Model, driving: Driving, counts: int) ->
     if received.gyro:
         known = odometry.covariance == "model" and driving.tells_gyro
         basis = "measured" if known else "unknown"
-        yield share("gyro", basis, driving.turned_by_gyro(), scale=GYRO_SCALE)
+        yield share("gyro", basis, driving.turned_by_gyro(), scale=GYRO_SCALE_STD)
 
 
 class _Model:

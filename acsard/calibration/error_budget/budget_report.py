@@ -8,10 +8,10 @@ from rich.console import RenderableType
 from rich.table import Table
 
 from acsard.calibration.error_budget.budget import Basis, Budget, Cause, Share
-from acsard.core.motion.uncertainty import COARSE_COUNTS
+from acsard.core.motion.uncertainty import ASSUMED_COUNTS
 from acsard.terminal.output import table
 
-MEANING: dict[Cause, str] = {
+CAUSE_TEXTS: dict[Cause, str] = {
     "time": "errors in the times of feedback lines",
     "quantization": "rounding of the values in a feedback line",
     "gaps": "distance driven while no feedback lines arrived",
@@ -36,19 +36,19 @@ ADVICE: dict[Cause, str] = {
     "bias of the gyro",
 }
 
-BASIS: dict[Basis, str] = {
+BASIS_TEXTS: dict[Basis, str] = {
     "measured": "measurements",
     "settings": "[odometry]",
     "unknown": "nothing",
 }
 
-COARSE = (
+COARSE_ADVICE = (
     "the encoders are coarse and the daemon does not know how many counts they have per wheel "
     "turn, so an error in the time of a feedback line becomes an error of the heading: write the "
     "counts per wheel turn as mcu.encoder_counts (`acsard mcu check` estimates them)"
 )
 
-CALIBRATE = (
+CALIBRATE_ADVICE = (
     "the errors of the configured wheel radii and track width are unknown, and if the wheels skid, "
     "they are usually the largest errors: run `acsard calibrate`"
 )
@@ -78,9 +78,9 @@ def advice(budget: Budget) -> str:
             "does not show most causes of errors"
         )
     measured, largest = budget.largest("measured"), budget.largest("measured", "settings")
-    advice = [COARSE] if budget.coarse else []
+    advice = [COARSE_ADVICE] if budget.coarse else []
     if any(share.cause == "parameters" and share.basis == "unknown" for share in budget.shares):
-        advice.append(CALIBRATE)
+        advice.append(CALIBRATE_ADVICE)
     if largest is not None and largest is not measured:
         advice.append(
             "according to the settings in [odometry], the largest cause of errors is "
@@ -105,7 +105,7 @@ def _driven(budget: Budget) -> str:
 
 
 def _table(budget: Budget) -> Table:
-    causes = [(s.cause, s.mm_per_100_m, s.deg_per_turn, MEANING[s.cause], BASIS[s.basis])
+    causes = [(s.cause, s.mm_per_100_m, s.deg_per_turn, CAUSE_TEXTS[s.cause], BASIS_TEXTS[s.basis])
               for s in budget.shares]  # fmt: skip
     total = ("all", *budget.total(), "square root of the sum of the squares above", "")
     rows = [
@@ -172,7 +172,7 @@ def _advice_on(share: Share, budget: Budget) -> str:
         return ADVICE[share.cause].format(
             late=1e3 * budget.lateness, missing=budget.missing, unseen=budget.unseen
         )
-    if 0 < budget.counts <= COARSE_COUNTS:
+    if 0 < budget.counts <= ASSUMED_COUNTS:
         return (
             f"the encoders have only {budget.counts} counts per wheel turn: use encoders with more "
             "counts, on the shafts of the motors"

@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping
 from acsard.calibration.error_budget.budget import Budget, Received, budget
 from acsard.calibration.error_budget.measured_errors import Line
 from acsard.client import Client, Subscription
-from acsard.client.follower import FIRST_S
+from acsard.client.follower import FIRST_STATE_TIMEOUT_S
 from acsard.client.synchronous import decoder
 from acsard.core.config.settings import Config
 from acsard.core.messages.encodings import DecodeError
@@ -29,13 +29,13 @@ from acsard.host.errors import ReplyError
 KEYS = ("odom", "wheel_states", "cmd_vel_out")
 """Zenoh keys of the messages that an error budget needs."""
 
-MOST = 60_000
+MAX_LINES = 60_000
 """Maximum number of feedback lines that are kept: ten minutes at 100 Hz.
 
 Older lines are dropped.
 """
 
-SHARE_COARSE = 0.1
+MAX_COARSE_FRACTION = 0.1
 """Fraction of feedback lines that show coarse encoders, above which the report mentions them."""
 
 LEAST_LOST, SHARE_LOST = 3, 0.01
@@ -46,13 +46,13 @@ more. A few lines always seem to be missed, because this program reads the daemo
 messages at different moments.
 """
 
-SAMPLED = "checked with samples"
+SAMPLED_CHECK = "checked with samples"
 """Value of `check` in the message `diagnostics` if feedback lines carry samples.
 
 The samples are encoder counts and the microcontroller's time.
 """
 
-LOOK_S = 0.05
+POLL_PERIOD_S = 0.05
 """Interval at which the message queues are polled, s."""
 
 
@@ -72,20 +72,20 @@ def budgets(robot: Client, config: Config, seconds: float) -> Iterator[Budget]:
 def _await_line(robot: Client, lines: Subscription) -> None:
     """Wait for the first feedback line. From then on, messages on all of `KEYS` arrive.
 
-    Raises `ReplyError` if no feedback line arrives within `FIRST_S`.
+    Raises `ReplyError` if no feedback line arrives within `FIRST_STATE_TIMEOUT_S`.
     """
-    end = time.monotonic() + FIRST_S
+    end = time.monotonic() + FIRST_STATE_TIMEOUT_S
     while lines.try_recv() is None:
         if time.monotonic() > end:
             raise ReplyError(f"the daemon receives no feedback lines: {robot.get('state').reason}")
-        time.sleep(LOOK_S)
+        time.sleep(POLL_PERIOD_S)
 
 
 def _follow(feed: Feed, queues: Mapping[str, Subscription], seconds: float) -> None:
     decoders = {key: decoder(key) for key in queues}
     end = time.monotonic() + seconds
     while time.monotonic() < end:
-        time.sleep(LOOK_S)
+        time.sleep(POLL_PERIOD_S)
         for key, queue in queues.items():
             while (sample := queue.try_recv()) is not None:
                 try:
@@ -111,8 +111,8 @@ class Feed:
         self._config, self._first = config, first
         self._start_ns = first.stamp.to_ns()
         self._odom: dict[int, Odometry] = {}
-        self._lines: deque[Line] = deque(maxlen=MOST)
-        self._sent: deque[int] = deque(maxlen=MOST)
+        self._lines: deque[Line] = deque(maxlen=MAX_LINES)
+        self._sent: deque[int] = deque(maxlen=MAX_LINES)
         self._wheels: dict[int, JointState] = {}
         self._count = 0
 
@@ -137,7 +137,8 @@ class Feed:
             list(self._lines),
             [(at - self._start_ns) / NS_PER_S for at in self._sent],
             whole=self._whole(last),
-            counted=self._config.mcu.wants_samples and _value(diagnostics, "check") == SAMPLED,
+            counted=self._config.mcu.wants_samples
+            and _value(diagnostics, "check") == SAMPLED_CHECK,
             gyro=last.gyro in ("used", "disagrees"),
             learned=learned,
             deviation=deviation,
@@ -150,7 +151,7 @@ class Feed:
         lines, coarse = (
             now.get(name, 0) - before.get(name, 0) for name in ("lines", "coarse_encoder_lines")
         )
-        return coarse > SHARE_COARSE * lines
+        return coarse > MAX_COARSE_FRACTION * lines
 
     def _join(self, stamp_ns: int) -> None:
         odom, wheels = self._odom.get(stamp_ns), self._wheels.get(stamp_ns)

@@ -16,25 +16,26 @@ from msgspec import Struct
 
 from acsard.calibration.error_budget.quantization_step import quantization_step
 from acsard.calibration.log_table import Floats
-from acsard.core.motion.error_model import DECIMAL
+from acsard.core.motion.error_model import SPEED_RESOLUTION
 from acsard.core.motion.gap_filling import Gaps
 from acsard.core.motion.kinematics import Kinematics
-from acsard.core.motion.uncertainty import GYRO_SCALE
+from acsard.core.motion.uncertainty import GYRO_SCALE_STD
 from acsard.core.values import Twist, WheelSpeeds
 
 Counts = npt.NDArray[np.int64]
 
-AHEAD = 30
+UNDELAYED_LINES = 30
 """Number of consecutive feedback lines, of which at least one is assumed not to be delayed.
 
 At 100 Hz, these lines take 0.3 s. A busy host does not keep the daemon from running for longer.
 """
 
-MISSING = 0.6
-"""Growth of the smallest delay among `AHEAD` lines, in periods, that shows a lost line."""
+LOST_LINE_PERIODS = 0.6
+"""Growth of the smallest delay among `UNDELAYED_LINES` lines, in periods, that shows a lost
+line."""
 
-FOLLOWED = 0.05
-"""Gain of the low-pass filter that follows the smallest delay among `AHEAD` lines.
+DELAY_GAIN = 0.05
+"""Gain of the low-pass filter that follows the smallest delay among `UNDELAYED_LINES` lines.
 
 This delay drifts because the period is at first known only to about 1 %.
 """
@@ -133,17 +134,17 @@ def _missing(at: Floats) -> Counts:
     """
     count = len(at)
     ahead = at - np.arange(count)
-    padded = np.concatenate([ahead, np.full(AHEAD, np.inf)])
-    earliest = np.lib.stride_tricks.sliding_window_view(padded, AHEAD)[:count].min(axis=1)
+    padded = np.concatenate([ahead, np.full(UNDELAYED_LINES, np.inf)])
+    earliest = np.lib.stride_tricks.sliding_window_view(padded, UNDELAYED_LINES)[:count].min(axis=1)
     found = np.zeros(count, dtype=np.int64)
     usual = float(earliest[0])
     for i, now in enumerate(earliest.tolist()):
         over = now - usual
-        if over >= MISSING:
+        if over >= LOST_LINE_PERIODS:
             found[i] = round(over)
             usual += round(over)
         else:
-            usual += FOLLOWED * over
+            usual += DELAY_GAIN * over
     return found
 
 
@@ -160,7 +161,7 @@ LEAST_LINES, ALIKE = 20, 0.99
 proportional to time (cosine above `ALIKE`), the fit cannot separate noise and scale error.
 """
 
-LATEST_S = 0.1
+MAX_DELAY_S = 0.1
 """Largest delay of a feedback line, s, that counts as an error of its stamp.
 
 It is also the shortest gap in the feedback. A gap is an interval between two lines in which the
@@ -274,7 +275,7 @@ def _noise(t: Floats, speeds: Floats, turns: Floats, variances: Floats) -> Float
     #
     # Leave out the lines in which the variance falls, because the pose was set there.
     dt, moves = np.diff(t), speeds[1:].any(axis=1) & (variances[1:] > variances[:-1] / 2)
-    levers, before = 2 * GYRO_SCALE**2 * turns, np.cumsum(turns) - turns / 2
+    levers, before = 2 * GYRO_SCALE_STD**2 * turns, np.cumsum(turns) - turns / 2
     grown = np.diff(variances) - levers * before
     columns = np.column_stack((dt, levers))[moves]
     sizes = np.sqrt(np.sum(columns**2, axis=0))
@@ -293,7 +294,7 @@ def _late(t: Floats, twists: list[Twist], found: LineTimes) -> Floats:
     # times dt. It changes the next interval by the opposite amount. Summation by parts gives each
     # line one error: the delay of the line times (speed in this line - speed in the next line).
     speeds = np.array([(one.linear, one.angular) for one in twists])
-    near = np.abs(found.late) <= LATEST_S
+    near = np.abs(found.late) <= MAX_DELAY_S
     # A constant delay causes no error, so subtract the mean delay.
     late = np.where(near, found.late - found.late[near].mean(), 0.0)
     parts = np.zeros((len(t) - 1, 2))
@@ -322,7 +323,7 @@ def _gaps(
         before, after, dt = twists[k], twists[k + 1], float(t[k + 1] - t[k])
         mean = Twist((before.linear + after.linear) / 2, (before.angular + after.angular) / 2)
         moves = moved != Twist() or after == Twist()
-        if not moves and dt >= LATEST_S:
+        if not moves and dt >= MAX_DELAY_S:
             unseen += dt
             lost += missing
             along, yaw = gaps.unseen(dt, before, after)
@@ -344,13 +345,13 @@ def _gaps(
     return filled, unfilled, lost, unseen
 
 
-TOGETHER = 0.8
+EQUAL_SPEEDS_FRACTION = 0.8
 """Fraction of lines in which two wheels must report equal speeds.
 
 From this fraction on, the two wheels are assumed to have equal rounding errors.
 """
 
-LEAST_VALUES = 3
+MIN_VALUES = 3
 """Minimum number of different speeds from which a quantization step is computed."""
 
 
@@ -393,14 +394,16 @@ def rounding(speeds: Floats, period: float) -> Rounding:
     """
     moving = np.any(speeds != 0.0, axis=1)
     same = speeds[moving][:, :, None] == speeds[moving][:, None, :]
-    alike = (same.mean(axis=0) >= TOGETHER).astype(float) if moving.any() else np.eye(4)
+    alike = (
+        (same.mean(axis=0) >= EQUAL_SPEEDS_FRACTION).astype(float) if moving.any() else np.eye(4)
+    )
     quantum = _quantum(speeds)
     if quantum:
         off = (speeds - quantum * np.round(speeds / quantum)) * period
         return Rounding(np.zeros_like(speeds), off, alike, quantum, quantum * period)
     variance = np.column_stack([_runs(column) for column in speeds.T])
-    scale = (DECIMAL * period) ** 2 / 12
-    return Rounding(variance * scale, np.zeros_like(speeds), alike, DECIMAL, 0.0)
+    scale = (SPEED_RESOLUTION * period) ** 2 / 12
+    return Rounding(variance * scale, np.zeros_like(speeds), alike, SPEED_RESOLUTION, 0.0)
 
 
 def _runs(values: Floats) -> Floats:
@@ -429,7 +432,7 @@ def _quantum(speeds: Floats) -> float:
     """Return the quantization step of which all speeds are multiples, rad/s; 0 if no step fits."""
     # Count each value once, because its repetitions do not add evidence.
     seen = np.unique(np.abs(speeds[speeds != 0.0]))
-    return quantization_step(seen) if len(seen) >= LEAST_VALUES else 0.0
+    return quantization_step(seen) if len(seen) >= MIN_VALUES else 0.0
 
 
 class Steps(Struct, frozen=True):

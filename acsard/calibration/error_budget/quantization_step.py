@@ -15,23 +15,23 @@ import numpy as np
 from acsard.calibration.log_table import Floats
 from acsard.core.link.whole_counts import ROUNDING
 
-FINEST = 4 * ROUNDING
+MIN_STEP = 4 * ROUNDING
 """Smallest quantization step to try, rad/s.
 
 A smaller step would fit more than half of all speeds by chance.
 """
 
-DEVIATION = 0.01 / math.sqrt(12)
+ROUNDING_STD = 0.01 / math.sqrt(12)
 """Standard deviation of the error of rounding to two decimals, rad/s."""
 
-STRAYS = 0.005
+MAX_OUTLIER_FRACTION = 0.005
 """Fraction of the speeds that need not be multiples of the step, because lines were damaged."""
 
-BY_CHANCE = 1e-5
+MAX_CHANCE = 1e-5
 """Largest accepted probability that a quantization step fits all speeds only by chance."""
 
-STEEP = 1.0
-"""Smallest quantization step, rad/s, that is accepted without a check against `BY_CHANCE`.
+COARSE_STEP = 1.0
+"""Smallest quantization step, rad/s, that is accepted without a check against `MAX_CHANCE`.
 
 Only speeds from coarse encoders have steps of this size.
 """
@@ -43,12 +43,12 @@ def quantization_step(speeds: Floats) -> float:
     `speeds` contains at least three different speeds above 0, rad/s, in rising order. The result
     is the largest step of which nearly all speeds are multiples, unless it may fit only by chance.
     """
-    spare = max(1, int(STRAYS * len(speeds)))
+    spare = max(1, int(MAX_OUTLIER_FRACTION * len(speeds)))
     # The anchor is one of the largest speeds. It is j times the step for a whole number j, so the
     # candidates for the step are anchor / j. The speeds above the anchor need not be multiples of
     # the step.
     anchor = float(speeds[-1 - spare])
-    for part in range(1, int(anchor / FINEST) + 1):
+    for part in range(1, int(anchor / MIN_STEP) + 1):
         # The anchor is rounded too, so the error of each multiple is proportional to its size.
         if _strays(speeds, anchor / part, ROUNDING / anchor) <= spare:
             step = _fitted(speeds, anchor / part, spare, part)
@@ -69,7 +69,7 @@ def _strays(speeds: Floats, step: float, doubt: float) -> int:
 def _fitted(speeds: Floats, rough: float, spare: int, tries: int) -> float:
     """Return the quantization step near `rough`, rad/s, fitted by least squares.
 
-    Return 0 if the step is smaller than `FINEST`, does not fit the speeds, or may fit only by
+    Return 0 if the step is smaller than `MIN_STEP`, does not fit the speeds, or may fit only by
     chance.
 
     Args:
@@ -84,9 +84,9 @@ def _fitted(speeds: Floats, rough: float, spare: int, tries: int) -> float:
     squares = float(whole @ whole)
     if not squares:
         return 0.0
-    step, deviation = float(whole @ speeds[near]) / squares, DEVIATION / math.sqrt(squares)
+    step, deviation = float(whole @ speeds[near]) / squares, ROUNDING_STD / math.sqrt(squares)
     # A multiple j of the step is wrong by j times the error of the step.
-    if step < FINEST or _strays(speeds, step, 4 * deviation / step) > spare:
+    if step < MIN_STEP or _strays(speeds, step, 4 * deviation / step) > spare:
         return 0.0
-    by_chance = tries * (FINEST / step) ** (len(np.unique(whole)) - 1)
-    return 0.0 if step < STEEP and by_chance > BY_CHANCE else step
+    by_chance = tries * (MIN_STEP / step) ** (len(np.unique(whole)) - 1)
+    return 0.0 if step < COARSE_STEP and by_chance > MAX_CHANCE else step

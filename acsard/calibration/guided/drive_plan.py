@@ -159,10 +159,10 @@ class Leg(Struct, frozen=True):
         return sum(move.seconds for move in self.moves)
 
 
-ROOM = 3.0
+FLOOR_M = 3.0
 """Side length of the square floor that must be free, m."""
 
-MOST_S = 90.0
+MAX_DRIVE_S = 90.0
 """Limit for the total driving time of all legs of a method, s.
 
 A test checks this limit for each method.
@@ -171,14 +171,14 @@ A test checks this limit for each method.
 USUAL_SPEED = 0.3
 """Speed straight ahead in a guided drive, m/s, unless the robot's limits are lower."""
 
-FASTEST_WHEEL = 0.5
+MAX_ROLLING_SPEED = 0.5
 """Largest rolling speed of the wheels while the robot turns in a guided drive, m/s."""
 
-REACH = 0.75
+REACH_RATIO = 0.75
 """Assumed distance from the robot's middle to its outermost point, as a multiple of the wheel
 separation."""
 
-EDGE = 0.1
+EDGE_MARGIN_M = 0.1
 """Distance to keep between the robot and the edge of the floor, m."""
 
 LONGEST, SHORTEST = 2.0, 0.8
@@ -191,10 +191,10 @@ LEAST_SPEED, LEAST_TURN = 0.05, 0.2
 rad/s.
 """
 
-STOPS_IN = 0.1
+STOP_DISTANCE_M = 0.1
 """Distance that the robot may still roll after a leg has ended, m."""
 
-WIDEST = 2.5
+MAX_TRACK_RATIO = 2.5
 """Largest ratio of effective track to wheel separation for which the plan works.
 
 The smallest ratio is 1.
@@ -224,7 +224,7 @@ class Setup(Struct, frozen=True):
 
         A person places the robot at this distance from the edge before the straight drive begins.
         """
-        return self.reach + EDGE
+        return self.reach + EDGE_MARGIN_M
 
     @property
     def to_middle(self) -> float:
@@ -232,7 +232,7 @@ class Setup(Struct, frozen=True):
 
         The robot drives back by this distance, so that it can turn in the middle of the floor.
         """
-        return self.from_edge + self.length - ROOM / 2
+        return self.from_edge + self.length - FLOOR_M / 2
 
     def ahead(self, metres: float) -> Move:
         """Return a straight move of `metres` m. A negative distance is a move backwards."""
@@ -301,7 +301,7 @@ ratio.
 
 # The largest ratio does not always need the longest time, because with a smaller ratio a leg may
 # have one more full turn.
-TRACKS = [1.0 + 0.05 * step for step in range(round((WIDEST - 1.0) / 0.05) + 1)]
+TRACK_RATIOS = [1.0 + 0.05 * step for step in range(round((MAX_TRACK_RATIO - 1.0) / 0.05) + 1)]
 """Ratios of effective track to wheel separation for which the driving time is computed."""
 
 
@@ -321,9 +321,9 @@ class Method(Struct, frozen=True):
         """Return the total driving time of all legs, s, for the least favorable effective track.
 
         The time depends on the ratio of effective track to wheel separation. The result is the
-        longest of the times for the ratios in `TRACKS`.
+        longest of the times for the ratios in `TRACK_RATIOS`.
         """
-        return max(sum(leg.seconds for leg in self.legs(setup, track)) for track in TRACKS)
+        return max(sum(leg.seconds for leg in self.legs(setup, track)) for track in TRACK_RATIOS)
 
 
 def setup(config: Config) -> Setup:
@@ -332,9 +332,9 @@ def setup(config: Config) -> Setup:
     Raises `GuideError` if the robot is too large or its limits are too low.
     """
     drive, limits = config.drive, config.limits
-    slowing = math.sqrt(2 * STOPS_IN * limits.linear_deceleration)
+    slowing = math.sqrt(2 * STOP_DISTANCE_M * limits.linear_deceleration)
     speed = min(USUAL_SPEED, limits.linear_speed, slowing)
-    wheel = min(FASTEST_WHEEL, 0.9 * limits.wheel_speed * drive.wheel_radius)
+    wheel = min(MAX_ROLLING_SPEED, 0.9 * limits.wheel_speed * drive.wheel_radius)
     speed = min(speed, wheel)
     if speed < LEAST_SPEED or limits.angular_speed < LEAST_TURN:
         raise GuideError(
@@ -343,11 +343,11 @@ def setup(config: Config) -> Setup:
             "limits.angular_speed, limits.wheel_speed or limits.linear_deceleration, or "
             "record a drive and use --log"
         )
-    reach = REACH * drive.wheel_separation + drive.wheel_radius / 2
-    length = min(LONGEST, ROOM - 2 * (reach + EDGE) - STOPS_IN)
+    reach = REACH_RATIO * drive.wheel_separation + drive.wheel_radius / 2
+    length = min(LONGEST, FLOOR_M - 2 * (reach + EDGE_MARGIN_M) - STOP_DISTANCE_M)
     if length < SHORTEST:
         raise GuideError(
-            f"the robot is too large to be calibrated on a floor of {ROOM:g} m x {ROOM:g} m "
+            f"the robot is too large to be calibrated on a floor of {FLOOR_M:g} m x {FLOOR_M:g} m "
             f"(drive.wheel_separation = {drive.wheel_separation:g}): record a drive "
             "on a larger floor, and use --log"
         )

@@ -9,7 +9,7 @@ from __future__ import annotations
 from enum import StrEnum
 
 from acsard.calibration.guided.drive_plan import Leg
-from acsard.client.commander import NEVER, OPENED_S, OPENING_S, objection
+from acsard.client.commander import NEVER_DRIVING_MODES, OPEN_TIMEOUT_S, OPENING_S, objection
 from acsard.client.follower import QUIET_S
 from acsard.core.config.settings import DriveConfig
 from acsard.core.link.link_diagnosis import is_ours
@@ -17,15 +17,15 @@ from acsard.core.messages.schema import RobotState
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.values import REST, Twist, WheelSpeeds
 
-HELD_UP = (
+STALL_REASON = (
     "this computer was suspended, or it was too busy for the calibration: end the other programs "
     "on it"
 )
 
-OBEYED_S = 1.5
+RESPONSE_TIMEOUT_S = 1.5
 """Time for which the robot may take to follow a changed command, including the ramp, s."""
 
-DEVIATES_S = 1.0
+DEVIATION_TIMEOUT_S = 1.0
 """Time for which the robot may deviate from the command, s, before the leg is halted."""
 
 LINEAR_OFF, ANGULAR_OFF, OFF_SHARE = 0.05, 0.15, 0.3
@@ -36,7 +36,7 @@ m/s plus the fraction `OFF_SHARE` of the commanded linear speed. The turn rate m
 `ANGULAR_OFF` rad/s plus `OFF_SHARE` of the commanded turn rate.
 """
 
-STILL = 0.02
+STANDSTILL_SPEED = 0.02
 """Largest speed at which a wheel is considered to stand still, rad/s."""
 
 STANDING_S, STANDS_S = 0.5, 6.0
@@ -47,7 +47,7 @@ The leg is done when the wheels have stood still for `STANDING_S`. If the leg is
 """
 
 ENTER = "\r\n"
-PRESSED = "a key was pressed"
+KEY_PRESSED = "a key was pressed"
 
 
 class Phase(StrEnum):
@@ -123,18 +123,18 @@ class LegDriver:
         if self.phase is Phase.MOVING and now - self._stepped > QUIET_S / 2:
             # This process was paused, and the robot stopped during the pause. The person may have
             # pressed a key only because the robot stopped.
-            self._halt(HELD_UP)
+            self._halt(STALL_REASON)
         last = self._number == len(self._leg.moves) - 1
         if self.phase is Phase.MOVING and self._leg.by_key and last:
             self._settle(now)
         elif self.phase is not Phase.SETTLING or not self._leg.by_key:
-            self._halt(PRESSED)
+            self._halt(KEY_PRESSED)
 
     def state(self, state: RobotState, now: float) -> None:
         """Process the daemon's `state`. Halt the leg if the robot does not follow its commands."""
         self._received = now
         why = self._objection(state)
-        if state.mode in (*NEVER, "waiting"):
+        if state.mode in (*NEVER_DRIVING_MODES, "waiting"):
             late = state.mode == "waiting" and is_ours(state.reason)
             self._halt(f"the robot is {state.mode}: {state.reason}", disturbed=late)
         elif state.source not in ("", self._source):
@@ -154,7 +154,7 @@ class LegDriver:
     def wheels(self, fastest: float, now: float) -> None:
         """Process wheel speeds from the daemon. `fastest` is that of the fastest wheel, rad/s."""
         self._received = now
-        if fastest > STILL:
+        if fastest > STANDSTILL_SPEED:
             self._still_since = None
         elif self._still_since is None:
             self._still_since = now
@@ -167,12 +167,12 @@ class LegDriver:
         # was silent. If the pause came before the first move, the person who started the leg may
         # have left in the meantime.
         if held_up > QUIET_S / 2 and self.phase in (Phase.OPENING, Phase.MOVING):
-            self._halt(HELD_UP, disturbed=True)
+            self._halt(STALL_REASON, disturbed=True)
         elif now - self._received > QUIET_S:
             late = held_up > QUIET_S / 2
             self.silent = self.silent or not (late or self.over)
             silence = "no messages of the daemon arrive: does the daemon run (`acsard doctor`)?"
-            self._halt(HELD_UP if late else silence, disturbed=late)
+            self._halt(STALL_REASON if late else silence, disturbed=late)
         if self.phase is Phase.OPENING:
             self._open(now)
         if self.phase is Phase.MOVING and now >= self._ends:
@@ -185,7 +185,7 @@ class LegDriver:
         passed = now - self._begun
         if passed >= OPENING_S and not self._waits:
             self.phase, self._ends = Phase.MOVING, now
-        elif passed >= OPENED_S:
+        elif passed >= OPEN_TIMEOUT_S:
             self._halt(self._waits)
 
     def _next(self, now: float) -> None:
@@ -219,7 +219,7 @@ class LegDriver:
             )
 
     def _tolerate_briefly(self, why: str, now: float, *, disturbed: bool) -> None:
-        """Halt the leg if the robot has deviated from the commands for `DEVIATES_S`.
+        """Halt the leg if the robot has deviated from the commands for `DEVIATION_TIMEOUT_S`.
 
         `why` is the reason of the present deviation, or "" if the robot does not deviate now.
         `disturbed` is true if the leg can be repeated.
@@ -230,7 +230,7 @@ class LegDriver:
             self._deviates_since = None
         elif self._deviates_since is None:
             self._deviates_since = now
-        elif now - self._deviates_since >= DEVIATES_S:
+        elif now - self._deviates_since >= DEVIATION_TIMEOUT_S:
             self._halt(why, disturbed=disturbed)
 
     def _objection(self, state: RobotState) -> str:
@@ -245,7 +245,7 @@ class LegDriver:
 
     def _deviation(self, state: RobotState, now: float) -> str:
         """Return a sentence about how the wheels deviate from the command; "" if they do not."""
-        if now - self._changed < OBEYED_S:
+        if now - self._changed < RESPONSE_TIMEOUT_S:
             return ""
         if not state.wheels:
             return "the microcontroller sends no feedback: check its cable and its power supply"

@@ -12,9 +12,9 @@ from __future__ import annotations
 import math
 
 from acsard.calibration.guided.drive_plan import (
-    EDGE,
-    ROOM,
-    WIDEST,
+    EDGE_MARGIN_M,
+    FLOOR_M,
+    MAX_TRACK_RATIO,
     Leg,
     Mean,
     Measure,
@@ -23,34 +23,34 @@ from acsard.calibration.guided.drive_plan import (
     Setup,
     Slant,
 )  # fmt: skip
-from acsard.calibration.multipliers import LEAST_M
+from acsard.calibration.multipliers import MIN_TAPE_M
 from acsard.terminal.prompt import Ask
 
-TAPE_M = 0.005
+TAPE_STD_M = 0.005
 """Standard deviation of the length of a straight drive that a person measures by tape, m.
 
 It covers the errors at both ends of the tape.
 """
 
-BY_EYE = 0.07
+EYE_HEADING_STD = 0.07
 """Standard deviation of a heading that a person judges by eye, rad."""
 
-END_M = 0.003
+END_STD_M = 0.003
 """Standard deviation of a distance between the robot and its marks after a square, m.
 
 It includes the error with which the person made the marks beside the robot.
 """
 
-FIRST_TURN = 1.2
+FIRST_TURN_RATE = 1.2
 """Turn rate of the first turn in place, rad/s, if the robot does not skid."""
 
-MISSED = 1.1
+FIRST_TURN_TIMEOUT = 1.1
 """Timeout of the first turn, as a multiple of the longest time for a full turn.
 
-The robot with the largest effective track (`WIDEST`) needs the longest time.
+The robot with the largest effective track (`MAX_TRACK_RATIO`) needs the longest time.
 """
 
-MOST_SPIN_S = 24.0
+MAX_SPIN_S = 24.0
 """Longest total time of the full turns in place in one leg, s."""
 
 STOP, SETTLE = Move(0.6), Move(1.0)
@@ -59,20 +59,22 @@ STOP, SETTLE = Move(0.6), Move(1.0)
 In `STOP`, the robot comes to rest. In `SETTLE`, the robot also stops shaking.
 """
 
-ROUND = "once round"
+ROUND_LEG = "once round"
 """Name of the leg in which the robot turns once in place, until the person presses a key."""
 
 FROM_MARK = Ask(
-    "How far is the marked wheel from its mark now, in a straight line?", "m", LEAST_M, 2 * ROOM,
+    "How far is the marked wheel from its mark now, in a straight line?",
+    "m", MIN_TAPE_M, 2 * FLOOR_M,
     name="metres",
 )  # fmt: skip
-DISTANCE = Mean("distance", ("metres",), TAPE_M)
+DISTANCE = Mean("distance", ("metres",), TAPE_STD_M)
 
 
 def _at_the_edge(setup: Setup) -> str:
     return (
         f"Place the robot so that its middle is {setup.from_edge:.2f} m from the edge behind it, "
-        f"on a free floor of {ROOM:g} m x {ROOM:g} m, and {ROOM / 2:g} m from the edges to its "
+        f"on a free floor of {FLOOR_M:g} m x {FLOOR_M:g} m, and {FLOOR_M / 2:g} m from the edges "
+        f"to its "
         "left and right."
     )
 
@@ -86,21 +88,21 @@ def once_round(setup: Setup, until: str, asks: tuple[Ask, ...] = (), *measures: 
         asks: the questions after the turn.
         measures: the measurements that follow from the answers.
     """
-    longest = MISSED * 2 * math.pi * WIDEST
-    rate = abs(setup.command(FIRST_TURN)) * setup.rate_per_command
+    longest = FIRST_TURN_TIMEOUT * 2 * math.pi * MAX_TRACK_RATIO
+    rate = abs(setup.command(FIRST_TURN_RATE)) * setup.rate_per_command
     words = f"The robot turns left in place. Press SPACE {until}"
-    turn = setup.spin(FIRST_TURN, longest / rate)
-    return Leg(ROUND, words, (turn,), asks, measures, by_key=True)
+    turn = setup.spin(FIRST_TURN_RATE, longest / rate)
+    return Leg(ROUND_LEG, words, (turn,), asks, measures, by_key=True)
 
 
 def turns(setup: Setup, rate: float, track: float, most: int) -> int:
-    """Return how many full turns in place fit into `MOST_SPIN_S`, from 1 to `most`.
+    """Return how many full turns in place fit into `MAX_SPIN_S`, from 1 to `most`.
 
     `rate` is the true turn rate, rad/s. `track` is the ratio of effective track to wheel
     separation.
     """
     one = setup.turn(2 * math.pi, rate, track).seconds
-    return max(1, min(most, int(MOST_SPIN_S / one)))
+    return max(1, min(most, int(MAX_SPIN_S / one)))
 
 
 # The method "tape": a tape measure, and a straight line on the floor.
@@ -121,7 +123,7 @@ TO_LINE = (
         name="rear",
     ),
 )
-LINE = "front", "rear", "wheelbase"
+LINE_ANSWERS = "front", "rear", "wheelbase"
 """Names of the answers for `Slant.near`, `Slant.far` and `Slant.apart`.
 
 The answers describe a line on the left of the robot.
@@ -135,7 +137,7 @@ def _tape(setup: Setup, track: float) -> tuple[Leg, ...]:
         around = setup.turn(side * 2 * math.pi * count, rate, track)
         to = "left" if side > 0 else "right"
         words = f"The robot turns {count} full circles to the {to}, {how}."
-        measure = Slant("angle", *LINE, since=since)
+        measure = Slant("angle", *LINE_ANSWERS, since=since)
         return Leg(how, words, (SETTLE, around, SETTLE), TO_LINE, (measure,))
 
     around = once_round(
@@ -143,12 +145,13 @@ def _tape(setup: Setup, track: float) -> tuple[Leg, ...]:
         "when it has turned one full circle and faces along the line as before; an error of 20 deg "
         "does not matter.",
         TO_LINE,
-        Slant("turned", *LINE, since="ahead", plus=2 * math.pi, over=("back", ROUND)),
+        Slant("turned", *LINE_ANSWERS, since="ahead", plus=2 * math.pi, over=("back", ROUND_LEG)),
     )
     return (
         Leg(
             "ahead",
-            f"On a free floor of {ROOM:g} m x {ROOM:g} m, find or draw a straight line across its "
+            f"On a free floor of {FLOOR_M:g} m x {FLOOR_M:g} m, find or draw a straight line "
+            f"across its "
             "middle (a joint of tiles, a board, chalk). Place the robot to the right of the line, "
             f"about 300 mm away, its middle {setup.from_edge:.2f} m from the edge behind it, "
             "facing along the line. Its front left and its rear left wheel must have the same "
@@ -157,7 +160,7 @@ def _tape(setup: Setup, track: float) -> tuple[Leg, ...]:
             f"{setup.length:.2f} m straight ahead.",
             (SETTLE, setup.ahead(setup.length), SETTLE),
             (FROM_MARK, *TO_LINE),
-            (DISTANCE, Slant("angle", *LINE)),
+            (DISTANCE, Slant("angle", *LINE_ANSWERS)),
             placed=True,
         ),
         Leg(
@@ -166,7 +169,7 @@ def _tape(setup: Setup, track: float) -> tuple[Leg, ...]:
             (setup.ahead(-setup.to_middle), SETTLE),
         ),
         around,
-        spun("slowly", -1, 0.6, ROUND),
+        spun("slowly", -1, 0.6, ROUND_LEG),
         spun("fast", 1, 1.2, "slowly"),
     )
 
@@ -176,7 +179,7 @@ def _tape(setup: Setup, track: float) -> tuple[Leg, ...]:
 GAP_M = 0.2
 """Distance from the wall at which the robot stops when it returns, m."""
 
-OUT_M = 0.9
+OUTWARD_M = 0.9
 """Distance that the robot drives away from the wall before several turns in place, m."""
 
 HALF_RATE, ROUND_RATE = 0.8, 1.2
@@ -185,7 +188,7 @@ HALF_RATE, ROUND_RATE = 0.8, 1.2
 `HALF_RATE` is that of half turns, and `ROUND_RATE` that of several full turns.
 """
 
-SQUARE = (
+PLACE_ROBOT_BACK = (
     "Push the robot's back flat against the wall by hand, so that both its rear corners touch it"
 )
 
@@ -213,7 +216,8 @@ def _wall(setup: Setup, track: float) -> tuple[Leg, ...]:
         home = setup.ahead(setup.length - 2 * GAP_M)
         return Leg(
             f"half round to the {to}",
-            f"{SQUARE}. The robot drives away from the wall, turns half a circle to the {to}, and "
+            f"{PLACE_ROBOT_BACK}. The robot drives away from the wall, turns half a circle to the "
+            f"{to}, and "
             "drives back.",
             (STOP, out, STOP, half, STOP, home, STOP),
             _corners("front"),
@@ -224,13 +228,14 @@ def _wall(setup: Setup, track: float) -> tuple[Leg, ...]:
     return (
         Leg(
             "out",
-            f"Along a straight wall, {ROOM:g} m x {ROOM:g} m must be free. {SQUARE}, in the "
+            f"Along a straight wall, {FLOOR_M:g} m x {FLOOR_M:g} m must be free. "
+            f"{PLACE_ROBOT_BACK}, in the "
             "middle of the free part of the wall. The robot drives straight away from the wall for "
             f"{setup.length:.2f} m.",
             (STOP, out, STOP),
             (
                 Ask(
-                    "How far is the robot's back from the wall now?", "m", LEAST_M, 2 * ROOM,
+                    "How far is the robot's back from the wall now?", "m", MIN_TAPE_M, 2 * FLOOR_M,
                     name="metres",
                 ),
             ),
@@ -247,15 +252,19 @@ def _wall(setup: Setup, track: float) -> tuple[Leg, ...]:
             "The robot drives back towards the wall.",
             (setup.ahead(GAP_M - setup.length), STOP),
             _corners("rear"),
-            (Slant("turned", *REAR, plus=2 * math.pi, over=("out", ROUND, "home")),),
+            (Slant("turned", *REAR, plus=2 * math.pi, over=("out", ROUND_LEG, "home")),),
         ),
         there_and_back("left", 1),
         there_and_back("right", -1),
         Leg(
             "round at the wall",
-            f"{SQUARE}. The robot drives away from the wall, turns {count} full circles to the "
+            f"{PLACE_ROBOT_BACK}. The robot drives away from the wall, turns {count} full circles "
+            f"to the "
             "right, and drives back.",
-            (STOP, setup.ahead(OUT_M), STOP, around, STOP, setup.ahead(GAP_M - OUT_M), STOP),
+            (
+                STOP, setup.ahead(OUTWARD_M), STOP, around,
+                STOP, setup.ahead(GAP_M - OUTWARD_M), STOP,
+            ),
             _corners("rear"),
             (Slant("angle", *REAR),),
             placed=True,
@@ -274,7 +283,7 @@ def side_of_square(setup: Setup) -> float:
 
     It is 1.2 m, or less for a large robot.
     """
-    return min(1.2, ROOM - 2 * (setup.from_edge + 2 * EDGE))
+    return min(1.2, FLOOR_M - 2 * (setup.from_edge + 2 * EDGE_MARGIN_M))
 
 
 def _umbmark(setup: Setup, track: float) -> tuple[Leg, ...]:
@@ -295,7 +304,8 @@ def _umbmark(setup: Setup, track: float) -> tuple[Leg, ...]:
         corner = setup.turn(side * math.pi / 2, CORNER_RATE, track)
         return Leg(
             f"square to the {to}",
-            f"Place the robot so that its middle is {(ROOM - edge) / 2:.2f} m from the edge of the "
+            f"Place the robot so that its middle is {(FLOOR_M - edge) / 2:.2f} m from the edge of "
+            f"the "
             f"floor behind it, and the same distance from the edge on its {other}. Make two marks "
             "on the floor: one exactly beside the middle of the robot's left side, one exactly "
             f"beside the middle of its right side. The robot drives a square with sides of "
@@ -303,8 +313,8 @@ def _umbmark(setup: Setup, track: float) -> tuple[Leg, ...]:
             (STOP, *(setup.ahead(edge), STOP, corner, STOP) * 4),
             ends,
             (
-                Mean("ahead", ("left", "right"), END_M),
-                Mean("aside", ("aside",), END_M),
+                Mean("ahead", ("left", "right"), END_STD_M),
+                Mean("aside", ("aside",), END_STD_M),
                 Slant("angle", "left", "right", "width"),
             ),
             placed=True,
@@ -330,7 +340,7 @@ def _umbmark(setup: Setup, track: float) -> tuple[Leg, ...]:
                     "deg", -90, 90, name="past",
                 ),
             ),
-            Mean("turned", ("past",), BY_EYE, plus=2 * math.pi),
+            Mean("turned", ("past",), EYE_HEADING_STD, plus=2 * math.pi),
         ),
         square("left", "right", 1),
         square("right", "left", -1),
@@ -351,7 +361,7 @@ SPIN_S, CURVE_M, TURN_RAD = 7.5, 1.2, 5.0
 - `TURN_RAD`: the angle of a turn in place in "positions", rad, if the robot does not skid.
 """
 
-PETALS = ((FAST, CURVE), (-FAST, -CURVE), (SLOW, 0.0), (-SLOW, CURVE), (FAST, -CURVE))
+POSITION_MOVES = ((FAST, CURVE), (-FAST, -CURVE), (SLOW, 0.0), (-SLOW, CURVE), (FAST, -CURVE))
 """Moves of the method "positions": each pair is a turn in place, and a curve there and back.
 
 The two numbers are the turn rates of the turn and of the curve, rad/s, if the robot does not skid.
@@ -364,13 +374,13 @@ STANDING, PAUSE, SHORT = Move(2.5), Move(1.4), Move(0.7)
 `STANDING` and `PAUSE` are long enough to measure the bias of a gyro.
 """
 
-STRAIGHT = "straight"
+STRAIGHT_LEG = "straight"
 """Name of the leg straight ahead. In the method "gyro", a person may measure its length by tape."""
 
 
 def _straight(setup: Setup, asks: tuple[Ask, ...] = ()) -> Leg:
     return Leg(
-        STRAIGHT,
+        STRAIGHT_LEG,
         f"{_at_the_edge(setup)} Mark on the floor where one of its wheels stands. Do not move the "
         "robot by hand until the calibration is done. The robot stands for "
         f"{STANDING.seconds:g} s, then drives {setup.length:.2f} m straight ahead.",
@@ -404,7 +414,7 @@ def _gyro(setup: Setup, track: float) -> tuple[Leg, ...]:
 def _positions(setup: Setup, track: float) -> tuple[Leg, ...]:
     # Positions show a turn in place only by the direction of the curve that follows it.
     moves = [SHORT, setup.ahead(-setup.to_middle), SHORT]
-    for turn_rate, curve_rate in PETALS:
+    for turn_rate, curve_rate in POSITION_MOVES:
         moves += [setup.spin(turn_rate, TURN_RAD / abs(turn_rate)), SHORT]
         moves += _there_and_back(setup, curve_rate)
     return (
@@ -423,7 +433,7 @@ def _there_and_back(setup: Setup, rate: float) -> tuple[Move, ...]:
 
     `rate` is the turn rate, rad/s, of a robot that does not skid.
     """
-    metres = min(CURVE_M, ROOM / 2 - setup.from_edge)
+    metres = min(CURVE_M, FLOOR_M / 2 - setup.from_edge)
     return setup.arc(rate, metres), SHORT, setup.arc(-rate, -metres), SHORT
 
 

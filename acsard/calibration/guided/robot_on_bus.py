@@ -21,7 +21,7 @@ from acsard.calibration.guided.leg_driver import LegDriver
 from acsard.calibration.log_table import APPLIED, FOUR, Floats, Table
 from acsard.calibration.runs import Log, Run, on_arrival_clock, runs
 from acsard.client.commander import OPENING_PERIOD_S, OPENING_S, SEND_PERIOD_S, ZEROS
-from acsard.client.follower import FIRST_S, Watch
+from acsard.client.follower import FIRST_STATE_TIMEOUT_S, Watch
 from acsard.client.synchronous import Client
 from acsard.core.config.settings import Config
 from acsard.core.messages.encodings import DecodeError, Decoder
@@ -34,19 +34,19 @@ from acsard.terminal.prompt import Prompt
 
 SOURCE = "app"
 
-LOOK_S = 0.005
+POLL_PERIOD_S = 0.005
 """Period at which the keyboard and the message queues are polled, s.
 
 A key takes effect within this time.
 """
 
-SHOWN_S = 0.2
+DISPLAY_PERIOD_S = 0.2
 """Interval between updates of the progress display of a leg, s."""
 
-RETURNS_S = 3.0
+RECONNECT_TIMEOUT_S = 3.0
 """Time within which a silent daemon must send its state again, s, so that the leg is repeated."""
 
-POSITIONS = (Odometry, PoseStamped)
+POSITION_TYPES = (Odometry, PoseStamped)
 """Types of a position message, in the order in which a sample is decoded as one of them.
 
 A CDR payload does not name its type. `Odometry` comes first because a pose is too short to be
@@ -84,17 +84,17 @@ class Sensor:
     def await_first(self, what: str) -> None:
         """Wait until a message arrives on the key, and discard it.
 
-        Raises `GuideError` if no message arrives within `FIRST_S`. Its text calls the message
-        `what`.
+        Raises `GuideError` if no message arrives within `FIRST_STATE_TIMEOUT_S`. Its text calls the
+        message `what`.
         """
-        end = clock.steady_s() + FIRST_S
+        end = clock.steady_s() + FIRST_STATE_TIMEOUT_S
         while not self.receive(lambda message, now: None, 0.0):
             if clock.steady_s() > end:
                 raise GuideError(
                     f"{what} does not arrive on the Zenoh key {self.key}: does the sender run, and "
                     "does it publish on this key?"
                 )
-            time.sleep(LOOK_S)
+            time.sleep(POLL_PERIOD_S)
 
     def _decoded(self, sample: zenoh.Sample) -> Any:
         errors = []
@@ -212,7 +212,7 @@ class RobotOnBus:
         `session` is the Zenoh session that receives the positions. If it is None, the session that
         commands the robot also receives the positions.
         """
-        sensor = Sensor(session or self._client.session, self._full(key), POSITIONS)
+        sensor = Sensor(session or self._client.session, self._full(key), POSITION_TYPES)
         sensor.await_first("a position (PoseStamped or Odometry)")
         self._sensors.append((sensor, "place"))
 
@@ -251,18 +251,18 @@ class RobotOnBus:
         return log.runs[0]
 
     def _returns(self) -> bool:
-        end = clock.steady_s() + RETURNS_S
+        end = clock.steady_s() + RECONNECT_TIMEOUT_S
         while clock.steady_s() < end:
             if self._watch.look(clock.steady_s()):
                 return True
-            time.sleep(LOOK_S)
+            time.sleep(POLL_PERIOD_S)
         return False
 
     def _drive(self, driver: LegDriver, recorder: Recorder) -> None:
         begun = sent = shown = clock.steady_s()
         last = None
         while not driver.over:
-            for key in self._prompt.keys(LOOK_S):
+            for key in self._prompt.keys(POLL_PERIOD_S):
                 driver.key(key, clock.steady_s())
             now = clock.steady_s()
             self._receive(driver, recorder, now)
@@ -271,7 +271,7 @@ class RobotOnBus:
             if command != last or now - sent >= period:
                 self._client.send(command.linear, command.angular)
                 last, sent = command, now
-            if now - shown > SHOWN_S:
+            if now - shown > DISPLAY_PERIOD_S:
                 self._prompt.progress(driver.progress(now))
                 shown = now
         self._prompt.progress(1.0)

@@ -14,7 +14,7 @@ from acsard.calibration.guided.drive_plan import (
     Setup,
     Slant,
 )  # fmt: skip
-from acsard.calibration.guided.methods import METHODS, STRAIGHT
+from acsard.calibration.guided.methods import METHODS, STRAIGHT_LEG
 from acsard.calibration.guided.tape_readings import (
     Answers,
     Reading,
@@ -22,16 +22,16 @@ from acsard.calibration.guided.tape_readings import (
     reading,
     track_ratio,
 )  # fmt: skip
-from acsard.calibration.multipliers import LEAST_M, Tape
+from acsard.calibration.multipliers import MIN_TAPE_M, Tape
 from acsard.calibration.runs import Log, Run
 from acsard.calibration.solve import Calibration, calibrate
 from acsard.calibration.wheel_response import response
 from acsard.terminal.prompt import Ask, Prompt
 
-MOST_REPEATS = 2
+MAX_REPEATS = 2
 """Maximum number of times that a disturbed leg is repeated on a real robot."""
 
-MOST_SIMULATED_REPEATS = 20
+MAX_SIMULATED_REPEATS = 20
 """Maximum number of times that a disturbed leg is repeated on the simulator.
 
 The number is large because no person has to put the simulated robot back.
@@ -97,7 +97,7 @@ def guide(
     # The legs that depend on the effective track come after the measurement that shows it.
     track, number = 1.0, 0
     repeats: dict[str, int] = {}
-    most = MOST_SIMULATED_REPEATS if simulated else MOST_REPEATS
+    most = MAX_SIMULATED_REPEATS if simulated else MAX_REPEATS
 
     def ask_for(leg: str, asks: tuple[Ask, ...]) -> None:
         for ask in asks:
@@ -148,8 +148,8 @@ def guide(
             return found
         notes = (*follows.sentences(), *found.notes)
         return replace(found, notes=notes, feedback=follows.settings())
-    metres = answers.get((STRAIGHT, "metres"), 0.0)
-    tape = Tape(metres, STRAIGHT) if metres >= LEAST_M else None
+    metres = answers.get((STRAIGHT_LEG, "metres"), 0.0)
+    tape = Tape(metres, STRAIGHT_LEG) if metres >= MIN_TAPE_M else None
     driven = tuple(replace(run, name=name) for name, run in rides.items())
     log = Log(driven, (), true_positions)
     return calibrate(log, setup.drive, tape, setup.odometry, setup.feedback)

@@ -16,11 +16,17 @@ import numpy as np
 from msgspec import Struct
 
 from acsard.calibration import heading
-from acsard.calibration.fit import COUNT, USUAL, Base, P, condition, student_factor
-from acsard.calibration.guided.drive_plan import WIDEST, GuideError, Mean, Measure, Quantity
+from acsard.calibration.fit import PARAMETER_COUNT, PRIOR_STD, Base, P, condition, student_factor
+from acsard.calibration.guided.drive_plan import (
+    MAX_TRACK_RATIO,
+    GuideError,
+    Mean,
+    Measure,
+    Quantity,
+)
 from acsard.calibration.heading import Rates, rates
 from acsard.calibration.improvement import (
-    NOTHING,
+    NOT_COMPARED,
     Improvement,
     per_amount,
     rms,
@@ -35,35 +41,35 @@ from acsard.calibration.runs import Run, blocks
 from acsard.calibration.solve import Calibration, Drives
 from acsard.core.config.settings import DriveConfig, OdometryConfig
 
-SKIDDING = 0.015
+SKID_HEADING_STD = 0.015
 """Standard deviation of the heading due to skidding, rad, after the wheels have rolled 1 m.
 
 The deviation grows with the square root of the rolled distance.
 """
 
-SKIDDING_LENGTH = 0.002
+SKID_LENGTH_STD = 0.002
 """Standard deviation of a distance due to skidding, as a fraction of the distance."""
 
-UNKNOWN = 1.0
+PRIOR_RADIUS_STD = 1.0
 """Prior standard deviation of the mean wheel radius, as a fraction of the wheel radius."""
 
-PRIOR_FREE = 4.0
+PRIOR_DEGREES_OF_FREEDOM = 4.0
 """Weight of the assumed noise of the readings, in degrees of freedom.
 
 The fit averages two estimates of the noise: the assumed noise, and the noise that the scatter of
 the readings shows. The weight of the second estimate is the number of surplus readings.
 """
 
-MOST_STEPS = 50
-SMALL = 1e-9
+MAX_STEPS = 50
+CONVERGED = 1e-9
 """Largest change of a parameter in the last step of a fit that has converged."""
 
-WORST_CONDITION = 1e8
+MAX_CONDITION = 1e8
 """Largest condition number of normal equations from which the parameters can be computed."""
 
-ACTIVE = [P.LEFT, P.RIGHT, P.INVERSE_TRACK, P.TRACK_GROWTH]
+FITTED_PARAMETERS = [P.LEFT, P.RIGHT, P.INVERSE_TRACK, P.TRACK_GROWTH]
 
-PRECISE = 0.2
+MAX_STARTING_STD = 0.2
 """Largest relative standard deviation of a `turned` reading with which the fit may start.
 
 The first estimate of the effective track is computed from this reading.
@@ -101,7 +107,7 @@ class Predicted(Struct, frozen=True):
 
     value: float
     derivatives: Floats
-    """Derivatives of `value` with respect to the parameters, shape (COUNT,)."""
+    """Derivatives of `value` with respect to the parameters, shape (PARAMETER_COUNT,)."""
     variance: float
     """Variance of `value` due to skidding, rad2 or m2."""
 
@@ -137,12 +143,12 @@ def predicted(steps: WheelSteps, quantity: Quantity, base: Base, parameters: Flo
         steps: the rolling of the wheels in the legs of the reading.
         quantity: the quantity that the reading measures.
         base: the configured geometry.
-        parameters: the parameters of the fit, shape (COUNT,).
+        parameters: the parameters of the fit, shape (PARAMETER_COUNT,).
     """
     driven = path(steps, base, parameters)
     rolled = base.radius * float(np.abs(steps.left).sum() + np.abs(steps.right).sum()) / 2
-    derivatives = np.zeros(COUNT)
-    place, heading_variance = complex(driven.place[-1]), SKIDDING**2 * rolled
+    derivatives = np.zeros(PARAMETER_COUNT)
+    place, heading_variance = complex(driven.place[-1]), SKID_HEADING_STD**2 * rolled
     if quantity in ("turned", "angle"):
         for index, values in driven.heading_derivatives.items():
             derivatives[index] = values[-1]
@@ -151,7 +157,7 @@ def predicted(steps: WheelSteps, quantity: Quantity, base: Base, parameters: Flo
     along = {"ahead": 1.0 + 0j, "aside": 1j}.get(quantity, place / (abs(place) or 1.0))
     for index, by_parameter in driven.derivatives.items():
         derivatives[index] = (np.conj(along) * by_parameter[-1]).real
-    variance = (SKIDDING_LENGTH * abs(place)) ** 2
+    variance = (SKID_LENGTH_STD * abs(place)) ** 2
     if quantity != "distance":
         # A heading error during the drive displaces the end point by the error times the remaining
         # distance. The mean square of this distance is a third of the span squared.
@@ -171,11 +177,13 @@ def fit_readings(readings: Sequence[Reading], base: Base) -> TapeFit:
     residuals, weights = np.array(compared).T
     # Combine the scatter of these readings with the assumed noise. If there are few readings, the
     # scatter is uncertain itself, so widen the deviation to that of Student's t.
-    free = PRIOR_FREE + max(0.0, len(readings) - len(ACTIVE) + 1.0)
-    scale = (PRIOR_FREE + float(weights @ residuals**2)) / free
-    covariance = np.zeros((COUNT, COUNT))
-    inner = np.linalg.inv(normal[np.ix_(ACTIVE, ACTIVE)])
-    covariance[np.ix_(ACTIVE, ACTIVE)] = inner * max(1.0, scale) * student_factor(free)
+    free = PRIOR_DEGREES_OF_FREEDOM + max(0.0, len(readings) - len(FITTED_PARAMETERS) + 1.0)
+    scale = (PRIOR_DEGREES_OF_FREEDOM + float(weights @ residuals**2)) / free
+    covariance = np.zeros((PARAMETER_COUNT, PARAMETER_COUNT))
+    inner = np.linalg.inv(normal[np.ix_(FITTED_PARAMETERS, FITTED_PARAMETERS)])
+    covariance[np.ix_(FITTED_PARAMETERS, FITTED_PARAMETERS)] = (
+        inner * max(1.0, scale) * student_factor(free)
+    )
     held_out = np.array(
         [_held_out_residual(n, readings, base, parameters) for n in range(len(readings))]
     )
@@ -190,7 +198,9 @@ def _starting_parameters(readings: Sequence[Reading], base: Base) -> Floats:
     """
     start = base.start()
     for reading in readings:
-        if reading.quantity == "turned" and reading.deviation < PRECISE * abs(reading.value):
+        if reading.quantity == "turned" and reading.deviation < MAX_STARTING_STD * abs(
+            reading.value
+        ):
             by_wheels = predicted(reading.steps, "turned", base, start).value
             if not 0.1 < by_wheels / reading.value < 10.0:
                 raise RefusedError(
@@ -216,11 +226,11 @@ def _compared(
 def _solved(readings: Sequence[Reading], base: Base, start: Floats) -> tuple[Floats, Floats]:
     """Fit the parameters to the readings by weighted least squares, and return a pair.
 
-    The first item is the array of the fitted parameters, shape (COUNT,). The second item is the
-    matrix on the left-hand side of the normal equations of the last step, shape (COUNT, COUNT). It
-    is J^T W J plus the prior information about the track growth and the mean radius. J contains
-    the derivatives of the predicted readings with respect to the parameters, and W contains the
-    weights of the readings.
+    The first item is the array of the fitted parameters, shape (PARAMETER_COUNT,). The second item
+    is the matrix on the left-hand side of the normal equations of the last step, shape
+    (PARAMETER_COUNT, PARAMETER_COUNT). It is J^T W J plus the prior information about the track
+    growth and the mean radius. J contains the derivatives of the predicted readings with respect to
+    the parameters, and W contains the weights of the readings.
 
     Args:
         readings: the measurements by tape.
@@ -232,27 +242,27 @@ def _solved(readings: Sequence[Reading], base: Base, start: Floats) -> tuple[Flo
             because the readings contradict each other.
     """
     parameters, configured = start.copy(), base.start()
-    for _ in range(MOST_STEPS):
-        normal, score = np.zeros((COUNT, COUNT)), np.zeros(COUNT)
+    for _ in range(MAX_STEPS):
+        normal, score = np.zeros((PARAMETER_COUNT, PARAMETER_COUNT)), np.zeros(PARAMETER_COUNT)
         for prediction, residual, weight in _compared(readings, base, parameters):
             normal += weight * np.outer(prediction.derivatives, prediction.derivatives)
             score += weight * prediction.derivatives * residual
-        normal[P.TRACK_GROWTH, P.TRACK_GROWTH] += USUAL[P.TRACK_GROWTH] ** -2
-        score[P.TRACK_GROWTH] -= parameters[P.TRACK_GROWTH] * USUAL[P.TRACK_GROWTH] ** -2
-        both = np.zeros(COUNT)
+        normal[P.TRACK_GROWTH, P.TRACK_GROWTH] += PRIOR_STD[P.TRACK_GROWTH] ** -2
+        score[P.TRACK_GROWTH] -= parameters[P.TRACK_GROWTH] * PRIOR_STD[P.TRACK_GROWTH] ** -2
+        both = np.zeros(PARAMETER_COUNT)
         both[[P.LEFT, P.RIGHT]] = 0.5
-        normal += np.outer(both, both) / UNKNOWN**2
-        score += both * float(both @ (configured - parameters)) / UNKNOWN**2
-        inner = normal[np.ix_(ACTIVE, ACTIVE)]
-        if condition(inner) > WORST_CONDITION:
+        normal += np.outer(both, both) / PRIOR_RADIUS_STD**2
+        score += both * float(both @ (configured - parameters)) / PRIOR_RADIUS_STD**2
+        inner = normal[np.ix_(FITTED_PARAMETERS, FITTED_PARAMETERS)]
+        if condition(inner) > MAX_CONDITION:
             raise RefusedError(
                 "the measurements cannot separate errors of the wheel radii from errors of the "
                 "track width, because the robot hardly moved or hardly turned: give the robot "
                 "room, and start again"
             )
-        step = np.linalg.solve(inner, score[ACTIVE])
-        parameters[ACTIVE] += step * min(1.0, 0.3 / (float(np.abs(step).max()) or 1.0))
-        if float(np.abs(step).max()) < SMALL:
+        step = np.linalg.solve(inner, score[FITTED_PARAMETERS])
+        parameters[FITTED_PARAMETERS] += step * min(1.0, 0.3 / (float(np.abs(step).max()) or 1.0))
+        if float(np.abs(step).max()) < CONVERGED:
             return parameters, normal
     raise RefusedError(
         "the measurements contradict each other: is each number in the unit that was asked for, "
@@ -282,13 +292,13 @@ def _held_out_residual(
     return residual
 
 
-READ_M = 0.002
+TAPE_STD_M = 0.002
 """Standard deviation of a distance that a person measures by tape, m.
 
 It is also the standard deviation of the position of a robot that a person places at a line.
 """
 
-CREDIBLE = 0.85, 3.0
+TRACK_RATIO_RANGE = 0.85, 3.0
 """Range of credible ratios of effective track to wheel separation."""
 
 Answers = dict[tuple[str, str], float]
@@ -321,23 +331,23 @@ def reading(measure: Measure, leg: str, rides: Mapping[str, Run], answers: Answe
         return slant(answers[leg, measure.near], answers[leg, measure.far], apart)
 
     turned = angle(leg) - (angle(measure.since) if measure.since else 0.0)
-    # The turn is the difference of two angles, each from two distances: four errors of `READ_M`
-    # combine to twice `READ_M`.
-    return Reading(driven, measure.quantity, measure.plus + turned, 2 * READ_M / apart)
+    # The turn is the difference of two angles, each from two distances: four errors of `TAPE_STD_M`
+    # combine to twice `TAPE_STD_M`.
+    return Reading(driven, measure.quantity, measure.plus + turned, 2 * TAPE_STD_M / apart)
 
 
 def track_ratio(reading: Reading, drive: DriveConfig) -> float:
     """Return the approximate ratio of effective track to wheel separation.
 
     `reading` is the measurement of one full turn of the robot. The ratio is limited to the range
-    from 1 to `WIDEST`, because the next legs are planned with it. Raises `GuideError` if the ratio
-    is not credible (`CREDIBLE`).
+    from 1 to `MAX_TRACK_RATIO`, because the next legs are planned with it. Raises `GuideError` if
+    the ratio is not credible (`TRACK_RATIO_RANGE`).
     """
     # Use the measured radius and separation without the configured multipliers.
     base = Base(drive.wheel_radius, drive.wheel_separation, 1.0, 1.0, 1.0)
     by_wheels = predicted(reading.steps, "turned", base, base.start()).value
     track = by_wheels / reading.value
-    least, most = CREDIBLE
+    least, most = TRACK_RATIO_RANGE
     if not least < track < most:
         raise GuideError(
             "the robot should have made one full turn, but according to the wheels it turned "
@@ -345,7 +355,7 @@ def track_ratio(reading: Reading, drive: DriveConfig) -> float:
             "measure drive.wheel_radius and drive.wheel_separation with a tape measure, and run "
             "this command again"
         )
-    return min(WIDEST, max(1.0, track))
+    return min(MAX_TRACK_RATIO, max(1.0, track))
 
 
 def slant(near: float, far: float, apart: float) -> float:
@@ -369,7 +379,7 @@ def slant(near: float, far: float, apart: float) -> float:
     return math.asin(sine)
 
 
-WORST = 0.1, 0.02
+MAX_STDS = 0.1, 0.02
 """Largest accepted relative standard deviations of the track and of the ratio of the radii."""
 
 ADVICE = (
@@ -403,7 +413,7 @@ def calibrated(
     result = multipliers(fit.parameters, fit.covariance, rate)
     inverse_track, std = fit.parameters[P.INVERSE_TRACK], np.sqrt(np.diag(fit.covariance))
     chance = float(std[P.INVERSE_TRACK] / abs(inverse_track))
-    for name, deviation in unsure(result, chance, WORST).items():
+    for name, deviation in unsure(result, chance, MAX_STDS).items():
         raise RefusedError(
             f"these readings determine {name} only to {deviation:.1%}, which is too inaccurate: "
             f"{ADVICE}"
@@ -450,5 +460,5 @@ def _improvement(readings: Sequence[Reading], base: Base, fit: TapeFit, rate: Ra
             sums["place"] += before**2, after**2, 1.0
     return Improvement(
         per_amount(sums["turn"], 360.0), per_amount(sums["straight"], math.degrees(10.0)),
-        NOTHING, rms(sums["place"]),
+        NOT_COMPARED, rms(sums["place"]),
     )  # fmt: skip

@@ -18,7 +18,7 @@ from acsard.core.config.settings import BusConfig, Config, McuConfig
 from acsard.core.config.validation import show
 from acsard.core.config.wire_time import (
     COMFORTABLE_USE,
-    FIELD,
+    FIELD_VALUES,
     STATUS_BYTES,
     STATUS_HZ,
     highest_rate,
@@ -26,9 +26,9 @@ from acsard.core.config.wire_time import (
     wire_ns,
     wire_use,
 )
-from acsard.core.values import ROOT, WHEELS
+from acsard.core.values import ROOT_KEY, WHEELS
 
-LEAST_WRAP_PERIODS = 2
+MIN_WRAP_PERIODS = 2
 """Smallest number of control periods in which a wheel at full speed may change its encoder count
 by half of the count's range. A larger change between two lines would look like a turn in the other
 direction. The value 2 allows for one lost line."""
@@ -41,10 +41,10 @@ and the daemon cannot always tell repeated speeds from new ones. With 16 to 96 c
 simulated robot measured distances that were up to 20 % too short at 200 Hz and up to 29 % too long
 at 300 Hz."""
 
-LEAST_HZ = 0.001
+MIN_RATE_HZ = 0.001
 """Lowest publishing rate that is not 0, Hz. It means one message in 17 min."""
 
-MOST_VOLTS = 99.99
+MAX_VOLTS = 99.99
 """Highest voltage that a status line can express, V."""
 
 
@@ -170,18 +170,20 @@ def _count_problems(config: Config) -> list[str]:
     """Return an error line if forward motion of a wheel could look like backward motion.
 
     To prevent this, `mcu.encoder_counts` must be low enough: while a wheel turns at full speed,
-    its count must not change by half of its range within `LEAST_WRAP_PERIODS` control periods.
+    its count must not change by half of its range within `MIN_WRAP_PERIODS` control periods.
     """
     counts, fastest = config.mcu.encoder_counts, config.feedback.wheel_speed / math.tau
-    lasts = LEAST_WRAP_PERIODS / config.rate_hz
-    if fastest * counts * lasts <= FIELD / 2:
+    lasts = MIN_WRAP_PERIODS / config.rate_hz
+    if fastest * counts * lasts <= FIELD_VALUES / 2:
         return []
     return [
         f"mcu.encoder_counts = {counts}: at feedback.wheel_speed = "
         f"{config.feedback.wheel_speed:g} rad/s a wheel's counter could wrap round within "
-        f"{FIELD / 2 / fastest / counts * 1000:.0f} ms, which is less than {LEAST_WRAP_PERIODS} "
+        f"{FIELD_VALUES / 2 / fastest / counts * 1000:.0f} ms, which is less than "
+        f"{MIN_WRAP_PERIODS} "
         f"control periods ({lasts * 1000:.0f} ms); write "
-        f"mcu.encoder_counts = {int(FIELD / 2 / fastest / lasts)} or less and make the firmware "
+        f"mcu.encoder_counts = {int(FIELD_VALUES / 2 / fastest / lasts)} or less and make the "
+        f"firmware "
         "count fewer edges; or lower feedback.wheel_speed; or write mcu.encoder_counts = 0"
     ]
 
@@ -194,10 +196,11 @@ def _rate_problems(config: Config) -> list[str]:
         "cmd_vel_out": rates.cmd_vel_out,
     }
     return [
-        f"rates.{name} = {hz:g} Hz: the rate must be 0 (every sample) or at least {LEAST_HZ:g} Hz; "
-        f"write rates.{name} = {LEAST_HZ:g} or more"
+        f"rates.{name} = {hz:g} Hz: the rate must be 0 (every sample) or at least {MIN_RATE_HZ:g} "
+        f"Hz; "
+        f"write rates.{name} = {MIN_RATE_HZ:g} or more"
         for name, hz in each.items()
-        if 0.0 < hz < LEAST_HZ
+        if 0.0 < hz < MIN_RATE_HZ
     ]
 
 
@@ -250,7 +253,7 @@ def _battery_problems(config: Config) -> list[str]:
             found.append(
                 f"{worse} = {lower:g}: not lower than {name} = {below:g}; write a lower {worse}"
             )
-    most = 100.0 if battery.measure == "percent" else MOST_VOLTS
+    most = 100.0 if battery.measure == "percent" else MAX_VOLTS
     for name, below in rows:
         if below + battery.hysteresis > most:
             found.append(
@@ -395,10 +398,10 @@ def _access_problems(config: Config) -> list[str]:
 
 def _ros_problems(config: Config) -> list[str]:
     ros = config.ros
-    if ros.bridge and ros.namespace.partition("/")[0] == ROOT:
+    if ros.bridge and ros.namespace.partition("/")[0] == ROOT_KEY:
         return [
             f"ros.namespace = {show(ros.namespace)}: acsard's own Zenoh keys also begin with "
-            f'"{ROOT}", so the keys of the ROS bridge would mix with acsard\'s; write another '
+            f'"{ROOT_KEY}", so the keys of the ROS bridge would mix with acsard\'s; write another '
             'namespace, like "robot1"'
         ]
     return []

@@ -20,7 +20,7 @@ from acsard.core.config.validation import build, show
 
 When = Literal["always", "raised", "rest"]
 
-WHEN: dict[When, str] = {
+WHEN_TEXTS: dict[When, str] = {
     "always": "at any time",
     "raised": "may be raised at any time, but lowered only while the robot stands",
     "rest": "only while the robot stands",
@@ -39,7 +39,7 @@ WHEN: dict[When, str] = {
 class Live(Struct, frozen=True):
     """A setting that may change while the daemon runs.
 
-    `when` is a key of `WHEN`. `what` describes the setting for users.
+    `when` is a key of `WHEN_TEXTS`. `what` describes the setting for users.
     """
 
     when: When

@@ -15,7 +15,7 @@ from acsard.core.config.parsing import ConfigError
 from acsard.core.config.settings import Config, LimitsConfig
 from acsard.core.values import Event
 
-TABLE = "limits."
+LIMITS_PREFIX = "limits."
 
 
 def stays(key: str) -> bool:
@@ -23,7 +23,7 @@ def stays(key: str) -> bool:
 
     `key` is the dotted key of the setting.
     """
-    return key.startswith(TABLE) and not key.endswith("_deceleration")
+    return key.startswith(LIMITS_PREFIX) and not key.endswith("_deceleration")
 
 
 def lowered(file: LimitsConfig, now: LimitsConfig) -> dict[str, float]:
@@ -33,9 +33,9 @@ def lowered(file: LimitsConfig, now: LimitsConfig) -> dict[str, float]:
     maps dotted keys to the values in `now`.
     """
     return {
-        TABLE + name: getattr(now, name)
+        LIMITS_PREFIX + name: getattr(now, name)
         for name in file.__struct_fields__
-        if stays(TABLE + name)
+        if stays(LIMITS_PREFIX + name)
         and _rank(name, getattr(now, name)) < _rank(name, getattr(file, name))
     }
 
@@ -57,7 +57,7 @@ def with_lowered(config: Config, kept: Mapping[str, float]) -> tuple[Config, lis
         key: value
         for key, value in kept.items()
         if stays(key)
-        and (name := key.removeprefix(TABLE)) in limits.__struct_fields__
+        and (name := key.removeprefix(LIMITS_PREFIX)) in limits.__struct_fields__
         and _rank(name, value) < _rank(name, getattr(limits, name))
     }
     try:

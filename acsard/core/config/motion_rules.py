@@ -11,27 +11,27 @@ import math
 from msgspec import Struct
 
 from acsard.core.config.partial import Rule, mistakes
-from acsard.core.config.settings import LONGEST_REPLY_S, Config
+from acsard.core.config.settings import MAX_REPLY_PERIOD_S, Config
 
-LEAST_JERK = 0.01
+MIN_JERK = 0.01
 """Smallest allowed jerk limit, m/s3 or rad/s3. With a lower limit, the robot would need more than
 10 s to reach walking pace."""
 
-LONGEST_STOP_S = 2.0
+MAX_STOP_S = 2.0
 """Longest allowed time to brake from full speed to rest after a stop, s. No person should have to
 wait longer."""
 
-LONGEST_RAMP_S = 5.0
+MAX_RAMP_S = 5.0
 """Longest allowed time to brake from full speed to rest after the last command, s. During this
 ramp, no sender controls the robot."""
 
-HEADROOM = 1.1
+OVERSPEED_FACTOR = 1.1
 """Highest speed that a sound wheel reaches for a moment, divided by its commanded speed."""
 
-MOST_WHEEL_SPEED = 99.99
+MAX_WHEEL_SPEED = 99.99
 """Highest wheel speed that a line to the board can express, rad/s."""
 
-LINES_OF_EVIDENCE = 2
+MIN_EVIDENCE_LINES = 2
 """Number of feedback lines that must show a wheel fault before the fault is reported."""
 
 
@@ -67,7 +67,7 @@ def _braking_problems(config: Config, axis: str, speed: float, unit: str) -> lis
     found = []
     softer = f"{axis}_deceleration"
     normal = getattr(config.limits, softer)
-    for name, most_s in ((softer, LONGEST_RAMP_S), (f"{axis}_stop_deceleration", LONGEST_STOP_S)):
+    for name, most_s in ((softer, MAX_RAMP_S), (f"{axis}_stop_deceleration", MAX_STOP_S)):
         value, least = getattr(config.limits, name), _rounded_up(speed / most_s)
         if name != softer and value < normal:
             found.append(
@@ -86,11 +86,11 @@ def _braking_problems(config: Config, axis: str, speed: float, unit: str) -> lis
 
 def _jerk_problems(config: Config, name: str) -> list[str]:
     jerk = getattr(config.limits, name)
-    if not 0.0 < jerk < LEAST_JERK:
+    if not 0.0 < jerk < MIN_JERK:
         return []
     return [
         f"limits.{name} = {jerk:g}: the robot would gain speed far too slowly; "
-        f"write {LEAST_JERK:g} or more, or 0 for no limit"
+        f"write {MIN_JERK:g} or more, or 0 for no limit"
     ]
 
 
@@ -100,7 +100,7 @@ def _feedback_problems(config: Config, asked: float) -> list[str]:
     `asked` is the highest wheel speed that a command can request within the limits, rad/s.
     """
     most = config.feedback.wheel_speed
-    needed = min(_rounded_up(HEADROOM * asked), MOST_WHEEL_SPEED)
+    needed = min(_rounded_up(OVERSPEED_FACTOR * asked), MAX_WHEEL_SPEED)
     if most >= needed:
         return []
     return [
@@ -119,7 +119,7 @@ def _reply_problems(config: Config) -> list[str]:
     return [
         f"mcu.reply_period = {period:g}: one lost line would look like a wheel fault; write "
         f"{most:g} or less and make the firmware report more often; or write feedback.fault_time "
-        f"= {_rounded_up(period * LINES_OF_EVIDENCE):g}"
+        f"= {_rounded_up(period * MIN_EVIDENCE_LINES):g}"
     ]
 
 
@@ -127,11 +127,11 @@ def longest_reply(fault_s: float) -> float:
     """Return the longest allowed interval between two feedback lines (`mcu.reply_period`), s.
 
     `fault_s` is `feedback.fault_time`, s. Within this time, the board must send
-    `LINES_OF_EVIDENCE` lines. If `fault_s` is 0, the daemon does not check for wheel faults, and
-    the result is `LONGEST_REPLY_S`.
+    `MIN_EVIDENCE_LINES` lines. If `fault_s` is 0, the daemon does not check for wheel faults, and
+    the result is `MAX_REPLY_PERIOD_S`.
     """
-    share = math.floor(round(fault_s / LINES_OF_EVIDENCE * 1000, 6)) / 1000
-    return min(LONGEST_REPLY_S, share) if fault_s else LONGEST_REPLY_S
+    share = math.floor(round(fault_s / MIN_EVIDENCE_LINES * 1000, 6)) / 1000
+    return min(MAX_REPLY_PERIOD_S, share) if fault_s else MAX_REPLY_PERIOD_S
 
 
 def _rounded_up(value: float) -> float:

@@ -37,22 +37,22 @@ ARGUMENTS = {
 one argument: `m` for a motor, `n` for a number. A user writes a motor as a to d, and `NamedFault`
 stores it as 0 to 3."""
 
-INPUTS = ("estop_pressed", "estop_silent", "bumper_pressed", "bumpers_silent", "driver_fault")
+INPUT_FAULTS = ("estop_pressed", "estop_silent", "bumper_pressed", "bumpers_silent", "driver_fault")
 """Names of the faults of the board's inputs. The last two arguments of each fault are a delay and
 a duration, s. The delay is the time from the start of the simulator to the beginning of the fault.
 A duration of 0 means that the fault never ends."""
 
-RESET = "reset"
+RESET_FAULT = "reset"
 """Name of the fault that restarts the simulated board periodically. Its argument is the period, s.
 It needs a timer, so only `acsard sim --fault` offers it."""
 
 MOTORS = "abcd"
 
-MOST = 1e6
+MAX_ARGUMENT = 1e6
 """Largest absolute value of a number that a fault takes as an argument. The limit prevents an
 overflow in the simulator."""
 
-SHORTEST_S = 0.001
+MIN_STALL_S = 0.001
 """Shortest duration of a stall in the fault `stalls`, s. A shorter stall has no visible effect."""
 
 
@@ -75,7 +75,7 @@ def named(text: str) -> NamedFault:
     not repeat `text`.
     """
     name, _, given = text.partition("=")
-    known = {RESET: "n", **dict.fromkeys(FAULTS, ""), **ARGUMENTS}
+    known = {RESET_FAULT: "n", **dict.fromkeys(FAULTS, ""), **ARGUMENTS}
     if name not in known:
         near = nearest(name, known)
         meant = f"did you mean {_form(near[0], known[near[0]])}?" if near else _all()
@@ -86,18 +86,18 @@ def named(text: str) -> NamedFault:
     fault = NamedFault(
         name, tuple(_value(kind, word) for kind, word in zip(kinds, values, strict=True))
     )
-    if name == RESET and not fault.values[0] > 0:
+    if name == RESET_FAULT and not fault.values[0] > 0:
         raise ValueError("the seconds between resets must be above 0")
-    if name == "stalls" and not fault.values[0] > fault.values[1] >= SHORTEST_S:
+    if name == "stalls" and not fault.values[0] > fault.values[1] >= MIN_STALL_S:
         raise ValueError(
             "give the seconds from one stall to the next, then the shorter duration of each "
-            f"stall in seconds; both values must be at least {SHORTEST_S}"
+            f"stall in seconds; both values must be at least {MIN_STALL_S}"
         )
     if name == "bumper_pressed" and fault.values[0] not in (1, 2, 3, 4):
         raise ValueError(
             "the bumpers have the numbers 1 to 4, in the order in which the board reports them"
         )
-    if name in INPUTS and not min(fault.values) >= 0:
+    if name in INPUT_FAULTS and not min(fault.values) >= 0:
         raise ValueError(
             "give the seconds from the start to the fault, then the seconds that the fault lasts "
             "(0 means that it never ends)"
@@ -130,7 +130,7 @@ def _problems(config: Config) -> list[str]:
     for i, text in enumerate(config.sim.faults):
         where = f"sim.faults[{i}] = {show(text)}"
         try:
-            if named(text).name == RESET:
+            if named(text).name == RESET_FAULT:
                 found.append(
                     f"{where}: works only as `acsard sim --fault {text}`; remove it from sim.faults"
                 )
@@ -160,6 +160,6 @@ def _value(kind: str, word: str) -> int | float:
         value = float(word)
     except ValueError:
         value = math.nan
-    if not abs(value) <= MOST:
-        raise ValueError(f"write a number like 5 or 0.15, up to {MOST:g}")
+    if not abs(value) <= MAX_ARGUMENT:
+        raise ValueError(f"write a number like 5 or 0.15, up to {MAX_ARGUMENT:g}")
     return int(value) if value.is_integer() else value

@@ -5,14 +5,14 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable
 
-LONGEST = 80
+MAX_COMPARED_LENGTH = 80
 """Number of characters of a mistyped word that `nearest` compares. It ignores the rest, so that
 even a very long word takes only a short time."""
 
 
 def nearest(word: str, known: Iterable[str]) -> list[str]:
     """Return a list with the known word most similar to `word`. It is empty if none is similar."""
-    return difflib.get_close_matches(word[:LONGEST], list(known), n=1, cutoff=0.6)
+    return difflib.get_close_matches(word[:MAX_COMPARED_LENGTH], list(known), n=1, cutoff=0.6)
 
 
 def hint(word: str, known: Iterable[str], otherwise: str) -> str:

@@ -146,7 +146,7 @@ class WheelMap(Struct, frozen=True):
 SIMULATOR = "sim"
 """Value of `mcu.port` that selects the built-in simulator."""
 
-LONGEST_REPLY_S = 0.25
+MAX_REPLY_PERIOD_S = 0.25
 """Largest allowed interval between two feedback lines of the board, s. A board that is silent for
 one second counts as restarted. With this interval, the loss of two lines in a row causes a silence
 of only 0.75 s."""
@@ -157,7 +157,8 @@ class McuConfig(Struct, frozen=True):
     baud_rate: Baud = 115200
     trailing_comma: bool = False
     reply_period: Annotated[
-        float, Meta(ge=0.0, le=LONGEST_REPLY_S, extra={"unit": "s between two lines of the board"})
+        float,
+        Meta(ge=0.0, le=MAX_REPLY_PERIOD_S, extra={"unit": "s between two lines of the board"}),
     ] = 0.0
     link_check: Literal["off", "auto", "require"] = "off"
     encoder_counts: EncoderCounts = 0
@@ -327,8 +328,9 @@ class RatesConfig(Struct, frozen=True):
     diagnostics: SlowRate = 1.0
 
 
-TLS = "tls/"
-"""Prefix of endpoints with mutual TLS: the server and the client each present a certificate."""
+TLS_PREFIX = "tls/"
+"""Prefix of endpoints with mutual TLS_PREFIX: the server and the client each present a
+certificate."""
 
 
 class BusConfig(Struct, frozen=True):
@@ -343,19 +345,19 @@ class BusConfig(Struct, frozen=True):
 
     @property
     def plain(self) -> tuple[str, ...]:
-        """The endpoints in `listen` without TLS, at which the daemon listens.
+        """The endpoints in `listen` without TLS_PREFIX, at which the daemon listens.
 
         The tuple is empty if `mode` is "client".
         """
-        return tuple(e for e in self.listen if not e.startswith(TLS)) if self._peer else ()
+        return tuple(e for e in self.listen if not e.startswith(TLS_PREFIX)) if self._peer else ()
 
     @property
     def outside(self) -> tuple[str, ...]:
-        """The endpoints in `listen` with TLS, at which the TLS gateway listens.
+        """The endpoints in `listen` with TLS_PREFIX, at which the TLS_PREFIX gateway listens.
 
         The tuple is empty if `mode` is "client".
         """
-        return tuple(e for e in self.listen if e.startswith(TLS)) if self._peer else ()
+        return tuple(e for e in self.listen if e.startswith(TLS_PREFIX)) if self._peer else ()
 
     @property
     def _peer(self) -> bool:
@@ -388,7 +390,7 @@ class LogConfig(Struct, frozen=True):
     format: Literal["auto", "console", "json", "logfmt", "journal"] = "auto"
 
 
-RECORD = "ACSARD_RECORD"
+RECORD_VARIABLE = "ACSARD_RECORD"
 """Environment variable with which the systemd units set the directory of the recordings."""
 
 

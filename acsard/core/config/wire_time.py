@@ -24,7 +24,7 @@ STATUS_BYTES = 28
 STATUS_HZ = 10
 """Rate at which a board sends status lines, Hz."""
 
-FIELD = 65536
+FIELD_VALUES = 65536
 """Number of different values of a sample field, which has four hexadecimal digits. After FFFF, the
 field continues with 0."""
 

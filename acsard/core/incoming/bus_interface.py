@@ -33,7 +33,7 @@ class BusInput(Struct, frozen=True):
     changed."""
 
 
-NOTHING = BusInput()
+NO_INPUT = BusInput()
 
 
 class Waker(Protocol):

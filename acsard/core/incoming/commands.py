@@ -38,11 +38,11 @@ from acsard.core.ros.transports import Transport
 from acsard.core.values import NS_PER_S, REST, Command, Pose, Request, Verb, WheelSpeeds
 from acsard.core.values import Twist as BodyTwist
 
-BOUND_NS = 60 * NS_PER_S
+BINDING_NS = 60 * NS_PER_S
 """Time without a command after which a sender id may be used with another certificate, ns. For
 example, a program with a fixed id may move from the robot to a laptop."""
 
-MAX_BOUND = 1024
+MAX_BINDINGS = 1024
 """Largest number of sender ids for which the daemon remembers the certificate. If there are more,
 the daemon forgets the sender that has sent no command for the longest time."""
 
@@ -71,11 +71,11 @@ class Bindings:
         of the certificate, or "" for a program on the robot itself. `now_ns` is monotonic.
         """
         bound, seen_ns = self._seen.get(sender, (certificate, now_ns))
-        if bound != certificate and now_ns - seen_ns <= BOUND_NS:
+        if bound != certificate and now_ns - seen_ns <= BINDING_NS:
             return bound
         self._seen.pop(sender, None)
         self._seen[sender] = (certificate, now_ns)
-        if len(self._seen) > MAX_BOUND:
+        if len(self._seen) > MAX_BINDINGS:
             del self._seen[next(iter(self._seen))]
         return None
 
@@ -84,7 +84,7 @@ MAX_COMMAND_BYTES = 4096
 """Largest payload of a command or a service query, bytes. A TwistStamped in JSON is shorter than
 300 bytes."""
 
-REPLACED_NS = NS_PER_S // 2
+MAX_TIMESTAMP_LEAD_NS = NS_PER_S // 2
 """Zenoh replaces a timestamp that is ahead of the daemon's clock by more than this, ns."""
 
 Via = Literal["native"] | Transport
@@ -198,7 +198,7 @@ class Receiver:
             identity.sequence,
             shared=identity.shared,
             ros=arrival.via != "native",
-            stamp_replaced=bool(ours and stamp_ns and stamp_ns - ours > REPLACED_NS),
+            stamp_replaced=bool(ours and stamp_ns and stamp_ns - ours > MAX_TIMESTAMP_LEAD_NS),
             steady=identity.steady,
         )
 

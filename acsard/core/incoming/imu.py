@@ -25,16 +25,16 @@ from acsard.core.values import NS_PER_S, Event, GyroSample
 MAX_RATE = 50.0
 """Largest turn rate that is accepted, rad/s. No robot turns that fast."""
 
-FOLLOWED_NS = NS_PER_S // 2
+SILENCE_TIMEOUT_NS = NS_PER_S // 2
 """Time without a sample of the gyro in use after which the daemon may use another gyro, ns."""
 
-OWN = "gyro of the simulator/own"
+SIMULATOR_SENDER = "gyro of the simulator/own"
 """Sender id that the built-in simulator puts on the samples of its simulated gyro."""
 
-MOST_WHO = 64
+MAX_NAME_LENGTH = 64
 """Number of characters after which a sender's name is cut off in an error message."""
 
-UNKNOWN = [0.0] * 9
+UNKNOWN_COVARIANCE = [0.0] * 9
 """Covariance to use if a sample contains none. In sensor_msgs/Imu, zeros mean "unknown"."""
 
 
@@ -60,8 +60,8 @@ class GyroFollower:
         If `own` is true, accept only the simulated gyro of the built-in simulator of this daemon.
         """
         self._own = own
-        self._followed = public_name(OWN) if own else ""
-        self._heard_ns = -FOLLOWED_NS
+        self._followed = public_name(SIMULATOR_SENDER) if own else ""
+        self._heard_ns = -SILENCE_TIMEOUT_NS
 
     def receive(
         self, arrival: Arrival, counters: MutableMapping[str, int], events: list[Event]
@@ -87,10 +87,11 @@ class GyroFollower:
         simulator is allowed.
         """
         other = who != self._followed
-        if other and (self._own or now_ns - self._heard_ns < FOLLOWED_NS):
+        if other and (self._own or now_ns - self._heard_ns < SILENCE_TIMEOUT_NS):
             raise DecodeError(
                 "second_sender",
-                f"{who[:MOST_WHO]} also sends gyro samples: end it, or end the sender in use, "
+                f"{who[:MAX_NAME_LENGTH]} also sends gyro samples: end it, or end the sender in "
+                f"use, "
                 f"{self._followed}",
             )
         before, self._followed, self._heard_ns = self._followed, who, now_ns
@@ -108,7 +109,7 @@ def reading(arrival: Arrival) -> GyroSample:
         got = decode_cdr(Imu, arrival.payload)
     else:
         got = _readings.decode(arrival.encoding, arrival.payload)
-    rate, variances = got.angular_velocity, got.angular_velocity_covariance or UNKNOWN
+    rate, variances = got.angular_velocity, got.angular_velocity_covariance or UNKNOWN_COVARIANCE
     numbers = (rate.x, rate.y, rate.z, variances[8])
     if not all(map(math.isfinite, numbers)):
         raise DecodeError("not_finite", "the angular velocity contains NaN or infinity")

@@ -49,18 +49,18 @@ from acsard.core.messages.schema import (
 from acsard.core.ros.attachments import Attachment, unpack
 from acsard.core.ros.parameters import (
     MAX_REQUEST_BYTES,
-    SETTING,
+    SETTING_SERVICES,
     Parameters,
     failure,
     outcome,
     wished,
 )
-from acsard.core.ros.transports import PARAMETERS, in_ros_words, left_out
+from acsard.core.ros.transports import PARAMETERS_PREFIX, in_ros_words, left_out
 from acsard.core.values import ROLES, Answer, Outputs, Request
 
 Current = Callable[[str], Message | None]
 
-MAX_WILDCARD = 512
+MAX_WILDCARD_LENGTH = 512
 """Largest number of characters of a key expression with a wildcard. No key is that long, and a
 longer expression would delay the control loop."""
 
@@ -172,7 +172,7 @@ class Queries:
         if waiting.ros:
             message = in_ros_words(message, self._config.ros)
         if waiting.wish:
-            service, name = key.removeprefix(PARAMETERS), ""
+            service, name = key.removeprefix(PARAMETERS_PREFIX), ""
             payload = outcome(service, waiting.wish, answer.success, message)
         else:
             payload = encode(ServiceReply(answer.success, message), form)
@@ -194,8 +194,8 @@ class Queries:
         if len(query.payload) > MAX_REQUEST_BYTES:
             raise DecodeError("too_big", f"the request has over {MAX_REQUEST_BYTES} bytes")
         try:
-            service = query.topic.removeprefix(PARAMETERS)
-            if service in SETTING:
+            service = query.topic.removeprefix(PARAMETERS_PREFIX)
+            if service in SETTING_SERVICES:
                 wish = wished(query.payload)
                 self._waiting[query.ticket] = _Waiting(
                     query.topic, "cdr", asked, True, query.payload
@@ -249,7 +249,7 @@ class Queries:
         """Return whether a query asks for `key`, a key without the prefix `acsard/<id>/`."""
         if "*" not in query.asked:
             return query.asked == key
-        if len(query.asked) > MAX_WILDCARD:
+        if len(query.asked) > MAX_WILDCARD_LENGTH:
             return False
         whole = full_key(self._config.robot.id, key)
         return includes(query.asked, key) or includes(query.asked, whole)
@@ -310,14 +310,14 @@ def refused(query: Query, why: str, wall_ns: int) -> Reply | None:
     if query.topic in VERBS:
         payload, name = encode(ServiceReply(False, why), "cdr"), "ServiceReply"
     else:
-        payload, name = failure(query.topic.removeprefix(PARAMETERS), why, query.payload), ""
+        payload, name = failure(query.topic.removeprefix(PARAMETERS_PREFIX), why, query.payload), ""
     encoding = encoding_name("cdr", name)
     return Reply(query.ticket, query.topic, payload, encoding, attachment=_echo(asked, wall_ns))
 
 
 def most_bytes(topic: str) -> int:
     """Return the largest allowed payload of a query for the key `topic`, in bytes."""
-    return MAX_REQUEST_BYTES if topic.startswith(PARAMETERS) else MAX_COMMAND_BYTES
+    return MAX_REQUEST_BYTES if topic.startswith(PARAMETERS_PREFIX) else MAX_COMMAND_BYTES
 
 
 def _echo(asked: Attachment | None, wall_ns: int) -> bytes:

@@ -28,15 +28,15 @@ from acsard.core.messages.keys_and_roles import SPEED_LIMIT
 from acsard.core.messages.schema import Header, SpeedLimit
 from acsard.core.values import NS_PER_S, Answer, Event, Refusal, Request
 
-SETTING = "limits.linear_speed"
+LOWERED_SETTING = "limits.linear_speed"
 """The setting that a speed limit lowers."""
 
-PAUSE_NS = NS_PER_S // 10
+MIN_INTERVAL_NS = NS_PER_S // 10
 """Least time between two changes of the limit, ns. Each change builds the whole configuration
 again, so many changes would delay the control loop. If several messages arrive within this time,
 only the newest one is applied."""
 
-LIFTED = 0.0
+NO_LIMIT_VALUE = 0.0
 """Value of nav2_msgs/SpeedLimit that means "no limit", in m/s and in %."""
 
 
@@ -82,10 +82,10 @@ def decode_limit(arrival: Arrival, configured: float) -> Limit:
         raise DecodeError("out_of_range", f"{value:g}{unit}: send 0{most}; 0 lifts the limit")
     speed = value / 100.0 * configured if got.percentage else value
     by = f"{SPEED_LIMIT}, {caller_name(arrival.via, arrival.attachment, arrival.sender)}"
-    return Limit(math.inf if value == LIFTED else speed, by, arrival.arrived_ns)
+    return Limit(math.inf if value == NO_LIMIT_VALUE else speed, by, arrival.arrived_ns)
 
 
-NONE = Limit(math.inf, "", 0)
+NO_LIMIT = Limit(math.inf, "", 0)
 
 
 class SpeedLimiter:
@@ -93,7 +93,7 @@ class SpeedLimiter:
 
     def __init__(self, config: Config) -> None:
         """Start without a limit. `config` is the robot's present configuration."""
-        self._limit = NONE
+        self._limit = NO_LIMIT
         self._waiting: Limit | None = None
         """The limit of the newest message, until it is applied; None if no message waits."""
         self._changed_ns = 0
@@ -148,12 +148,12 @@ class SpeedLimiter:
         time of the step. The caller must call `settle` after the step.
         """
         own = self._own(now_ns)
-        if self._limit is NONE and not self._held:
+        if self._limit is NO_LIMIT and not self._held:
             return (*own, *requests), []
         found, refused, taken = list(own), list[Answer](), False
         waiting, self._held = [*self._held, *requests], []
         for request in waiting:
-            if request.verb != "set" or self._limit is NONE:
+            if request.verb != "set" or self._limit is NO_LIMIT:
                 found.append(request)
             elif taken:
                 self._held.append(request)
@@ -172,13 +172,13 @@ class SpeedLimiter:
         """
         # The robot itself checks whether a change must wait until the robot stands still.
         made, _ = changed(self.settings, request.settings, at_rest=True)
-        if SETTING not in request.settings:
+        if LOWERED_SETTING not in request.settings:
             return request
         wanted = made.limits.linear_speed
         self._asked = request, wanted
         if wanted <= self._limit.speed:
             return request
-        return replace(request, settings=request.settings | {SETTING: self._limit.speed})
+        return replace(request, settings=request.settings | {LOWERED_SETTING: self._limit.speed})
 
     def _own(self, now_ns: int) -> tuple[Request, ...]:
         """Put the newest limit in force, and return the `set` request that sends it to the robot.
@@ -186,15 +186,17 @@ class SpeedLimiter:
         The result is () if no new limit waits, if the last change is too recent, or if the robot
         already has the right value. `now_ns` is monotonic.
         """
-        if self._waiting is None or now_ns - self._changed_ns < PAUSE_NS:
+        if self._waiting is None or now_ns - self._changed_ns < MIN_INTERVAL_NS:
             return ()
         new, self._waiting = self._waiting, None
-        self._limit = NONE if math.isinf(new.speed) else new
+        self._limit = NO_LIMIT if math.isinf(new.speed) else new
         lowest = min(self.settings.limits.linear_speed, new.speed)
         if lowest == self._robot.limits.linear_speed:
             return ()
         self._changed_ns = now_ns
-        return (Request("set", asked_ns=new.arrived_ns, by=new.by, settings={SETTING: lowest}),)
+        return (
+            Request("set", asked_ns=new.arrived_ns, by=new.by, settings={LOWERED_SETTING: lowest}),
+        )
 
     def settle(
         self, robot: Config, answers: Iterable[Answer], events: list[Event]
@@ -214,7 +216,7 @@ class SpeedLimiter:
             if answer is not None and answer.success:
                 speed = wanted
                 if wanted > self._limit.speed:
-                    text = f"{SETTING} = {wanted:g} {self._until}"
+                    text = f"{LOWERED_SETTING} = {wanted:g} {self._until}"
                     events.append(Event("set", text, by=request.by, kind="waits"))
                     if len(request.settings) > 1:
                         text = f"{answer.message}; {text}"
@@ -222,7 +224,7 @@ class SpeedLimiter:
                     answers = tuple([told if one is answer else one for one in answers])
         if robot is not self._robot or speed != self.settings.limits.linear_speed:
             self._robot = robot
-            limited = self._limit is not NONE
+            limited = self._limit is not NO_LIMIT
             limits = replace(robot.limits, linear_speed=speed) if limited else robot.limits
             self.settings = replace(robot, limits=limits) if limited else robot
         return answers

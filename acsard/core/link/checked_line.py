@@ -23,10 +23,10 @@ from acsard.core.link.codec import FrameError
 SEQUENCES = 256
 """Number of different sequence numbers. The number after 255 is 0."""
 
-ASK_SAMPLE = b"S"
+SAMPLE_REQUEST = b"S"
 """The request letter that asks for the sample fields."""
 
-ASK_NOTHING = b"H"
+ECHO_MARK = b"H"
 """A request letter that the board ignores. The letter marks a line as a line of the daemon. Replies
 contain no request letters, so a received line with this letter is an echo."""
 

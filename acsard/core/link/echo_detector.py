@@ -13,33 +13,33 @@ from msgspec import Struct
 
 from acsard.core.values import WheelSpeeds
 
-REPORTS = 20
+MIN_REPEATED_LINES = 20
 """Least number of successive sent lines that must come back to count as an echo. 20 lines take 0.2
 s at 100 Hz."""
 
-OTHERS = 2
+MAX_OTHER_REPORTS = 2
 """Largest number of genuine replies between two lines of an echo. If a board is connected behind an
 adapter that echoes, the daemon receives both the echo and the replies of the board. A board that
 reports by its own clock may send two replies in a row."""
 
-CHANGE = 2.0
+MIN_TOTAL_CHANGE = 2.0
 """Least total change of the wheel speeds in an echo, rad/s. From each line that came back to the
 next, only the largest of the four changes counts, and these changes are added up. With coarse
 encoders, a smaller sum may be a coincidence."""
 
-CORNER = 0.025
+MIN_BEND = 0.025
 """Least difference between two successive speed changes in an echo, rad/s. At least one such
 difference must occur, as at the start or the end of a ramp. Speeds in lines are rounded to 0.01
 rad/s, so on a straight ramp two speed changes differ by up to 0.02 rad/s. Therefore an echo may
 stay undetected while all ramps are gentler than 0.025 rad/s per line, which is 0.125 m/s2 for a
 wheel radius of 0.05 m at 100 Hz."""
 
-LINES = 8
+COMPARED_LINES = 8
 """Number of sent lines, the newest ones, with which `EchoDetector` compares each received reply. At
 100 Hz, an echo that comes back within 70 ms is detected."""
 
 _Wheels = tuple[float, float, float, float]
-STEADY: _Wheels = (0.0, 0.0, 0.0, 0.0)
+NO_CHANGE: _Wheels = (0.0, 0.0, 0.0, 0.0)
 """Change of the four wheel speeds between two lines with equal speeds, rad/s."""
 
 
@@ -57,9 +57,10 @@ class _Run(Struct, gc=False):
     lines: int = 1
     """Number of lines in the run."""
     change: float = 0.0
-    """Sum of the speed changes between successive lines, rad/s, as `CHANGE` defines it."""
+    """Sum of the speed changes between successive lines, rad/s, as `MIN_TOTAL_CHANGE` defines
+    it."""
     corner: float = 0.0
-    """Largest difference between two successive speed changes in the run, rad/s. See `CORNER`."""
+    """Largest difference between two successive speed changes in the run, rad/s. See `MIN_BEND`."""
 
 
 class EchoDetector:
@@ -69,18 +70,20 @@ class EchoDetector:
     the same form as a command, so an echo looks like a board that reports exactly the commanded
     speeds. The received lines are an echo if all of these conditions hold:
 
-    - At least `REPORTS` successive sent lines came back in order, byte for byte.
-    - Between two successive lines that came back, at most `OTHERS` other reports came. The speeds
+    - At least `MIN_REPEATED_LINES` successive sent lines came back in order, byte for byte.
+    - Between two successive lines that came back, at most `MAX_OTHER_REPORTS` other reports came.
+    The speeds
       in these reports do not lie between the speeds in the two lines. A motor that changes from one
       speed to the other would report speeds between them.
-    - The speed changes from line to line add up to at least `CHANGE`, and one of them differs by
-      more than `CORNER` from the speed change before it. A motor that lags by a whole number of
+    - The speed changes from line to line add up to at least `MIN_TOTAL_CHANGE`, and one of them
+    differs by
+      more than `MIN_BEND` from the speed change before it. A motor that lags by a whole number of
       lines repeats a steady ramp exactly, but it rounds off the start and the end of the ramp.
 
     At rest every board looks like an echo, so lines without speed changes prove nothing. A device
     that echoes and also passes on replies, such as an RS-485 adapter with a board behind it, is
     detected just as quickly as a device that only echoes. While all ramps are gentle (see
-    `CORNER`), no echo is detected.
+    `MIN_BEND`), no echo is detected.
 
     A board that reports its set points instead of measured speeds looks exactly like an echo. A
     simulator whose wheels have no lag may look like an echo too. The daemon then does not drive
@@ -92,14 +95,14 @@ class EchoDetector:
 
     def forget(self) -> None:
         """Forget all lines and reports, because the port has been opened."""
-        self._sent: deque[bytes] = deque(maxlen=LINES + 1)
-        """The last `LINES` sent lines, and one older line, so that a run that ends with the older
-        line can continue."""
-        self._runs: deque[_Run | None] = deque(maxlen=LINES + 1)
+        self._sent: deque[bytes] = deque(maxlen=COMPARED_LINES + 1)
+        """The last `COMPARED_LINES` sent lines, and one older line, so that a run that ends with
+        the older line can continue."""
+        self._runs: deque[_Run | None] = deque(maxlen=COMPARED_LINES + 1)
         """For each line in `_sent`, the run that ends with this line: the series of successive sent
         lines that came back. None if this line did not come back."""
         self._reports = 0
-        self._last: deque[_Wheels] = deque(maxlen=OTHERS + 1)
+        self._last: deque[_Wheels] = deque(maxlen=MAX_OTHER_REPORTS + 1)
         """Wheel speeds in the last reports, rad/s."""
 
     def left(self, line: bytes) -> None:
@@ -119,7 +122,7 @@ class EchoDetector:
             return False
         found, sent, runs = False, self._sent, self._runs
         # The newest line is first, so that a report makes each run longer by at most one line.
-        for place in range(len(sent) - 1, max(0, len(sent) - LINES) - 1, -1):
+        for place in range(len(sent) - 1, max(0, len(sent) - COMPARED_LINES) - 1, -1):
             if sent[place] != line:
                 continue
             before, known = runs[place - 1] if place else None, runs[place]
@@ -129,12 +132,12 @@ class EchoDetector:
                 run = known  # a continued run would not be longer
             if known is None or known.lines < run.lines:
                 runs[place] = known = run
-            elif known.slope == STEADY:
+            elif known.slope == NO_CHANGE:
                 # At a steady speed all lines are equal, so several reports equal the same line.
                 # On a ramp only one report equals it.
                 known.report = self._reports
-            enough = known.lines >= REPORTS and known.change >= CHANGE
-            found = found or (enough and known.corner > CORNER)
+            enough = known.lines >= MIN_REPEATED_LINES and known.change >= MIN_TOTAL_CHANGE
+            found = found or (enough and known.corner > MIN_BEND)
         return found
 
     def _continued(self, run: _Run | None, wheels: _Wheels) -> _Run:
@@ -143,14 +146,14 @@ class EchoDetector:
         `wheels` are the speeds in the line, rad/s. A new run begins if `run` is None, or if the
         reports since the last line of `run` show that the line is not an echo.
         """
-        others = OTHERS + 1 if run is None else self._reports - run.report - 1
-        if run is None or others > OTHERS:
+        others = MAX_OTHER_REPORTS + 1 if run is None else self._reports - run.report - 1
+        if run is None or others > MAX_OTHER_REPORTS:
             return _Run(self._reports, wheels)
         lines, change, corner = run.lines + 1, run.change, run.corner
-        if run.slope == STEADY and run.wheels == wheels:
-            return _Run(self._reports, wheels, STEADY, lines, change, corner)
+        if run.slope == NO_CHANGE and run.wheels == wheels:
+            return _Run(self._reports, wheels, NO_CHANGE, lines, change, corner)
         slope = _differences(run.wheels, wheels)
-        steady = STEADY in (run.slope, slope)
+        steady = NO_CHANGE in (run.slope, slope)
         for other in [self._last[-2 - n] for n in range(others)]:
             if _between(other, run.wheels, wheels) and not (steady and other == run.wheels):
                 return _Run(self._reports, wheels)

@@ -15,7 +15,7 @@ from typing import Literal
 
 from msgspec import Struct
 
-from acsard.core.config.wire_time import FIELD
+from acsard.core.config.wire_time import FIELD_VALUES
 from acsard.core.link.checked_line import Reading
 from acsard.core.link.codec import Motors
 from acsard.core.link.minimum_delay import MinimumDelay
@@ -30,7 +30,7 @@ ROUNDING_MS = 2
 """Largest error of the time between two readings, ms. The time of each reading is in whole ms, so
 it is wrong by up to 1 ms."""
 
-LATEST_MS = 1000.0
+MAX_DELAY_MS = 1000.0
 """Largest delay of a reading that `Encoders` distinguishes, ms. A longer delay is treated as this
 delay. A larger limit is not needed, because the session restarts after a gap of one second."""
 
@@ -72,7 +72,7 @@ class Encoders:
         self._last: tuple[Reading, int] | None = None
         # A restart sets the board's clock to 0. The clock counts modulo 65536 ms, so it then seems
         # to have jumped ahead, and the delay of the next reading seems too small.
-        self._promptest = MinimumDelay(most=LATEST_MS)
+        self._promptest = MinimumDelay(most=MAX_DELAY_MS)
         """Measures the delay of each reading in excess of the least delay so far, ms. The delay is
         the arrival time of the reading minus its time by the board's clock."""
 
@@ -91,10 +91,10 @@ class Encoders:
             return "unknown"
         before, before_ns = last
         host_ms = (at_ns - before_ns) * 1000 / NS_PER_S
-        mcu_ms = (reading.mcu_ms - before.mcu_ms) % FIELD
+        mcu_ms = (reading.mcu_ms - before.mcu_ms) % FIELD_VALUES
         if self._promptest.add(host_ms, mcu_ms) < -self._early_ms:
             return "restarted"
-        if self._most(max(host_ms, mcu_ms)) >= FIELD / 2:
+        if self._most(max(host_ms, mcu_ms)) >= FIELD_VALUES / 2:
             return "unknown"
         pairs = zip(reading.counts, before.counts, strict=True)
         a, b, c, d = [_signed(now - then) for now, then in pairs]
@@ -110,4 +110,4 @@ class Encoders:
 
 def _signed(difference: int) -> int:
     """Return the number nearest to 0 that equals `difference` modulo 65536."""
-    return (difference + FIELD // 2) % FIELD - FIELD // 2
+    return (difference + FIELD_VALUES // 2) % FIELD_VALUES - FIELD_VALUES // 2

@@ -23,49 +23,49 @@ from acsard.core.link.checked_line import Reading
 from acsard.core.link.codec import Codec, Motors
 from acsard.core.link.encoders import Encoders, Turned
 from acsard.core.link.link_state import WATCHDOG_NS
-from acsard.core.link.sample_time import BRIDGED_S, FreeRunningTimes, Placed, PromptedTimes
+from acsard.core.link.sample_time import MAX_FILLED_GAP_S, FreeRunningTimes, Placed, PromptedTimes
 from acsard.core.values import NS_PER_S, Instant, WheelSpeeds
 
-APART_NS = 1000
+MIN_INTERVAL_NS = 1000
 """Least difference between the sample times of two successive lines, ns. Two lines with equal
 sample times would look like a single line."""
 
-LATER = 0.05
+DIFFERENCE_GAIN = 0.05
 """Gain of the filter for a mean difference: the time that `PromptedTimes` gives to a line, minus
 the time that `FreeRunningTimes` gives to the same line."""
 
-FULL_READ = 1024
+FULL_READ_BYTES = 1024
 """If a read of the port contains at least this number of bytes, the kernel may hold more data."""
 
-DIFFERS = 1.5
-"""A read of the port helps `ReplyStyle` to decide if two numbers differ by at least `DIFFERS`: the
-reply periods that have passed since the previous read, and the commands that were written since
-then. Scheduling alone causes a smaller difference."""
+EVALUATION_START = 1.5
+"""A read of the port helps `ReplyStyle` to decide if two numbers differ by at least
+`EVALUATION_START`: the reply periods that have passed since the previous read, and the commands
+that were written since then. Scheduling alone causes a smaller difference."""
 
-TELLING = 2.5
+DECISION_DIFFERENCE = 2.5
 """`ReplyStyle` adds up two numbers over the reads of the port that it evaluates: the reply periods
 that passed, and the commands that were written. It decides only if the two sums differ by at least
-`TELLING`."""
+`DECISION_DIFFERENCE`."""
 
-LATEST = 100.0
+MAX_READ_PERIODS = 100.0
 """`ReplyStyle` ignores a read of the port if more than this number of reply periods have passed
 since the previous read."""
 
-CLEAR = 0.5
+CLEAR_FRACTION = 0.5
 """`ReplyStyle` decides only if the number n of received lines is clearly nearer to one of two sums
 than to the other: the number p of reply periods, and the number c of commands. Therefore |p - n|
-and |c - n| must differ by at least `CLEAR` times |p - c|. All three numbers are sums over the reads
-of the port that `ReplyStyle` evaluates."""
+and |c - n| must differ by at least `CLEAR_FRACTION` times |p - c|. All three numbers are sums over
+the reads of the port that `ReplyStyle` evaluates."""
 
-AFTER = 3
+EXTRA_READS = 3
 """Number of further reads that `ReplyStyle` evaluates after a read of the port that reaches
-`DIFFERS`."""
+`EVALUATION_START`."""
 
-NEAR = 0.35
+NEAR_FRACTION = 0.35
 """`ReplyStyle` decides only if the number n of received lines is near to one of two sums: the
 number p of reply periods, or the number c of commands. Therefore |p - n| or |c - n| must be at most
-`NEAR` times n, or at most 1.5 if that is more. The limit is not 0, because some lines get lost. All
-three numbers are sums over the reads of the port that `ReplyStyle` evaluates."""
+`NEAR_FRACTION` times n, or at most 1.5 if that is more. The limit is not 0, because some lines get
+lost. All three numbers are sums over the reads of the port that `ReplyStyle` evaluates."""
 
 
 class Feedback(Struct, frozen=True, gc=False):
@@ -146,10 +146,10 @@ class ReplyStyle:
         `periods` is the time since the previous such read, in reply periods of the board.
         """
         left, self._left = self._left, 0
-        if self._known or periods > LATEST:
+        if self._known or periods > MAX_READ_PERIODS:
             return
-        if abs(periods - left) >= DIFFERS:
-            self._after = AFTER
+        if abs(periods - left) >= EVALUATION_START:
+            self._after = EXTRA_READS
         elif self._after:
             self._after -= 1
         else:
@@ -163,9 +163,9 @@ class ReplyStyle:
             abs(self._came - self._asked),
         )
         apart = abs(self._periods - self._asked)
-        if apart < TELLING or abs(own - asked) < CLEAR * apart:
+        if apart < DECISION_DIFFERENCE or abs(own - asked) < CLEAR_FRACTION * apart:
             return
-        if min(own, asked) <= max(1.5, NEAR * came):
+        if min(own, asked) <= max(1.5, NEAR_FRACTION * came):
             self.speaks = own < asked
         self._came = self._periods = self._asked = 0.0
         self._after = 0
@@ -251,7 +251,7 @@ class Timeline:
         self._share_ns = (end_ns - before) / lines
         style, slots = self._style, self._slots
         if style.speaks is not False:
-            slots.read(end_ns, lines, size < FULL_READ)
+            slots.read(end_ns, lines, size < FULL_READ_BYTES)
         spoke = style.speaks
         style.read(lines, (end_ns - before) / self._usual_ns)
         if style.speaks is False:
@@ -312,7 +312,7 @@ class Timeline:
             dt, bridged, since, known = turned.dt, 0.0, turned.dt, not silent
             wheels = self._codec.wheels(turned.motors)
         gap = 0.0
-        if self._forgotten or self.restarted or not known or dt >= BRIDGED_S:
+        if self._forgotten or self.restarted or not known or dt >= MAX_FILLED_GAP_S:
             gap = 0.0 if first else max(since, dt)
             self._share_ns = min(self._share_ns, wire_ns(length, self._baud_rate))
             self._last_placed = self._placed_by_reads() if placed.clock == "reads" else placed
@@ -384,7 +384,7 @@ class Timeline:
             return
         if slot.dt is None or self._last_placed.clock != "slots" or not self._compared:
             self._later, self._compared = float(later_ns), True
-        self._later += LATER * (later_ns - self._later)
+        self._later += DIFFERENCE_GAIN * (later_ns - self._later)
 
     def _late_ns(self, clock: str) -> float:
         """Return how much later `clock` usually is than `FreeRunningTimes` for the same line, ns.
@@ -409,9 +409,12 @@ class Timeline:
         mono_ns = min(came_ns, placed.due_ns) - wire_ns(length, self._baud_rate)
         last, read = self._last, self._at
         wall_ns = read.wall_ns - read.mono_ns + mono_ns
-        if last is not None and mono_ns < last.mono_ns + APART_NS:
-            late_ns = last.mono_ns + APART_NS - mono_ns
-            mono_ns, wall_ns = mono_ns + late_ns, max(wall_ns + late_ns, last.wall_ns + APART_NS)
+        if last is not None and mono_ns < last.mono_ns + MIN_INTERVAL_NS:
+            late_ns = last.mono_ns + MIN_INTERVAL_NS - mono_ns
+            mono_ns, wall_ns = (
+                mono_ns + late_ns,
+                max(wall_ns + late_ns, last.wall_ns + MIN_INTERVAL_NS),
+            )
         self._last = Instant(mono_ns, wall_ns)
         return self._last
 

@@ -7,7 +7,7 @@ every session with a bare line end, and a board that echoes may send it back.
 
 from __future__ import annotations
 
-MAX_LINE = 128
+MAX_LINE_BYTES = 128
 """Largest number of bytes in a line, including its line end. A reply has about 62 bytes, and a
 status line with all fields about 100."""
 
@@ -42,13 +42,13 @@ class LineReader:
             self._held = b""
             if self._discarding:
                 self._discarding = False
-            elif len(line) >= MAX_LINE:
+            elif len(line) >= MAX_LINE_BYTES:
                 self.too_long += 1
             elif line not in (b"", b"\r"):
                 lines.append((line.removesuffix(b"\r"), following))
         if not self._discarding:
             self._held += rest
-            if len(self._held) >= MAX_LINE:
+            if len(self._held) >= MAX_LINE_BYTES:
                 self.too_long += 1
                 self._held = b""
                 self._discarding = True

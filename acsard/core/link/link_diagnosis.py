@@ -13,33 +13,33 @@ from msgspec import Struct
 
 from acsard.core.formatting import many, printable_bytes
 from acsard.core.link.codec import TOKENS
-from acsard.core.link.link_state import WORDS, Link
+from acsard.core.link.link_state import STATE_TEXTS, Link
 from acsard.core.link.link_state import State as LinkState
-from acsard.core.link.negotiation import MENDS, Negotiation
+from acsard.core.link.negotiation import ADVICE, Negotiation
 from acsard.core.values import NS_PER_S, Event
 
-SHARE = 0.5
+LATE_STEP_FRACTION = 0.5
 """A control step is late if the time since the previous step reaches this share of `Link.quiet_ns`,
 the duration of silence after which the link is stale. The daemon reads the lines of the board only
 in its control steps. So before a late step, this computer has caused a silence by not running the
 daemon, and the board is not to blame."""
 
-BUSY = (
+BUSY_ADVICE = (
     "the Linux command `top` shows which other program uses the processor; acsard has priority if "
     "it runs as the systemd service"
 )
 
-HOST = "this computer did not run the daemon for"
-SIMULATOR = (
+HOST_STALL = "this computer did not run the daemon for"
+SIMULATOR_FAULT = (
     "a fault in sim.faults silences the built-in simulator, or the simulator, which is a part of "
     "the daemon, is late"
 )
 
-PATIENCE_NS = 3 * NS_PER_S
+FIRST_DIAGNOSIS_NS = 3 * NS_PER_S
 """Time without a link until the first diagnosis, ns. A board that is only booting answers within
 this time."""
 
-SHOWN = 64
+MAX_SHOWN_BYTES = 64
 """Largest number of bytes that a diagnosis shows: a whole line and some noise."""
 
 Look = Literal["nothing", "statuses", "cut", "foreign", "garbage", "few", "sparse"]
@@ -70,16 +70,16 @@ _RIGHT = re.compile(TOKENS)
 _PIECE = re.compile(rb"[abcdpn0-9A-F., #@*\r\n]+")
 """Pattern of bytes that may be a piece of a reply: only characters that a reply can contain."""
 
-BLOCKED = (
+PORT_BLOCKED = (
     "the serial port sends nothing, because its driver accepts no bytes: unplug the "
     "adapter and plug it in again"
 )
 
-WINDOW = 1000
+WINDOW_LINES = 1000
 """Number of sent lines after which `UnansweredLines` counts the answers to these lines. At 100 Hz,
 this takes 10 s."""
 
-LOST = 0.02
+MAX_UNANSWERED_FRACTION = 0.02
 """Share of unanswered lines above which `UnansweredLines` warns. A good link loses no answer."""
 
 
@@ -88,7 +88,7 @@ def is_ours(words: str) -> bool:
 
     `words` is the text of an event of the link, or the `reason` in `state`.
     """
-    return HOST in words or SIMULATOR in words
+    return HOST_STALL in words or SIMULATOR_FAULT in words
 
 
 class Lateness:
@@ -105,7 +105,7 @@ class Lateness:
         `simulated` is true if the built-in simulator takes the place of the board. `quiet_ns` is
         the duration of silence after which the link is stale, ns.
         """
-        self._simulated, self._least_ns = simulated, SHARE * quiet_ns
+        self._simulated, self._least_ns = simulated, LATE_STEP_FRACTION * quiet_ns
         self._looked_ns: int | None = None
         self.late_s = 0.0
         """Longest time between two control steps since the last good line, s; 0 if no control step
@@ -139,12 +139,13 @@ class Lateness:
         """
         if link == "stale" and self.late_s:
             return (
-                f"{HOST} {self.late_s:.2f} s, so it received nothing from the microcontroller: "
-                f"{BUSY}"
+                f"{HOST_STALL} {self.late_s:.2f} s, so it received nothing from the "
+                f"microcontroller: "
+                f"{BUSY_ADVICE}"
             )
         if link == "stale" and self._simulated:
-            return f"{SIMULATOR}: {BUSY}"
-        return WORDS[link]
+            return f"{SIMULATOR_FAULT}: {BUSY_ADVICE}"
+        return STATE_TEXTS[link]
 
 
 class Heard(Struct):
@@ -167,7 +168,7 @@ class Heard(Struct):
         """Add received bytes. Call this method before `line` adds the lines in these bytes."""
         self.size += len(data)
         if not self.lines:
-            self.last = (self.last + data)[-SHOWN:]
+            self.last = (self.last + data)[-MAX_SHOWN_BYTES:]
 
     def line(self, line: bytes, good: bool) -> None:
         """Add a received line without its line end. `good` is true if the line is a valid reply."""
@@ -197,7 +198,7 @@ class Heard(Struct):
         if not self.size:
             return "nothing was received"
         if not self.lines:
-            last = printable_bytes(self.last, SHOWN, last=True)
+            last = printable_bytes(self.last, MAX_SHOWN_BYTES, last=True)
             return (
                 f"{many(self.size, 'byte')} received but no line end; the last bytes are `{last}`"
             )
@@ -206,7 +207,7 @@ class Heard(Struct):
             good, which = f"only {self.good} good", "last bad one"
             if self.good == self.lines:
                 good = "all of them good, but too few for a link"
-        bad = printable_bytes(self.last, SHOWN)
+        bad = printable_bytes(self.last, MAX_SHOWN_BYTES)
         last = f", the {which} is `{bad}`" if self.good < self.lines else ""
         return f"{many(self.lines, 'line')} received, {good}{last}"
 
@@ -214,13 +215,16 @@ class Heard(Struct):
     def words(self) -> str:
         """The whole diagnosis as a sentence for the message `state`."""
         if self.looks == "sparse" and self.late_s:
-            return f"{HOST} {self.late_s:.2f} s, so it received too little for a link: {BUSY}"
+            return (
+                f"{HOST_STALL} {self.late_s:.2f} s, so it received too little for a link: "
+                f"{BUSY_ADVICE}"
+            )
         mend = f"{LOOK_MENDS[self.looks]} `acsard mcu check` finds out more"
         return f"no link to the microcontroller: {self.counted}; {mend}"
 
 
 class SilenceDiagnosis:
-    """The diagnosis of why the link is not up, renewed every 3 s (`PATIENCE_NS`)."""
+    """The diagnosis of why the link is not up, renewed every 3 s (`FIRST_DIAGNOSIS_NS`)."""
 
     def __init__(self) -> None:
         self.heard: Heard | None = None
@@ -240,8 +244,8 @@ class SilenceDiagnosis:
     def judge(self, now_ns: int, late_s: float = 0.0) -> bool:
         """Process a control step without a link, and return whether the diagnosis is new.
 
-        A new diagnosis is made every 3 s (`PATIENCE_NS`), from the bytes received in these 3 s. The
-        result is True if this step makes the first diagnosis, or a diagnosis whose class of
+        A new diagnosis is made every 3 s (`FIRST_DIAGNOSIS_NS`), from the bytes received in these 3
+        s. The result is True if this step makes the first diagnosis, or a diagnosis whose class of
         received bytes (`Look`) differs from that of the previous diagnosis. `late_s` is the time
         since the previous step, s, if this step is late; otherwise 0.
         """
@@ -250,7 +254,7 @@ class SilenceDiagnosis:
             self._since_ns = now_ns
         else:
             self.now.late_s = max(self.now.late_s, late_s)
-        if now_ns - self._since_ns < PATIENCE_NS:
+        if now_ns - self._since_ns < FIRST_DIAGNOSIS_NS:
             return False
         before, self.heard = self.heard, self.now
         self.now, self._since_ns = Heard(), now_ns
@@ -260,11 +264,11 @@ class SilenceDiagnosis:
 class UnansweredLines:
     """The warning that the board does not answer all lines while the link is up.
 
-    After every `WINDOW` sent lines, the class compares the number of sent lines with the number of
-    good lines received. It warns once. It can warn again only after the board has answered enough
-    lines of a later window, or after the link was lost. A healthy board that reports by its own
-    clock also causes the warning if it sends fewer lines than the daemon and `mcu.reply_period` is
-    not set.
+    After every `WINDOW_LINES` sent lines, the class compares the number of sent lines with the
+    number of good lines received. It warns once. It can warn again only after the board has
+    answered enough lines of a later window, or after the link was lost. A healthy board that
+    reports by its own clock also causes the warning if it sends fewer lines than the daemon and
+    `mcu.reply_period` is not set.
     """
 
     def __init__(self, reply_period: float) -> None:
@@ -289,10 +293,10 @@ class UnansweredLines:
         if self._since is None:
             self._since = sent, good
         lines, answers = sent - self._since[0], good - self._since[1]
-        if lines < WINDOW:
+        if lines < WINDOW_LINES:
             return None
         self._since = sent, good
-        told, self._told = self._told, answers < (1.0 - LOST) * lines
+        told, self._told = self._told, answers < (1.0 - MAX_UNANSWERED_FRACTION) * lines
         if told or not self._told:
             return None
         return Event(
@@ -325,7 +329,7 @@ def words(
     if link.state in ("booting", "stale"):
         heard = hearing.heard
         if check.trouble:
-            return MENDS[check.trouble]
+            return ADVICE[check.trouble]
         if heard is not None and not heard.good:
             return heard.words
         if damaged(link, check):

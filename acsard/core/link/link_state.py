@@ -23,7 +23,7 @@ from acsard.core.values import NS_PER_S
 State = Literal["down", "booting", "up", "stale"]
 Sign = Literal["closed", "opened", "restarted", "trusted", "silent", "damaged", "blocked", "echo"]
 
-TABLE: dict[tuple[State, Sign], State] = {
+TRANSITIONS: dict[tuple[State, Sign], State] = {
     ("down", "opened"): "booting",
     ("booting", "closed"): "down",
     ("booting", "opened"): "booting",
@@ -42,7 +42,7 @@ TABLE: dict[tuple[State, Sign], State] = {
 """Maps each pair of a state and an input (`Sign`) to the next state. A pair without an entry does
 not change the state."""
 
-WORDS: dict[State, str] = {
+STATE_TEXTS: dict[State, str] = {
     "down": "the serial port is closed; it is being reopened",
     "booting": "the port is open; waiting for the microcontroller's first good lines",
     "up": "linked",
@@ -63,7 +63,7 @@ BAD_LINES = 5
 """Number of bad lines in a row on a checked link after which the daemon negotiates the check
 again."""
 
-SPARSE = 2
+SPARSE_SILENCES = 2
 """The lines of the board count as too sparse after this number of silences in a row, with only one
 good line between two of them. A single silence only means that the link was lost for a moment."""
 
@@ -79,7 +79,8 @@ class Link:
         self.quiet_ns = quiet_ns
         self.state: State = "down"
         self.sparse_s = 0.0
-        """Time between the last two good lines, s, after `SPARSE` silences in a row; else 0."""
+        """Time between the last two good lines, s, after `SPARSE_SILENCES` silences in a row; else
+        0."""
         self._silences = 0
         self._good_in_row = self._bad_in_row = 0
         self._heard_ns: int | None = None
@@ -88,11 +89,11 @@ class Link:
         `_waited` is true if `wait` was called since the last good line."""
 
     def sign(self, sign: Sign) -> None:
-        """Change the state as `TABLE` says for the input `sign`.
+        """Change the state as `TRANSITIONS` says for the input `sign`.
 
         Every input except "trusted" resets the count of good lines in a row.
         """
-        self.state = TABLE.get((self.state, sign), self.state)
+        self.state = TRANSITIONS.get((self.state, sign), self.state)
         if sign == "trusted":
             return
         self._good_in_row = 0
@@ -126,7 +127,7 @@ class Link:
             self.missed()
             if since_ns is not None:
                 self._silences += 1
-                self.sparse_s = since_ns / NS_PER_S if self._silences >= SPARSE else 0.0
+                self.sparse_s = since_ns / NS_PER_S if self._silences >= SPARSE_SILENCES else 0.0
         self._good_in_row += 1
         self._bad_in_row = 0
         self._heard_ns, self._waited = at_ns, False

@@ -10,14 +10,14 @@ from __future__ import annotations
 
 import math
 
-DRIFT = 0.01
+MAX_DRIFT = 0.01
 """Largest relative drift between two clocks. A ceramic resonator reaches half of it."""
 
 
 class MinimumDelay:
     """The delay of the last event minus the least delay so far, in the caller's unit of time."""
 
-    def __init__(self, drift: float = DRIFT, most: float = math.inf) -> None:
+    def __init__(self, drift: float = MAX_DRIFT, most: float = math.inf) -> None:
         """Start before the first event.
 
         `drift` is the largest relative drift between the two clocks. `most` is in the caller's unit

@@ -31,7 +31,7 @@ from typing import Literal
 
 from acsard.core.config.settings import McuConfig
 from acsard.core.config.wire_time import line_bytes, wire_ns
-from acsard.core.link.checked_line import ASK_NOTHING, ASK_SAMPLE, SEQUENCES, Checked, seal
+from acsard.core.link.checked_line import ECHO_MARK, SAMPLE_REQUEST, SEQUENCES, Checked, seal
 from acsard.core.link.codec import FrameError
 from acsard.core.link.echo_detector import EchoDetector
 from acsard.core.link.link_state import WATCHDOG_S
@@ -49,7 +49,7 @@ Sign = Literal["gap", "heard", "answer", "sample", "refusal", "samples_end"]
 - samples_end: the replies no longer contain samples
 """
 
-TABLE: dict[tuple[State, Sign], State] = {
+TRANSITIONS: dict[tuple[State, Sign], State] = {
     ("waking", "gap"): "waking",
     ("waking", "heard"): "asking",
     ("waking", "answer"): "checked",
@@ -84,7 +84,7 @@ there is no such reason.
 - unknown: the board does not support the check, and the configuration requires it
 """
 
-MENDS: dict[Trouble, str] = {
+ADVICE: dict[Trouble, str] = {
     "": "",
     "echo": "the daemon's own lines come back: TX and RX are connected to each other, or a "
     "terminal or the RS-485 adapter echoes, or the board reports the commanded speeds "
@@ -97,29 +97,29 @@ MENDS: dict[Trouble, str] = {
     'write mcu.link_check = "auto"',
 }
 
-TRIES = 3
+MAX_UNANSWERED_QUESTIONS = 3
 """After this number of unanswered questions of one kind, the daemon concludes that the board does
 not support this kind. A question is a stop line with a sequence number and a checksum. Questions of
 the first kind ask for a sample, and those of the second kind have no request letters. If the daemon
-wants no samples, it sends a single question with `ASK_NOTHING` instead of the first kind."""
+wants no samples, it sends a single question with `ECHO_MARK` instead of the first kind."""
 
-WINDOW = 64
+MAX_OPEN_LINES = 64
 """Largest number of written lines whose answers the daemon waits for. It is far below the number of
 sequence numbers (256), so a reply cannot match the wrong line."""
 
-LATE_NS = round(WATCHDOG_S * NS_PER_S)
+ANSWER_TIMEOUT_NS = round(WATCHDOG_S * NS_PER_S)
 """Longest time from the writing of a command to its answer, ns. Later answers are rejected. If the
 board receives no line for this time, its watchdog stops the motors."""
 
-BLIND_PERIOD_NS = NS_PER_S // 10
+SILENT_BOARD_PERIOD_NS = NS_PER_S // 10
 """Least time between two stop lines while the board sends nothing, ns. A rate of 10 Hz is enough to
 wake the board, and only few lines then accumulate in buffers."""
 
-THINKING_NS = 30_000_000
+PROCESSING_NS = 30_000_000
 """Time that the board and the drivers may need for an answer in addition to the time on the wire,
 ns."""
 
-FEW_SAMPLES = 5
+MAX_REPLIES_WITHOUT_SAMPLE = 5
 """Number of correct replies in a row without a sample after which the daemon no longer asks for
 samples."""
 
@@ -165,18 +165,18 @@ class Negotiation:
         self.trouble: Trouble = ""
         self.settled_ns = 0
         """Monotonic time at which the last negotiation ended, ns."""
-        first = (ASK_SAMPLE,) * TRIES if mcu.wants_samples else (ASK_NOTHING,)
-        self._letters = (*first, *(b"",) * TRIES)
+        first = (SAMPLE_REQUEST,) * MAX_UNANSWERED_QUESTIONS if mcu.wants_samples else (ECHO_MARK,)
+        self._letters = (*first, *(b"",) * MAX_UNANSWERED_QUESTIONS)
         self._question = b""
         """The last question without its line end, to detect its echo; b"" if the question has no
         request letters, because a genuine reply may equal such a question."""
         longest = line_bytes(mcu.trailing_comma, check=True, sample=mcu.wants_samples)
-        self._answer_ns = THINKING_NS + 4 * wire_ns(longest, mcu.baud_rate)
+        self._answer_ns = PROCESSING_NS + 4 * wire_ns(longest, mcu.baud_rate)
         self._sequence = 0
         self._made: tuple[int, int] | None = None
         """A pair: the sequence number of the last checked line, and the monotonic time at which it
         was made, ns. None once `settle` has recorded whether the line was written."""
-        self._pending: deque[tuple[int, int]] = deque(maxlen=WINDOW)
+        self._pending: deque[tuple[int, int]] = deque(maxlen=MAX_OPEN_LINES)
         """The written checked lines that are not answered yet, oldest first. Each is a pair of its
         sequence number and the monotonic time at which it was written, ns."""
         self._knows = False
@@ -221,7 +221,7 @@ class Negotiation:
         self._plain_turn = 0 if fresh else 1
 
     def _sign(self, sign: Sign) -> None:
-        self.state = TABLE.get((self.state, sign), self.state)
+        self.state = TRANSITIONS.get((self.state, sign), self.state)
 
     # Lines to the board.
 
@@ -232,7 +232,7 @@ class Negotiation:
         """
         if not self.checked:
             return line
-        return self._sealed(line, ASK_SAMPLE if self.state == "sampled" else b"", now_ns)
+        return self._sealed(line, SAMPLE_REQUEST if self.state == "sampled" else b"", now_ns)
 
     def question(self, now_ns: int) -> bytes | None:
         """Return the next question or plain stop to send, or None if none is due yet.
@@ -241,7 +241,7 @@ class Negotiation:
         is the monotonic time at which the line is made.
         """
         waking = self.state == "waking"
-        wait_ns = max(BLIND_PERIOD_NS, self._answer_ns) if waking else self._answer_ns
+        wait_ns = max(SILENT_BOARD_PERIOD_NS, self._answer_ns) if waking else self._answer_ns
         if not self._asked.lets(now_ns, wait_ns):
             return None
         self._just_asked = True
@@ -314,11 +314,11 @@ class Negotiation:
         """Process a correct checked reply, and return the time at which its command was written.
 
         This time is monotonic, in ns. Raises `FrameError` if the command was written more than 0.3
-        s (`LATE_NS`) before the reply was read, or if the sequence number of the reply belongs to
-        no command that waits for an answer. `at_ns` is the monotonic time at which the reply was
-        read.
+        s (`ANSWER_TIMEOUT_NS`) before the reply was read, or if the sequence number of the reply
+        belongs to no command that waits for an answer. `at_ns` is the monotonic time at which the
+        reply was read.
         """
-        while self._pending and at_ns - self._pending[0][1] > LATE_NS:
+        while self._pending and at_ns - self._pending[0][1] > ANSWER_TIMEOUT_NS:
             self._pending.popleft()
         if reply.sequence not in [sequence for sequence, _ in self._pending]:
             raise FrameError("stale_sequence", reply.plain)
@@ -333,16 +333,16 @@ class Negotiation:
             self._sign("sample" if has_sample else "answer")
             return left_ns
         self._without = 0 if has_sample else self._without + 1
-        if self._without >= FEW_SAMPLES:
+        if self._without >= MAX_REPLIES_WITHOUT_SAMPLE:
             self._sign("samples_end")
         return left_ns
 
     def judge(self, now_ns: int) -> None:
         """Count the last question as unanswered if its answer is overdue.
 
-        After `TRIES` unanswered questions of each kind, accept plain lines if `mcu.link_check` is
-        "auto" and the board has never answered with the check. Otherwise set `trouble`. `now_ns` is
-        monotonic.
+        After `MAX_UNANSWERED_QUESTIONS` unanswered questions of each kind, accept plain lines if
+        `mcu.link_check` is "auto" and the board has never answered with the check. Otherwise set
+        `trouble`. `now_ns` is monotonic.
         """
         asked_ns = self._asked.last_ns
         if self.state != "asking" or not self._open or asked_ns is None:

@@ -17,23 +17,23 @@ from acsard.core.link.codec import Motors
 from acsard.core.link.feedback import Feedback
 from acsard.core.link.whole_counts import WholeCounts
 
-FLICKER = 0.0105
+MIN_CHANGE = 0.0105
 """Smallest change of a wheel's reported speed that is more than rounding, rad/s."""
 
-BLOCK = 64
+BLOCK_STEPS = 64
 """Number of steps (changes of a reported speed) in a block. At the end of each block, `Steps.size`
 is computed again from the steps of the block. Even if counts are rare and the firmware filters the
 speeds, at least three counts fall into a block."""
 
-FIRST = 24
+FIRST_STEPS = 24
 """Number of steps (changes of a reported speed) after which `Steps.size` gets its first value.
 Until the end of the block, this value may still grow."""
 
-RECUR = 3
+STEP_RANK = 3
 """`Steps.size` is the third largest step of a block. The largest step would be wrong, because a
 single damaged line causes two large steps."""
 
-ALIKE = 3.0
+MAX_STEP_RATIO = 3.0
 """Upper bound on the quantization step of a wheel, as a multiple of the second largest step among
 the four wheels. The bound is needed because random jumps of a speed look like quantization too."""
 
@@ -42,11 +42,11 @@ COARSE, JUMP_GAIN = 0.015, 0.06
 coarse. `Coarseness` defines a jump. An encoder with about 200 counts a turn reaches this value.
 `JUMP_GAIN` is the gain of the filter for the mean jump."""
 
-LONGEST_LINE = 0.03
+MAX_INTERVAL_S = 0.03
 """Longest time between two lines whose speeds `Coarseness` compares, s. Over a longer time, the
 accelerations of the motors look like jumps."""
 
-NOTHING = (0.0, 0.0, 0.0, 0.0)
+NO_STEPS = (0.0, 0.0, 0.0, 0.0)
 
 
 class Steps:
@@ -57,20 +57,20 @@ class Steps:
     is learned from the reported speeds. So it is right whether the firmware divides counts by its
     nominal period, divides them by the measured time, or filters the speeds.
 
-    `size` is in rad/s. It is `math.inf` until `FIRST` steps have occurred.
+    `size` is in rad/s. It is `math.inf` until `FIRST_STEPS` steps have occurred.
     """
 
     def __init__(self) -> None:
         self.size = math.inf
         self._before = math.inf
         self._last = 0.0
-        self._largest = [0.0] * RECUR
+        self._largest = [0.0] * STEP_RANK
         self._count = 0
 
     def add(self, speed: float) -> None:
         """Process the next reported speed, rad/s."""
         step = abs(speed - self._last)
-        if step < FLICKER:
+        if step < MIN_CHANGE:
             return
         self._last = speed
         largest = self._largest
@@ -80,12 +80,12 @@ class Steps:
             if largest[0] > self.size:
                 self.size = largest[0]
         self._count += 1
-        if self._count == FIRST and self.size == math.inf:
+        if self._count == FIRST_STEPS and self.size == math.inf:
             self.size = largest[0]
-        if self._count == BLOCK:
+        if self._count == BLOCK_STEPS:
             # A new block has too few steps at first, so it starts with the size of this block.
             self._before, self._count = largest[0], 0
-            self.size, self._largest = self._before, [0.0] * RECUR
+            self.size, self._largest = self._before, [0.0] * STEP_RANK
 
 
 class Coarseness:
@@ -97,7 +97,7 @@ class Coarseness:
     """
 
     def __init__(self) -> None:
-        self._rows = NOTHING, NOTHING
+        self._rows = NO_STEPS, NO_STEPS
         self._jumps, self._wheel = [0.0] * 4, 0
         """`_jumps` is the mean jump of each wheel, rad per line. `_wheel` is the index of the wheel
         that was examined in the last line."""
@@ -107,11 +107,11 @@ class Coarseness:
 
         Each call examines the encoder of one wheel, and the wheels take turns. `speeds` are the
         speeds of the four wheels, rad/s. `own` is the time since the previous line, s. Return False
-        without an examination if `own` exceeds `LONGEST_LINE`, or if all speeds of this line and of
-        the previous line are 0.
+        without an examination if `own` exceeds `MAX_INTERVAL_S`, or if all speeds of this line and
+        of the previous line are 0.
         """
         (older, before), self._rows = self._rows, (self._rows[1], speeds)
-        if speeds == NOTHING == before or own > LONGEST_LINE:
+        if speeds == NO_STEPS == before or own > MAX_INTERVAL_S:
             return False
         # Only one wheel is examined per line, to keep every control step short.
         wheel = self._wheel = (self._wheel + 1) % 4
@@ -138,10 +138,10 @@ class CountRecovery:
         """Forget all earlier lines, because the board has restarted or was replaced."""
         self._whole.forget()
         self._coarseness = Coarseness()
-        self._wheels = tuple(Steps() for _ in NOTHING)
-        self._reported, self._steps = NOTHING, NOTHING
+        self._wheels = tuple(Steps() for _ in NO_STEPS)
+        self._reported, self._steps = NO_STEPS, NO_STEPS
         """Quantization step of each wheel, rad/s. `_reported` are the steps that were learned from
-        the speeds. `_steps` are the same steps, limited by `ALIKE`."""
+        the speeds. `_steps` are the same steps, limited by `MAX_STEP_RATIO`."""
 
     @property
     def counts(self) -> tuple[int, ...]:
@@ -175,7 +175,7 @@ class CountRecovery:
         d.add(speeds[3])
         reported = a.size, b.size, c.size, d.size
         if reported != self._reported:
-            most = ALIKE * sorted(reported)[2]
+            most = MAX_STEP_RATIO * sorted(reported)[2]
             self._reported = reported
             self._steps = min(a.size, most), min(b.size, most), min(c.size, most), min(d.size, most)
         return replace(line, counted=counted, steps=self._steps, count=self._whole.angle)

@@ -25,7 +25,7 @@ Read = tuple[int, int]
 """A read of the port, as a pair: the monotonic time at which the last line of the read was
 complete, ns, and the number of lines in the read."""
 
-BRIDGED_S = 1.0
+MAX_FILLED_GAP_S = 1.0
 """If no line came for this time, s, the odometry does not fill the gap, because the board may have
 been reset. The odometry fills only shorter gaps."""
 
@@ -62,23 +62,23 @@ LOOP_GAIN = 0.2
 and falls during the first windows. One window shows the error of the clock only to a few hundredths
 of a period, so a small gain averages over several windows."""
 
-DRIFT = 0.01
+MAX_CLOCK_ERROR = 0.01
 """Largest relative error of a board's clock. A ceramic resonator reaches half of it."""
 
-EXACT = 0.001
+MAX_ROUNDING = 0.001
 """A measured period is rounded to a whole number of ms if the rounding changes it by less than this
 share. The share covers the error of a quartz and of the measurement."""
 
-LONE = 0.7
+SINGLE_READ_FRACTION = 0.7
 """If at least this share of the reads of the port contains a single line, the lines are treated as
 read one by one. Otherwise they are treated as batches of an adapter."""
 
 LATE_ALONE, LATE_BATCHED = 0.6, 1.3
 """`FreeRunningTimes` accepts a clock only if every line comes at most this long after its slot, in
 periods of the board. `LATE_ALONE` is for lines that are read one by one, and `LATE_BATCHED` for
-lines that an adapter batches. `HELD_NS` limits both."""
+lines that an adapter batches. `MAX_ADAPTER_DELAY_NS` limits both."""
 
-HELD_NS = 25_000_000
+MAX_ADAPTER_DELAY_NS = 25_000_000
 """Longest time for which an adapter is assumed to hold a line back, ns. An FTDI chip holds a line
 for 16 ms. If a line comes later than this, `FreeRunningTimes` finds no clock. Such a line probably
 answers a command that was sent between two periods, or comes from a slow board whose lines vary by
@@ -91,19 +91,19 @@ earliest read, more than one in `ALONE` reads confirm it. If fewer reads do, the
 contain answers to commands that were sent between two periods, and the clock is too early for all
 other lines."""
 
-JUMP = 1.4
+COMPLETE_PERIODS = 1.4
 """If two reads with a single line each are less than this number of periods apart, no line is
 missing between them."""
 
-SURE = 0.15
+LATENESS_MARGIN = 0.15
 """Margin on the lateness of a line, in periods. An adapter delays a line only up to a limit. If the
 lateness exceeds this limit by more than one period plus the margin, an earlier line is missing."""
 
-EARLY = 0.25
+MAX_EARLY_PERIODS = 0.25
 """If a line comes before its slot by more than this number of periods, `FreeRunningTimes` gives up
 its clock as wrong."""
 
-LOSSY_READS = 0.45
+LOSSY_READ_FRACTION = 0.45
 """If missing lines precede more than this share of the reads in two successive windows, the period
 of the clock is wrong."""
 
@@ -191,7 +191,9 @@ class FreeRunningTimes:
             return 0
         self._slot += lost
         # If the missing lines cover more time than may be filled, place them all before the read.
-        self._stretch = 1.0 + lost / lines if lost * self.usual < BRIDGED_S * NS_PER_S else 1.0
+        self._stretch = (
+            1.0 + lost / lines if lost * self.usual < MAX_FILLED_GAP_S * NS_PER_S else 1.0
+        )
         self._given += lost
         self._passed += lines + lost
         self._lossy += lost > 0
@@ -248,9 +250,9 @@ class FreeRunningTimes:
             held = self._batch + 1.0  # 1.0: an adapter also holds back the last line of a backlog
         else:
             held, prompt = 0.0, lines == 1
-            if prompt and alone and since < JUMP:
+            if prompt and alone and since < COMPLETE_PERIODS:
                 return -1 if ahead > 1 else 0  # the delay grew line by line, so no line is missing
-        seen = ahead + 0.5 - 1.4 * lag if prompt else ahead - SURE - held
+        seen = ahead + 0.5 - 1.4 * lag if prompt else ahead - LATENESS_MARGIN - held
         return math.floor(seen) if seen > 0.0 else 0
 
     # Finding the clock and following it.
@@ -263,7 +265,7 @@ class FreeRunningTimes:
         gaps = [after - before for (before, _), (after, _) in pairwise(reads)]
         for slots, most, guess in self._clocks(reads, gaps):
             first, late = _latest(reads, slots, guess)
-            latest = min(most, HELD_NS / guess)
+            latest = min(most, MAX_ADAPTER_DELAY_NS / guess)
             if max(late) <= latest and sorted(late)[1 + len(late) // ALONE] <= EARLY_ALONE:
                 break
         else:
@@ -292,7 +294,7 @@ class FreeRunningTimes:
         own = plain
         # Bytes that come faster than the wire can carry them have equal times, so the median may be
         # 0.
-        if len(alone) >= LONE * len(gaps) and (usual := median(alone)) > 0:
+        if len(alone) >= SINGLE_READ_FRACTION * len(gaps) and (usual := median(alone)) > 0:
             own = _slots(reads, usual)
             yield from ((own, LATE_ALONE, period) for period in known)
         # Lines that are read one by one may also fill the packets of an adapter one by one, so the
@@ -304,8 +306,8 @@ class FreeRunningTimes:
         if own is not plain:
             yield own, LATE_ALONE, slope
         # Half a second of batched lines cannot distinguish the measured period from a configured
-        # period that is within `DRIFT` of it.
-        elif all(abs(slope / period - 1) > DRIFT for period in known):
+        # period that is within `MAX_CLOCK_ERROR` of it.
+        elif all(abs(slope / period - 1) > MAX_CLOCK_ERROR for period in known):
             yield own, LATE_BATCHED, slope
 
     def _begin(self, at_ns: int) -> None:
@@ -326,7 +328,11 @@ class FreeRunningTimes:
         """
         least, slots = self._least, self._passed
         lossy, self._share = self._share, self._lossy / self._count
-        if (lossy + self._share) / 2 > LOSSY_READS or least < -EARLY or least == math.inf:
+        if (
+            (lossy + self._share) / 2 > LOSSY_READ_FRACTION
+            or least < -MAX_EARLY_PERIODS
+            or least == math.inf
+        ):
             self.forget()
             return
         self._gain = max(LOOP_GAIN, self._gain / (1 + self._gain))
@@ -347,10 +353,10 @@ class FreeRunningTimes:
         """
         seconds = self.usual / NS_PER_S
         for known in self._known:
-            if abs(seconds / known - 1) < DRIFT:
+            if abs(seconds / known - 1) < MAX_CLOCK_ERROR:
                 return known
         whole = max(1, round(seconds * 1000)) / 1000
-        return whole if abs(seconds / whole - 1) < EXACT else seconds
+        return whole if abs(seconds / whole - 1) < MAX_ROUNDING else seconds
 
 
 def _slots(reads: list[Read], period: float = math.inf) -> list[int]:
@@ -387,17 +393,17 @@ def _latest(reads: list[Read], slots: list[int], period: float) -> tuple[float, 
 
 # A prompted board.
 
-MEMORY = 64
+MAX_OPEN_COMMANDS = 64
 """Largest number of commands that `PromptedTimes` remembers because replies may still come."""
 
-FAST = 0.05
+FAST_GAIN = 0.05
 """Gain of several filters: for the usual reply delay and its spread, for the usual time between
 commands, for the usual time between batches, and for the share of batches among the reads."""
 
-SLOW = 0.0125
+SLOW_GAIN = 0.0125
 """Gain per read of the filter that decides whether the board itself varies the reply delay."""
 
-LEAST = 0.002
+LEAST_DELAY_GAIN = 0.002
 """Gain per reply with which the long-term least delay rises toward the usual delay. With this gain,
 an outdated least delay is forgotten after about 500 replies."""
 
@@ -408,47 +414,47 @@ For this purpose, the time since the previous read counts as at least 1 and at m
 times the usual time between two commands. The upper limit is for a board that stalls and then
 answers all lines."""
 
-LATE = 1.25
+LOST_REPLY_PERIODS = 1.25
 """Replies were lost if the least delay of the last replies exceeds the long-term least delay by
-more than `LATE` times the usual time between two commands. A factor of 1 is too low, because the
-delay may permanently rise by almost the time between two commands."""
+more than `LOST_REPLY_PERIODS` times the usual time between two commands. A factor of 1 is too low,
+because the delay may permanently rise by almost the time between two commands."""
 
-RARE = 0.002
+RARE_LOSS_FRACTION = 0.002
 """While the share of lost replies is below this value, a late reply after a host stall does not
 prove that a reply was lost. After a host stall, two commands are written close together, so the
 reply to the first command is late even if no reply was lost."""
 
-JITTER_NS = 350_000
+MAX_USB_JITTER_NS = 350_000
 """If the mean deviation of the reply delay is at most this, ns, USB and the scheduler explain the
 deviation."""
 
-THOUGHT_NS = 800_000
+MIN_BOARD_JITTER_NS = 800_000
 """If the mean deviation of the reply delay exceeds this, ns, the board itself varies the delay. USB
 and the scheduler rarely cause such a large deviation."""
 
-RISE_NS = 20_000
+DELAY_RISE_NS = 20_000
 """On a batched link, the least reply delay rises by this time with each read, ns, so that an
 outdated value is forgotten. A link is batched if an adapter holds replies back, so that a read
 contains several replies."""
 
-LOSING = 0.005
+LOSS_GAIN = 0.005
 """Gain of the filter for the share of lost replies. With a gain of 1/20 instead, two lost replies
-would be enough to reach `LOSSY`."""
+would be enough to reach `LOSSY_FRACTION`."""
 
-LOSSY = 0.03
+LOSSY_FRACTION = 0.03
 """If more than this share of the replies is lost on a batched link, the link counts as lossy. Then
 the reply to any command may be missing."""
 
-SEVERAL = 0.15
+BATCH_READ_FRACTION = 0.15
 """If more than this share of the reads of the port contain several lines, an adapter batches lines.
 Host stalls alone cause fewer such reads."""
 
-THINKS = 0.6
+BOARD_JITTER_FRACTION = 0.6
 """If the reply delay varies in more than this share of the reads, the board itself varies the
 delay. An adapter whose packets fill line by line also varies the delay, but only for a quarter of a
 second."""
 
-BATCH_NS = 2_000_000
+MIN_ADAPTER_JITTER_NS = 2_000_000
 """If the mean deviation of the reply delay exceeds this, ns, an adapter and not the board varies
 the delay."""
 
@@ -473,7 +479,7 @@ class PromptedTimes:
         `soonest_ns` is the time that a command and its reply take on the wire together, ns.
         """
         self._soonest = soonest_ns
-        self._left: deque[int] = deque(maxlen=MEMORY)
+        self._left: deque[int] = deque(maxlen=MAX_OPEN_COMMANDS)
         self.forget()
 
     def forget(self) -> None:
@@ -530,18 +536,19 @@ class PromptedTimes:
 
         The delay then varies more than this computer or its USB adapter can cause.
         """
-        return self._thinking > THINKS and not self._batched
+        return self._thinking > BOARD_JITTER_FRACTION and not self._batched
 
     @property
     def lossy(self) -> bool:
-        """Whether an adapter batches the replies, and a share of them above `LOSSY` is lost."""
-        return self._batched and self._losses > LOSSY
+        """Whether an adapter batches the replies, and a share of them above `LOSSY_FRACTION` is
+        lost."""
+        return self._batched and self._losses > LOSSY_FRACTION
 
     def left(self, at_ns: int) -> None:
         """Record that a command was written at the monotonic time `at_ns`, ns."""
         if self._sent is not None:
             apart, usual = at_ns - self._sent, self._apart
-            self._apart = usual + FAST * (min(apart, 2 * usual) - usual) if usual else apart
+            self._apart = usual + FAST_GAIN * (min(apart, 2 * usual) - usual) if usual else apart
         self._sent = at_ns
         self._left.append(at_ns)
 
@@ -553,10 +560,10 @@ class PromptedTimes:
         """
         alone, since = lines == 1, at_ns - self._at
         self._at, self._alone, self._since = at_ns, alone, since
-        self._several += FAST * ((not alone) - self._several)
-        self._batched = self._several > SEVERAL
-        varies = THOUGHT_NS < self._spread < BATCH_NS and not self._batched
-        self._thinking += SLOW * (varies - self._thinking)
+        self._several += FAST_GAIN * ((not alone) - self._several)
+        self._batched = self._several > BATCH_READ_FRACTION
+        varies = MIN_BOARD_JITTER_NS < self._spread < MIN_ADAPTER_JITTER_NS and not self._batched
+        self._thinking += SLOW_GAIN * (varies - self._thinking)
         if self._batched:
             self._soon = 0.0
             self._weigh(lines, since, cut)
@@ -654,9 +661,9 @@ class PromptedTimes:
         if self.lossy:
             # If many replies are lost, the first reply of the batch decides instead, because the
             # board made it after the previous batch.
-            judged, soonest = 0, max(soonest, self._base - JITTER_NS)
+            judged, soonest = 0, max(soonest, self._base - MAX_USB_JITTER_NS)
         if since < 1.5 * self._batch:
-            self._batch += FAST * (since - self._batch)
+            self._batch += FAST_GAIN * (since - self._batch)
         given, self._given, again = self._given, [], False
         # The first part of a reply can come sooner than a whole reply.
         earliest = self._soonest // 2 if cut else self._soonest
@@ -671,14 +678,14 @@ class PromptedTimes:
         lost = 0
         while len(left) > began and not again:
             late = at - left[judged] - self._base
-            if late <= self._batch + 2 * JITTER_NS or at - left[lines] < soonest:
+            if late <= self._batch + 2 * MAX_USB_JITTER_NS or at - left[lines] < soonest:
                 break
             self._passed, lost = left.popleft(), lost + 1
             self._given.append(self._passed)
-        self._losses += LOSING * (lost / (lines + lost) - self._losses)
+        self._losses += LOSS_GAIN * (lost / (lines + lost) - self._losses)
         # If a line is given up too late, a reply looks late, but nothing makes a reply look early.
         # So the base is the least delay, which rises slowly.
-        self._base = min(self._base + RISE_NS, at - left[lines - 1])
+        self._base = min(self._base + DELAY_RISE_NS, at - left[lines - 1])
         self._delay = self._base
 
     def _given_up_too_early(self, delay: float) -> bool:
@@ -690,7 +697,7 @@ class PromptedTimes:
         """
         left, at, wide = self._left, self._at, 4 * self._spread
         lost, self._lost = self._lost, False
-        self._missing -= LOSING * self._missing
+        self._missing -= LOSS_GAIN * self._missing
         # No reply comes sooner than the least delay. A reply that seems to come sooner is a late
         # reply to the previous line.
         soonest = max(float(self._soonest), self._least)
@@ -698,7 +705,7 @@ class PromptedTimes:
             most = CREEPS_FOR * self._apart
             rise = CREEP * min(max(self._since, self._apart), most)
             self._soon = min(self._soon + rise, at - left[0])
-            if self._soon - soonest > LATE * self._apart:
+            if self._soon - soonest > LOST_REPLY_PERIODS * self._apart:
                 # All of the last replies are late by more than the time between two lines. So
                 # replies were lost, but the large spread of the delay had hidden the loss.
                 delay = self._delay = self._soon = soonest
@@ -711,10 +718,10 @@ class PromptedTimes:
             # line is late, but not so late that the reply to the second line should have come too.
             overdue = at - left[1] - delay > max(self._apart / 2, wide)
             close = apart < self._apart / 2 and not overdue
-            if close and self._missing < RARE:
+            if close and self._missing < RARE_LOSS_FRACTION:
                 break
             self._passed, self._lost = left.popleft(), True
-            self._missing += LOSING * (not close)
+            self._missing += LOSS_GAIN * (not close)
         if not lost or not left:
             return lost
         return at - left[0] - delay <= -max((left[0] - self._passed) / 2, wide)
@@ -747,9 +754,9 @@ class PromptedTimes:
         size = abs(error)
         if size >= delay and size >= 4 * spread:
             return 0  # a host stall has probably delayed this reply
-        self._delay = delay + FAST * error
-        self._least = min(self._least + LEAST * (delay - self._least), delay + error)
-        self._spread += FAST * (size - spread)
-        if not JITTER_NS < spread < BATCH_NS or size > 4 * spread:
+        self._delay = delay + FAST_GAIN * error
+        self._least = min(self._least + LEAST_DELAY_GAIN * (delay - self._least), delay + error)
+        self._spread += FAST_GAIN * (size - spread)
+        if not MAX_USB_JITTER_NS < spread < MIN_ADAPTER_JITTER_NS or size > 4 * spread:
             return 0
-        return int(error * (1 - (JITTER_NS / spread) ** 2))
+        return int(error * (1 - (MAX_USB_JITTER_NS / spread) ** 2))

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections import Counter
 
-from acsard.core.config.settings import LONGEST_REPLY_S, FeedbackConfig, McuConfig
+from acsard.core.config.settings import MAX_REPLY_PERIOD_S, FeedbackConfig, McuConfig
 from acsard.core.link import link_diagnosis
 from acsard.core.link.board_status import STATUS, BoardStatus, decode_status, merged
 from acsard.core.link.checked_line import Reading, unseal
@@ -25,7 +25,7 @@ from acsard.core.link.lines import LineReader
 from acsard.core.link.link_diagnosis import Lateness, SilenceDiagnosis
 from acsard.core.link.link_state import WATCHDOG_NS, WATCHDOG_S, Link
 from acsard.core.link.link_state import State as LinkState
-from acsard.core.link.negotiation import BLIND_PERIOD_NS, MENDS, Negotiation, Throttle
+from acsard.core.link.negotiation import ADVICE, SILENT_BOARD_PERIOD_NS, Negotiation, Throttle
 from acsard.core.link.quantization import CountRecovery
 from acsard.core.values import NS_PER_S, STILL, Event, EventName, Instant, Received, WheelSpeeds
 
@@ -66,7 +66,7 @@ class McuSession:
         mcu: McuConfig,
         rate_hz: float,
         wheel_speed: float = FeedbackConfig().wheel_speed,
-        longest_reply: float = LONGEST_REPLY_S,
+        longest_reply: float = MAX_REPLY_PERIOD_S,
     ) -> None:
         """Start with the port closed.
 
@@ -196,7 +196,7 @@ class McuSession:
         if self.negotiation.asking:
             return self.negotiation.question(now_ns)
         if self.silent(now_ns):
-            self._just_blind = self._blind.lets(now_ns, BLIND_PERIOD_NS)
+            self._just_blind = self._blind.lets(now_ns, SILENT_BOARD_PERIOD_NS)
             if not self._just_blind:
                 return None
             speeds = STILL
@@ -226,7 +226,7 @@ class McuSession:
         if self.link == "down" and port_trouble:
             return port_trouble
         if self.blocked:
-            return link_diagnosis.BLOCKED
+            return link_diagnosis.PORT_BLOCKED
         return link_diagnosis.words(
             self._link, self.negotiation, self._hearing, self.lateness, self._longest_reply
         )
@@ -361,7 +361,7 @@ class McuSession:
         if check.in_force != before[1] and not check.asking:
             self.events.append(link_diagnosis.check_event(check, self._wants_samples))
         if check.trouble and not before[2]:
-            self.events.append(Event("link_check", MENDS[check.trouble], "error"))
+            self.events.append(Event("link_check", ADVICE[check.trouble], "error"))
 
     # lines
 

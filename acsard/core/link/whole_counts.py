@@ -36,16 +36,16 @@ from acsard.core.link.codec import Motors
 ROUNDING = 0.0052
 """Largest rounding error of a speed with two decimals (0.005 rad/s), with a small margin."""
 
-MOST_TRIES = 16
+MAX_TRIES = 16
 """Largest number of different values of n, the counts of the fastest wheel, that are tried for a
 line. This limit bounds the time of a control step."""
 
-BY_CHANCE = 0.05
+MAX_CHANCE = 0.05
 """Largest accepted probability that random speeds look like whole counts. The probability grows
 with each number of counts that is tried for a line. If the probability exceeds this limit, speeds
 that look like whole counts prove nothing."""
 
-EXACT = 0.3
+MAX_COUNT_ERROR = 0.3
 """Largest accepted difference between a whole number of counts and the number of counts that
 follows from the speed and the host's estimate of the time. This limit applies if the speeds alone
 prove nothing, as with fine encoders. It also helps to decide whether the counts of a line include
@@ -55,22 +55,22 @@ WIDE, WIDE_S = 0.6, 0.005
 """Largest assumed error of the host's estimate of the time between two samples: the estimate times
 `WIDE`, plus `WIDE_S` s."""
 
-KEPT = 0.95
+MAX_CARRIED_ERROR = 0.95
 """Largest share of the error of the host's estimate that is added to the estimate for the next
 line. The share must be below 1. If the whole error were added and the two clocks differed by 0.5 %,
 the sum of the errors would grow forever."""
 
-REPEATED = 0.65
+REPEATED_FRACTION = 0.65
 """Firmware that is asked again very soon has no new counts, and repeats the speeds of the previous
 line. A line with unchanged speeds can be such a repetition only if the time since the previous line
-is less than `REPEATED` times the time over which the firmware last counted."""
+is less than `REPEATED_FRACTION` times the time over which the firmware last counted."""
 
 SOON, OFF = 0.45, 0.25
 """Let q be the time since the previous line, divided by the time over which the firmware last
 counted. If q is less than `SOON`, a line with unchanged speeds is a repetition of the previous
-line. If q lies between `SOON` and `REPEATED`, the line is a repetition in two cases: its speeds are
-not whole counts, or the host's estimate of the time contradicts its counts by more than `OFF`
-counts of the fastest wheel."""
+line. If q lies between `SOON` and `REPEATED_FRACTION`, the line is a repetition in two cases: its
+speeds are not whole counts, or the host's estimate of the time contradicts its counts by more than
+`OFF` counts of the fastest wheel."""
 
 UNSURE, SLOW = 0.2, 0.025
 """The error of the host's estimate of the time is measured in counts of the fastest wheel. If its
@@ -161,7 +161,7 @@ class WholeCounts:
         if (
             self.believed
             and speeds == before
-            and want < REPEATED * self._period
+            and want < REPEATED_FRACTION * self._period
             and (
                 not number
                 or want < SOON * self._period
@@ -188,7 +188,7 @@ class WholeCounts:
         # After the first line, the error comes from two sample times in equal parts, so only half
         # of it is carried. With each further line the share grows.
         self._run += 1
-        kept = min(KEPT, self._run / (self._run + 1))
+        kept = min(MAX_CARRIED_ERROR, self._run / (self._run + 1))
         self._period, self._apart = period, kept * (want - period)
         if abs(want - period) <= period * ROUNDING / fastest:
             self._apart = 0.0  # the rounding of the speeds explains the difference
@@ -203,9 +203,10 @@ class WholeCounts:
     def _fits(self, number: int, fastest: float, want: float) -> bool:
         """Return whether a wheel makes about `number` counts in the time `want`, s.
 
-        `fastest` is the speed of the wheel, rad/s. `EXACT` is the largest accepted difference.
+        `fastest` is the speed of the wheel, rad/s. `MAX_COUNT_ERROR` is the largest accepted
+        difference.
         """
-        return abs(number - want * fastest / self.angle) <= EXACT
+        return abs(number - want * fastest / self.angle) <= MAX_COUNT_ERROR
 
     def _number(self, speeds: Motors, fastest: float, want: float) -> tuple[int, bool | None]:
         """Return a pair: the number n of counts of the fastest wheel, and whether n is proved.
@@ -230,7 +231,7 @@ class WholeCounts:
         # by up to (1 + s) n times the relative rounding error of the fastest speed.
         error = ROUNDING / fastest
         step, chance = 1 if exact > number else -1, 0.0
-        for _ in range(MOST_TRIES):
+        for _ in range(MAX_TRIES):
             if number > 0:
                 if abs(number - exact) > room:
                     return 0, False
@@ -244,10 +245,10 @@ class WholeCounts:
                     if abs(whole - round(whole)) > error * number * (1 + share):
                         fits = False
                         break
-                if chance > BY_CHANCE:
+                if chance > MAX_CHANCE:
                     # The speeds prove nothing. If the firmware divides by a round period, then the
                     # host's time alone agrees with the counts.
-                    return (number if fits and abs(number - exact) <= EXACT else 0), None
+                    return (number if fits and abs(number - exact) <= MAX_COUNT_ERROR else 0), None
                 if fits:
                     return number, True
             number += step

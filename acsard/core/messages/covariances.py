@@ -15,7 +15,7 @@ SMALLEST, LARGEST = 1e-6, 1e6
 """Smallest and largest variance of an axis that is not measured: m2 or rad2 for a pose, m2/s2 or
 rad2/s2 for a twist."""
 
-UNKNOWN = [LARGEST if cell % 7 == 0 else 0.0 for cell in range(36)]
+UNKNOWN_COVARIANCE = [LARGEST if cell % 7 == 0 else 0.0 for cell in range(36)]
 """Covariance of a twist about which nothing is known: 6x6, row major, m2/s2 and rad2/s2."""
 
 

@@ -22,10 +22,15 @@ from acsard.core.formatting import many
 from acsard.core.messages.schema import DiagnosticArray, DiagnosticStatus, Header, KeyValue, Time
 from acsard.core.motion import battery
 from acsard.core.motion.arbiter_text import waiting
-from acsard.core.motion.bumpers import SILENT as SILENT_BUMPERS
+from acsard.core.motion.bumpers import SILENT_REASON as SILENT_BUMPERS
 from acsard.core.motion.bumpers import missing
-from acsard.core.motion.emergency_stop import DRIVER_FAULT, MISSING, PRESSED, SILENT
-from acsard.core.motion.gyro import WORDS
+from acsard.core.motion.emergency_stop import (
+    DRIVER_FAULT_REASON,
+    MISSING_REASON,
+    PRESSED_REASON,
+    SILENT_REASON,
+)
+from acsard.core.motion.gyro import STATUS_TEXTS
 from acsard.core.motion.learned_track import tracks
 from acsard.core.values import (
     WHEELS,
@@ -40,25 +45,25 @@ from acsard.core.values import (
 
 OK, WARN, ERROR = 0, 1, 2
 
-OF_MODE = {"stopped": WARN, "fault": ERROR}
+MODE_LEVELS = {"stopped": WARN, "fault": ERROR}
 """Diagnostic levels of the modes `stopped` and `fault`. All other modes have the level OK."""
 
 BOARD = {
     "": (OK, "no emergency-stop input"),
     "released": (OK, "emergency stop released"),
-    "pressed": (WARN, PRESSED),
-    "silent": (ERROR, SILENT),
+    "pressed": (WARN, PRESSED_REASON),
+    "silent": (ERROR, SILENT_REASON),
 }
 """Maps each state of the emergency-stop input to the diagnostic level and the text to show."""
 
-OF_LEVEL = {"ok": OK, "warning": WARN, "return": WARN, "stop": ERROR, "unknown": WARN}
+WARNING_LEVELS = {"ok": OK, "warning": WARN, "return": WARN, "stop": ERROR, "unknown": WARN}
 """Maps each battery level, such as "return", to the diagnostic level to show for it."""
 
-REFUSED_S = 2.0
+SHOW_REFUSAL_S = 2.0
 """Time for which `diagnostics` shows a refused command, s. At the default 1 Hz, this is long enough
 for two messages."""
 
-MISSED_SHARE = 0.01
+MAX_MISSED_FRACTION = 0.01
 """Fraction of missed control periods in the last minute above which `diagnostics` warns."""
 
 NO_ROUTER, NOT_YET = "a peer, not a router", "not connected yet"
@@ -95,7 +100,7 @@ def diagnostics(
     """
     mode = {"mode": outputs.mode, "source": outputs.source}
     rows = [
-        Row("mode", OF_MODE.get(outputs.mode, OK), outputs.reason, mode),
+        Row("mode", MODE_LEVELS.get(outputs.mode, OK), outputs.reason, mode),
         _serial_link(config, outputs, snapshot),
         _control_loop(snapshot),
         _commands(outputs, snapshot, speed_limit),
@@ -148,7 +153,7 @@ def _control_loop(snapshot: Snapshot) -> Row:
     }
     return Row(
         "control loop",
-        WARN if missed > MISSED_SHARE * (kept + missed) else OK,
+        WARN if missed > MAX_MISSED_FRACTION * (kept + missed) else OK,
         f"{missed} of {kept + missed} periods missed in the last minute",
         values | _counted(snapshot.counters, "missed") | _counted(snapshot.counters, "bus"),
     )
@@ -167,7 +172,7 @@ def _commands(outputs: Outputs, snapshot: Snapshot, speed_limit: str) -> Row:
             "robot follows one of them: end the others, or give each a source of its own"
         )
     age_s = snapshot.refused_age_s
-    refused = age_s is not None and age_s < REFUSED_S
+    refused = age_s is not None and age_s < SHOW_REFUSAL_S
     if refused:
         message = f"{message}; refused: {snapshot.refused}"
     return Row("commands", WARN if refused or crowded else OK, message, values)
@@ -204,7 +209,7 @@ def _board(config: Config, snapshot: Snapshot) -> list[Row]:
         return []
     found = [BOARD[snapshot.estop]]
     if required and not snapshot.estop:
-        found = [(ERROR, MISSING)]
+        found = [(ERROR, MISSING_REASON)]
     if snapshot.bumper:
         found.append((ERROR if snapshot.bumper == SILENT_BUMPERS else WARN, snapshot.bumper))
     elif bumpers is not None:
@@ -212,7 +217,7 @@ def _board(config: Config, snapshot: Snapshot) -> list[Row]:
     elif needed:
         found.append((ERROR, missing(safety)))
     if snapshot.board.get("motor_driver") == "fault":
-        found.append((ERROR, DRIVER_FAULT))
+        found.append((ERROR, DRIVER_FAULT_REASON))
     counted: dict[str, str] = {}
     for kind in ("line_status", "emergency", "bumper"):
         counted |= _counted(snapshot.counters, kind)
@@ -227,7 +232,7 @@ def _battery(config: Config, snapshot: Snapshot) -> list[Row]:
     """
     status, bounds = snapshot.battery, config.battery.bounds
     if status is None:
-        return [Row("battery", WARN, battery.MISSING, {})] if bounds else []
+        return [Row("battery", WARN, battery.MISSING_REASON, {})] if bounds else []
     shown: dict[str, str] = {"level": status.level}
     numbers = {
         "volts": status.volts,
@@ -237,7 +242,9 @@ def _battery(config: Config, snapshot: Snapshot) -> list[Row]:
     }
     shown |= {name: f"{value:.2f}" for name, value in numbers.items() if value is not None}
     shown |= {f"{level}_below": f"{below:g}" for level, below in bounds.items()}
-    return [Row("battery", OF_LEVEL[status.level], battery.words(config.battery, status), shown)]
+    return [
+        Row("battery", WARNING_LEVELS[status.level], battery.words(config.battery, status), shown)
+    ]
 
 
 def _gyro(config: Config, gyro: GyroStatus) -> list[Row]:
@@ -255,7 +262,7 @@ def _gyro(config: Config, gyro: GyroStatus) -> list[Row]:
         values["multiplier_in_use"] = f"{learned if gyro.track_use == 'used' else configured:.3f}"
         track = f"; effective track: {tracks(gyro, configured)}"
     level = OK if gyro.does in ("used", "waiting for rest") else WARN
-    return [Row("gyro", level, WORDS[gyro.does] + track, values)]
+    return [Row("gyro", level, STATUS_TEXTS[gyro.does] + track, values)]
 
 
 def _routers(endpoints: Sequence[str], routers: RoutersStatus) -> list[Row]:

@@ -24,7 +24,7 @@ from acsard.core.messages.schema import (
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 
-ONLY_IN = {
+INCOMING_ONLY = {
     "Twist",
     "SpeedLimit",
     "GatewayState",
@@ -32,7 +32,7 @@ ONLY_IN = {
 }
 BOTH_WAYS = (TwistStamped, JointState, Imu)
 
-ENOUGH: dict[type, list[str]] = {
+REQUIRED_FIELDS: dict[type, list[str]] = {
     TwistStamped: ["twist"],
     JointState: ["name", "velocity"],
     Imu: ["angular_velocity"],
@@ -59,7 +59,7 @@ def going_out(cls: type, name: str) -> Schema:
 def coming_in(cls: type, name: str) -> Schema:
     """Return the schema `name` of messages of type `cls` that the daemon accepts from clients."""
     schema = _described(cls, name)
-    return schema | {"required": ENOUGH[cls]} if cls in ENOUGH else schema
+    return schema | {"required": REQUIRED_FIELDS[cls]} if cls in REQUIRED_FIELDS else schema
 
 
 def _described(cls: type, name: str) -> Schema:
@@ -73,7 +73,7 @@ def _described(cls: type, name: str) -> Schema:
 
 SCHEMAS: dict[str, Schema] = {
     **{
-        name: (coming_in if name in ONLY_IN else going_out)(cls, name)
+        name: (coming_in if name in INCOMING_ONLY else going_out)(cls, name)
         for name, cls in MESSAGES.items()
     },
     **{f"{cls.__name__}In": coming_in(cls, f"{cls.__name__}In") for cls in BOTH_WAYS},

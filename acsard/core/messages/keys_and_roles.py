@@ -16,7 +16,7 @@ from msgspec import Struct
 
 from acsard.core.config.nearest import hint
 from acsard.core.config.settings import Config
-from acsard.core.values import ROOT, Role, Verb
+from acsard.core.values import ROOT_KEY, Role, Verb
 
 _PLACE = re.compile("<[A-Za-z]+>")
 
@@ -297,7 +297,7 @@ def published(config: Config) -> tuple[Topic, ...]:
 
 def full_key(robot_id: str, key: str) -> str:
     """Return the key on the bus, such as `acsard/acsar/state` for the key `state`."""
-    return f"{ROOT}/{robot_id}/{key}"
+    return f"{ROOT_KEY}/{robot_id}/{key}"
 
 
 COMMANDS = ("cmd", "wheel_cmd")

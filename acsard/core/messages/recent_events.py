@@ -17,11 +17,11 @@ from acsard.core.messages.schema import Events, LogEvent, Time
 from acsard.core.motion.event_throttle import together
 from acsard.core.values import NS_PER_S, Event, Instant
 
-LAST = 20
+MAX_ROWS = 20
 """Number of rows in the message `events`. With this number, even a client that polls slowly seldom
 misses an event."""
 
-PAUSE_NS = 60 * NS_PER_S
+NEW_ROW_AFTER_NS = 60 * NS_PER_S
 """Longest time between two events of the same name that share a row, ns. After a longer pause, an
 event gets a new row."""
 
@@ -38,7 +38,7 @@ class RecentEvents:
     """
 
     def __init__(self) -> None:
-        self._rows: deque[_Row] = deque(maxlen=LAST)
+        self._rows: deque[_Row] = deque(maxlen=MAX_ROWS)
         self._total = 0
 
     def add(self, events: Iterable[Event], now: Instant) -> None:
@@ -58,7 +58,7 @@ class RecentEvents:
         return Events(_time(self._rows[-1]), self._total, [_log_event(row) for row in self._rows])
 
     def _same(self, event: Event, now: Instant) -> _Row | None:
-        since_ns = now.mono_ns - PAUSE_NS
+        since_ns = now.mono_ns - NEW_ROW_AFTER_NS
         for row in self._rows:
             if row.event.name == event.name and not row.event.news and row.at.mono_ns >= since_ns:
                 return row

@@ -13,7 +13,7 @@ from msgspec.structs import asdict
 
 from acsard.core.config.settings import Config
 from acsard.core.messages.certificate_expiry import DAY_NS, expiry, first
-from acsard.core.messages.covariances import UNKNOWN, Covariances
+from acsard.core.messages.covariances import UNKNOWN_COVARIANCE, Covariances
 from acsard.core.messages.diagnostics import diagnostics
 from acsard.core.messages.recent_events import RecentEvents
 from acsard.core.messages.schema import (
@@ -229,11 +229,13 @@ class Report:
         """Return the message `odom` for an estimate.
 
         `live` is False if the board no longer sends feedback. The message then has a twist of zero
-        with the covariance `UNKNOWN`.
+        with the covariance `UNKNOWN_COVARIANCE`.
         """
         frames, pose = self._config.odometry, estimate.pose
         of_pose = self._covariances.of_pose(estimate.covariance)
-        of_twist = self._covariances.of_twist(estimate.twist_variances) if live else UNKNOWN
+        of_twist = (
+            self._covariances.of_twist(estimate.twist_variances) if live else UNKNOWN_COVARIANCE
+        )
         return Odometry(
             Header(Time.from_ns(estimate.at.wall_ns), frames.odom_frame),
             frames.base_frame,

@@ -38,7 +38,7 @@ Covariance3 = Annotated[list[float], Meta(min_length=9, max_length=9)]
 LatchNumber = Annotated[int, Meta(ge=0, lt=1 << 53)]
 """Number of a latch. It is below 2^53, so JavaScript represents it exactly."""
 
-FEW = Meta(max_length=64)
+MAX_64_ITEMS = Meta(max_length=64)
 """Limit of a list or a map to 64 items, with which a huge message is refused quickly. No robot has
 more than 64 joints."""
 
@@ -184,10 +184,10 @@ class JointState(Message, frozen=True):
     """
 
     header: Header = Header()
-    name: Annotated[list[str], FEW] = []
-    position: Annotated[list[float], FEW] = []
-    velocity: Annotated[list[float], FEW] = []
-    effort: Annotated[list[float], FEW] = []
+    name: Annotated[list[str], MAX_64_ITEMS] = []
+    position: Annotated[list[float], MAX_64_ITEMS] = []
+    velocity: Annotated[list[float], MAX_64_ITEMS] = []
+    effort: Annotated[list[float], MAX_64_ITEMS] = []
 
 
 class Imu(Message, frozen=True):
@@ -251,9 +251,9 @@ class Battery(Message, frozen=True):
     """Always 0, unknown."""
     present: bool = False
     """Whether the board reports a battery at present."""
-    cell_voltage: Annotated[list[Float32], FEW] = []
+    cell_voltage: Annotated[list[Float32], MAX_64_ITEMS] = []
     """Voltage of each cell, V. The list is always empty."""
-    cell_temperature: Annotated[list[Float32], FEW] = []
+    cell_temperature: Annotated[list[Float32], MAX_64_ITEMS] = []
     """Temperature of each cell, degrees Celsius. The list is always empty."""
     location: str = ""
     serial_number: str = ""
@@ -529,7 +529,7 @@ class Release(Message, frozen=True):
 class Settings(Message, frozen=True):
     """New values for settings, by the dotted keys of the settings in `acsard.toml`."""
 
-    settings: Annotated[dict[str, Plain], FEW]
+    settings: Annotated[dict[str, Plain], MAX_64_ITEMS]
     keep: bool = False
     """True if the daemon must also write the new values into its configuration file."""
 

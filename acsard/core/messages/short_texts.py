@@ -41,8 +41,8 @@ def speeds(linear: float | None, angular: float | None) -> list[str]:
 
 
 def short(message: object) -> str:
-    """Format a message as one line. The type of the message must be in `SHORT`."""
-    return "  ".join(SHORT[type(message)](message))
+    """Format a message as one line. The type of the message must be in `SHORT_TEXTS`."""
+    return "  ".join(SHORT_TEXTS[type(message)](message))
 
 
 def _odometry(odom: Odometry) -> list[str]:
@@ -83,7 +83,7 @@ def _twist(twist: Twist) -> list[str]:
     return speeds(twist.linear.x, twist.angular.z)
 
 
-SHORT: dict[type, Callable[[Any], list[str]]] = {
+SHORT_TEXTS: dict[type, Callable[[Any], list[str]]] = {
     Odometry: _odometry,
     RobotState: _state,
     Battery: _battery,

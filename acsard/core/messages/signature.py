@@ -18,20 +18,20 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta, Struct
 
-MOST = (1 << 63) - 1
+MAX_INT64 = (1 << 63) - 1
 
-MAX_SENDER = 64
+MAX_SENDER_LENGTH = 64
 """Largest number of characters in a sender id."""
 
-MAX_NAME = 40
+MAX_NAME_LENGTH = 40
 """Largest number of characters that a public name takes from NAME in the sender id
 `NAME/SECRET`."""
 
-DIGITS = 16
+HASH_DIGITS = 16
 """Number of hexadecimal digits of the hash in a public name. 16 digits encode 64 bits, so nobody
 can find a second sender id with the same hash."""
 
-MARKS = " @._-:/+"
+ALLOWED_PUNCTUATION = " @._-:/+"
 """Characters besides letters and digits that a public name may contain. All others become "?".
 Brackets and commas are not allowed, because the log puts brackets around the name of a certificate
 and commas between the names of senders."""
@@ -40,12 +40,12 @@ and commas between the names of senders."""
 class Signature(Struct, frozen=True, omit_defaults=True):
     """The attachment of one command or service call. It names the sending program."""
 
-    sender: Annotated[str, Meta(min_length=1, max_length=MAX_SENDER)]
+    sender: Annotated[str, Meta(min_length=1, max_length=MAX_SENDER_LENGTH)]
     """The sender id, such as "joystick/8Xg2kq0vRw-1yEJc7hPzUA"."""
-    stamp: Annotated[int, Meta(gt=0, le=MOST)] | None = None
+    stamp: Annotated[int, Meta(gt=0, le=MAX_INT64)] | None = None
     """Time at which the command was sent, by the sender's clock, ns since 1970. None if the sender
     sends no time."""
-    sequence: Annotated[int, Meta(ge=0, le=MOST)] | None = None
+    sequence: Annotated[int, Meta(ge=0, le=MAX_INT64)] | None = None
     """Number of the command, which grows by 1 with each command of this sender. None if the sender
     does not number its commands."""
     steady: bool = False
@@ -87,11 +87,11 @@ def public_name(sender: str, certificate: str = "") -> str:
             that set the timestamp of the message.
         certificate: the common name of the sender's TLS certificate, or "".
     """
-    digits = sha256(sender.encode("utf-8", "surrogatepass")).hexdigest()[:DIGITS]
-    name = _cleaned(sender.rpartition("/")[0][:MAX_NAME]).strip()
+    digits = sha256(sender.encode("utf-8", "surrogatepass")).hexdigest()[:HASH_DIGITS]
+    name = _cleaned(sender.rpartition("/")[0][:MAX_NAME_LENGTH]).strip()
     shown = f"{name}/{digits}" if name else digits
-    return f"{shown} [{_cleaned(certificate[:MAX_SENDER])}]" if certificate else shown
+    return f"{shown} [{_cleaned(certificate[:MAX_SENDER_LENGTH])}]" if certificate else shown
 
 
 def _cleaned(text: str) -> str:
-    return "".join(char if char.isalnum() or char in MARKS else "?" for char in text)
+    return "".join(char if char.isalnum() or char in ALLOWED_PUNCTUATION else "?" for char in text)

@@ -24,8 +24,8 @@ from typing import Literal
 from msgspec import Struct
 
 from acsard.core.config.settings import CommandsConfig, Source
-from acsard.core.motion.emergency_stop import LATE_NS
-from acsard.core.motion.freshness import LONGEST_PROOF_NS, Freshness
+from acsard.core.motion.emergency_stop import LATE_STEP_NS
+from acsard.core.motion.freshness import MAX_PROOF_NS, Freshness
 from acsard.core.motion.neutral import Sender, is_zero
 from acsard.core.values import NS_PER_S, REST, Command, SourceStatus, Twist, Wait
 
@@ -37,7 +37,7 @@ live, armed sender."""
 Objection = Literal["", "unknown_source", "not_finite", "too_many_senders", "unproven", "stale"]
 """The reason for which the arbiter refuses a command; "" if the command is accepted."""
 
-LASTING_S = (3.0, 10.0, 60.0, 600.0, 3600.0)
+REPORTED_DURATIONS_S = (3.0, 10.0, 60.0, 600.0, 3600.0)
 """Durations, s, that `state` can report for a sender that sends only zero commands, or only speeds
 without being armed. The true duration is rounded down to one of these values."""
 
@@ -75,7 +75,7 @@ class _Source:
         """Apply new settings to the source and its senders. `pause` is `neutral_pause`, s."""
         self.pause_ns = int(pause * NS_PER_S)
         self.timeout_ns = int(settings.timeout * NS_PER_S)
-        self.proof = Wait("proof", settings.name, min(self.timeout_ns, LONGEST_PROOF_NS) / NS_PER_S)
+        self.proof = Wait("proof", settings.name, min(self.timeout_ns, MAX_PROOF_NS) / NS_PER_S)
         self.late = Wait("late", settings.name, settings.timeout)
         self.stalled = Wait("stalled", settings.name)
         for sender in self.senders.values():
@@ -239,13 +239,13 @@ class Arbiter:
     def begin(self, now_ns: int) -> None:
         """Begin a control step at the monotonic time `now_ns`, ns. Call this before `accept`.
 
-        If the previous step was more than `LATE_NS` ago, the daemon stood still, and the bus may
-        not have delivered the commands of that time yet. Each sender then takes part in the choice
-        for a short time more, and a running `commands.neutral_pause` takes longer (see
+        If the previous step was more than `LATE_STEP_NS` ago, the daemon stood still, and the bus
+        may not have delivered the commands of that time yet. Each sender then takes part in the
+        choice for a short time more, and a running `commands.neutral_pause` takes longer (see
         `Sender.resume`).
         """
         before_ns, self._begun_ns = self._begun_ns, now_ns
-        if now_ns - before_ns > LATE_NS:
+        if now_ns - before_ns > LATE_STEP_NS:
             self._watched_ns = now_ns
             for source in self._ranking:
                 for sender in source.senders.values():
@@ -376,7 +376,7 @@ class Arbiter:
 
 
 def _lasts(ns: int) -> float:
-    """Return the duration `ns` in s, rounded down to a value of `LASTING_S` or to 0."""
-    if ns < LASTING_S[0] * NS_PER_S:
+    """Return the duration `ns` in s, rounded down to a value of `REPORTED_DURATIONS_S` or to 0."""
+    if ns < REPORTED_DURATIONS_S[0] * NS_PER_S:
         return 0.0  # Nearly every step ends here.
-    return max(seconds for seconds in LASTING_S if ns >= seconds * NS_PER_S)
+    return max(seconds for seconds in REPORTED_DURATIONS_S if ns >= seconds * NS_PER_S)

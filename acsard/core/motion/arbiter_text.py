@@ -21,7 +21,7 @@ REFUSED = {
     "robot has already accepted: the network delayed it, or the sender's clock was set",
 }
 
-MAX_SENDER = 124
+MAX_SENDER_LENGTH = 124
 """Largest number of characters of a sender's name in a log event. The public name of a program has
 at most 57 characters, and the name from its certificate adds at most 67. A name that is made from a
 Zenoh key can be longer, and is then cut to this length."""
@@ -93,7 +93,7 @@ def refused(refusal: Refusal) -> Event:
     The event is `new_sender` if the clock of the sender is not proven yet, otherwise
     `command_refused`.
     """
-    by, kind = refusal.sender[:MAX_SENDER], refusal.reason
+    by, kind = refusal.sender[:MAX_SENDER_LENGTH], refusal.reason
     if kind == "unproven":
         return Event("new_sender", refusal.text, by=by, news=False)
     return Event("command_refused", refusal.text, "warning", by, kind, news=False)
@@ -146,4 +146,4 @@ class CommandEvents:
 
 def _name(commander: tuple[str, str]) -> str:
     source, sender = commander
-    return f"{source} ({sender[:MAX_SENDER]})" if source else "nobody"
+    return f"{source} ({sender[:MAX_SENDER_LENGTH]})" if source else "nobody"

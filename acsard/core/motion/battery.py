@@ -25,31 +25,31 @@ reacts soon enough."""
 
 SETTLE_S = 3.0
 """Time that the reports of the battery must cover before their running mean decides the level, s.
-The covered time is the sum of the intervals between the reports, each limited to `LONGEST_NS`. A
+The covered time is the sum of the intervals between the reports, each limited to `MAX_WEIGHT_NS`. A
 silence of the board resets it to 0. A motor start in this time lowers the mean by up to a tenth of
 the voltage drop."""
 
-SILENT_S = 5.0
+SILENCE_TIMEOUT_S = 5.0
 """Largest age of a reported value of the battery, s. An older value is dropped. If the board sends
 one report a second, four consecutive reports may be lost without an effect."""
 
-LONGEST_NS = 300_000_000
+MAX_WEIGHT_NS = 300_000_000
 """Largest weight of one report in the running mean, ns. The weight of a report is the time since
 the previous report, but at most this limit, which is the duration of a motor start. Without the
 limit, a report during a motor start would weigh too much after a gap. If the board sends only one
 report a second, the limit slows the mean down to a third of its speed."""
 
-EMPTY = "battery below "
+EMPTY_REASON = "battery below "
 """First words of the text `Battery.why`, the reason for a stop by an empty battery."""
 
-ORDER: tuple[BatteryLevel, ...] = get_args(BatteryLevel)[:4]
+LEVELS_BY_URGENCY: tuple[BatteryLevel, ...] = get_args(BatteryLevel)[:4]
 """The battery levels from the best to the worst, except "unknown"."""
 
-MISSING = (
+MISSING_REASON = (
     "the board has not reported its battery, but the configuration has thresholds in [battery]"
 )
 
-SILENT = f"the board has not reported its battery for {SILENT_S:g} s"
+SILENT_REASON = f"the board has not reported its battery for {SILENCE_TIMEOUT_S:g} s"
 
 
 def words(config: BatteryConfig, status: BatteryStatus) -> str:
@@ -57,7 +57,7 @@ def words(config: BatteryConfig, status: BatteryStatus) -> str:
     forms = ((status.volts, "{:.2f} V"), (status.percent, "{:g} %"), (status.amps, "{:.2f} A"))
     values = [form.format(value) for value, form in forms if value is not None]
     if status.volts is None and status.percent is None:
-        return SILENT
+        return SILENT_REASON
     shown, level = ", ".join(values), status.level
     if level == "ok":
         return shown
@@ -110,7 +110,7 @@ class Battery:
         """Monotonic times, ns. `_since_ns` is the arrival of the first report since the last
         silence, and `_mean_ns` is the arrival of the newest report in `_mean`."""
         self._stood_ns = 0
-        """Sum of the weights of all reports in `_mean`, ns (see `LONGEST_NS`)."""
+        """Sum of the weights of all reports in `_mean`, ns (see `MAX_WEIGHT_NS`)."""
 
     @property
     def held(self) -> bool:
@@ -120,7 +120,7 @@ class Battery:
     @property
     def why(self) -> str:
         """Reason of a stop by an empty battery, as text without measured values."""
-        return f"{EMPTY}{_threshold(self._config, 'stop')}"
+        return f"{EMPTY_REASON}{_threshold(self._config, 'stop')}"
 
     @property
     def mend(self) -> str:
@@ -164,7 +164,7 @@ class Battery:
         if self.status is None and not ("volts" in self._values or "percent" in self._values):
             return []
         for name, (_, at_ns) in [*self._values.items()]:
-            if now_ns - at_ns > SILENT_S * NS_PER_S:
+            if now_ns - at_ns > SILENCE_TIMEOUT_S * NS_PER_S:
                 del self._values[name]
                 news = True
         level = self._level(now_ns)
@@ -189,7 +189,7 @@ class Battery:
         elif at_ns > self._mean_ns:
             # Until the weights add up to `TIME_CONSTANT_S`, this is the weighted mean of all
             # reports. After that, it is an exponential mean.
-            stood_ns = min(at_ns - self._mean_ns, LONGEST_NS)
+            stood_ns = min(at_ns - self._mean_ns, MAX_WEIGHT_NS)
             self._stood_ns += stood_ns
             span_ns = min(TIME_CONSTANT_S * NS_PER_S, self._stood_ns)
             self._mean += (value - self._mean) * stood_ns / span_ns
@@ -212,10 +212,10 @@ class Battery:
             return None
         if self._mean is None:
             return "unknown"
-        reached = ORDER.index(self._known)
+        reached = LEVELS_BY_URGENCY.index(self._known)
         found: BatteryLevel = "ok"
         for level, below in self._bounds.items():
-            rise = self._config.hysteresis if reached >= ORDER.index(level) else 0.0
+            rise = self._config.hysteresis if reached >= LEVELS_BY_URGENCY.index(level) else 0.0
             if self._mean < below + rise:
                 found = level
         self.stopped_now = found == "stop" != self._known

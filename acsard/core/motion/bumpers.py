@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from acsard.core.config.settings import Place, SafetyConfig
 from acsard.core.formatting import many
 from acsard.core.link.board_status import BoardStatus
-from acsard.core.motion.emergency_stop import SILENT_S, TABLE, BoardInput
+from acsard.core.motion.emergency_stop import SILENCE_TIMEOUT_S, TRANSITIONS, BoardInput
 from acsard.core.values import REST, EstopState, Twist
 
 AWAY_SPEED = 0.1
@@ -30,7 +30,9 @@ no straight motion leads away from the bumper."""
 
 ALLOWED = {-1: "backwards", 1: "forwards"}
 
-SILENT = f"the board has not reported its bumpers for {SILENT_S:g} s, so they count as pressed"
+SILENT_REASON = (
+    f"the board has not reported its bumpers for {SILENCE_TIMEOUT_S:g} s, so they count as pressed"
+)
 
 
 def missing(safety: SafetyConfig) -> str:
@@ -60,10 +62,10 @@ def pressed_words(places: Sequence[Place], pressed: Sequence[bool]) -> str:
 class Bumpers(BoardInput):
     """The state of all bumpers of one robot, and the motion that they allow."""
 
-    # In contrast to `TABLE`, silence changes the state even while a bumper is pressed, because a
-    # silent board cannot report the press of another bumper.
-    table = TABLE | {("pressed", "silence"): "silent"}
-    silent, events = SILENT, ("bumper_pressed", "bumper_released")
+    # In contrast to `TRANSITIONS`, silence changes the state even while a bumper is pressed,
+    # because a silent board cannot report the press of another bumper.
+    table = TRANSITIONS | {("pressed", "silence"): "silent"}
+    silent, events = SILENT_REASON, ("bumper_pressed", "bumper_released")
 
     def __init__(self, safety: SafetyConfig) -> None:
         off = safety.bumper == "off"

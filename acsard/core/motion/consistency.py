@@ -18,7 +18,7 @@ from msgspec.structs import replace
 
 from acsard.core.config.settings import FeedbackConfig, OdometryConfig
 from acsard.core.link.feedback import Feedback
-from acsard.core.motion.gap_filling import NOWHERE, Rolled, plus
+from acsard.core.motion.gap_filling import AT_REST, Rolled, plus
 from acsard.core.motion.gyro import Gyro, Turn
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.learned_track import LearnedTrack, Track
@@ -91,7 +91,7 @@ class ConsistencyChecks:
             for piece in rolled.pieces:
                 turned = plus(turned, piece)
             self._by_wheels = self._kinematics.moved(wheels.believed(turned))[1]
-            still = wheels.believed(line.speeds.as_tuple()) == NOWHERE
+            still = wheels.believed(line.speeds.as_tuple()) == AT_REST
             turn = gyro.turn(line.at.mono_ns, rolled.known, self._by_wheels, still)
             self.on_trial = gyro.owes
             by_gyro = None if turn is None else turn.wheels

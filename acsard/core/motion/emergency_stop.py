@@ -1,9 +1,10 @@
 """Monitors the safety inputs that the board reports, and decides when an input counts as pressed.
 
 `BoardInput` is the common base class of `EmergencyStop` and of the bumpers (`bumpers.py`). A board
-that has reported an input once must continue to report this input. After `SILENT_S` without a
-report, the input counts as pressed: a cable may be cut, or the emergency stop may have cut the
-board's own supply. `lifecycle.py` keeps the latch of the stop. Only the call `clear` releases it.
+that has reported an input once must continue to report this input. After `SILENCE_TIMEOUT_S`
+without a report, the input counts as pressed: a cable may be cut, or the emergency stop may have
+cut the board's own supply. `lifecycle.py` keeps the latch of the stop. Only the call `clear`
+releases it.
 
 When the port is opened again, another board may answer, which need not have the input. The input
 then keeps its state until the board reports it, or until `session.py` finds that the board does not
@@ -27,7 +28,7 @@ from acsard.core.values import NS_PER_S, EstopState, Event, EventName
 
 Sign = Literal["ok", "pressed", "silence"]
 
-TABLE: dict[tuple[EstopState, Sign], EstopState] = {
+TRANSITIONS: dict[tuple[EstopState, Sign], EstopState] = {
     ("", "ok"): "released",
     ("", "pressed"): "pressed",
     ("released", "pressed"): "pressed",
@@ -37,42 +38,43 @@ TABLE: dict[tuple[EstopState, Sign], EstopState] = {
     ("silent", "pressed"): "pressed",
 }
 """Maps the state of a safety input and a sign to the next state. The sign is `ok` or `pressed` if a
-status line reports the input, and `silence` if no line has reported the input for `SILENT_S`. A
-pair without an entry does not change the state."""
+status line reports the input, and `silence` if no line has reported the input for
+`SILENCE_TIMEOUT_S`. A pair without an entry does not change the state."""
 
-SILENT_S = 0.5
+SILENCE_TIMEOUT_S = 0.5
 """Time without a report after which an input counts as pressed, s: five status lines at 10 Hz."""
 
-LATE_NS = 150_000_000
+LATE_STEP_NS = 150_000_000
 """Time between two control steps above which the second step counts as late, ns. The longest
 control period that can be configured is 100 ms."""
 
-EXCUSE_NS = 100_000_000
+CATCH_UP_NS = 100_000_000
 """Extra time that a late control step gives the board before it counts as silent, ns. In this time,
 the daemon reads the lines and commands that arrived while no control step ran. The daemon grants
 the extra time only once between two reports of the board, so that a control loop that is always
 late does not delay the stop forever."""
 
-PRESSED = "emergency stop pressed at the robot"
-SILENT = (
-    f"the board has not reported its emergency stop for {SILENT_S:g} s, so it counts as pressed"
+PRESSED_REASON = "emergency stop pressed at the robot"
+SILENT_REASON = (
+    f"the board has not reported its emergency stop for {SILENCE_TIMEOUT_S:g} s, "
+    "so it counts as pressed"
 )
 
 RELEASE, CHECK = "release it at the robot", "check the board and its cable"
 
-MISSING = (
+MISSING_REASON = (
     'safety.estop = "required", but the microcontroller has not reported an emergency-stop input: '
     "does its firmware send status lines with `estop=`?"
 )
 
-DRIVER_FAULT = "the board reports a fault of a motor driver"
-DRIVER_MEND = "repair the driver, or switch the robot off and on"
+DRIVER_FAULT_REASON = "the board reports a fault of a motor driver"
+DRIVER_FAULT_ADVICE = "repair the driver, or switch the robot off and on"
 
 
 class BoardInput(ABC):
     """The state of one safety input, or of several that the board always reports together."""
 
-    table = TABLE
+    table = TRANSITIONS
     silent: str
     """Reason, as text, of a stop that is latched because the board does not report the inputs."""
     events: tuple[EventName, EventName]
@@ -135,10 +137,10 @@ class BoardInput(ABC):
             if pressed is not None:
                 self._reported_ns, self._excused, self._awaited = at_ns, False, False
                 events += self._take("pressed" if any(pressed) else "ok", pressed)
-        late, self._looked_ns = now_ns - self._looked_ns > LATE_NS, now_ns
+        late, self._looked_ns = now_ns - self._looked_ns > LATE_STEP_NS, now_ns
         if self.pressed is not None and now_ns - self._reported_ns > _SILENT_NS:
             if late and not self._excused:
-                self._reported_ns, self._excused = now_ns - _SILENT_NS + EXCUSE_NS, True
+                self._reported_ns, self._excused = now_ns - _SILENT_NS + CATCH_UP_NS, True
             else:
                 events += self._take("silence", (True,) * len(self.pressed))
         return events
@@ -178,7 +180,7 @@ class BoardInput(ABC):
 class EmergencyStop(BoardInput):
     """The state of the emergency stop."""
 
-    silent, events = SILENT, ("emergency_stop", "emergency_stop_released")
+    silent, events = SILENT_REASON, ("emergency_stop", "emergency_stop_released")
 
     def __init__(self, use: EstopUse, unpowered: bool = False) -> None:
         super().__init__(use)
@@ -224,7 +226,7 @@ class EmergencyStop(BoardInput):
 
     def words(self) -> str:
         """Return the reason of a stop by a pressed emergency stop, as text."""
-        return PRESSED
+        return PRESSED_REASON
 
     def released(self, before: EstopState) -> str:
         """Return the log text for an emergency stop that is not pressed any more.
@@ -236,4 +238,4 @@ class EmergencyStop(BoardInput):
         return "the emergency stop is released; the robot stays stopped until srv/clear is called"
 
 
-_SILENT_NS = int(SILENT_S * NS_PER_S)
+_SILENT_NS = int(SILENCE_TIMEOUT_S * NS_PER_S)

@@ -33,23 +33,23 @@ m/rad). The last two numbers are the error of the turn per m of distance and per
 rad/rad). A parameter is, for example, a wheel radius.
 """
 
-SLIPPING = 100.0
+SLIP_FACTOR = 100.0
 """Factor by which slip of the wheels increases the variances of a step and of the twist."""
 
-DECIMAL = 0.01
+SPEED_RESOLUTION = 0.01
 """Resolution of the wheel speeds in a feedback line, rad/s. The line has two decimals."""
 
-MOST = 1e9
+MAX_TWIST_VARIANCE = 1e9
 """Largest variance of a twist, m2/s2 and rad2/s2. It means "unknown"."""
 
-LEAST = 1e-8
+MIN_TWIST_VARIANCE = 1e-8
 """Smallest variance of a twist, m2/s2 and rad2/s2. Filters that use the published twist treat a
 smaller variance as an error."""
 
-PERIOD = 0.01
+ASSUMED_PERIOD_S = 0.01
 """Assumed period of the feedback lines before it is measured, s."""
 
-SMOOTHED = 0.05
+PERIOD_GAIN = 0.05
 """Weight of the newest period in the running mean of the time between feedback lines. The weight is
 small, because periods vary: several lines may be read at the same time."""
 
@@ -182,12 +182,12 @@ class TwistUncertainty:
       uncertain as the pose.
     - The sums are over the uncertain parameters of the kinematics (c_1 to c_4: see `columns`).
 
-    If the wheels slip, `slipping` multiplies the variances by `SLIPPING`. For a robot at rest,
+    If the wheels slip, `slipping` multiplies the variances by `SLIP_FACTOR`. For a robot at rest,
     `at_rest` allows only a motion that is too small for the encoders.
     """
 
     def __init__(self, model: ErrorModel, counts: int) -> None:
-        """Start with a feedback period of `PERIOD`.
+        """Start with a feedback period of `ASSUMED_PERIOD_S`.
 
         `counts` is the number of encoder counts per revolution of a wheel; 0 if it is unknown.
         """
@@ -195,7 +195,7 @@ class TwistUncertainty:
         self._count = math.tau / counts if counts else 0.0
         # The errors of the four wheels are independent, and each side is the mean of two wheels.
         self._to_linear = model.radius**2 / 4 / 12
-        self._period = PERIOD
+        self._period = ASSUMED_PERIOD_S
         self.bend()
 
     def bend(self) -> None:
@@ -216,9 +216,9 @@ class TwistUncertainty:
         """
         if dt > 0.0:
             # A single late line, or a line after lost lines, does not mean a longer period.
-            self._period += SMOOTHED * (min(dt, 2 * self._period) - self._period)
+            self._period += PERIOD_GAIN * (min(dt, 2 * self._period) - self._period)
         model, period, linear, angular = self._model, self._period, twist.linear, twist.angular
-        quantum = max(DECIMAL, self._count / period, step) ** 2
+        quantum = max(SPEED_RESOLUTION, self._count / period, step) ** 2
         along, yaw, _ = model.noise.of(linear, angular, abs(angular))
         along, yaw = along / period, yaw / period
         for to_along, by_turn, to_yaw, of_turn in model.columns:
@@ -229,9 +229,9 @@ class TwistUncertainty:
         lateral = model.settings.twist_covariance_diagonal[1]
         # Do not call `max` here: three calls take half as long as all lines above.
         return TwistVariances(
-            along if along > LEAST else LEAST,
-            lateral if lateral > LEAST else LEAST,
-            yaw if yaw > LEAST else LEAST,
+            along if along > MIN_TWIST_VARIANCE else MIN_TWIST_VARIANCE,
+            lateral if lateral > MIN_TWIST_VARIANCE else MIN_TWIST_VARIANCE,
+            yaw if yaw > MIN_TWIST_VARIANCE else MIN_TWIST_VARIANCE,
         )
 
     def at_rest(self, seconds: float, step: float = 0.0) -> TwistVariances:
@@ -242,20 +242,21 @@ class TwistUncertainty:
         """
         quantum = (max(self._count, step * self._period) / seconds) ** 2
         return TwistVariances(
-            max(LEAST, self._to_linear * quantum),
-            LEAST,
-            max(LEAST, self._to_angular * quantum),
+            max(MIN_TWIST_VARIANCE, self._to_linear * quantum),
+            MIN_TWIST_VARIANCE,
+            max(MIN_TWIST_VARIANCE, self._to_angular * quantum),
         )
 
     def slipping(self, variances: TwistVariances) -> TwistVariances:
-        """Return `variances` times `SLIPPING`, but at most `MOST`. Use this while the wheels slip.
+        """Return `variances` times `SLIP_FACTOR`, but at most `MAX_TWIST_VARIANCE`. Use this while
+        the wheels slip.
 
         The lateral variance grows too, because the wheels may slip in any direction.
         """
         return TwistVariances(
-            min(SLIPPING * variances.linear, MOST),
-            min(SLIPPING * variances.lateral, MOST),
-            min(SLIPPING * variances.angular, MOST),
+            min(SLIP_FACTOR * variances.linear, MAX_TWIST_VARIANCE),
+            min(SLIP_FACTOR * variances.lateral, MAX_TWIST_VARIANCE),
+            min(SLIP_FACTOR * variances.angular, MAX_TWIST_VARIANCE),
         )
 
     def with_gyro(self, variances: TwistVariances, angular: float) -> TwistVariances:
@@ -263,4 +264,8 @@ class TwistUncertainty:
 
         `angular` is the variance of the turn rate that a gyro measured, rad2/s2.
         """
-        return TwistVariances(variances.linear, variances.lateral, min(max(LEAST, angular), MOST))
+        return TwistVariances(
+            variances.linear,
+            variances.lateral,
+            min(max(MIN_TWIST_VARIANCE, angular), MAX_TWIST_VARIANCE),
+        )

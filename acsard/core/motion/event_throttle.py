@@ -17,7 +17,7 @@ BURST = 5
 """Number of log lines of one name that may be written without a delay between them. A person who
 presses buttons does not need more."""
 
-MOST = 8
+MAX_LISTED = 8
 """Largest number of event kinds that one log line lists, and largest number of client names in it.
 All further kinds or names appear as "others"."""
 
@@ -99,7 +99,7 @@ class EventThrottle:
         return True
 
 
-NUMBERED = re.compile(r"\A\d+ (?:x [^:;]*|times)(?:; the last)?: ")
+COMBINED_TEXT = re.compile(r"\A\d+ (?:x [^:;]*|times)(?:; the last)?: ")
 """Pattern for the start of the text of a log line that combines several events."""
 
 
@@ -109,18 +109,18 @@ def together(before: Event, line: Event) -> Event:
     `line` is later than `before`. The result has the total number of events, the higher level, the
     names of all clients, and the text of `line`.
     """
-    count, last = before.count + line.count, NUMBERED.sub("", line.text, count=1)
+    count, last = before.count + line.count, COMBINED_TEXT.sub("", line.text, count=1)
     level = max(before.level, line.level, key=LEVELS.index)
     names = dict.fromkeys(filter(None, [*before.by.split(", "), *line.by.split(", ")]))
     by = [name for name in names if name != "others"]
-    more = ["others"] if len(by) > MOST or "others" in names else []
+    more = ["others"] if len(by) > MAX_LISTED or "others" in names else []
     text = f"{count} times; the last: {last}"
-    return Event(line.name, text, level, ", ".join(by[:MOST] + more), count=count, news=False)
+    return Event(line.name, text, level, ", ".join(by[:MAX_LISTED] + more), count=count, news=False)
 
 
 def _count(counts: Counter[str], what: str, times: int) -> None:
     if what:
-        counts[what if what in counts or len(counts) < MOST else "others"] += times
+        counts[what if what in counts or len(counts) < MAX_LISTED else "others"] += times
 
 
 def _numbered(counts: Counter[str]) -> str:

@@ -31,8 +31,8 @@ from acsard.core.values import NS_PER_S, Command
 # look the same. Therefore the sum of the rises of the delay that are trusted in this way is bounded
 # by a budget: `FORGIVE_NS`, refilled by 1 s a minute. If the stamps of more than one command go
 # back or stand still, the adjustment of the clock is visible and costs no budget, because no
-# network can cause that. After a pause of the sender (`GAP_NS`), a rise is trusted even beyond the
-# budget, because the clock may have been set by any amount.
+# network can cause that. After a pause of the sender (`MAX_PAUSE_NS`), a rise is trusted even
+# beyond the budget, because the clock may have been set by any amount.
 #
 # Sequence numbers show which commands the network lost, repeated or delivered in another order.
 # Lost commands do not count as a pause, and a repeated command changes nothing.
@@ -40,7 +40,7 @@ from acsard.core.values import NS_PER_S, Command
 # Times of arrival are measured by the monotonic clock, because the daemon's own wall clock may be
 # set.
 
-DRIFT = 5000
+SECONDS_PER_DRIFT = 5000
 """Number of seconds in which two clocks may drift apart by 1 s. A bad crystal takes twice as
 long."""
 
@@ -49,10 +49,10 @@ FORGET_NS = 250 * NS_PER_S
 50 ms. If the arrival times show the pause but the stamps do not, the network held commands back,
 and the clock stays known."""
 
-KEEP_NS = 3600 * NS_PER_S
+MEMORY_NS = 3600 * NS_PER_S
 """Silence of a sender, ns, after which its clock is forgotten to save memory."""
 
-EARLY_NS = NS_PER_S // 20
+MAX_JITTER_NS = NS_PER_S // 20
 """Largest decrease of the delay that can be jitter, ns. After a larger decrease, a backlog has
 ended or a clock was set."""
 
@@ -71,7 +71,7 @@ CREEP, JITTER_NS = 10, NS_PER_S // 200
 """A delay creeps if it changes little between two commands: by at most the time between the two
 commands divided by `CREEP`, plus `JITTER_NS`. Otherwise the delay jumps."""
 
-LONGEST_PROOF_NS = 2 * NS_PER_S
+MAX_PROOF_NS = 2 * NS_PER_S
 """Nominal duration of a proof (a test whether the delay is constant), ns. The timeout of the source
 applies instead if it is shorter."""
 
@@ -79,23 +79,23 @@ JUMP_PROOF_NS = 3 * NS_PER_S // 2
 """Shortest time for which the delay must be constant after a jump before it is trusted, ns. The
 cause of a jump is more likely a backlog that arrives in bursts than a clock that was set."""
 
-GAP_NS = 2 * NS_PER_S
+MAX_PAUSE_NS = 2 * NS_PER_S
 """Longest silence of a sender that is not a pause, ns. If the timeout of the source is longer, the
 timeout applies instead, because the sender need not send more often. A pause ends a test of the
 delay. If both stamps and arrival times show the pause, a foreign clock (one that may be adjusted)
 may have been set by any amount during the pause."""
 
-STANDS_NS = 10_000
+MAX_STOPPED_STAMP_NS = 10_000
 """Largest step of the stamps, ns, at which a clock seems to have been set back: the stamp of a
 command is later than that of the previous command by at most this, although the commands arrived
-more than `APART_NS` apart. Zenoh's own clock never goes back. If the wall clock was set back,
+more than `SEPARATE_NS` apart. Zenoh's own clock never goes back. If the wall clock was set back,
 Zenoh's clock advances by a fraction of a microsecond for each message until the wall clock has
 caught up."""
 
-APART_NS = NS_PER_S // 500
+SEPARATE_NS = NS_PER_S // 500
 """Commands that arrive within this time of each other, ns, may have been sent together."""
 
-TOGETHER_NS = NS_PER_S // 2000
+SAME_QUEUE_NS = NS_PER_S // 2000
 """Commands that arrive within this time of each other, ns, come from one queue. A test of the delay
 waits for the last command of the queue, which has the smallest delay. No sender may send more than
 1000 commands a second."""
@@ -151,10 +151,10 @@ class _Proof:
         command. A command whose delay exceeds the lowest delay by more than `timeout_ns` cannot
         complete the test.
         """
-        if not -EARLY_NS <= delay - self._first <= WAVER_NS:
+        if not -MAX_JITTER_NS <= delay - self._first <= WAVER_NS:
             return "failed"
         proven = False
-        if at_ns - self._begun_ns >= self._length_ns and at_ns - self.last_ns > TOGETHER_NS:
+        if at_ns - self._begun_ns >= self._length_ns and at_ns - self.last_ns > SAME_QUEUE_NS:
             self._halves.append((self._begun_ns, self._half))
             self._begun_ns += self._length_ns
             if at_ns - self._begun_ns >= self._length_ns:
@@ -177,16 +177,16 @@ class _Proof:
                     self.least = self._first = minima[1]
             return even
         # The test of a new clock compares the last eight halves in four pairs. The minima of the
-        # pairs must agree within the same limit, or differ by at most `EARLY_NS` without a trend. A
-        # trend means that the minima only fall, as while a backlog arrives, or only rise, as while
-        # a queue grows.
+        # pairs must agree within the same limit, or differ by at most `MAX_JITTER_NS` without a
+        # trend. A trend means that the minima only fall, as while a backlog arrives, or only rise,
+        # as while a queue grows.
         if count < 8:
             return False
         del self._halves[0]
         pairs = [min(pair) for pair in zip(minima[::2], minima[1::2], strict=True)]
         spread, up = max(pairs) - min(pairs), sorted(pairs)
         trend = pairs in (up, up[::-1])
-        return spread <= lasted // self._share or (spread <= EARLY_NS and not trend)
+        return spread <= lasted // self._share or (spread <= MAX_JITTER_NS and not trend)
 
 
 class _Clock:
@@ -197,9 +197,9 @@ class _Clock:
         self.at_ns = at_ns
         """Monotonic time at which the last command of this clock arrived, ns. Repeated commands do
         not count."""
-        self.gap_ns = GAP_NS
-        """Longest silence that is not a pause, ns: `GAP_NS`, or the longest timeout of the sources
-        to which the sender has sent commands, if that is longer."""
+        self.gap_ns = MAX_PAUSE_NS
+        """Longest silence that is not a pause, ns: `MAX_PAUSE_NS`, or the longest timeout of the
+        sources to which the sender has sent commands, if that is longer."""
         self.forgiven_ns = 0
         """Part of the last trusted increase of the delay for which no adjustment of the clock was
         visible, ns."""
@@ -258,7 +258,7 @@ class _Clock:
         elif self.state == "new":
             verdict = self._prove(delay, at_ns, silence, timeout_ns)
         else:
-            self._least += silence // DRIFT
+            self._least += silence // SECONDS_PER_DRIFT
             if not command.steady:
                 self._look_for_adjustment(stamp_ns, silence, number)
             verdict = self._compare(delay, at_ns, silence, timeout_ns, command.steady)
@@ -310,7 +310,7 @@ class _Clock:
             delay: the delay of the present command, ns.
             silence: the time since the previous command arrived, ns.
         """
-        floor = delay if self._floor is None else self._floor + silence // DRIFT
+        floor = delay if self._floor is None else self._floor + silence // SECONDS_PER_DRIFT
         self._floor = min(floor, delay)
         return delay - self._floor
 
@@ -335,7 +335,7 @@ class _Clock:
             return
         departed, accepted = stamp_ns - self._stamp_ns, self._accepted
         doubted, self._doubted = self._doubted, None
-        if doubted is not None and (departed <= STANDS_NS or stamp_ns <= doubted[2]):
+        if doubted is not None and (departed <= MAX_STOPPED_STAMP_NS or stamp_ns <= doubted[2]):
             self._before = doubted[0] if self._before is None else self._before
             self._shown += doubted[1]
         if lost and accepted is not None:
@@ -344,7 +344,7 @@ class _Clock:
                 self._doubted = self._delay, back, accepted[0]
         elif departed > self.gap_ns and silence > self.gap_ns:
             self._paused = True
-        elif departed <= STANDS_NS and silence > APART_NS:
+        elif departed <= MAX_STOPPED_STAMP_NS and silence > SEPARATE_NS:
             self._doubted = self._delay, silence - departed, self._stamp_ns
 
     def _prove(self, delay: int, at_ns: int, silence: int, timeout_ns: int) -> Verdict:
@@ -356,7 +356,7 @@ class _Clock:
                 return "fresh"
             if sign == "open":
                 return "unproven"
-        needed_ns = min(timeout_ns, LONGEST_PROOF_NS)
+        needed_ns = min(timeout_ns, MAX_PROOF_NS)
         self._proof = _Proof(delay, at_ns, timeout_ns, needed_ns, EVEN, again=False)
         return "first"
 
@@ -366,7 +366,7 @@ class _Clock:
         late = delay - self._least
         early = max(0, self._early - silence // CREEP) + max(0, -late)
         proof = self._proof
-        if late <= timeout_ns and early <= EARLY_NS:
+        if late <= timeout_ns and early <= MAX_JITTER_NS:
             self._paused = False
             if proof is not None and late > proof.timeout_ns:
                 # This source has a longer timeout than the source whose commands are in doubt.
@@ -378,7 +378,7 @@ class _Clock:
         if steady:  # the known minimum was measured while a backlog arrived
             self.state, self._proof = "new", None
             return self._prove(delay, at_ns, silence, timeout_ns)
-        needed_ns, share = min(timeout_ns, LONGEST_PROOF_NS), CREPT
+        needed_ns, share = min(timeout_ns, MAX_PROOF_NS), CREPT
         if proof is None:
             self._accrue(at_ns, FORGIVE_NS)
         elif at_ns - proof.last_ns <= self.gap_ns:
@@ -434,7 +434,7 @@ class Freshness:
         forgotten after a pause."""
         self._unproved: dict[str, _Clock] = {}
         """Clocks that are never adjusted and have not stamped an accepted command yet. They are
-        kept for `KEEP_NS` of silence, because their lowest delay is valid from the first command
+        kept for `MEMORY_NS` of silence, because their lowest delay is valid from the first command
         on."""
         self._numbers: dict[str, tuple[int, int]] = {}
         """Last sequence number of each sender that numbers its commands but does not stamp them,
@@ -449,7 +449,7 @@ class Freshness:
         only if its sequence number is out of order.
         """
         if command.stamp_ns is None:
-            return self._in_order(command, max(GAP_NS, timeout_ns))
+            return self._in_order(command, max(MAX_PAUSE_NS, timeout_ns))
         name, at_ns = command.clock or command.source, command.arrived_ns
         clock = None
         for held in (self._clocks, self._newcomers, self._unproved):
@@ -486,14 +486,18 @@ class Freshness:
         """Forget clocks that were silent for long, and one more if `MAX_CLOCKS` is exceeded."""
         # The number of clocks is limited, because a recording begins with all clocks, and the
         # control loop writes all of them in one step.
-        limits = (self._newcomers, GAP_NS), (self._unproved, KEEP_NS), (self._clocks, KEEP_NS)
+        limits = (
+            (self._newcomers, MAX_PAUSE_NS),
+            (self._unproved, MEMORY_NS),
+            (self._clocks, MEMORY_NS),
+        )
         for held, silent_ns in limits:
             while held and now_ns - _oldest(held).at_ns > max(silent_ns, _oldest(held).gap_ns):
                 del held[next(iter(held))]
         some = [held for held, _ in limits if held]
         if sum(map(len, some)) > MAX_CLOCKS:
             doubtful = [held for held in some if held is not self._clocks]
-            silent = [held for held in doubtful if now_ns - _oldest(held).at_ns > GAP_NS]
+            silent = [held for held in doubtful if now_ns - _oldest(held).at_ns > MAX_PAUSE_NS]
             held = min(silent or some, key=lambda clocks: _oldest(clocks).at_ns)
             del held[next(iter(held))]
 

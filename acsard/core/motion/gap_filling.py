@@ -22,8 +22,8 @@ from acsard.core.config.settings import FeedbackConfig
 from acsard.core.link.codec import Motors
 from acsard.core.link.feedback import Feedback
 from acsard.core.link.link_state import WATCHDOG_S
-from acsard.core.motion.error_model import SMOOTHED
-from acsard.core.motion.sanity import SLACK
+from acsard.core.motion.error_model import PERIOD_GAIN
+from acsard.core.motion.sanity import SPEED_MARGIN
 from acsard.core.values import REST, Twist, WheelSpeeds
 
 MAX_LOST_S, MAX_LOST = 0.05, 1
@@ -32,21 +32,21 @@ total duration, s, and `MAX_LOST` for their number. If the lines exceed both lim
 the robot during these lines is unknown. Otherwise, the robot is assumed to have moved at the speed
 of the next plausible line."""
 
-NOWHERE = (0.0, 0.0, 0.0, 0.0)
+AT_REST = (0.0, 0.0, 0.0, 0.0)
 
-GUESS = Twist(0.125, 0.5)
+ASSUMED_ACCELERATION = Twist(0.125, 0.5)
 """Standard deviation of the acceleration, m/s2 and rad/s2, until it is measured. It is an eighth of
 the default acceleration limits. Random driving rarely exceeds it."""
 
-SPAN = 0.2
+ACCELERATION_SPAN_S = 0.2
 """Time over which the deviation from constant acceleration is measured, s."""
 
 FIRST, MOST = 4.0, 300.0
 """Weights in the mean of the squared deviations from constant acceleration. Each measured span of
-`SPAN` s has the weight 1, and `GUESS` has the weight `FIRST`. The total weight is limited to `MOST`
-(a minute of driving)."""
+`ACCELERATION_SPAN_S` s has the weight 1, and `ASSUMED_ACCELERATION` has the weight `FIRST`. The
+total weight is limited to `MOST` (a minute of driving)."""
 
-GROWTH = 5
+VARIANCE_POWER = 5
 """Exponent: the variance of the motion in a gap grows with this power of the gap's duration."""
 
 
@@ -106,7 +106,7 @@ class Rolling:
         - `_gap`: the total of the gaps before the lines without counts that cannot be filled.
         - `_driven`: the part of `_bridged` before the motors were commanded to rest.
         """
-        self._turned, self._skipped = NOWHERE, 0
+        self._turned, self._skipped = AT_REST, 0
 
     @property
     def skipped(self) -> float:
@@ -151,8 +151,8 @@ class Rolling:
             # Nearly every line takes this shortcut. The code below would give the same result.
             seen = times(speeds, dt)
             moved = seen if line.counted is None else line.counted
-            arcs = () if moved == NOWHERE else (moved,)
-            return Rolled(arcs, NOWHERE, seen, dt, 0.0, 0.0, dt)
+            arcs = () if moved == AT_REST else (moved,)
+            return Rolled(arcs, AT_REST, seen, dt, 0.0, 0.0, dt)
         # For implausible lines without counts, assume the speed of this line, unless those lines
         # last too long.
         guessed = self._lost <= MAX_LOST_S or self._skipped <= MAX_LOST
@@ -188,7 +188,7 @@ class Rolling:
 
 
 def _some(*pieces: Motors) -> tuple[Motors, ...]:
-    return tuple([piece for piece in pieces if piece != NOWHERE])
+    return tuple([piece for piece in pieces if piece != AT_REST])
 
 
 def _until_rest(before: Motors, driven: float, after: Motors, bridged: float) -> Motors:
@@ -273,13 +273,13 @@ class Confirmation:
         period, held, seconds = self._period, self._held, line.dt + line.gap + skipped
         # A long time counts as two periods, so that a single gap changes the mean only a little.
         # A board with a longer period still changes it in the long run.
-        self._period += SMOOTHED * (min(seconds, 2 * period) - period) if period else seconds
+        self._period += PERIOD_GAIN * (min(seconds, 2 * period) - period) if period else seconds
         if not held and (seconds <= 2 * period or not period or line.turned is not None):
             return [line], []
         self._seconds = seconds = seconds + (self._seconds if held else 0.0)
         # This change of one wheel's speed falsifies the motion of the whole time by as much as a
         # damaged line of the usual duration can.
-        most = (self._acceleration * period + SLACK) * period / seconds
+        most = (self._acceleration * period + SPEED_MARGIN) * period / seconds
         used, now = believed(before.as_tuple()), believed(line.speeds.as_tuple())
         lines, three = [*held, line], [*[believed(one.speeds.as_tuple()) for one in held], now]
         kept = lines
@@ -320,7 +320,7 @@ class Gaps:
     Let s be the standard deviation of the acceleration, m/s2 or rad/s2. After t s without lines,
     the true motion deviates by s t^2 / 2 from the motion at the known speeds, so the variance of
     the motion is s^2 t^4 / 4. The robot may change its acceleration at any time. Therefore s^2
-    itself grows with t, and the variance grows with t^5 (`GROWTH`).
+    itself grows with t, and the variance grows with t^5 (`VARIANCE_POWER`).
 
     `follow` measures s while lines arrive without gaps. The configured acceleration limits are not
     used, because robots seldom accelerate that much. The deviation is limited to the motion at the
@@ -329,8 +329,8 @@ class Gaps:
     """
 
     def __init__(self) -> None:
-        self._along = (GUESS.linear * SPAN**2 / 2) ** 2
-        self._turning = (GUESS.angular * SPAN**2 / 2) ** 2
+        self._along = (ASSUMED_ACCELERATION.linear * ACCELERATION_SPAN_S**2 / 2) ** 2
+        self._turning = (ASSUMED_ACCELERATION.angular * ACCELERATION_SPAN_S**2 / 2) ** 2
         self._spans = FIRST
         self.interrupt(REST)
 
@@ -350,14 +350,14 @@ class Gaps:
         self._distance += linear * dt
         self._turn += angular * dt
         span = self._seconds - dt  # the time between the first and the last line of the span
-        if span < SPAN:
+        if span < ACCELERATION_SPAN_S:
             return
         # Compare the motion in the span with the motion at the mean of the first and last speeds.
         first = self._first
         if self._distance or self._turn or linear or angular:
             off = self._distance - linear * dt - span * (first.linear + linear) / 2
             turned = self._turn - angular * dt - span * (first.angular + angular) / 2
-            scale = (SPAN / span) ** GROWTH
+            scale = (ACCELERATION_SPAN_S / span) ** VARIANCE_POWER
             self._spans = min(self._spans + 1.0, MOST)
             self._along += (off * off * scale - self._along) / self._spans
             self._turning += (turned * turned * scale - self._turning) / self._spans
@@ -394,7 +394,7 @@ class Gaps:
 
         `before` and `after` are the twists before and after the gap.
         """
-        scale = (seconds / SPAN) ** GROWTH
+        scale = (seconds / ACCELERATION_SPAN_S) ** VARIANCE_POWER
         fastest = max(abs(before.linear), abs(after.linear)) * seconds
         turning = max(abs(before.angular), abs(after.angular)) * seconds
         return min(self._along * scale, fastest**2), min(self._turning * scale, turning**2)

@@ -21,50 +21,50 @@ from collections import deque
 from msgspec import Struct
 
 from acsard.core.link.minimum_delay import MinimumDelay
-from acsard.core.motion.gyro_bias import KNOWN_S, Bias
+from acsard.core.motion.gyro_bias import LEARNING_TIME_S, Bias
 from acsard.core.motion.gyro_match import WINDOW_S, Match
-from acsard.core.motion.gyro_trial import PROPORTIONS, Trial
-from acsard.core.motion.learned_track import LEAST, Track
+from acsard.core.motion.gyro_trial import TURN_RATIO_RANGE, Trial
+from acsard.core.motion.learned_track import MIN_TRACK_STD, Track
 from acsard.core.values import NS_PER_S, Event, GyroDoes, GyroSample, GyroStatus, Level
 
 REST_S = 0.2
 """Time for which all four wheels must report zero speed before the robot counts as standing still,
 s."""
 
-SILENT_NS = NS_PER_S // 5
+SILENCE_TIMEOUT_NS = NS_PER_S // 5
 """Age of the gyro's last sample from which the gyro counts as silent, ns. Up to this age, the robot
 is assumed to continue turning at the rate of this sample."""
 
-LATEST_NS = NS_PER_S // 4
+MAX_EXTRA_DELAY_NS = NS_PER_S // 4
 """Difference of a sample's delay from the smallest delay of earlier samples, ns. If it is larger
 than this, the clock of the sender is assumed to have been set."""
 
-SET_BACK_NS = NS_PER_S // 50
+MIN_SET_BACK_NS = NS_PER_S // 50
 """Largest step back of the stamps that is not taken for a clock that was set, ns. A small step may
 have another cause: a driver may swap two samples or measure their times with some jitter."""
 
-DELAYS_NS = (-NS_PER_S // 10, 3 * NS_PER_S // 10)
+DELAY_RANGE_NS = (-NS_PER_S // 10, 3 * NS_PER_S // 10)
 """Range of the gyro's delay relative to the wheels, ns. The delay is negative if the gyro reports a
 turn earlier than the wheels do."""
 
-LEAST_DELAY_S = 0.002
+MIN_DELAY_CORRECTION_S = 0.002
 """Smallest measured error of the gyro's delay that is corrected, s."""
 
 SLIP_S = 0.5
 """Time for which the wheels count as slipping after they last contradicted the gyro, s."""
 
-MOST_SLIP_S = 5.0
+MAX_SLIP_S = 5.0
 """Longest plausible slip, s. If gyro and wheels contradict each other for longer, the gyro is not
 used until they agree again."""
 
-ENOUGH_BLOCKS = 20.0
+TRUSTED_BLOCKS = 20.0
 """Number of blocks of 0.1 s in which the robot must turn before the measured ratio of the gyro's
 turn to the wheels' turn is used."""
 
-WORDS: dict[GyroDoes, str] = {
+STATUS_TEXTS: dict[GyroDoes, str] = {
     "off": "",
     "waiting for rest": "the gyro's bias is not known yet: the robot must stand for "
-    f"{REST_S + KNOWN_S:.1f} s",
+    f"{REST_S + LEARNING_TIME_S:.1f} s",
     "used": "the heading comes from the gyro",
     "silent": "the gyro is silent: the heading comes from the wheels",
     "disagrees": "the wheels seem to slip: the gyro measures a different turn than the wheels",
@@ -154,9 +154,9 @@ class Gyro:
     def learned(self) -> Track | None:
         """Effective track learned from this gyro or an earlier one; None before enough turns."""
         match = self._match
-        if match.blocks < ENOUGH_BLOCKS or match.ratio <= 0.0:
+        if match.blocks < TRUSTED_BLOCKS or match.ratio <= 0.0:
             return self._learned
-        return Track(1.0 / match.ratio, max(LEAST, match.spread / match.ratio))
+        return Track(1.0 / match.ratio, max(MIN_TRACK_STD, match.spread / match.ratio))
 
     def hear(self, samples: tuple[GyroSample, ...]) -> None:
         """Store the `samples` that arrived since the last control step, in the order of arrival.
@@ -188,8 +188,8 @@ class Gyro:
         self._rest_s = self._rest_s + dt if still else 0.0
         resting = self._rest_s > REST_S
         self._take(at_ns, resting)
-        ahead = SILENT_NS if self._told_ns is None else at_ns - self._told_ns
-        silent = ahead - max(0, self._delay_ns) >= SILENT_NS
+        ahead = SILENCE_TIMEOUT_NS if self._told_ns is None else at_ns - self._told_ns
+        silent = ahead - max(0, self._delay_ns) >= SILENCE_TIMEOUT_NS
         held = 0.0 if resting or silent else self._rate * max(0, ahead) / NS_PER_S
         angle, variance = self._angle + held - self._given, self._variance
         self._given, self._variance = self._angle + held, 0.0
@@ -207,7 +207,7 @@ class Gyro:
         self._judge(silent)
         if lost or tried or self._does not in ("used", "disagrees"):
             return None
-        rolled = angle / max(PROPORTIONS[0], self._match.ratio)
+        rolled = angle / max(TURN_RATIO_RANGE[0], self._match.ratio)
         if not self._trial.open:
             angle, variance = angle + self._owed, variance + self._owed_variance
             self.forgive()
@@ -246,7 +246,7 @@ class Gyro:
         if last is None or sample.stamp_ns is None or last.stamp_ns is None:
             return sample.at_ns
         late = self._promptest.add(sample.at_ns - last.at_ns, sample.stamp_ns - last.stamp_ns)
-        if late > LATEST_NS or last.stamp_ns - sample.stamp_ns > SET_BACK_NS:
+        if late > MAX_EXTRA_DELAY_NS or last.stamp_ns - sample.stamp_ns > MIN_SET_BACK_NS:
             self._promptest = MinimumDelay()
             return sample.at_ns
         return sample.at_ns - max(0, int(late))
@@ -262,11 +262,11 @@ class Gyro:
         while heard and heard[0][0] <= until_ns:
             time_ns, sample = heard.popleft()
             time_ns -= self._delay_ns
-            span_ns = SILENT_NS if self._told_ns is None else time_ns - self._told_ns
-            self._hole |= span_ns >= SILENT_NS
+            span_ns = SILENCE_TIMEOUT_NS if self._told_ns is None else time_ns - self._told_ns
+            self._hole |= span_ns >= SILENCE_TIMEOUT_NS
             self._told_ns = time_ns if self._told_ns is None else max(time_ns, self._told_ns)
             passed = max(0, span_ns) / NS_PER_S
-            span = passed if span_ns < SILENT_NS else 0.0
+            span = passed if span_ns < SILENCE_TIMEOUT_NS else 0.0
             bias.drift(passed)
             stands = resting and bias.rest(sample.rate, sample.variance, span)
             self._rate = 0.0 if stands else sample.rate - bias.value
@@ -314,26 +314,26 @@ class Gyro:
         Call this only while the robot is at rest. Otherwise the heading would jump.
         """
         delay = self._match.delay()
-        if delay is not None and abs(delay) >= LEAST_DELAY_S:
-            earliest, latest = DELAYS_NS
+        if delay is not None and abs(delay) >= MIN_DELAY_CORRECTION_S:
+            earliest, latest = DELAY_RANGE_NS
             shifted = self._delay_ns + math.floor(delay * NS_PER_S)
             self._delay_ns = min(max(earliest, shifted), latest)
 
     def _judge(self, silent: bool) -> None:
         match, before, verdict = self._match, self._does, self._trial.verdict
-        least, most = PROPORTIONS
-        wrong = match.blocks >= ENOUGH_BLOCKS and not least <= match.ratio <= most
+        least, most = TURN_RATIO_RANGE
+        wrong = match.blocks >= TRUSTED_BLOCKS and not least <= match.ratio <= most
         if verdict != "none yet" and verdict != "good":
             self._does = verdict
         elif silent:
             self._does = "silent"
         elif not self._bias.known:
             self._does = "waiting for rest"
-        elif wrong or self._slipped_s > MOST_SLIP_S:
+        elif wrong or self._slipped_s > MAX_SLIP_S:
             self._does = "not believed"
         else:
             self._does = "disagrees" if self._slip_s > 0.0 else "used"
         if self._does != before:
             good = self._does in ("used", "waiting for rest")
             level: Level = "info" if good else "warning"
-            self.events.append(Event("gyro", WORDS[self._does], level, kind=self._does))
+            self.events.append(Event("gyro", STATUS_TEXTS[self._does], level, kind=self._does))

@@ -1,42 +1,42 @@
 """Learns the bias of a gyro: its reading while the robot stands still (zero-velocity update).
 
-The first estimate is the mean of the samples in `KNOWN_S`. The bias drifts between rests. Therefore
-a scalar Kalman filter models it as a random walk, and a rest has more weight if the previous rest
-was long ago.
+The first estimate is the mean of the samples in `LEARNING_TIME_S`. The bias drifts between rests.
+Therefore a scalar Kalman filter models it as a random walk, and a rest has more weight if the
+previous rest was long ago.
 """
 
 from __future__ import annotations
 
 import math
 
-KNOWN_S = 0.5
+LEARNING_TIME_S = 0.5
 """Time at rest after which the bias is known, s."""
 
 MAX_BIAS = 0.2
 """Largest plausible bias, rad/s. A higher rate at rest means that a person turns the robot."""
 
-WALK = 1e-4
+BIAS_RANDOM_WALK = 1e-4
 """Random walk of a cheap gyro's bias with temperature, rad/s per square root of a second."""
 
-UNLIKELY = 5.0
+MAX_DEVIATIONS = 5.0
 """Number of standard deviations. A sample at rest counts as noise if it differs from the bias by at
-most this number of standard deviations plus `SLACK`. A sample that differs by more contradicts the
-bias."""
+most this number of standard deviations plus `DEVIATION_MARGIN`. A sample that differs by more
+contradicts the bias."""
 
-SLACK = 0.01
-"""Difference of a sample from the bias, rad/s, that is allowed in addition to `UNLIKELY` standard
-deviations, because a robot that stands still may vibrate."""
+DEVIATION_MARGIN = 0.01
+"""Difference of a sample from the bias, rad/s, that is allowed in addition to `MAX_DEVIATIONS`
+standard deviations, because a robot that stands still may vibrate."""
 
-LEAST_NOISE = 1e-5
+MIN_NOISE = 1e-5
 """Smallest assumed standard deviation of a sample, rad/s. A coarse gyro may repeat one value, so
 its measured standard deviation may be 0."""
 
-ANEW_S = 1.0
+NEW_BIAS_TIME_S = 1.0
 """Time for which the reading at rest must stay constant before it becomes the new bias, s, if it
 differs from the known bias. The gyro may have restarted or warmed up, or the robot may have turned
 while the first bias was learned."""
 
-LEARNING = 0.02
+NOISE_GAIN = 0.02
 """Weight of a new sample in the estimate of the noise. About the last fifty samples count."""
 
 
@@ -57,11 +57,11 @@ class Bias:
     @property
     def known(self) -> bool:
         """Whether the robot has stood still long enough to determine the bias."""
-        return self._rested_s >= KNOWN_S
+        return self._rested_s >= LEARNING_TIME_S
 
     def drift(self, dt: float) -> None:
         """Increase the variance of the bias by the drift that may occur in `dt` s."""
-        self.variance += WALK * WALK * dt
+        self.variance += BIAS_RANDOM_WALK * BIAS_RANDOM_WALK * dt
 
     def rest(self, rate: float, variance: float, dt: float) -> bool:
         """Update the bias with a sample that was measured while the wheels stood still.
@@ -74,15 +74,15 @@ class Bias:
             return self._average(rate, variance, dt)
         self._rested_s += dt
         error = rate - self.value
-        noise = max(self.noise, variance, LEAST_NOISE**2)
-        if abs(error) > UNLIKELY * math.sqrt(noise + self.variance) + SLACK:
+        noise = max(self.noise, variance, MIN_NOISE**2)
+        if abs(error) > MAX_DEVIATIONS * math.sqrt(noise + self.variance) + DEVIATION_MARGIN:
             return self._doubt(rate, variance, dt, noise)
         self._other = None
         gain = self.variance / (self.variance + noise)
         self.value += gain * error
         self.variance *= 1.0 - gain
         # The part of the error by which the bias was corrected is not noise.
-        self.noise += LEARNING * ((1.0 - gain) * error * error - self.noise)
+        self.noise += NOISE_GAIN * ((1.0 - gain) * error * error - self.noise)
         return True
 
     def _doubt(self, rate: float, variance: float, dt: float, noise: float) -> bool:
@@ -91,10 +91,10 @@ class Bias:
         `noise` is the variance of the samples so far, rad2/s2. For the other arguments, see `rest`.
         """
         other = self._other = self._other or Bias()
-        if not other.rest(rate, variance, dt) or other._rested_s < ANEW_S:
+        if not other.rest(rate, variance, dt) or other._rested_s < NEW_BIAS_TIME_S:
             return False
         self._other = None
-        if math.sqrt(other.noise) > UNLIKELY * math.sqrt(noise) + SLACK:
+        if math.sqrt(other.noise) > MAX_DEVIATIONS * math.sqrt(noise) + DEVIATION_MARGIN:
             return False
         self.value, self.variance, self.noise = other.value, other.variance, other.noise
         return True
@@ -109,5 +109,5 @@ class Bias:
         self.value += error / self._samples
         self.noise += (error * (rate - self.value) - self.noise) / self._samples
         if self.known:
-            self.variance = max(self.noise, variance, LEAST_NOISE**2) / self._samples
+            self.variance = max(self.noise, variance, MIN_NOISE**2) / self._samples
         return True

@@ -24,14 +24,14 @@ BLOCK_S = 0.1
 """Duration of a block, over which the turn rates are averaged, s. A single feedback line has too
 few encoder counts for a precise rate."""
 
-LEAST_RATE = 0.05
+MIN_TURN_RATE = 0.05
 """Smallest turn rate according to the wheels, rad/s, at which the robot counts as turning."""
 
-LEAST_CHANGE = 0.3
+MIN_RATE_CHANGE = 0.3
 """Smallest change of the turn rate, rad/s2, from which the delay of the gyro is learned. If the
 gyro's rate changes more slowly, the change of the wheels' rate counts as 0."""
 
-MEMORY = 0.995
+FORGETTING_FACTOR = 0.995
 """Factor by which the weight of all earlier blocks is multiplied in each block of turning, so that
 the fit remembers 200 blocks (20 s of turning)."""
 
@@ -40,46 +40,46 @@ ROUGH, FINE = 0.5, 0.1
 that is assumed before any data. `FINE` is the smallest value that is assumed, because floor and
 turn rate change the ratio."""
 
-STRETCH = 1.0
+STRETCH_ANGLE = 1.0
 """Size of a stretch, which is a turn of the robot to the left or to the right, rad. Each stretch
 yields one measurement of the error of the ratio (gyro's turn divided by wheels' turn). The delay of
 the gyro hardly matters over such a turn."""
 
 KEPT, PRIOR = 0.9, 0.1
 """`KEPT` is the factor by which the weight of the earlier stretches is multiplied in each new
-stretch (a turn of `STRETCH`). `PRIOR` is the initial weight of `ROUGH`, as a number of
+stretch (a turn of `STRETCH_ANGLE`). `PRIOR` is the initial weight of `ROUGH`, as a number of
 stretches."""
 
-DELAY_S = 0.2
+PRIOR_DELAY_STD_S = 0.2
 """Standard deviation of the gyro's delay before any data, s."""
 
-NO_DELAY = 0.0, 0.0, 1.0 / DELAY_S**2
+INITIAL_DELAY_SUMS = 0.0, 0.0, 1.0 / PRIOR_DELAY_STD_S**2
 """Initial values of the three least-squares sums from which the delay is computed."""
 
 BEFORE, BEHIND = 2, 3
 """Numbers of blocks. If the wheels' rate changes in a block, the gyro may show that change up to
 `BEFORE` blocks earlier and up to `BEHIND` blocks later. This covers every delay in
-`gyro.DELAYS_NS`."""
+`gyro.DELAY_RANGE_NS`."""
 
 BLOCK_NOISE, BLOCK_SHARE = 0.01, 0.03
 """The standard deviation of a block's mean rate is `BLOCK_NOISE` rad/s plus `BLOCK_SHARE` times the
 rate."""
 
-LAG_S = 0.05
+ASSUMED_DELAY_STD_S = 0.05
 """Standard deviation of the gyro's delay that `contradiction` assumes before the delay is known,
 s."""
 
-CERTAIN_S = 0.004
+MAX_DELAY_STD_S = 0.004
 """`Match.delay` returns a delay only if its standard deviation is below this, s."""
 
 WINDOW_S = 0.2
 """Time over which the turns of gyro and wheels are compared to find a contradiction, s."""
 
-LEAST_SLIP = 0.015
+WINDOW_STD = 0.015
 """Standard deviation, rad, of the difference between the turns of gyro and wheels over `WINDOW_S`
 without slip. Encoder counts and vibration cause it."""
 
-CERTAIN = 3.0
+MAX_DEVIATIONS = 3.0
 """If the turns of gyro and wheels over `WINDOW_S` differ by more than this number of standard
 deviations, gyro and wheels contradict each other."""
 
@@ -106,17 +106,20 @@ class Match:
         self._ww, self._wg = 1.0 / ROUGH**2, 1.0 / ROUGH**2
         """Sums of the least-squares fit. Their initial values stand for the ratio 1 with the
         standard deviation `ROUGH`."""
-        self._wd, self._dg, self._dd = NO_DELAY
+        self._wd, self._dg, self._dd = INITIAL_DELAY_SUMS
         self._off = self._way = 0.0
-        """Sums over the present stretch (a turn of `STRETCH`), rad. `_way` is the turn of the
+        """Sums over the present stretch (a turn of `STRETCH_ANGLE`), rad. `_way` is the turn of the
         wheels. `_off` is the gyro's turn minus the turn that the fit predicts for the gyro."""
-        self._ways = PRIOR * STRETCH**2
+        self._ways = PRIOR * STRETCH_ANGLE**2
         """Weighted sum of `_way` squared over the completed stretches, rad2."""
         self._offs = ROUGH**2 * self._ways
         """Weighted sum of `_off` squared over the completed stretches, rad2."""
-        self._lag = LAG_S
+        self._lag = ASSUMED_DELAY_STD_S
         self.blocks = 0.0
-        """Number of blocks in which the robot turned. Older blocks count less (`MEMORY`)."""
+        """Number of blocks in which the robot turned.
+
+        Older blocks count less (`FORGETTING_FACTOR`).
+        """
         self._solve()
         self._wheels = self._gyro = self._time = 0.0
         self._rate = self._began = 0.0
@@ -130,7 +133,7 @@ class Match:
     def spread(self) -> float:
         """Standard deviation of the ratio of the gyro's turn to the wheels' turn.
 
-        It is measured from the errors of the fit over turns of about `STRETCH` rad each.
+        It is measured from the errors of the fit over turns of about `STRETCH_ANGLE` rad each.
         """
         return math.sqrt(self._offs / self._ways)
 
@@ -142,11 +145,11 @@ class Match:
         """
         ratio, slope = self.ratio, self._slope
         spread = self._dd - self._wd * self._wd / self._ww
-        if ratio < ROUGH / 2 or spread * (CERTAIN_S * ratio) ** 2 < 1.0:
+        if ratio < ROUGH / 2 or spread * (MAX_DELAY_STD_S * ratio) ** 2 < 1.0:
             return None
         self._blocks.clear()
-        self._wd, self._dg, self._dd = NO_DELAY
-        self._lag = CERTAIN_S
+        self._wd, self._dg, self._dd = INITIAL_DELAY_SUMS
+        self._lag = MAX_DELAY_STD_S
         self._solve()
         return -slope / ratio
 
@@ -182,8 +185,8 @@ class Match:
             return False
         first, last = self._window[0], self._window[-1]
         lag = self._lag * self.ratio * (last[0] / last[2] - first[0] / first[2])
-        uncertain = (self.deviation * wheels) ** 2 + lag * lag + variance + LEAST_SLIP**2
-        return (gyro - self.ratio * wheels) ** 2 > CERTAIN**2 * uncertain
+        uncertain = (self.deviation * wheels) ** 2 + lag * lag + variance + WINDOW_STD**2
+        return (gyro - self.ratio * wheels) ** 2 > MAX_DEVIATIONS**2 * uncertain
 
     def _slide(self, wheels: float, gyro: float, dt: float) -> None:
         window, sums = self._window, self._sums
@@ -205,24 +208,24 @@ class Match:
         block = self._blocks[BEFORE]
         wheels, gyro, change = block.wheels / block.time, block.gyro / block.time, block.change
         rates = [one.gyro / one.time for one in self._blocks]
-        if max(rates) - min(rates) < LEAST_CHANGE * BLOCK_S:
+        if max(rates) - min(rates) < MIN_RATE_CHANGE * BLOCK_S:
             change = 0.0
-        if block.slips or (abs(wheels) < LEAST_RATE and abs(change) < LEAST_CHANGE):
+        if block.slips or (abs(wheels) < MIN_TURN_RATE and abs(change) < MIN_RATE_CHANGE):
             return
         weight = 1.0 / (BLOCK_NOISE + BLOCK_SHARE * abs(wheels)) ** 2
         self._way += block.wheels
         self._off += (gyro - self.ratio * wheels - self._slope * change) * block.time
-        if abs(self._way) >= STRETCH:
+        if abs(self._way) >= STRETCH_ANGLE:
             self._offs = KEPT * self._offs + self._off * self._off
             self._ways = KEPT * self._ways + self._way * self._way
             self._off = self._way = 0.0
-        self._ww = MEMORY * self._ww + weight * wheels * wheels
-        self._wg = MEMORY * self._wg + weight * wheels * gyro
-        self._wd = MEMORY * self._wd + weight * wheels * change
-        self._dd = MEMORY * self._dd + weight * change * change
-        self._dg = MEMORY * self._dg + weight * change * gyro
-        if abs(wheels) >= LEAST_RATE:
-            self.blocks = MEMORY * self.blocks + 1.0
+        self._ww = FORGETTING_FACTOR * self._ww + weight * wheels * wheels
+        self._wg = FORGETTING_FACTOR * self._wg + weight * wheels * gyro
+        self._wd = FORGETTING_FACTOR * self._wd + weight * wheels * change
+        self._dd = FORGETTING_FACTOR * self._dd + weight * change * change
+        self._dg = FORGETTING_FACTOR * self._dg + weight * change * gyro
+        if abs(wheels) >= MIN_TURN_RATE:
+            self.blocks = FORGETTING_FACTOR * self.blocks + 1.0
         self._solve()
 
     def _solve(self) -> None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-LEAST_RATE = 0.1
+MIN_TURN_RATE = 0.1
 """Smallest turn rate according to the wheels, rad/s, at which a feedback line in the opposite
 direction begins a new turn. A lower rate may come from a single encoder count. It is also the
 smallest rate at which a gyro that reads zero is called dead, because wheels with unequal tires
@@ -20,7 +20,7 @@ SLOWEST, STRETCH_S = 0.05, 0.5
 """`SLOWEST` is the smallest mean turn rate according to the wheels that counts as a turn, rad/s.
 `STRETCH_S` is the duration of the intervals over which the mean is taken, s."""
 
-PROPORTIONS = (0.25, 2.5)
+TURN_RATIO_RANGE = (0.25, 2.5)
 """Range of the ratio of the robot's true turn to its turn according to the wheels. On any floor,
 the ratio is within this range."""
 
@@ -29,11 +29,11 @@ PROVED, REFUTED = 0.1, 0.4
 gyro is good, and a turn of `REFUTED` can show that it is not. The second one is larger, because the
 gyro may be late."""
 
-REFUTED_S = 0.3
+MIN_REFUTING_TURN_S = 0.3
 """Shortest time for which the robot must turn before the gyro can be refuted, s. No gyro has a
 delay as long as this."""
 
-DEGREES = (15.0, 150.0)
+DEGREES_RATIO_RANGE = (15.0, 150.0)
 """Range of the ratio of the gyro's turn to the wheels' turn if the gyro reads degrees. Without slip
 and errors, the ratio is 57."""
 
@@ -54,7 +54,7 @@ class Trial:
         duration, s; and the turn according to the gyro, rad."""
         self._fast = self._fast_gyro = 0.0
         """Turns according to wheels and gyro, rad, over all intervals in which the mean turn rate
-        was at least `LEAST_RATE`."""
+        was at least `MIN_TURN_RATE`."""
 
     @property
     def open(self) -> bool:
@@ -74,11 +74,11 @@ class Trial:
         if self._stretch_s >= STRETCH_S:
             if abs(self._stretch) < SLOWEST * self._stretch_s:
                 self._begin()
-            if abs(self._stretch) >= LEAST_RATE * self._stretch_s:
+            if abs(self._stretch) >= MIN_TURN_RATE * self._stretch_s:
                 self._fast += self._stretch
                 self._fast_gyro += self._stretch_gyro
             self._stretch = self._stretch_s = self._stretch_gyro = 0.0
-        if wheels * self._wheels < 0.0 and abs(wheels) >= LEAST_RATE * dt:
+        if wheels * self._wheels < 0.0 and abs(wheels) >= MIN_TURN_RATE * dt:
             # At the start of a turn to the other side, a late gyro still reports the previous turn.
             self._begin()
             return
@@ -99,23 +99,23 @@ class Trial:
     def _says_nothing(self) -> bool:
         """Return whether the gyro reads about zero although the wheels report a fast turn."""
         fast, gyro = self._fast, self._fast_gyro
-        if abs(self._stretch) >= LEAST_RATE * self._stretch_s:
+        if abs(self._stretch) >= MIN_TURN_RATE * self._stretch_s:
             fast, gyro = fast + self._stretch, gyro + self._stretch_gyro
-        return abs(fast) >= REFUTED and abs(gyro) < PROPORTIONS[0] * abs(fast)
+        return abs(fast) >= REFUTED and abs(gyro) < TURN_RATIO_RANGE[0] * abs(fast)
 
     def _verdict(self, ratio: float) -> Verdict:
-        least, most = PROPORTIONS
+        least, most = TURN_RATIO_RANGE
         if abs(self._wheels) >= PROVED and least <= ratio <= most:
             return "good"
-        if abs(self._wheels) < REFUTED or self._seconds < REFUTED_S:
+        if abs(self._wheels) < REFUTED or self._seconds < MIN_REFUTING_TURN_S:
             return "none yet"
         return _named(ratio)
 
 
 def _named(ratio: float) -> Verdict:
     """Return the fault of a gyro. `ratio` is the gyro's turn divided by the wheels' turn."""
-    least, most = PROPORTIONS
-    if DEGREES[0] <= abs(ratio) <= DEGREES[1]:
+    least, most = TURN_RATIO_RANGE
+    if DEGREES_RATIO_RANGE[0] <= abs(ratio) <= DEGREES_RATIO_RANGE[1]:
         return "in degrees"
     if -most <= ratio <= -least:
         return "reversed"

@@ -13,7 +13,7 @@ from msgspec import Struct
 
 from acsard.core.values import Event, GyroStatus, Level, TrackUse
 
-LEAST = 0.05
+MIN_TRACK_STD = 0.05
 """Smallest relative standard deviation of a learned track. Floor and turn rate may change, so the
 track is never more certain. The value is half of `gyro_match.FINE`, because the mean error over a
 whole drive is smaller than the error at one moment."""
@@ -22,17 +22,17 @@ CERTAIN, UNCERTAIN = 0.1, 0.2
 """Limits of the learned track's relative standard deviation. An uncertain track becomes certain
 below `CERTAIN`, and a certain track becomes uncertain above `UNCERTAIN`."""
 
-BOUNDS = (0.5, 2.5)
+TRACK_RATIO_RANGE = (0.5, 2.5)
 """Range of the ratio of the learned track to the configured track. Outside this range, the learned
 track is not used. The effective track is 1.4 to 1.9 times the wheel separation on most floors, and
 2.5 times on slippery ones."""
 
-INWARDS = 1.05
-"""Factor that narrows `BOUNDS` for a learned track that is not in use: such a track comes into use
-only above the lower bound times this factor and below the upper bound divided by this factor.
-Without this margin, a track near a bound could alternate between use and non-use."""
+RANGE_HYSTERESIS = 1.05
+"""Factor that narrows `TRACK_RATIO_RANGE` for a learned track that is not in use: such a track
+comes into use only above the lower bound times this factor and below the upper bound divided by
+this factor. Without this margin, a track near a bound could alternate between use and non-use."""
 
-NOTES: dict[TrackUse, str] = {
+STATUS_TEXTS: dict[TrackUse, str] = {
     "shown": "(only reported)",
     "uncertain": "(uncertain)",
     "too far off": "(implausible)",
@@ -86,8 +86,8 @@ def _use(learned: Track | None, before: TrackUse) -> TrackUse:
     most = CERTAIN if before == "uncertain" else UNCERTAIN
     if learned is None or learned.deviation > most:
         return "uncertain"
-    inwards = 1.0 if before == "used" else INWARDS
-    within = BOUNDS[0] * inwards <= learned.share <= BOUNDS[1] / inwards
+    inwards = 1.0 if before == "used" else RANGE_HYSTERESIS
+    within = TRACK_RATIO_RANGE[0] * inwards <= learned.share <= TRACK_RATIO_RANGE[1] / inwards
     return "used" if within else "too far off"
 
 
@@ -100,7 +100,7 @@ def beside(learned: Track, multiplier: float, use: TrackUse) -> str:
     value = learned.share * multiplier
     configured = "" if use == "used" else " (in use)"
     return (
-        f"learned {value:.3f} ± {value * learned.deviation:.3f} {NOTES[use]}, "
+        f"learned {value:.3f} ± {value * learned.deviation:.3f} {STATUS_TEXTS[use]}, "
         f"configured {multiplier:.3f}{configured}"
     )
 

@@ -5,7 +5,8 @@ time, and only `activate` releases the latch of a `deactivate`. Neither request 
 or a `deactivate` that its sender has not seen, even if the network delivers the request late:
 
 - A request that names a number releases the latch with exactly this number.
-- A request without a number is refused if less than `LOOK_FIRST_S` has passed since the last stop
+- A request without a number is refused if less than `LATCH_REQUIRED_S` has passed since the
+last stop
   or `deactivate`, or since the start of the daemon. A `clear` may release a fault that its sender
   has not seen, because a fault that persists latches again.
 - A request that arrived before the latch was set never releases it.
@@ -25,10 +26,10 @@ from functools import lru_cache
 
 from msgspec.structs import replace
 
-from acsard.core.motion.modes import GOING_DOWN, Mode, RefusedError, mode_of, require_allowed
+from acsard.core.motion.modes import SHUTDOWN_REASON, Mode, RefusedError, mode_of, require_allowed
 from acsard.core.values import NS_PER_S, Instant, Latch, Latches
 
-LOOK_FIRST_S = 2.0
+LATCH_REQUIRED_S = 2.0
 """Time after a stop, a `deactivate` or the start of the daemon in which a call `clear` or
 `activate` must name the number of the latch, s. A `clear` that can only release a fault need not
 name it. The network seldom takes longer to deliver a packet."""
@@ -162,7 +163,7 @@ class Lifecycle:
             self._stop_asked_ns = max(self._stop_asked_ns, asked_ns)
             self._latch(stop=self._stop(now, by, why))
         if self._shutting_down:
-            return f"stopped and latched; {GOING_DOWN}"
+            return f"stopped and latched; {SHUTDOWN_REASON}"
         if self.latches.fault is not None:
             return (
                 "stopped and latched; call srv/clear twice: the first call releases the fault, the "
@@ -329,10 +330,10 @@ class Lifecycle:
         stop = self.latches.stop
         if stop is None:
             return
-        if asked_ns - self._cleared_ns < LOOK_FIRST_S * NS_PER_S:
+        if asked_ns - self._cleared_ns < LATCH_REQUIRED_S * NS_PER_S:
             # The network may have delivered one call twice.
             raise RefusedError(
-                f"a latch was cleared less than {LOOK_FIRST_S:g} s ago; the robot is still "
+                f"a latch was cleared less than {LATCH_REQUIRED_S:g} s ago; the robot is still "
                 f"{_still(stop)}: look at the robot, then call srv/clear again"
             )
         self._require_seen(stop, self._stopped_ns, asked_ns, "srv/clear")
@@ -349,7 +350,7 @@ class Lifecycle:
         """
         began_ns = LONG_AGO_NS if self._began_ns is None else self._began_ns
         since = asked_ns - max(set_ns, began_ns)
-        if since >= LOOK_FIRST_S * NS_PER_S:
+        if since >= LATCH_REQUIRED_S * NS_PER_S:
             return
         age_s = max(0.1, math.floor(since / NS_PER_S * 10) / 10)
         came = f"the robot was {_stopped(latch)} {age_s:.1f} s ago"
@@ -358,7 +359,7 @@ class Lifecycle:
             # restarted and the wall clock may have been set since.
             came = f"the daemon started {age_s:.1f} s ago and the robot is still {_still(latch)}"
         raise RefusedError(
-            f"{came}: look at the robot, then call {call} again when {LOOK_FIRST_S:g} s have "
+            f"{came}: look at the robot, then call {call} again when {LATCH_REQUIRED_S:g} s have "
             "passed since then, or name the number of the latch that you have seen"
         )
 

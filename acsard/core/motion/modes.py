@@ -65,12 +65,12 @@ def mode_of(
     return Mode.DRIVING if commanded else Mode.READY
 
 
-GOING_DOWN = "the daemon is going down"
+SHUTDOWN_REASON = "the daemon is going down"
 
 REFUSALS: dict[tuple[Mode, Verb], str] = {
-    (Mode.SHUTDOWN, "clear"): GOING_DOWN,
-    (Mode.SHUTDOWN, "activate"): GOING_DOWN,
-    (Mode.SHUTDOWN, "deactivate"): GOING_DOWN,
+    (Mode.SHUTDOWN, "clear"): SHUTDOWN_REASON,
+    (Mode.SHUTDOWN, "activate"): SHUTDOWN_REASON,
+    (Mode.SHUTDOWN, "deactivate"): SHUTDOWN_REASON,
     (Mode.FAULT, "activate"): "the robot is in fault: call srv/clear first",
     (Mode.FAULT, "deactivate"): "the robot is in fault and cannot move: call srv/clear first",
     (Mode.STOPPED, "activate"): "the robot is stopped: call srv/clear first",

@@ -7,15 +7,15 @@ of any shared identity of the source follows for `commands.neutral_pause`.
 
 A sender is live while its last accepted command is not older than the timeout of its source. A
 sender is present while it takes part in the choice of the arbiter: while it is live, and after a
-stall of the daemon or doubtful stamps for at most `PLACE_NS` after its last accepted command.
+stall of the daemon or doubtful stamps for at most `CANDIDATE_NS` after its last accepted command.
 Without this extra time, a sender that holds the robot still would lose the robot to a sender of
 speeds.
 """
 
 from __future__ import annotations
 
-from acsard.core.motion.emergency_stop import EXCUSE_NS
-from acsard.core.motion.freshness import LONGEST_PROOF_NS, Verdict
+from acsard.core.motion.emergency_stop import CATCH_UP_NS
+from acsard.core.motion.freshness import MAX_PROOF_NS, Verdict
 from acsard.core.values import REST, Command
 
 # Programs without a sender id and without a GID may share an identity. These rules apply to them:
@@ -29,7 +29,7 @@ from acsard.core.values import REST, Command
 #   depends on the Zenoh session that stamps its commands. Therefore a speed of one shared identity
 #   cancels the zeros of all shared identities of the source.
 
-PLACE_NS = 2 * LONGEST_PROOF_NS
+CANDIDATE_NS = 2 * MAX_PROOF_NS
 """Longest time after its last accepted command for which a sender takes part in the choice of the
 arbiter, ns. It is also the longest time for which an unarmed sender keeps control of the robot
 after its clock was set. A proof of the clock (see `freshness.py`) ends within this time, even if
@@ -103,14 +103,15 @@ class Sender:
     def present(self, now_ns: int) -> bool:
         """Return whether the sender takes part in the choice of the arbiter at the time `now_ns`.
 
-        A live sender takes part. For at most `PLACE_NS` after its last accepted command, a sender
-        also takes part in two other cases: while it goes on sending commands with doubtful stamps,
-        without a silence longer than the timeout, and for one timeout after a stall of the daemon.
+        A live sender takes part. For at most `CANDIDATE_NS` after its last accepted command, a
+        sender also takes part in two other cases: while it goes on sending commands with doubtful
+        stamps, without a silence longer than the timeout, and for one timeout after a stall of the
+        daemon.
         """
         arrived_ns, timeout_ns = self.arrived_ns, self._timeout_ns
         return arrived_ns is not None and (
             now_ns - arrived_ns <= timeout_ns
-            or (now_ns - self._present_ns <= timeout_ns and now_ns - arrived_ns <= PLACE_NS)
+            or (now_ns - self._present_ns <= timeout_ns and now_ns - arrived_ns <= CANDIDATE_NS)
         )
 
     def rank(self, now_ns: int) -> tuple[bool, int]:
@@ -161,10 +162,10 @@ class Sender:
         """Return whether the sender may keep control of the robot if it already has control.
 
         It may if it is present (`present`), and if one of these conditions holds: it is armed,
-        `disarm` disarmed it at most `PLACE_NS` ago, or `commands.neutral_pause` runs after its
+        `disarm` disarmed it at most `CANDIDATE_NS` ago, or `commands.neutral_pause` runs after its
         zero.
         """
-        just_set = self.disarmed_ns is not None and now_ns - self.disarmed_ns <= PLACE_NS
+        just_set = self.disarmed_ns is not None and now_ns - self.disarmed_ns <= CANDIDATE_NS
         waits = just_set or self._zero_ns is not None
         return self.present(now_ns) and (waits or self.armed(now_ns))
 
@@ -176,15 +177,15 @@ class Sender:
         """Continue after the daemon stood still from `before_ns` to `now_ns` (monotonic times, ns).
 
         The bus may deliver the commands of that time only after this step. Therefore the sender
-        stays present for one timeout more, but at most until `PLACE_NS` after its last accepted
+        stays present for one timeout more, but at most until `CANDIDATE_NS` after its last accepted
         command. A running `commands.neutral_pause` does not advance during the stall, and lasts for
-        at least `EXCUSE_NS` after it.
+        at least `CATCH_UP_NS` after it.
         """
         if self.present(before_ns):
             self._present_ns = now_ns
         self._settle(before_ns)
         if not self._armed and self._zero_ns is not None:
-            rest_ns = max(self._zero_ns + self._pause_ns - before_ns, EXCUSE_NS)
+            rest_ns = max(self._zero_ns + self._pause_ns - before_ns, CATCH_UP_NS)
             proven = self._proven_zero_ns is not None
             self._zero_ns = now_ns + rest_ns - self._pause_ns
             self._proven_zero_ns = self._zero_ns if proven else None

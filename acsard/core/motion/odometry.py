@@ -27,7 +27,7 @@ from acsard.core.link.feedback import Feedback
 from acsard.core.motion.consistency import ConsistencyChecks
 from acsard.core.motion.error_model import ErrorModel, TwistUncertainty
 from acsard.core.motion.gap_filling import (
-    NOWHERE,
+    AT_REST,
     Confirmation,
     Gaps,
     Rolled,
@@ -38,7 +38,7 @@ from acsard.core.motion.gyro import REST_S, Turn
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.learned_track import CONFIGURED, Track
 from acsard.core.motion.path import Path
-from acsard.core.motion.uncertainty import COARSE_COUNTS, PoseUncertainty
+from acsard.core.motion.uncertainty import ASSUMED_COUNTS, PoseUncertainty
 from acsard.core.values import (
     REST,
     STILL,
@@ -49,7 +49,7 @@ from acsard.core.values import (
     WheelSpeeds,
 )
 
-TAKEN_BACK = 128
+MAX_RECOMPUTED_LINES = 128
 """Largest number of feedback lines that are recomputed when a wheel proves faulty."""
 
 
@@ -92,13 +92,13 @@ class Odometry:
         `quiet` is the time without feedback after which the daemon commands rest, s.
         """
         self._kinematics, self._track = kinematics, CONFIGURED
-        self._positions = NOWHERE
+        self._positions = AT_REST
         self._rolling = Rolling(quiet)
         self._confirmation = Confirmation(feedback)
-        self._held = NOWHERE
+        self._held = AT_REST
         """Angles that the wheels have rolled at rest, rad. The odometry adds these angles to the
         pose when they exceed two encoder counts (`_unsettled`) or when the robot drives."""
-        self._steps_of, self._coarsest = NOWHERE, 0.0
+        self._steps_of, self._coarsest = AT_REST, 0.0
         """`_steps_of` contains the quantization step of each wheel's speed in the last line, rad/s.
         `_coarsest` is the largest known step of these, rad/s."""
         self._path = Path()
@@ -107,8 +107,8 @@ class Odometry:
         self._twist_uncertainty = TwistUncertainty(self._errors, encoder_counts)
         self._gaps = Gaps()
         self.checks = ConsistencyChecks(odometry, kinematics, encoder_counts, feedback)
-        self._steps: deque[Step] = deque(maxlen=TAKEN_BACK)
-        self._unsettled = 2 * math.tau / (encoder_counts or COARSE_COUNTS)
+        self._steps: deque[Step] = deque(maxlen=MAX_RECOMPUTED_LINES)
+        self._unsettled = 2 * math.tau / (encoder_counts or ASSUMED_COUNTS)
         """Angle of two encoder counts, rad. If a wheel at rest rocks between the edges of one
         count, the reported angle is not larger than this."""
         self._still = 0.0
@@ -212,7 +212,7 @@ class Odometry:
         believed = checks.wheels.believed(speeds.as_tuple())
         linear, angular = self._kinematics.moved(believed)
         twist = Twist(linear, angular / self._track.share)
-        self._still = self._still + dt if believed == NOWHERE else 0.0
+        self._still = self._still + dt if believed == AT_REST else 0.0
         at_rest = self._still > REST_S
         if rolled.unknown > 0.0:
             self._stand(rolled.unknown, before, twist)
@@ -243,16 +243,16 @@ class Odometry:
         Small motions at rest are not returned yet. They are kept in `_held`.
         """
         turned = rolled.turned
-        if self._held != NOWHERE:
+        if self._held != AT_REST:
             turned = plus(self._held, turned)
-        if turned == NOWHERE:
+        if turned == AT_REST:
             # The wheels have turned back by the held motion.
-            self._held = NOWHERE
+            self._held = AT_REST
             return rolled.pieces
         if at_rest and max(map(abs, turned)) <= self._unsettled:
             self._held = turned
             return rolled.pieces
-        self._held = NOWHERE
+        self._held = AT_REST
         return (turned, *rolled.pieces)
 
     def _take_back(self) -> None:

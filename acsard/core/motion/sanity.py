@@ -20,26 +20,26 @@ from acsard.core.link.codec import Motors
 from acsard.core.link.feedback import Feedback
 from acsard.core.values import WHEELS, Event, WheelSpeeds
 
-REPEATED = 3
+FAULT_LINES = 3
 """Number of impossible feedback lines in a row that latch a fault: 30 ms at 100 Hz."""
 
-WINDOW = 1000
+WINDOW_LINES = 1000
 """Number of feedback lines in a window (10 s at 100 Hz). The daemon counts the impossible lines of
 each window."""
 
-SHARE = 0.01
+WARNING_FRACTION = 0.01
 """If more than this fraction of the feedback lines in a window is impossible, one warning is
 logged."""
 
-SLACK = 2.0
+SPEED_MARGIN = 2.0
 """Change of a wheel speed that is allowed in addition to `feedback.wheel_acceleration`, rad/s.
 Coarse encoders and a robot at rest can cause changes of this size."""
 
-STEPS = 2
+COUNT_MARGIN = 2
 """Encoder counts by which two reports of a wheel at constant speed may differ, because each report
 may be wrong by one count."""
 
-SHORTEST_S = 0.004
+MIN_INTERVAL_S = 0.004
 """Shortest time between two feedback lines, s. Lines follow each other this quickly while this
 computer catches up after a stall. A single encoder count in so short a time looks like a high
 speed."""
@@ -85,8 +85,8 @@ class Sanity:
 
     @property
     def doubtful(self) -> bool:
-        """Whether at least the last `REPEATED` lines were impossible. This latches a fault."""
-        return self._impossible >= REPEATED
+        """Whether at least the last `FAULT_LINES` lines were impossible. This latches a fault."""
+        return self._impossible >= FAULT_LINES
 
     def impossible(self, feedback: Feedback) -> str:
         """Return why no wheel can have the speeds in this line; "" if the line is possible.
@@ -114,7 +114,7 @@ class Sanity:
                 why = self._jump(feedback, last, most)
                 if why:
                     agrees = not self._trusted and self._agrees(feedback, longest)
-                    self._rejected = [*self._rejected[1 - REPEATED :], (speeds, self._since)]
+                    self._rejected = [*self._rejected[1 - FAULT_LINES :], (speeds, self._since)]
                     why = "" if agrees else why
         self._count(why)
         if why:
@@ -136,7 +136,7 @@ class Sanity:
         # Each speed is a mean over the time that its line covers. Therefore the change may have
         # lasted from the middle of one such time to the middle of the next.
         mean = (since + longest) / 2
-        return self._settings.wheel_acceleration * (mean if mean > since else since) + SLACK
+        return self._settings.wheel_acceleration * (mean if mean > since else since) + SPEED_MARGIN
 
     def _agrees(self, line: Feedback, longest: float) -> bool:
         """Return whether a feedback line agrees with one of the impossible lines in `_rejected`.
@@ -157,9 +157,9 @@ class Sanity:
         self.warning = None
         if why:
             self._dropped += 1
-            if self._dropped == int(SHARE * WINDOW) + 1:
+            if self._dropped == int(WARNING_FRACTION * WINDOW_LINES) + 1:
                 self.warning = Event("lines_implausible", self._words(why), "warning")
-        if self._lines == WINDOW:
+        if self._lines == WINDOW_LINES:
             self._lines = self._dropped = 0
 
     def _words(self, why: str) -> str:
@@ -194,10 +194,10 @@ class Sanity:
 
         The allowed difference is `most`, rad/s, plus the quantization of the speeds.
         """
-        least = line.count / SHORTEST_S if _proven(line) is not None else 0.0
+        least = line.count / MIN_INTERVAL_S if _proven(line) is not None else 0.0
         rows = zip(WHEELS, line.speeds.as_tuple(), before.as_tuple(), line.steps, strict=True)
         for name, now, then, step in rows:
-            if abs(now - then) > most + STEPS * max(step, least):
+            if abs(now - then) > most + COUNT_MARGIN * max(step, least):
                 leap = f"{name} jumps from {then:.2f} to {now:.2f} rad/s"
                 return f"{leap}, which is over feedback.wheel_acceleration"
         return ""

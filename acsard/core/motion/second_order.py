@@ -54,7 +54,7 @@ MAX_HEADING_VARIANCE = 1.0
 larger variance, the series does not converge, and a stretch of the path adds nothing to the
 terms."""
 
-NOTHING = PoseCovariance(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+NO_TERMS = PoseCovariance(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 class SecondOrder:
@@ -109,7 +109,7 @@ class SecondOrder:
         for x, y, yaw in j:
             xyaw, yyaw, yawyaw = xyaw + x * yaw, yyaw + y * yaw, yawyaw + yaw * yaw
         if yawyaw > MAX_HEADING_VARIANCE:
-            return NOTHING
+            return NO_TERMS
         of_noise = bracket_covariance(p, q)
         self._noise = plus(self._noise, (of_noise[0] / 4, of_noise[1] / 4, of_noise[2] / 4))
         for i, (column, new) in enumerate(zip(j, w, strict=True)):

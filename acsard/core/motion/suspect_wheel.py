@@ -30,16 +30,16 @@ FOLLOWED_COUNTS, FOLLOWED_ANGLE = 2.5, 0.01
 would have rolled a clearly different angle. The difference must be at least `FOLLOWED_COUNTS`
 encoder counts plus `FOLLOWED_ANGLE` rad."""
 
-LEAVES = 0.05
+MIN_COMMAND_CHANGE = 0.05
 """Smallest change of the command, rad/s, after which a healthy wheel must report a different
 speed."""
 
-VOTE = 1 / 3
+MIN_DISTANCE_FRACTION = 1 / 3
 """A reference (a gyro or the command) decides which of two wheels is faulty only if it is clearly
 nearer to one wheel. Its distances from the two wheels must differ by at least this fraction of the
 difference between the wheels."""
 
-HAND_S = 0.3
+STUCK_TIME_S = 0.3
 """Time for which a wheel must repeat one speed before it is called stuck, s, if neither a command
 nor a gyro shows which wheel is right. A person cannot turn a wheel so evenly by hand."""
 
@@ -48,14 +48,14 @@ DEAD, REVERSED = 0.1, 0.3
 at most the fraction `DEAD`. It is reversed if it rolled in the opposite direction, and if the
 magnitudes of the two angles differ by at most the fraction `REVERSED`."""
 
-STUCK = 0.3
+MIN_STUCK_FRACTION = 0.3
 """Smallest difference between the two wheels of a side at which one wheel can be called stuck, as a
 fraction of the faster wheel's angle. If the difference is smaller, the wheel with the constant
 speed may be healthy while the other wheel slips."""
 
 WheelFault = Literal["dead", "reversed", "stuck"]
 
-WORDS: dict[WheelFault, str] = {
+FAULT_TEXTS: dict[WheelFault, str] = {
     "dead": "reports no motion while the other wheel on its side turns",
     "reversed": "reports a direction opposite to that of the other wheel on its side",
     "stuck": "reports a speed that never changes",
@@ -185,18 +185,18 @@ class Suspect:
         enough = FAULT_COUNTS * count + FAULT_ANGLE
         if self._lines < FAULT_LINES or self._seconds < FAULT_S or abs(self._apart) < enough:
             return False
-        if self._gyro.apart >= enough and abs(self._gyro.vote) >= VOTE:
+        if self._gyro.apart >= enough and abs(self._gyro.vote) >= MIN_DISTANCE_FRACTION:
             return self._gyro.vote > 0.0 and self._plain(self._gyro)
         if self._command.apart >= enough:
-            return self._command.vote >= VOTE and self._plain(self._command)
-        return self.sign == "stuck" and not self._known and self._seconds >= HAND_S
+            return self._command.vote >= MIN_DISTANCE_FRACTION and self._plain(self._command)
+        return self.sign == "stuck" and not self._known and self._seconds >= STUCK_TIME_S
 
     def _plain(self, ballot: _Ballot) -> bool:
         """Return whether the two wheels differ by more than slip of the other wheel can cause.
 
         Only the sign "stuck" needs this test. For the other signs, the result is True.
         """
-        return self.sign != "stuck" or ballot.share >= STUCK
+        return self.sign != "stuck" or ballot.share >= MIN_STUCK_FRACTION
 
 
 class Stuck:
@@ -218,10 +218,10 @@ class Stuck:
     def left_by(self, command: float) -> bool:
         """Return whether the command has changed since the wheel began to repeat its speed.
 
-        `command` is the present command for the wheel, rad/s. A change below `LEAVES` does not
-        count.
+        `command` is the present command for the wheel, rad/s. A change below `MIN_COMMAND_CHANGE`
+        does not count.
         """
-        return abs(command - self._command) >= LEAVES
+        return abs(command - self._command) >= MIN_COMMAND_CHANGE
 
     def says(self, same: bool, apart: float, dt: float, count: float, expected: Expected) -> bool:
         """Add a feedback line, and return whether the encoder of this wheel is stuck.
@@ -237,7 +237,7 @@ class Stuck:
         slow, command = expected.speed, expected.commanded
         leaves = command - self._command
         # In the first line, the NaN makes this condition true.
-        if not (same and abs(leaves) >= LEAVES):
+        if not (same and abs(leaves) >= MIN_COMMAND_CHANGE):
             self._begin(slow, command)
             return False
         self._seconds += dt

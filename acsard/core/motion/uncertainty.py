@@ -29,7 +29,7 @@ from __future__ import annotations
 
 import math
 
-from acsard.core.motion.error_model import SLIPPING, Column, ErrorModel
+from acsard.core.motion.error_model import SLIP_FACTOR, Column, ErrorModel
 from acsard.core.motion.se2 import (
     ORIGIN,
     Vector,
@@ -47,20 +47,20 @@ from acsard.core.values import PoseCovariance
 MAX_VARIANCE = 1e9
 """Largest variance of the pose, m2 or rad2. A variance of this size means that it is unknown."""
 
-COARSE_COUNTS = 400
+ASSUMED_COUNTS = 400
 """Number of encoder counts per revolution of a wheel that is assumed if this number is not
 configured. Few encoders have fewer counts."""
 
-NOWHERE = PoseCovariance(MAX_VARIANCE, 0.0, 0.0, MAX_VARIANCE, 0.0, MAX_VARIANCE)
+UNKNOWN_POSE = PoseCovariance(MAX_VARIANCE, 0.0, 0.0, MAX_VARIANCE, 0.0, MAX_VARIANCE)
 
-GYRO_SCALE = 0.004
+GYRO_SCALE_STD = 0.004
 """Relative standard deviation of the scale factor of a gyro. An error of this size changes the
 heading by 1.4 degrees in one revolution. After equal turns to the left and to the right, its
 effects cancel."""
 
 NO_EFFECT: Column = (0.0, 0.0, 0.0, 0.0)
 
-STRETCH = 0.2
+UPDATE_DISTANCE = 0.2
 """Distance that the wheels roll between two updates of the second-order terms, m."""
 
 
@@ -76,7 +76,7 @@ class PoseUncertainty:
         self._parameters = self._effects = model.columns
         self._counted = counts > 0
         self._count = 0.0
-        self._stand_within(math.tau / (counts or COARSE_COUNTS))
+        self._stand_within(math.tau / (counts or ASSUMED_COUNTS))
         self._dx = self._dy = self._rolled = 0.0
         """Motion since the last update of the second-order terms, m. `_dx` and `_dy` are the
         displacement in odom, and `_rolled` is the distance that the wheels rolled."""
@@ -127,7 +127,7 @@ class PoseUncertainty:
 
     def advance(
         self, distance: float, turn: float, dx: float, dy: float, heading: float,
-        variance: float | None = None, slips: bool = False, scale: float = GYRO_SCALE,
+        variance: float | None = None, slips: bool = False, scale: float = GYRO_SCALE_STD,
     ) -> None:  # fmt: skip
         """Update the covariance after a step, which is an arc of `distance` m through `turn` rad.
 
@@ -141,7 +141,7 @@ class PoseUncertainty:
                 wheels measured it. With a gyro, the errors of the parameters affect only the
                 distance.
             slips: whether the wheels slip. The noise of the wheels is then larger by the factor
-                `SLIPPING`.
+                `SLIP_FACTOR`.
             scale: the relative standard deviation of the gyro's scale.
         """
         if self._lost:
@@ -150,7 +150,7 @@ class PoseUncertainty:
         c, s = self._cos, self._sin = math.cos(heading), math.sin(heading)
         along, yaw, both = self._model.noise.of(distance, turn, self._beyond_play(turn))
         if slips:
-            along, yaw, both = SLIPPING * along, SLIPPING * yaw, SLIPPING * both
+            along, yaw, both = SLIP_FACTOR * along, SLIP_FACTOR * yaw, SLIP_FACTOR * both
         if variance is not None:
             yaw, both = variance, 0.0
         self._p = stepped(self._p, dx, dy, along, yaw, both, c, s)
@@ -161,7 +161,7 @@ class PoseUncertainty:
         self._dx += dx
         self._dy += dy
         self._rolled += abs(distance) + self._model.track / 2 * abs(turn)
-        if self._rolled > STRETCH:
+        if self._rolled > UPDATE_DISTANCE:
             self._end_stretch()
         self._publish()
 
@@ -214,7 +214,7 @@ class PoseUncertainty:
         Call this only if the position or the heading is already unknown.
         """
         if distance or turn:
-            self.covariance = NOWHERE
+            self.covariance = UNKNOWN_POSE
 
     def _beyond_play(self, turn: float) -> float:
         """Return the part of `turn` that leaves the heading's dead band of one count, rad."""

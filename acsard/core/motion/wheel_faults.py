@@ -5,7 +5,7 @@ other, one of them may have a faulty encoder. A wheel is faulty if it shows the 
 and an independent reference contradicts it (`suspect_wheel.py`). The pose then ignores this wheel
 and uses the other one in its place.
 
-- If both wheels agree again for `BACK_S` of rolling, the pose uses the ignored wheel again.
+- If both wheels agree again for `RECOVERY_S` of rolling, the pose uses the ignored wheel again.
 - If the ignored wheel contradicts both the other wheel and its command for `feedback.fault_time`,
   the robot latches a fault.
 - If any wheel contradicts its command for this time (`wheel_witness.py`), the robot also latches a
@@ -24,14 +24,14 @@ from __future__ import annotations
 
 import math
 
-from acsard.core.config.motion_rules import LINES_OF_EVIDENCE
+from acsard.core.config.motion_rules import MIN_EVIDENCE_LINES
 from acsard.core.config.settings import FeedbackConfig
 from acsard.core.link.codec import Motors
-from acsard.core.motion.error_model import PERIOD, SMOOTHED
+from acsard.core.motion.error_model import ASSUMED_PERIOD_S, PERIOD_GAIN
 from acsard.core.motion.kinematics import Kinematics
-from acsard.core.motion.suspect_wheel import WORDS, Stuck, Suspect, WheelFault, was_faulty
-from acsard.core.motion.wheel_residual import MEMORY_S, Residual
-from acsard.core.motion.wheel_witness import FAULTS, SLACK, Expected, Witness
+from acsard.core.motion.suspect_wheel import FAULT_TEXTS, Stuck, Suspect, WheelFault, was_faulty
+from acsard.core.motion.wheel_residual import TIME_CONSTANT_S, Residual
+from acsard.core.motion.wheel_witness import MIN_FAULT_SPEED, WITNESS_TEXTS, Expected, Witness
 from acsard.core.values import STILL, WHEELS, Event, WheelSpeeds, WheelsStatus
 
 COARSEST, FINEST = math.tau / 16, math.tau / 2000
@@ -43,7 +43,7 @@ RECUR, SOUGHT = 3, 1000
 is the `RECUR`-th smallest angle that a front wheel rolled in a feedback line, within `SOUGHT`
 lines. The smallest angle alone may come from a damaged line."""
 
-LEAST = 0.005
+MIN_COMMANDED_SPEED = 0.005
 """Smallest commanded wheel speed that does not count as zero, rad/s. The line to the board has two
 decimals and shows a lower speed as 0.00."""
 
@@ -52,20 +52,20 @@ ROLLED_S, REPEATED_S = 0.2, 1.0
 motion, s. A shorter motion may be the rocking of a robot that comes to rest. `REPEATED_S` is the
 shortest time between two such log lines, s."""
 
-SLIP_S = 0.5
+SLIP_HOLD_S = 0.5
 """Time for which a side still counts as slipping after the last contradiction of its wheels, s."""
 
 SLIP_REPORTED_S = 0.1
 """Time for which the two wheels of a side must contradict each other before slip is logged, s."""
 
-BACK_S = 0.5
+RECOVERY_S = 0.5
 """Time for which an ignored wheel must agree with the other wheel of its side while both roll, s.
 After this time, the pose uses the ignored wheel again."""
 
 Same = tuple[bool, bool, bool, bool]
 """Whether each wheel reports the same speed as in the previous feedback line, in `WHEELS` order."""
 
-NONE: Same = (False, False, False, False)
+NO_FAULTS: Same = (False, False, False, False)
 
 LEFT, RIGHT = (1, 2), (0, 3)
 """Indices of the front and the rear wheel of each side in `WHEELS` order."""
@@ -103,7 +103,8 @@ class _Side:
         """A text about the ignored wheel or about slip on this side; "" if both wheels are fine."""
         if self.out is not None:
             return (
-                f"{self.left_out} wheel is left out of the pose: it {WORDS[self._fault]}; check "
+                f"{self.left_out} wheel is left out of the pose: it {FAULT_TEXTS[self._fault]}; "
+                f"check "
                 "its encoder"
             )
         if self.slip_s > 0.0:
@@ -154,7 +155,8 @@ class _Side:
                 if lasted > limit:
                     wheel, told = self.wheels[i], self.expected.commanded
                     return (
-                        f"{WHEELS[wheel]} wheel {FAULTS[kind]} (commanded {told:.1f}, measured "
+                        f"{WHEELS[wheel]} wheel {WITNESS_TEXTS[kind]} (commanded {told:.1f}, "
+                        f"measured "
                         f"{seen[wheel]:.1f} rad/s)"
                     )
         return ""
@@ -169,7 +171,7 @@ class _Side:
         if self.out is None or not self.residual.rolling:
             return
         self._agreed_s += dt
-        if self._agreed_s >= BACK_S:
+        if self._agreed_s >= RECOVERY_S:
             again = (
                 f"{self.left_out} wheel agrees with the other wheel of its side again: the "
                 "pose uses it"
@@ -244,7 +246,7 @@ class _Side:
         if fault or not self.residual.slips:
             self._pass(dt)
             return False
-        self.slip_s, reported = SLIP_S, self._odd_s >= SLIP_REPORTED_S
+        self.slip_s, reported = SLIP_HOLD_S, self._odd_s >= SLIP_REPORTED_S
         self._odd_s += dt
         if self._odd_s >= SLIP_REPORTED_S and not reported:
             self.event = Event("wheel_fault", self.text, "warning", kind="slip")
@@ -284,7 +286,7 @@ class WheelFaults:
         """
         self._kinematics, self._settings = kinematics, feedback
         self._count = math.tau / counts if counts else COARSEST
-        self._seeking, self._period = not counts, PERIOD
+        self._seeking, self._period = not counts, ASSUMED_PERIOD_S
         self._least, self._looked = [COARSEST] * RECUR, 0
         """`_least` contains the `RECUR` smallest angles that a front wheel rolled in one of the
         last `_looked` feedback lines, rad."""
@@ -293,7 +295,7 @@ class WheelFaults:
         self._busy = self._leaves_out = self._stands = False
         self.slips = False
         """Whether a side slips, which means that its wheels contradicted each other in the last
-        `SLIP_S`."""
+        `SLIP_HOLD_S`."""
         self._rolled, self._unreported = 0.0, REPEATED_S
         self.pushed = ""
         """Message that wheels turn without a command, for example by hand; "" unless the last line
@@ -374,10 +376,13 @@ class WheelFaults:
         front_right, front_left, rear_left, rear_right = speeds
         left.expected.follow(commanded.front_left, front_left, rear_left, dt, lag)
         right.expected.follow(commanded.front_right, front_right, rear_right, dt, lag)
-        still = abs(commanded.front_left) < LEAST and abs(commanded.front_right) < LEAST
+        still = (
+            abs(commanded.front_left) < MIN_COMMANDED_SPEED
+            and abs(commanded.front_right) < MIN_COMMANDED_SPEED
+        )
         # After this computer did not run the daemon for a while, one line covers that whole time.
         # This line alone must not prove a fault.
-        most, count = limit / LINES_OF_EVIDENCE, self._count
+        most, count = limit / MIN_EVIDENCE_LINES, self._count
         bad_left = left.watch(speeds, dt, most, count, still)
         bad_right = right.watch(speeds, dt, most, count, still)
         self._notice(speeds, dt, still)
@@ -398,7 +403,7 @@ class WheelFaults:
                 for wheel, witness in zip(side.wheels, side.witnesses, strict=True)
                 if not witness.driven
             ], default=0.0)  # fmt: skip
-        self._rolled = self._rolled + dt if fastest > SLACK else 0.0
+        self._rolled = self._rolled + dt if fastest > MIN_FAULT_SPEED else 0.0
         self._unreported += dt
         if self._rolled > ROLLED_S and self._unreported >= REPEATED_S:
             self._unreported = 0.0
@@ -429,7 +434,7 @@ class WheelFaults:
             return False
         if self._seeking:
             self._seek(speeds, dt)
-        keep, count = MEMORY_S / (MEMORY_S + dt), self._count
+        keep, count = TIME_CONSTANT_S / (TIME_CONSTANT_S + dt), self._count
         front_right, front_left, rear_left, rear_right = turned
         left = self._left.residual.add(front_left, rear_left, keep, dt, count)
         right = self._right.residual.add(front_right, rear_right, keep, dt, count)
@@ -443,7 +448,7 @@ class WheelFaults:
         stood, self._stands = self._stands, True in same
         self._found = None
         if stood or self._stands:
-            self._found = self._standing(turned, same if stood else NONE, dt)
+            self._found = self._standing(turned, same if stood else NO_FAULTS, dt)
         if self._found is None and left and right and not self._busy:
             return False
         for i, side in enumerate(self._sides):
@@ -489,7 +494,7 @@ class WheelFaults:
         `speeds` contains the wheel speeds in a feedback line that covers `dt` s. See `RECUR` and
         `SOUGHT`.
         """
-        self._period += SMOOTHED * (dt - self._period)
+        self._period += PERIOD_GAIN * (dt - self._period)
         self._looked += 1
         if self._looked > SOUGHT:
             self._least, self._looked = [COARSEST] * RECUR, 1

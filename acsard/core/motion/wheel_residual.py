@@ -11,14 +11,14 @@ harmless effects explains the difference:
 - The speeds in a feedback line have two decimals.
 
 The comparison uses sums of the angles that the wheels rolled recently. Older angles have less
-weight (`MEMORY_S`). The wheels contradict each other if
+weight (`TIME_CONSTANT_S`). The wheels contradict each other if
 
-    |D - r A| > SHARE A + COUNTS c + LEAST
+    |D - r A| > ALLOWED_FRACTION A + ALLOWED_COUNTS c + ALLOWED_ANGLE
 
 where D is the sum of the front wheel's angles minus the sum of the rear wheel's angles, rad, A is
 the sum over the lines of the mean angle of both wheels, rad, r is the learned fraction, and c is
 the angle of an encoder count, rad. The wheels slip if |D - r A| exceeds this limit by more than
-LAG_S |v - mean of v|, where v is the speed of the side, rad/s.
+ALLOWED_DELAY_S |v - mean of v|, where v is the speed of the side, rad/s.
 """
 
 from __future__ import annotations
@@ -28,39 +28,40 @@ import math
 # Without slip, the angles of two wheels can differ by two counts. Therefore a slip by the fraction
 # s at v rad/s is certain only after 2 c / (s v) seconds. With 96 counts per revolution, a slip of a
 # tenth at 10 rad/s is certain after 0.13 s, or after 0.26 s if unequal tires may cause the
-# difference SHARE. With the limit COUNTS, and with sums that forget old angles, a slip of a tenth
-# is found within 0.2 s at speeds above 22 rad/s, and is never found at speeds below 11.5 rad/s.
+# difference ALLOWED_FRACTION. With the limit ALLOWED_COUNTS, and with sums that forget old angles,
+# a slip of a tenth is found within 0.2 s at speeds above 22 rad/s, and is never found at speeds
+# below 11.5 rad/s.
 
-MEMORY_S = 0.14
+TIME_CONSTANT_S = 0.14
 """Time after which the weight of an angle in the sums has fallen to 1 / e, s."""
 
-SHARE = 0.05
+ALLOWED_FRACTION = 0.05
 """Allowed difference of the angles of the two wheels, as a fraction of their mean angle. It is half
 of the slip of 10 % that must be found."""
 
-COUNTS = 1.2
+ALLOWED_COUNTS = 1.2
 """Allowed difference of the angles of the two wheels, in encoder counts. Wheels without slip rarely
 differ by more."""
 
-LAG_S = 0.03
+ALLOWED_DELAY_S = 0.03
 """Allowed delay of one motor of a side relative to the other motor, s."""
 
-LEAST = 0.002
-"""Allowed difference of the angles of the two wheels, rad, in addition to `SHARE` and `COUNTS`.
-Backlash and the rounding of speeds to two decimals cause it."""
+ALLOWED_ANGLE = 0.002
+"""Allowed difference of the angles of the two wheels, rad, in addition to `ALLOWED_FRACTION` and
+`ALLOWED_COUNTS`. Backlash and the rounding of speeds to two decimals cause it."""
 
-UNEQUAL = 0.05
+MAX_LASTING_DIFFERENCE = 0.05
 """Largest fraction by which two healthy wheels of a side may differ permanently."""
 
 LEARNING_S, DOUBTED_S = 5.0, 20.0
 """Times that determine how fast the difference of the two wheels is learned, s. While the wheels
 agree, the fraction by which they differ is learned with the time constant `LEARNING_S`. While the
-wheels contradict each other, the learned fraction changes by `WILD` in `DOUBTED_S`."""
+wheels contradict each other, the learned fraction changes by `LEARNING_STEP` in `DOUBTED_S`."""
 
-SLOWEST = 1.0
+MIN_LEARNING_SPEED = 1.0
 """Wheel speed below which the difference of the two wheels is not learned, rad/s."""
 
-WILD = 0.1
+LEARNING_STEP = 0.1
 """Change of the learned fraction if the wheels contradict each other for `DOUBTED_S`. Slip ends
 sooner, but a flat tire stays flat, so its effect is learned."""
 
@@ -86,7 +87,7 @@ class Residual:
             front: the angle that the front wheel rolled since the previous feedback line, rad.
             rear: the angle that the rear wheel rolled since the previous feedback line, rad.
             keep: the factor, from 0 to 1, with which the sums of the angles are multiplied after
-                this line was added, so that older angles have less weight (`MEMORY_S`).
+                this line was added, so that older angles have less weight (`TIME_CONSTANT_S`).
             dt: the time in which the wheels rolled these angles, s.
             count: the angle of one encoder count, rad.
         """
@@ -96,14 +97,14 @@ class Residual:
         total = self._off = keep * (self._off + off)
         way = self._way = keep * (self._way + size)
         self._net = keep * (self._net + mean)
-        most = SHARE * way + COUNTS * count + LEAST
+        most = ALLOWED_FRACTION * way + ALLOWED_COUNTS * count + ALLOWED_ANGLE
         if abs(total) > most:
             # While the speed changes, a motor that reacts later causes a further difference.
-            late = LAG_S * abs(mean / dt - self._net / MEMORY_S)
+            late = ALLOWED_DELAY_S * abs(mean / dt - self._net / TIME_CONSTANT_S)
             self.slips = abs(total) > most + late
-            self._learn(math.copysign(WILD, off * mean) * dt / DOUBTED_S)
+            self._learn(math.copysign(LEARNING_STEP, off * mean) * dt / DOUBTED_S)
             return False
-        if abs(mean) > SLOWEST * dt:
+        if abs(mean) > MIN_LEARNING_SPEED * dt:
             self._learn(off / mean * dt / LEARNING_S)
         return True
 
@@ -118,13 +119,17 @@ class Residual:
 
     @property
     def rolling(self) -> bool:
-        """Whether the wheels recently rolled faster than `SLOWEST` on average.
+        """Whether the wheels recently rolled faster than `MIN_LEARNING_SPEED` on average.
 
         Slower wheels do not show reliably whether they differ.
         """
-        return self._way > SLOWEST * MEMORY_S
+        return self._way > MIN_LEARNING_SPEED * TIME_CONSTANT_S
 
     def _learn(self, more: float) -> None:
         if self.learns:
             ratio = self.ratio + more
-            self.ratio = ratio if abs(ratio) <= UNEQUAL else math.copysign(UNEQUAL, ratio)
+            self.ratio = (
+                ratio
+                if abs(ratio) <= MAX_LASTING_DIFFERENCE
+                else math.copysign(MAX_LASTING_DIFFERENCE, ratio)
+            )

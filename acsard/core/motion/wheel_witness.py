@@ -17,25 +17,25 @@ from __future__ import annotations
 import math
 from typing import Literal
 
-SLACK = 2.0
+MIN_FAULT_SPEED = 2.0
 """Smallest wheel speed at which a fault can be recognized, rad/s. At lower speeds, coarse encoders
 and a robot at rest can look like any fault."""
 
-COMMANDED = 0.3
+MIN_COMMANDED_SPEED = 0.3
 """Smallest commanded speed at which the command can show which of two wheels is right, rad/s."""
 
-SLOWEST = 3.0
+SLOW_RESPONSE_FACTOR = 3.0
 """Response time of the wheels of a slow robot, as a multiple of `feedback.response_time`."""
 
-CLEAR = 1.0
+SMOOTHING_SPEED = 1.0
 """Wheel speed that determines the smoothing of the measured speed, rad/s. The time constant of the
 smoothing is the time in which a wheel with this speed turns by one encoder count."""
 
-NEARER = 1.0
+MIN_APPROACH = 1.0
 """If a wheel is too fast, stands still or turns against its command, but its speed comes closer to
 the command by more than this, rad/s, its behavior is not evidence of a fault."""
 
-RATIO_S = 2.0
+RATIO_DRIVE_S = 2.0
 """Time of driving, s, after which the angle that a wheel rolled is compared with the expected
 angle."""
 
@@ -45,7 +45,7 @@ TOO_SLOW, FAST_ENOUGH = 0.7, 0.8
 
 FaultKind = Literal["dead", "reversed", "runaway", "stuck"]
 
-FAULTS: dict[FaultKind, str] = {
+WITNESS_TEXTS: dict[FaultKind, str] = {
     "dead": "does not turn, or its encoder is dead: check cable, motor and encoder, and for "
     "motor d also the setting mcu.trailing_comma",
     "reversed": "turns against its command: check the leads of its motor, the wires A and B of its "
@@ -96,10 +96,14 @@ class Expected:
             self._begins = False
             self.speed = self._slow = faster(front, rear)
         speed = self.speed = self.speed + (commanded - self.speed) * dt / (lag + dt)
-        slow = self._slow = self._slow + (commanded - self._slow) * dt / (SLOWEST * lag + dt)
+        slow = self._slow = self._slow + (commanded - self._slow) * dt / (
+            SLOW_RESPONSE_FACTOR * lag + dt
+        )
         self.commanded = commanded
         follows = speed * commanded > 0.0
-        self.clear = follows and abs(speed) >= COMMANDED and abs(commanded) >= COMMANDED
+        self.clear = (
+            follows and abs(speed) >= MIN_COMMANDED_SPEED and abs(commanded) >= MIN_COMMANDED_SPEED
+        )
         """Whether a healthy wheel must already turn clearly in the direction of the command."""
         self.settled = follows and slow * commanded > 0.0
         """Whether even the wheel of a slow robot must already turn in the direction of the
@@ -113,7 +117,7 @@ class Witness:
         self.driven = False
         """True while any wheel is commanded to turn, and then until this wheel has come to rest."""
         self.ratio = 1.0
-        """Angle that the wheel rolled in the last full `RATIO_S` of driving, divided by the
+        """Angle that the wheel rolled in the last full `RATIO_DRIVE_S` of driving, divided by the
         expected angle."""
         self.slow = False
         """Whether the wheel turns in the commanded direction, but too slowly."""
@@ -121,7 +125,7 @@ class Witness:
         """Expected magnitude of `speed`, rad/s. It is smoothed like `speed` itself: an encoder with
         few counts needs much smoothing, and then a healthy wheel seems to brake too late."""
         self._rested_s = 0.0
-        """Time since the last feedback line with a speed above `SLACK`, s."""
+        """Time since the last feedback line with a speed above `MIN_FAULT_SPEED`, s."""
         self.forget()
 
     def forget(self) -> None:
@@ -129,7 +133,7 @@ class Witness:
         self.speed = 0.0
         """Measured speed, smoothed, rad/s."""
         self._seen, self._begins = 0.0, True
-        self.evidence: dict[FaultKind, float] = dict.fromkeys(FAULTS, 0.0)
+        self.evidence: dict[FaultKind, float] = dict.fromkeys(WITNESS_TEXTS, 0.0)
         """Time for which the wheel has shown each fault, s."""
         self.suspected = False
         # Because of the infinity, the first line counts as approaching the command. With 0, a wheel
@@ -153,14 +157,14 @@ class Witness:
         self.driven = self.driven and not self._rests(seen, dt, count)
 
     def _rests(self, seen: float, dt: float, count: float) -> bool:
-        """Return whether the wheel is certainly not faster than `SLACK`.
+        """Return whether the wheel is certainly not faster than `MIN_FAULT_SPEED`.
 
         The arguments are as in `look`.
         """
         # An encoder with few counts often reports 0 although the wheel turns. Therefore the
-        # reported speed must stay low for the time of one count at the speed `SLACK`.
-        self._rested_s = 0.0 if abs(seen) > SLACK else self._rested_s + dt
-        return self._rested_s >= count / SLACK and abs(seen) <= SLACK
+        # reported speed must stay low for the time of one count at the speed `MIN_FAULT_SPEED`.
+        self._rested_s = 0.0 if abs(seen) > MIN_FAULT_SPEED else self._rested_s + dt
+        return self._rested_s >= count / MIN_FAULT_SPEED and abs(seen) <= MIN_FAULT_SPEED
 
     def look(
         self, seen: float, expected: Expected, dt: float, most: float, count: float, still: bool
@@ -178,24 +182,24 @@ class Witness:
         goal, command = expected.speed, expected.commanded
         if self._begins:
             self._begins, self.speed = False, seen
-        share = dt / (count / CLEAR + dt)
+        share = dt / (count / SMOOTHING_SPEED + dt)
         speed = self.speed = self.speed + (seen - self.speed) * share
         constant, self._seen = seen == self._seen, seen
         size, wish, turns = abs(goal), abs(command), abs(speed)
-        rests = self._rests(seen, dt, count) and turns <= SLACK
+        rests = self._rests(seen, dt, count) and turns <= MIN_FAULT_SPEED
         driven = self.driven = not still or (self.driven and not rests)
         fastest, least = (size, wish) if size > wish else (wish, size)
         due = self._due + (fastest - self._due) * share
         due = self._due = due if due > fastest else fastest
-        moving = size > SLACK and expected.settled
-        fast = driven and turns > 1.5 * due + SLACK
+        moving = size > MIN_FAULT_SPEED and expected.settled
+        fast = driven and turns > 1.5 * due + MIN_FAULT_SPEED
         against = moving and speed * goal < 0.0 and turns > 0.3 * size
         # A wheel that slows down sooner than according to `response_time` is not dead. Therefore
         # compare its speed with the smaller of command and expected speed.
-        dead = moving and least > SLACK and abs(seen) < 0.1 * least
+        dead = moving and least > MIN_FAULT_SPEED and abs(seen) < 0.1 * least
         wrong = fast or against or dead
         off = turns if fast else -math.copysign(1.0, command) * speed
-        nearing = off < self._nearest - NEARER
+        nearing = off < self._nearest - MIN_APPROACH
         if nearing or not wrong:
             self._nearest = off
         elif not self._wrong:
@@ -205,13 +209,13 @@ class Witness:
             self._compare(turns, size, dt)
         stuck = constant and driven and seen != 0.0
         if stuck:
-            stuck = min(abs(seen - goal), abs(seen - command)) > SLACK + 0.4 * fastest
+            stuck = min(abs(seen - goal), abs(seen - command)) > MIN_FAULT_SPEED + 0.4 * fastest
         wrong = wrong and not nearing
         bad = wrong or stuck
         if bad or self.suspected:
             self.suspected = bad
             signs = dead and wrong, against and wrong, fast and wrong, stuck
-            for kind, sign in zip(FAULTS, signs, strict=True):
+            for kind, sign in zip(WITNESS_TEXTS, signs, strict=True):
                 self.evidence[kind] = self.evidence[kind] + min(dt, most) if sign else 0.0
         return bad
 
@@ -219,7 +223,7 @@ class Witness:
         self._seconds += dt
         self._went += turns * dt
         self._way += size * dt
-        if self._seconds >= RATIO_S:
+        if self._seconds >= RATIO_DRIVE_S:
             self.ratio = self._went / self._way
             self.slow = self.ratio < (FAST_ENOUGH if self.slow else TOO_SLOW)
             self._seconds = self._went = self._way = 0.0

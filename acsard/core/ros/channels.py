@@ -24,7 +24,7 @@ from acsard.core.ros.names import Qos, full_name
 from acsard.core.ros.shapes import Log, State, state
 from acsard.core.ros.transports import PUBLISHED
 
-OURS = "acsard/msg/"
+ACSARD_PREFIX = "acsard/msg/"
 """Prefix of the message types that ROS does not have."""
 
 Field = tuple[str, str]
@@ -117,13 +117,13 @@ DEFINITIONS: dict[str, tuple[Field, ...]] = {
 }
 """The fields of each message type, in order, without the constants."""
 
-RULE = "=" * 80
+SEPARATOR_LINE = "=" * 80
 
 
 def schema_text(name: str) -> str:
     """Return the definitions of a type and of its nested types in MCAP's `ros2msg` format."""
     parts = [_fields(name)]
-    parts += [f"{RULE}\nMSG: {_short(other)}\n{_fields(other)}" for other in nested(name)]
+    parts += [f"{SEPARATOR_LINE}\nMSG: {_short(other)}\n{_fields(other)}" for other in nested(name)]
     return "".join(parts)
 
 
@@ -152,7 +152,7 @@ def _short(kind: str) -> str:
 ENCODING, SCHEMA_ENCODING = "cdr", "ros2msg"
 """Names of the message encoding and the schema encoding in MCAP and in Foxglove's live protocol."""
 
-SOURCE = "<source>"
+SOURCE_PLACEHOLDER = "<source>"
 
 
 class Channel(Struct, frozen=True):
@@ -178,7 +178,7 @@ class Channel(Struct, frozen=True):
         `namespace` is the ROS namespace of the robot. `source` is the name of the command source
         that replaces `<source>`.
         """
-        return full_name(namespace, self.name.replace(SOURCE, source))
+        return full_name(namespace, self.name.replace(SOURCE_PLACEHOLDER, source))
 
     @property
     def schema(self) -> str:
@@ -201,20 +201,22 @@ def _published() -> dict[str, Channel]:
 
 TWIST_STAMPED = "geometry_msgs/msg/TwistStamped"
 
-STATE = Channel("state", "state", OURS + "RobotState", State)
+STATE_CHANNEL = Channel("state", "state", ACSARD_PREFIX + "RobotState", State)
 
-LOG = Channel("log", "events", "rcl_interfaces/msg/Log", Log, Qos(1000))
+LOG_CHANNEL = Channel("log", "events", "rcl_interfaces/msg/Log", Log, Qos(1000))
 """The topic of the daemon's events. Each event is one log message."""
 
-CMD_VEL_IN = Channel(f"cmd_vel_in/{SOURCE}", f"cmd/{SOURCE}", TWIST_STAMPED, TwistStamped)
+CMD_VEL_IN = Channel(
+    f"cmd_vel_in/{SOURCE_PLACEHOLDER}", f"cmd/{SOURCE_PLACEHOLDER}", TWIST_STAMPED, TwistStamped
+)
 """The topics of the received commands, one topic for each command source. The stamp of a message
 is the time at which the command arrived."""
 
-BY_KEY: dict[str, Channel] = {**_published(), STATE.native: STATE}
+BY_KEY: dict[str, Channel] = {**_published(), STATE_CHANNEL.native: STATE_CHANNEL}
 """Maps each native Zenoh key to its channel, for all messages that `Report` (`messages/report.py`)
 builds."""
 
-CHANNELS: tuple[Channel, ...] = (*BY_KEY.values(), CMD_VEL_IN, LOG)
+CHANNELS: tuple[Channel, ...] = (*BY_KEY.values(), CMD_VEL_IN, LOG_CHANNEL)
 
 
 def published_channels(silent: Container[str]) -> tuple[Channel, ...]:

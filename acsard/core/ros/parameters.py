@@ -17,7 +17,7 @@ from typing import Annotated, TypeVar
 from msgspec import Meta, Struct, inspect
 from msgspec.structs import fields
 
-from acsard.core.config.live import WHEN, flat, live
+from acsard.core.config.live import WHEN_TEXTS, flat, live
 from acsard.core.config.settings import Config
 from acsard.core.config.validation import expected
 from acsard.core.messages.cdr import Cdr, CdrError
@@ -83,7 +83,9 @@ def _described(name: str, type_of: int) -> ParameterDescriptor:
         name,
         type_of,
         words if row is None else f"{row.what}: {words}",
-        "change it in acsard.toml, then restart the daemon" if row is None else WHEN[row.when],
+        "change it in acsard.toml, then restart the daemon"
+        if row is None
+        else WHEN_TEXTS[row.when],
         read_only=row is None,
         floating_point_range=floats,
         integer_range=whole,
@@ -222,7 +224,7 @@ class SetAtomicallyReply(Struct, frozen=True):
     result: SetParametersResult
 
 
-SETTING = ("set_parameters", "set_parameters_atomically")
+SETTING_SERVICES = ("set_parameters", "set_parameters_atomically")
 """The services that set parameters. `Parameters.answer` does not answer them."""
 
 
@@ -233,12 +235,12 @@ def failure(service: str, why: str, request: bytes = b"") -> bytes:
 
     Args:
         service: the name of the service.
-        why: the reason of the refusal. Only the replies of the services in `SETTING` contain it.
-            All other replies are empty, as in rclcpp.
+        why: the reason of the refusal. Only the replies of the services in `SETTING_SERVICES`
+            contain it. All other replies are empty, as in rclcpp.
         request: the refused request, in CDR.
     """
     refused = SetParametersResult(False, why)
-    if service in SETTING:
+    if service in SETTING_SERVICES:
         with suppress(CdrError):
             return outcome(service, request, successful=False, reason=why)
     replies: dict[str, Struct] = {
@@ -321,7 +323,7 @@ def outcome(service: str, payload: bytes, successful: bool, reason: str) -> byte
     Raises `CdrError` if a request of `set_parameters` is not valid.
 
     Args:
-        service: the name of the service, one of `SETTING`.
+        service: the name of the service, one of `SETTING_SERVICES`.
         payload: the request, in CDR.
         successful: True if the robot has set the parameters.
         reason: the text for the client, such as the reason of a refusal.

@@ -39,7 +39,7 @@ class Log(Struct, frozen=True):
     line: Natural = 0
 
 
-NUMBERED = re.compile(r"\d+ (x|times)\b")
+COUNT_PREFIX = re.compile(r"\d+ (x|times)\b")
 """Pattern of a count at the beginning of an event's text, such as "3 x" or "3 times"."""
 
 LEVELS: dict[str, int] = {"info": 20, "warning": 30, "error": 40}
@@ -59,7 +59,7 @@ def how_often(text: str, count: int) -> str:
     `text` is the text of the event. The suffix is "" if `count` is 1, or if `text` already begins
     with a count.
     """
-    return "" if count == 1 or NUMBERED.match(text) else f" ({count} times)"
+    return "" if count == 1 or COUNT_PREFIX.match(text) else f" ({count} times)"
 
 
 def asked(twist: BodyTwist, arrived: Time, frame: str) -> TwistStamped:

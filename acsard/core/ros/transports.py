@@ -33,7 +33,7 @@ from acsard.core.ros.names import (
     full_name,
     rmw_key,
 )
-from acsard.core.values import ROOT
+from acsard.core.values import ROOT_KEY
 
 Transport = Literal["bridge", "rmw"]
 
@@ -95,7 +95,7 @@ PARAMETER_SERVICES = {
     "set_parameters_atomically": "rcl_interfaces/srv/SetParametersAtomically",
 }
 
-PARAMETERS = "parameters/"
+PARAMETERS_PREFIX = "parameters/"
 """Prefix of `RosName.native` for the ROS services that read and set parameters. No native key on
 the bus begins like this, because native clients read the same settings with the key `config`."""
 
@@ -119,14 +119,14 @@ SOURCES = {
 }
 """Maps each ROS topic that commands the robot to the name of its command source."""
 
-URDF = RosName(DESCRIPTION, DESCRIPTION, "out", "std_msgs/msg/String", Qos(1, transient=True))
-"""The topic of the robot's URDF. It is not in `PUBLISHED`, because the topics in `PUBLISHED` are
-recorded and the URDF is not."""
+URDF_TOPIC = RosName(DESCRIPTION, DESCRIPTION, "out", "std_msgs/msg/String", Qos(1, transient=True))
+"""The topic of the robot's URDF_TOPIC. It is not in `PUBLISHED`, because the topics in `PUBLISHED`
+are recorded and the URDF_TOPIC is not."""
 
-SLOWER = RosName(SPEED_LIMIT, SPEED_LIMIT, "in", "nav2_msgs/msg/SpeedLimit")
+SPEED_LIMIT_TOPIC = RosName(SPEED_LIMIT, SPEED_LIMIT, "in", "nav2_msgs/msg/SpeedLimit")
 """Subscription to the speed limits of Nav2's speed filter."""
 
-GYRO = RosName("imu/data", IMU, "in", "sensor_msgs/msg/Imu", Qos(best_effort=True))
+GYRO_TOPIC = RosName("imu/data", IMU, "in", "sensor_msgs/msg/Imu", Qos(best_effort=True))
 """Subscription to the samples of a gyro. It is best effort, so that it also receives from gyro
 drivers that publish with SensorDataQoS."""
 
@@ -159,7 +159,7 @@ def ros_names(ros: RosConfig, silent: Container[str] = ()) -> tuple[RosName, ...
     """
     kinds = [kind for kind in TWISTS if ros.cmd_vel_type in ("auto", kind)]
     return (
-        *(row for row in (*PUBLISHED, URDF) if row.native not in silent),
+        *(row for row in (*PUBLISHED, URDF_TOPIC) if row.native not in silent),
         *(
             RosName(name, f"cmd/{SOURCES[name]}", "in", TWISTS[kind])
             for name in ("cmd_vel", "cmd_vel_dock", "cmd_vel_teleop")
@@ -171,14 +171,14 @@ def ros_names(ros: RosConfig, silent: Container[str] = ()) -> tuple[RosName, ...
             "in",
             "sensor_msgs/msg/JointState",
         ),
-        SLOWER,
-        *(row for row in (GYRO,) if row.native not in silent),
+        SPEED_LIMIT_TOPIC,
+        *(row for row in (GYRO_TOPIC,) if row.native not in silent),
         *(
             RosName(f"{ros.node}/{verb}", service_key(verb), "service", "std_srvs/srv/Trigger")
             for verb in TRIGGERS
         ),
         *(
-            RosName(f"{ros.node}/{name}", PARAMETERS + name, "query", type_name)
+            RosName(f"{ros.node}/{name}", PARAMETERS_PREFIX + name, "query", type_name)
             for name, type_name in PARAMETER_SERVICES.items()
         ),
     )
@@ -238,7 +238,7 @@ def claims(ros: RosConfig) -> tuple[str, ...]:
     """
     name = full_name(ros.namespace, "cmd_vel")
     trees = (("bridge", ros.bridge), (f"rmw/{ros.domain}", ros.rmw))
-    return tuple(f"{ROOT}/@ros/{tree}{name}" for tree, on in trees if on)
+    return tuple(f"{ROOT_KEY}/@ros/{tree}{name}" for tree, on in trees if on)
 
 
 def _node(ros: RosConfig, zid: str) -> Node:

@@ -28,7 +28,7 @@ MS = 1_000_000
 RESET_NS = 2 * NS_PER_S
 """Time for which a board with a bootloader ignores its input after a reset, ns."""
 
-SHORTEST_WINDOW_NS = 4 * MS
+MIN_WINDOW_NS = 4 * MS
 """Shortest time over which the board computes speeds from encoder counts, ns. If the last
 computation is more recent, a reply repeats its speeds."""
 
@@ -323,13 +323,13 @@ class FakeMcu(Faults):
     def _speeds(self, now_ns: int) -> list[float]:
         """Return the mean speeds of the motors a to d since the last computation, rad/s.
 
-        If the last computation is less than `SHORTEST_WINDOW_NS` old, return its speeds again.
+        If the last computation is less than `MIN_WINDOW_NS` old, return its speeds again.
         """
         since, before = self._window
         gains = self.gains
         if self.stuck is not None:
             gains = [0.0 if motor == self.stuck else gain for motor, gain in enumerate(gains)]
-        if now_ns - since >= SHORTEST_WINDOW_NS:
+        if now_ns - since >= MIN_WINDOW_NS:
             counts = self._encoders()
             if counts == before and self.frozen is None:
                 # No motor has turned by a count, so wrong gains and swapped wires have no effect.

@@ -20,7 +20,7 @@ HEX = b"0123456789ABCDEF"
 
 _LINE = re.compile(rb"a([pn]\d\d\.\d\d),b([pn]\d\d\.\d\d),c([pn]\d\d\.\d\d),d([pn]\d\d\.\d\d),?")
 
-PLAIN = 31
+PLAIN_LENGTH = 31
 """Length of a plain line in bytes, without a trailing comma and the line end."""
 
 
@@ -63,7 +63,7 @@ def prefix(line: bytes) -> Command | None:
 
     Return None if the four speeds are not valid.
     """
-    return _plain(line[:PLAIN])
+    return _plain(line[:PLAIN_LENGTH])
 
 
 def latched(line: bytes) -> Command:

@@ -16,7 +16,7 @@ from acsard.core.simulator.fake_mcu import FakeMcu
 from acsard.core.simulator.noise import gauss
 from acsard.core.values import NS_PER_S, Pose
 
-LOOK_NS = NS_PER_S // 100
+OBSERVATION_PERIOD_NS = NS_PER_S // 100
 """Interval at which the simulated robot is observed, ns. The gyro has the same interval."""
 
 
@@ -39,7 +39,7 @@ class WatchedMcu(FakeMcu):
         self._sim, self._see = config.sim, see
         self._delay_ns = int(config.sim.gyro_delay * NS_PER_S)
         self._looks = 0
-        self._look_ns = now_ns + LOOK_NS
+        self._look_ns = now_ns + OBSERVATION_PERIOD_NS
         self._history: deque[tuple[int, float]] = deque([(now_ns, 0.0)])
         """The motion that the delayed gyro has not reported yet, oldest first. Each item is a
         pair: a monotonic time, ns, and the angle by which the robot had turned until then, rad."""
@@ -58,17 +58,17 @@ class WatchedMcu(FakeMcu):
         while self._look_ns <= now_ns:
             out += super().advance(self._look_ns)
             self._look()
-            self._look_ns += LOOK_NS
+            self._look_ns += OBSERVATION_PERIOD_NS
         return out + super().advance(now_ns)
 
     def _look(self) -> None:
         now_ns, sim = self._look_ns, self._sim
         self._history.append((now_ns, self.vehicle.turned))
         end_ns = now_ns - self._delay_ns
-        turned = self._turned(end_ns) - self._turned(end_ns - LOOK_NS)
-        while self._history[1][0] <= end_ns - LOOK_NS:
+        turned = self._turned(end_ns) - self._turned(end_ns - OBSERVATION_PERIOD_NS)
+        while self._history[1][0] <= end_ns - OBSERVATION_PERIOD_NS:
             self._history.popleft()
-        rate = turned * NS_PER_S / LOOK_NS + sim.gyro_bias
+        rate = turned * NS_PER_S / OBSERVATION_PERIOD_NS + sim.gyro_bias
         rate += sim.gyro_noise * gauss(sim.seed, self._looks)
         self._looks += 1
         self._see(Sight(now_ns, self.vehicle.pose, rate))

@@ -24,10 +24,10 @@ from acsard.core.motion.path import arc
 from acsard.core.simulator.noise import uniform
 from acsard.core.values import Pose
 
-GRIP_S = 0.25
+GRIP_CHANGE_S = 0.25
 """Time after which the random grip of the wheels on the floor changes, s."""
 
-HANDS_S = 0.1
+PUSH_TIME_CONSTANT_S = 0.1
 """Time constant, s, with which the wheel speeds approach the speed of a person who pushes the
 robot."""
 
@@ -73,7 +73,7 @@ class Vehicle:
         self._time += dt
         if push is not None:
             right, left = push / self._right_radius, push / self._left_radius
-            goals, lag = [right, left, left, right], HANDS_S
+            goals, lag = [right, left, left, right], PUSH_TIME_CONSTANT_S
         else:
             given = 1.0 - self.load
             goals, lag = [point * given for point in self.set_points], self._lag
@@ -101,5 +101,5 @@ class Vehicle:
         """Return the fraction of a turn that remains although the wheels skid, 0 to 1."""
         kept = 1.0 - self.turn_slip
         if self._floor:
-            kept *= 1.0 - self._floor * uniform(self._seed, int(self._time / GRIP_S))
+            kept *= 1.0 - self._floor * uniform(self._seed, int(self._time / GRIP_CHANGE_S))
         return kept

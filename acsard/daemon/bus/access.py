@@ -35,17 +35,17 @@ from acsard.core.messages.keys_and_roles import (
     source_keys,
 )
 from acsard.core.messages.permissions import COMMAND_ROLE, Use, has, keys_for, least_role
-from acsard.core.ros.transports import PARAMETERS, Endpoint, claims, endpoints, left_out
-from acsard.core.values import ROLES, ROOT, Role
+from acsard.core.ros.transports import PARAMETERS_PREFIX, Endpoint, claims, endpoints, left_out
+from acsard.core.values import ROLES, ROOT_KEY, Role
 
 LOCAL_LINKS = ("tcp",)
 """Link protocols without certificates. Such a link connects two programs on the same machine,
 unless `bus.insecure` permits links to other machines."""
 
-TOKENS = ("@ros2_lv/**", "@/*/@ros2_lv/**")
+LIVELINESS_TOKENS = ("@ros2_lv/**", "@/*/@ros2_lv/**")
 """Key expressions of the liveliness tokens of ROS."""
 
-SPOKEN = (
+DECLARATIONS = (
     "declare_subscriber",
     "declare_queryable",
     "reply",
@@ -56,7 +56,7 @@ SPOKEN = (
 """Zenoh's names of the message types that a daemon sends. The type `put` (data) has rules of its
 own."""
 
-EVERYTHING = (*SPOKEN, "put", "delete", "query")
+ALL_MESSAGES = (*DECLARATIONS, "put", "delete", "query")
 
 DRIVERS: tuple[Role, ...] = tuple(role for role in ROLES if has(role, COMMAND_ROLE))
 
@@ -73,7 +73,7 @@ USES = ("subscribes", "queries", "publishes")
 GRANTS: dict[Role, tuple[str, ...]] = {role: _grants(role) for role in ROLES}
 """Maps each role to the names of its access rules. `_rules` defines these rules."""
 
-WIDE: dict[Role, tuple[str, ...]] = {
+WIDE_SUBSCRIPTIONS: dict[Role, tuple[str, ...]] = {
     "viewer": ("roam", "recall"),
     "operator": ("roam", "recall"),
     "maintainer": ("roam", "recall", "browse", "attend"),
@@ -81,9 +81,9 @@ WIDE: dict[Role, tuple[str, ...]] = {
 """Maps each role to the names of the additional access rules that the role gets if
 `access.wildcards` is true."""
 
-LOCAL = (
+LOCAL_RULES = (
     *GRANTS["maintainer"],
-    *WIDE["maintainer"],
+    *WIDE_SUBSCRIPTIONS["maintainer"],
     "command",
     "hand_on",
     "look",
@@ -189,7 +189,7 @@ class _Keys:
         keys.
         """
         native = endpoint.native
-        if native.startswith(PARAMETERS):
+        if native.startswith(PARAMETERS_PREFIX):
             return least_role("config")
         if native.startswith(tuple(f"{kind}/" for kind in COMMANDS)):
             return COMMAND_ROLE if native.rpartition("/")[2] in self._sources else None
@@ -214,7 +214,7 @@ def access_control(config: Config) -> dict[str, object]:
     Every TLS link of that session leads to a router. The daemon accepts commands with the name of
     any certificate from the router, because the router has checked the certificate of each client.
     """
-    return _access(config, LOCAL, gateway=False)
+    return _access(config, LOCAL_RULES, gateway=False)
 
 
 def gateway_access(config: Config) -> dict[str, object]:
@@ -249,7 +249,7 @@ def _access(config: Config, local: tuple[str, ...], *, gateway: bool) -> dict[st
         for role, held in names.items()
         if held
     }
-    wide = WIDE if access.wildcards else dict.fromkeys(GRANTS, ())
+    wide = WIDE_SUBSCRIPTIONS if access.wildcards else dict.fromkeys(GRANTS, ())
     granted: dict[str, tuple[str, ...]] = {"local": local}
     granted |= {role: (*GRANTS[role], *wide[role]) for role in GRANTS}
     drivers = [name for role in DRIVERS for name in names[role]]
@@ -280,7 +280,7 @@ def _access(config: Config, local: tuple[str, ...], *, gateway: bool) -> dict[st
 
 
 def _rules(keys: _Keys) -> dict[str, Rule]:
-    tokens = [keys.alive, *keys.claims, *keys.kept, *TOKENS]
+    tokens = [keys.alive, *keys.claims, *keys.kept, *LIVELINESS_TOKENS]
     # The gyro's key is not forbidden, although the daemon of a simulator publishes on it. So the
     # daemon receives a client's sample on this key, and can refuse the sample with a reason.
     forged = [key for key in keys.answered if key != keys.imu]
@@ -288,7 +288,7 @@ def _rules(keys: _Keys) -> dict[str, Rule]:
     rules = [
         # The daemon sends declarations and answers (`speak`) and data (`tell`). It also forwards
         # commands to clients that subscribe to commands (`overhear`):
-        _rule("speak", "egress", SPOKEN, [*keys.answered, *keys.subscribed, *tokens]),
+        _rule("speak", "egress", DECLARATIONS, [*keys.answered, *keys.subscribed, *tokens]),
         _rule("tell", "egress", ["put"], [*keys.published, *keys.kept]),
         _rule("overhear", "egress", ["put"], keys.subscribed),
     ]
@@ -308,17 +308,17 @@ def _rules(keys: _Keys) -> dict[str, Rule]:
         # These rules allow wildcards. `roam`: subscribe to all robots and to the tokens of ROS.
         # `recall`: query the samples for late subscribers, and the queries of viewers. `browse`:
         # query all keys of the robot. `attend`: declare the tokens of late subscribers.
-        _rule("roam", "ingress", following, [f"{ROOT}/**", *tokens]),
+        _rule("roam", "ingress", following, [f"{ROOT_KEY}/**", *tokens]),
         _rule("recall", "ingress", ["query"], [*keys.kept, *keys.viewer_queries]),
         _rule("browse", "ingress", ["query"], [keys.all]),
         _rule("attend", "ingress", ["liveliness_token"], keys.kept),
-        # The next three rules are only for a client on the robot's own machine (`LOCAL`).
+        # The next three rules are only for a client on the robot's own machine (`LOCAL_RULES`).
         _rule("look", "ingress", ["declare_subscriber"], ["**"]),
         _rule("err", "ingress", ["put", "delete"], ["**"]),
         _rule("forge", "ingress", ["put", "delete"], [*forged, *tokens], "deny"),
         # The TLS gateway and the daemon exchange all messages. In Zenoh, `**` does not match a part
         # of a key that begins with @, so the tokens are listed.
-        _rule("pass", "both", EVERYTHING, ["**", *tokens]),
+        _rule("pass", "both", ALL_MESSAGES, ["**", *tokens]),
     ]
     return {rule["id"]: rule for rule in rules}
 

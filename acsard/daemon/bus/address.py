@@ -9,13 +9,14 @@ from typing import NamedTuple
 from msgspec import ValidationError, convert
 
 from acsard.core.config.parsing import ConfigError, parse
-from acsard.core.config.settings import TLS, Config, Name
+from acsard.core.config.settings import TLS_PREFIX, Config, Name
 from acsard.daemon.bus.zenoh_sessions import reachable
 from acsard.host.errors import UsageError
 
 
 class Address(NamedTuple):
-    """The address of a robot for a client: its endpoint, its id, and the client's TLS directory."""
+    """The address of a robot for a client: its endpoint, its id, and the client's TLS_PREFIX
+    directory."""
 
     endpoint: str
     robot_id: str
@@ -102,4 +103,4 @@ def require_id(robot_id: str) -> None:
 
 
 def _is_tls(endpoint: str) -> bool:
-    return endpoint.startswith(TLS)
+    return endpoint.startswith(TLS_PREFIX)

@@ -14,7 +14,7 @@ from msgspec.structs import replace
 
 from acsard.core.config.settings import Config
 from acsard.core.incoming.bus_interface import BusInput, Waker
-from acsard.core.incoming.imu import OWN
+from acsard.core.incoming.imu import SIMULATOR_SENDER
 from acsard.core.incoming.queries import Reply
 from acsard.core.messages.encodings import encoding_name
 from acsard.core.messages.keys_and_roles import IMU, Topic, full_key, json_key, offered, published
@@ -179,7 +179,7 @@ class ZenohBus:
                 self._kept.append(session.declare_queryable(key, on_query))
         for topic in published(self._config):
             key, encoding = full_key(self._id, topic.key), encoding_name("msgpack", topic.type)
-            signed = Signature(OWN).pack() if topic.key == IMU else b""
+            signed = Signature(SIMULATOR_SENDER).pack() if topic.key == IMU else b""
             self._outlets.declare(
                 session, topic.key, key, "msgpack", encoding, topic.latched, signed=signed
             )

@@ -12,14 +12,14 @@ import asyncio
 from collections.abc import Iterable, MutableMapping
 from pathlib import Path
 
-from acsard.core.config.settings import TLS, BusConfig
+from acsard.core.config.settings import TLS_PREFIX, BusConfig
 from acsard.core.values import NS_PER_S
 from acsard.daemon.bus.tls import ends, peer_ends_ns, unusable
 from acsard.daemon.bus.zenoh_sessions import certificate_trouble
 from acsard.host import clock
 from acsard.host.threads import NoThreadError, in_thread
 
-FILES_LOOK_NS = 2 * NS_PER_S
+FILES_CHECK_PERIOD_NS = 2 * NS_PER_S
 """Time between two checks for replaced files, ns. Copying three files takes less time. So if the
 files have not changed between two checks, all of them have been copied."""
 
@@ -28,7 +28,7 @@ Signature = tuple[tuple[int, int, int], ...]
 
 
 class CertificateFiles:
-    """The three TLS files of a process that listens: authority, certificate and key.
+    """The three TLS_PREFIX files of a process that listens: authority, certificate and key.
 
     `renewed` detects that they were replaced.
     """
@@ -41,18 +41,18 @@ class CertificateFiles:
         """
         self._files = authority, certificate, key
         self._used = self._seen = self._signature()
-        self._due_ns = clock.mono_ns() + FILES_LOOK_NS
+        self._due_ns = clock.mono_ns() + FILES_CHECK_PERIOD_NS
 
     def renewed(self) -> bool:
         """Return whether the files have been replaced by new ones that can be used together.
 
         Return True only once for each replacement. The files are checked at most every
-        `FILES_LOOK_NS`.
+        `FILES_CHECK_PERIOD_NS`.
         """
         now_ns = clock.mono_ns()
         if now_ns < self._due_ns:
             return False
-        self._due_ns = now_ns + FILES_LOOK_NS
+        self._due_ns = now_ns + FILES_CHECK_PERIOD_NS
         before, self._seen = self._seen, self._signature()
         if self._seen != before or self._seen == self._used or not self._seen:
             return False
@@ -76,10 +76,10 @@ class CertificateFiles:
         return tuple((one.st_ino, one.st_size, one.st_mtime_ns) for one in about)
 
 
-ENDS_LOOK_S = 60.0
+EXPIRY_CHECK_PERIOD_S = 60.0
 """Pause between two readings of the certificates' expiry times, s."""
 
-ROUTER_LOOKS = 60
+ROUTER_CHECK_EVERY = 60
 """Number of readings of the robot's own certificates for each reading of the routers' certificates.
 The routers' certificates are read less often, because each reading takes one of a router's
 connections. If a router did not answer, all routers are tried again at the next reading of the
@@ -101,32 +101,34 @@ def ends_of(routers: Iterable[str], directory: str) -> dict[str, int]:
 
 
 async def watch_certificates(bus: BusConfig, known: MutableMapping[str, int]) -> None:
-    """Update the expiry times in `known` every `ENDS_LOOK_S`, until this task is cancelled.
+    """Update the expiry times in `known` every `EXPIRY_CHECK_PERIOD_S`, until this task is
+    cancelled.
 
     If a certificate cannot be read, its value stays unchanged. If `bus.outside` names endpoints,
-    the value of the robot's own certificate is not updated, because the TLS gateway reports it.
+    the value of the robot's own certificate is not updated, because the TLS_PREFIX gateway reports
+    it.
 
     Args:
         bus: the settings with the certificate directory and the routers.
         known: maps the name of each certificate to its expiry time, ns since 1970. The names are
             the dict keys of `tls.ends` and `ends_of`.
     """
-    routers = [endpoint for endpoint in bus.connect if endpoint.startswith(TLS)]
+    routers = [endpoint for endpoint in bus.connect if endpoint.startswith(TLS_PREFIX)]
     answered, look = 0, 0
     while True:
         found: dict[str, int] = {}
         try:
             # Wait without a time limit. With a limit, each attempt to read from a disk that hangs
             # would leave one more blocked thread.
-            if answered < len(routers) or look % ROUTER_LOOKS == 0:
+            if answered < len(routers) or look % ROUTER_CHECK_EVERY == 0:
                 found |= await in_thread(lambda: ends_of(routers, bus.tls), None)
                 answered = len(found)
             found |= await in_thread(lambda: ends(bus.tls), None)
         except NoThreadError:
             pass  # the next round tries again
         if bus.outside:
-            # The TLS gateway reports the certificate that it uses.
+            # The TLS_PREFIX gateway reports the certificate that it uses.
             found.pop("", None)
         known.update(found)
         look += 1
-        await asyncio.sleep(ENDS_LOOK_S)
+        await asyncio.sleep(EXPIRY_CHECK_PERIOD_S)

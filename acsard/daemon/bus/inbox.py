@@ -17,7 +17,7 @@ from itertools import count
 
 import zenoh
 
-from acsard.core.incoming.bus_interface import NOTHING, BusInput, Waker
+from acsard.core.incoming.bus_interface import NO_INPUT, BusInput, Waker
 from acsard.core.incoming.commands import MAX_COMMAND_BYTES, Arrival, Via, parts
 from acsard.core.incoming.queries import BUSY, Query, Reply, most_bytes, refused
 from acsard.core.messages.keys_and_roles import (
@@ -34,7 +34,7 @@ from acsard.daemon.bus.bus_thread import BusThread
 from acsard.host import clock
 from acsard.host.mailbox import Mailbox
 
-TICKETS = 1024
+MAX_OPEN_QUERIES = 1024
 """Largest number of queries that are not ended yet. A further query is dropped without an
 answer."""
 
@@ -54,10 +54,10 @@ class Replies:
     def issue(self, query: zenoh.Query, key: str) -> int | None:
         """Store a query, and return its ticket, which is a number.
 
-        Return None if `TICKETS` queries are stored already. The replies are sent on the full key
-        `key`. If `key` is "", each reply is sent on its own key below the robot's id.
+        Return None if `MAX_OPEN_QUERIES` queries are stored already. The replies are sent on the
+        full key `key`. If `key` is "", each reply is sent on its own key below the robot's id.
         """
-        if len(self._queries) >= TICKETS:
+        if len(self._queries) >= MAX_OPEN_QUERIES:
             return None
         ticket = next(self._tickets)
         self._queries[ticket] = (query, key)
@@ -115,32 +115,32 @@ class Replies:
         )
 
 
-ARRIVALS = 16
+COMMAND_BUFFER = 16
 """Size of the buffer of each command key at 100 control steps a second, in samples. At a lower
 control rate the buffer is larger. A newer sample displaces the oldest one. A sender at the limit of
 1000 Hz puts 10 samples between two steps."""
 
-SAMPLES = 64
+GYRO_BUFFER = 64
 """Size of the buffer for gyro samples. A gyro at 400 Hz fills it if the control loop takes no
 samples for 160 ms."""
 
-OTHERS = ""
+OTHER_SOURCES = ""
 """Name of the buffer that the keys of all unconfigured sources share, so that a flood on them
 cannot displace the command of a configured source."""
 
-ALL = "*"
+ANY_CERTIFICATE = "*"
 """Placeholder in a command key for the name of any certificate."""
 
-STOPS = 16
+STOP_BUFFER = 16
 """Size of the buffer for stops. Stops have a buffer of their own, so that no flood of commands
 displaces a stop."""
 
-QUERIES = 256
+QUERY_QUEUE = 256
 """Size of each of the three queues: services, other native queries, and slow queries. If a queue is
 full, further queries are refused with `BUSY`. One slow query is answered per step, so the last of
 256 waits 2.6 s at 100 Hz."""
 
-ATTACHMENT_BYTES = 256
+MAX_ATTACHMENT_BYTES = 256
 """Largest size of an attachment, bytes. An attachment of rmw_zenoh has 33 bytes, and an attachment
 of acsard has up to 140. A longer attachment is cut off. It then cannot be decoded, so it names no
 sender."""
@@ -174,13 +174,19 @@ class Inbox:
         that comes without a timestamp, so a timestamp with this id is not from the sender."""
         self._prefix, self._replies = prefix, replies
         self._arrivals: dict[str, Mailbox[Arrival]] = {
-            key: Mailbox(max(ARRIVALS, round(ARRIVALS * 100.0 / rate_hz)), self._commanded)
-            for key in (*source_keys(sources), *source_keys(sources, ALL), OTHERS)
+            key: Mailbox(
+                max(COMMAND_BUFFER, round(COMMAND_BUFFER * 100.0 / rate_hz)), self._commanded
+            )
+            for key in (
+                *source_keys(sources),
+                *source_keys(sources, ANY_CERTIFICATE),
+                OTHER_SOURCES,
+            )
         }
         # A gyro sample does not wake the control loop. It waits for the next feedback line.
-        self._arrivals[IMU] = Mailbox(SAMPLES, self._note)
-        self._arrivals[SPEED_LIMIT] = Mailbox(ARRIVALS, self._note)
-        self._stops = Mailbox[Arrival](STOPS, self._stopped)
+        self._arrivals[IMU] = Mailbox(GYRO_BUFFER, self._note)
+        self._arrivals[SPEED_LIMIT] = Mailbox(COMMAND_BUFFER, self._note)
+        self._stops = Mailbox[Arrival](STOP_BUFFER, self._stopped)
         # These queues are not mailboxes. In a mailbox a new query would displace the oldest one,
         # but a new query that finds the queue full must be refused.
         self._services: deque[Query] = deque()
@@ -206,7 +212,7 @@ class Inbox:
         addition.
         """
         if not self._any:
-            return NOTHING
+            return NO_INPUT
         self._any = False
         arrivals, overrun, sources = list[Arrival](), 0, set[str]()
         for key, box in self._arrivals.items():
@@ -262,7 +268,7 @@ class Inbox:
             stamp_ns,
             sender,
             via,
-            _bytes(sample.attachment, ATTACHMENT_BYTES),
+            _bytes(sample.attachment, MAX_ATTACHMENT_BYTES),
             received_ns,
         )
         if key == "stop" and put:
@@ -278,7 +284,9 @@ class Inbox:
         """
         buffer = self._arrivals.get(key)
         if buffer is None:
-            buffer = self._arrivals.get(f"{key.rpartition('/')[0]}/{ALL}", self._arrivals[OTHERS])
+            buffer = self._arrivals.get(
+                f"{key.rpartition('/')[0]}/{ANY_CERTIFICATE}", self._arrivals[OTHER_SOURCES]
+            )
         return buffer
 
     def _note(self) -> None:
@@ -326,7 +334,7 @@ class Inbox:
         arrived = clock.now()
         if topic == STOP:
             # The stop itself never waits for other queries, and is never refused with `BUSY`.
-            by = _bytes(query.attachment, ATTACHMENT_BYTES)
+            by = _bytes(query.attachment, MAX_ATTACHMENT_BYTES)
             self._stops.put(Arrival("stop", True, b"", "", arrived.mono_ns, None, "", via, by))
         ticket = self._replies.issue(query, key)
         if ticket is None:
@@ -341,10 +349,10 @@ class Inbox:
             str(encoding) if encoding else "",
             arrived.mono_ns,
             via,
-            _bytes(query.attachment, ATTACHMENT_BYTES),
+            _bytes(query.attachment, MAX_ATTACHMENT_BYTES),
         )
         waiting = self._queue_of(topic, via)
-        if len(waiting) >= QUERIES:
+        if len(waiting) >= QUERY_QUEUE:
             busy = refused(item, BUSY, arrived.wall_ns)
             if busy is not None:
                 self._replies.send(busy)

@@ -26,18 +26,18 @@ from acsard.daemon.bus.bus_thread import BusThread
 from acsard.host import clock
 from acsard.host.mailbox import Bell, Mailbox
 
-OPTIONS: dict[str, Any] = {
+PUBLISHER_OPTIONS: dict[str, Any] = {
     "congestion_control": zenoh.CongestionControl.DROP,
     # A blocked put of another thread with the same priority would delay the puts of this thread.
     "priority": zenoh.Priority.REAL_TIME,
 }
 
-HELD = 16
+SLOT_MESSAGES = 16
 """Largest number of messages of a topic that wait in its slot for the thread. A newer message
 displaces the oldest one. With odometry at 100 Hz, a slot covers 0.16 s. A busy machine, or a client
 that connects, usually blocks the thread for a shorter time."""
 
-STUCK_NS = NS_PER_S // 4
+BLOCKED_AFTER_NS = NS_PER_S // 4
 """Time after which the bus counts as blocked, ns, if the thread has not sent all waiting messages.
 Usually the thread needs 0.1 ms."""
 
@@ -138,7 +138,7 @@ class Outlets:
         """
         dropped, self._dropped = self._dropped, 0
         began_ns, was_stuck = self._began_ns, self._stuck
-        self._stuck = began_ns is not None and now_ns - began_ns > STUCK_NS
+        self._stuck = began_ns is not None and now_ns - began_ns > BLOCKED_AFTER_NS
         return dropped, self._stuck and not was_stuck
 
     def start(self) -> None:
@@ -205,11 +205,11 @@ class Outlets:
                 cache=zenoh.ext.CacheConfig(max_samples=1),
                 publisher_detection=True,
                 sample_miss_detection=HEARTBEAT if gid else None,
-                **OPTIONS,
+                **PUBLISHER_OPTIONS,
             )
         else:
-            publisher = session.declare_publisher(key, encoding=encoding, **OPTIONS)
-        self._slots.setdefault(topic, Mailbox(HELD))
+            publisher = session.declare_publisher(key, encoding=encoding, **PUBLISHER_OPTIONS)
+        self._slots.setdefault(topic, Mailbox(SLOT_MESSAGES))
         outlet = _Outlet(publisher, form, gid, signed)
         self._outlets.setdefault(topic, []).append(outlet)
         if latched:

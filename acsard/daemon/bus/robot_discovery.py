@@ -1,7 +1,7 @@
 """Finds, follows or stops the robots that an `--id` names, and explains why a robot is silent.
 
-Over TLS the access rules allow only exact keys, because a few wildcards can take all the processor
-time of a router. So a client over TLS must name each robot.
+Over TLS_PREFIX the access rules allow only exact keys, because a few wildcards can take all the
+processor time of a router. So a client over TLS_PREFIX must name each robot.
 """
 
 from __future__ import annotations
@@ -13,16 +13,16 @@ import msgspec
 import zenoh
 from msgspec import Struct
 
-from acsard.core.config.settings import TLS
+from acsard.core.config.settings import TLS_PREFIX
 from acsard.core.formatting import many
 from acsard.core.messages.keys_and_roles import JSON_TREE, Topic, by_key, full_key, key_hint, row_of
-from acsard.core.values import ROOT
+from acsard.core.values import ROOT_KEY
 from acsard.daemon.bus.address import require_id
 from acsard.daemon.bus.subscription import Subscription, queue_on
 from acsard.host.errors import NoAnswerError, UsageError
 
-ALL = "*"
-PRESENT_S = 2.0
+ALL_ROBOTS = "*"
+DISCOVERY_S = 2.0
 """Longest wait for the liveliness tokens of the daemons, s."""
 
 
@@ -32,8 +32,8 @@ def named(text: str) -> tuple[str, ...]:
     Return ("*",) for all robots, and () if the text names only one robot. Raises `UsageError` for a
     text with commas that is not a list of robot ids.
     """
-    if text == ALL:
-        return (ALL,)
+    if text == ALL_ROBOTS:
+        return (ALL_ROBOTS,)
     if "," not in text:
         return ()
     ids = tuple(dict.fromkeys(part.strip() for part in text.split(",")))
@@ -56,10 +56,10 @@ def present(session: zenoh.Session, ids: Sequence[str], endpoint: str) -> list[s
     """
     found = set()
     for robot_id in ids:
-        replies = session.liveliness().get(full_key(robot_id, "alive"), timeout=PRESENT_S)
+        replies = session.liveliness().get(full_key(robot_id, "alive"), timeout=DISCOVERY_S)
         found |= {robot_of(str(reply.ok.key_expr)) for reply in replies if reply.ok is not None}
     found.discard("")
-    if not found and ALL in ids:
+    if not found and ALL_ROBOTS in ids:
         raise NoAnswerError(nobody(endpoint))
     return sorted(found)
 
@@ -74,7 +74,7 @@ def presence(session: zenoh.Session, robot_id: str, endpoint: str) -> Presence |
             return Presence(linked=False, here=False)
         if present(session, (robot_id,), endpoint):
             return Presence(linked=True, here=True)
-        return Presence(True, False, tuple(present(session, (ALL,), endpoint)))
+        return Presence(True, False, tuple(present(session, (ALL_ROBOTS,), endpoint)))
     except NoAnswerError:
         return Presence(linked=True, here=False)
     except zenoh.ZError:
@@ -100,7 +100,7 @@ def seen(endpoint: str, robots: int) -> str:
 
 def nobody(endpoint: str) -> str:
     """Return a message that explains why no robot is visible at an endpoint."""
-    if endpoint.startswith(TLS):
+    if endpoint.startswith(TLS_PREFIX):
         return (
             "no robot is visible. Over TLS, name the robots (--id robot1,robot2), or set [access] "
             "wildcards = true on the robots. If that does not help, your certificate has no role "
@@ -137,7 +137,7 @@ def robot_of(key: str) -> str:
     Return "" for any other key, and for a key with a wildcard.
     """
     root, _, rest = key.partition("/")
-    return rest.partition("/")[0] if root == ROOT and not set(key) & set("*$") else ""
+    return rest.partition("/")[0] if root == ROOT_KEY and not set(key) & set("*$") else ""
 
 
 MAX_NAMED = 5
@@ -152,8 +152,8 @@ class Presence(Struct, frozen=True):
     here: bool
     """True if the requested robot is present."""
     others: tuple[str, ...] = ()
-    """The ids of the other visible robots if the requested robot is absent, else (). Over TLS, a
-    client sees other robots only if `access.wildcards` is set."""
+    """The ids of the other visible robots if the requested robot is absent, else (). Over
+    TLS_PREFIX, a client sees other robots only if `access.wildcards` is set."""
 
 
 def explain_silence(key: str, robot_id: str, endpoint: str, presence: Presence) -> str:
@@ -178,7 +178,7 @@ def explain_silence(key: str, robot_id: str, endpoint: str, presence: Presence) 
         more = len(presence.others) - len(near)
         named = ", ".join(near) + (f" and {more} more (`acsard fleet` lists them)" if more else "")
         return f"there is no robot {robot_id}. Robots here: {named}; use --id {near[0]}"
-    if endpoint.startswith(TLS):
+    if endpoint.startswith(TLS_PREFIX):
         return (
             f"robot {robot_id} is not visible: no robot at {endpoint} has this robot.id, or your "
             f"certificate does not permit you to see the robot; `acsard whoami --id {robot_id}` "

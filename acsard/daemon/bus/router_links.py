@@ -15,7 +15,7 @@ from acsard.host.mailbox import Mailbox
 POLL_S = 0.5
 """Time between two polls of Zenoh, s. One poll takes Zenoh 0.1 ms."""
 
-STOP_S = 0.05
+STOP_TIMEOUT_S = 0.05
 """Longest time for which `stop` waits until the polling thread ends, s."""
 
 
@@ -54,11 +54,12 @@ class RouterLinks:
     def stop(self) -> None:
         """Stop polling.
 
-        Wait at most `STOP_S` for the end of the polling thread, because a name lookup may block it.
+        Wait at most `STOP_TIMEOUT_S` for the end of the polling thread, because a name lookup may
+        block it.
         """
         self._over.set()
         if self._thread.is_alive():
-            self._thread.join(STOP_S)
+            self._thread.join(STOP_TIMEOUT_S)
 
     def _run(self) -> None:
         # The first wait gives Zenoh the time to connect.

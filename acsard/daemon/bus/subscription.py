@@ -14,7 +14,7 @@ from acsard.core.values import NS_PER_S
 from acsard.host import clock
 from acsard.host.mailbox import Mailbox
 
-QUEUED = 1000
+MAX_QUEUED_SAMPLES = 1000
 """Largest number of samples that wait for a slow reader. A newer sample displaces the oldest
 one."""
 
@@ -23,7 +23,7 @@ class Arrivals(Mailbox[zenoh.Sample]):
     """The queue of a subscription. Zenoh's thread adds the samples, and a reader takes them."""
 
     def __init__(self) -> None:
-        super().__init__(QUEUED)
+        super().__init__(MAX_QUEUED_SAMPLES)
         self.declared: list[Any] = []
         """The Zenoh subscribers that fill this queue."""
 
@@ -59,7 +59,7 @@ class Subscription:
         Raises `ZError` if the session has closed and no sample waits.
         """
         # The loop is bounded, because a flood of samples on other keys must not block the caller.
-        for _ in range(QUEUED):
+        for _ in range(MAX_QUEUED_SAMPLES):
             sample: zenoh.Sample | None = self._queue.try_recv()
             if sample is None or not self._key or on(self._key, sample):
                 return sample

@@ -1,8 +1,8 @@
-"""Checks and reads the certificate files, and explains why a TLS endpoint cannot be reached.
+"""Checks and reads the certificate files, and explains why a TLS_PREFIX endpoint cannot be reached.
 
 Zenoh reports the same error for every cause. `trouble` therefore repeats the connection step by
-step with Python's own TLS, and returns a message for each cause. This module needs a library from
-the optional extra `tls` only to read the expiry times of certificates.
+step with Python's own TLS_PREFIX, and returns a message for each cause. This module needs a library
+from the optional extra `tls` only to read the expiry times of certificates.
 """
 
 from __future__ import annotations
@@ -16,17 +16,17 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from acsard.core.config.settings import TLS
+from acsard.core.config.settings import TLS_PREFIX
 from acsard.core.values import NS_PER_S
 from acsard.host.errors import CertificateError, NotPermittedError
 
 CA, CERTIFICATE, KEY = "ca.pem", "certificate.pem", "key.pem"
-"""File names in a TLS directory: the certificate of the authority, the certificate of the
+"""File names in a TLS_PREFIX directory: the certificate of the authority, the certificate of the
 directory's owner, and the owner's private key."""
 
 
 def require_usable(directory: str) -> None:
-    """Check that the files of a TLS directory can be read and belong together.
+    """Check that the files of a TLS_PREFIX directory can be read and belong together.
 
     Raises `CertificateError` for a missing or unusable file, and `NotPermittedError` for a file
     that this user may not read. The error's message says how to fix the problem.
@@ -60,7 +60,8 @@ def require_usable(directory: str) -> None:
 
 
 def files_in(directory: str) -> tuple[Path, Path, Path]:
-    """Return the paths of the three files in a TLS directory: authority, certificate and key."""
+    """Return the paths of the three files in a TLS_PREFIX directory: authority, certificate and
+    key."""
     return Path(directory, CA), Path(directory, CERTIFICATE), Path(directory, KEY)
 
 
@@ -90,9 +91,9 @@ def shown_at(endpoint: str, directory: str) -> str:
     """Return the common name of the certificate that this client shows to an endpoint.
 
     Return "" if the endpoint needs no certificate, or if the certificate cannot be read.
-    `directory` is the TLS directory of the client, or "".
+    `directory` is the TLS_PREFIX directory of the client, or "".
     """
-    return common_name(directory) if directory and endpoint.startswith(TLS) else ""
+    return common_name(directory) if directory and endpoint.startswith(TLS_PREFIX) else ""
 
 
 def names_in(directory: str) -> list[str]:
@@ -116,7 +117,7 @@ def _decoded(directory: str) -> dict[str, Any]:
     """Return the decoded certificate in `directory`, or {} if it cannot be read.
 
     The standard library decodes only the certificate of a connected peer. So this function connects
-    a TLS client and a TLS server in memory, both of which use this certificate.
+    a TLS_PREFIX client and a TLS_PREFIX server in memory, both of which use this certificate.
     """
     server_context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     server_context.verify_mode = ssl.CERT_REQUIRED
@@ -145,7 +146,7 @@ AUTHORITY = "the authority"
 
 
 def ends(directory: str) -> dict[str, int]:
-    """Return the expiry times of the certificates in a TLS directory, ns since 1970.
+    """Return the expiry times of the certificates in a TLS_PREFIX directory, ns since 1970.
 
     In the returned dict, the key "" stands for `certificate.pem`, and `AUTHORITY` for `ca.pem`.
     Return {} if a file cannot be read, or if the library `cryptography` is missing.
@@ -166,15 +167,16 @@ def ends(directory: str) -> dict[str, int]:
 
 
 def peer_ends_ns(endpoint: str, directory: str) -> int | None:
-    """Return the expiry time of the certificate that a TLS endpoint uses, ns since 1970.
+    """Return the expiry time of the certificate that a TLS_PREFIX endpoint uses, ns since 1970.
 
     The certificate is not verified, so the function also works if the certificate has expired.
     Return None if no program answers at the endpoint, or if the library `cryptography` is missing.
-    Each wait for the program lasts at most `PATIENCE_S`.
+    Each wait for the program lasts at most `HANDSHAKE_TIMEOUT_S`.
 
     Args:
         endpoint: the endpoint, such as "tls/robot.local:7449".
-        directory: the TLS directory of this machine, whose certificate the program may require.
+        directory: the TLS_PREFIX directory of this machine, whose certificate the program may
+            require.
     """
     try:
         from cryptography import x509
@@ -183,7 +185,7 @@ def peer_ends_ns(endpoint: str, directory: str) -> int | None:
     host, port = _place(endpoint)
     try:
         with (
-            socket.create_connection((host, int(port)), PATIENCE_S) as plain,
+            socket.create_connection((host, int(port)), HANDSHAKE_TIMEOUT_S) as plain,
             _trusting(directory).wrap_socket(plain) as link,
         ):
             return _ends_ns(x509.load_der_x509_certificate(link.getpeercert(True) or b""))
@@ -192,7 +194,7 @@ def peer_ends_ns(endpoint: str, directory: str) -> int | None:
 
 
 def _trusting(directory: str) -> ssl.SSLContext:
-    """Return a TLS client context that accepts any certificate of the server.
+    """Return a TLS_PREFIX client context that accepts any certificate of the server.
 
     The client shows the certificate in `directory` to the server.
     """
@@ -222,16 +224,16 @@ def _place(endpoint: str) -> tuple[str, str]:
     return host.strip("[]"), port
 
 
-PATIENCE_S = 2.0
+HANDSHAKE_TIMEOUT_S = 2.0
 """Longest wait for the server to accept the TCP connection, s. It is also the longest wait for each
-answer of the server in the TLS handshake."""
+answer of the server in the TLS_PREFIX handshake."""
 
-REFUSAL_S = 0.5
-"""Time for which this client waits after the TLS handshake, s. If the server rejects the client's
-certificate, it reports that within this time. If the server accepts it, the server sends
+REFUSAL_WAIT_S = 0.5
+"""Time for which this client waits after the TLS_PREFIX handshake, s. If the server rejects the
+client's certificate, it reports that within this time. If the server accepts it, the server sends
 nothing."""
 
-AWAY = (errno.EHOSTUNREACH, errno.ENETUNREACH, errno.EHOSTDOWN)
+UNREACHABLE = (errno.EHOSTUNREACH, errno.ENETUNREACH, errno.EHOSTDOWN)
 """Error numbers of the operating system that mean that no machine answers at the address."""
 
 EXPIRED, NOT_YET, WRONG_NAME, WRONG_ADDRESS = 10, 9, 62, 64
@@ -243,21 +245,22 @@ UNSIGNED, BARRED, WRONG_PURPOSE = (2, 7, 18, 19, 20, 21), (47, 48), 26
 sign for the names in the certificate, or the certificate is not for a server. For any other code,
 `trouble` reports OpenSSL's own text."""
 
-RENEW = (
+RENEW_ADVICE = (
     "run `acsard tls renew` on the machine that has ca-key.pem (with `--name NAME` for a robot of "
     "a fleet); this command prints the next step"
 )
 
 
 def trouble(endpoint: str, directory: str) -> str:
-    """Return the reason why this machine cannot connect to a TLS endpoint, and how to fix that.
+    """Return the reason why this machine cannot connect to a TLS_PREFIX endpoint, and how to fix
+    that.
 
-    Return "" if the connection succeeds. `directory` is the TLS directory of the client. Blocks for
-    a few seconds at most.
+    Return "" if the connection succeeds. `directory` is the TLS_PREFIX directory of the client.
+    Blocks for a few seconds at most.
     """
     host, port = _place(endpoint)
     try:
-        plain = socket.create_connection((host, int(port)), PATIENCE_S)
+        plain = socket.create_connection((host, int(port)), HANDSHAKE_TIMEOUT_S)
     except socket.gaierror:
         return (
             f"the name {host} does not resolve on this machine; write the robot's IP address "
@@ -270,7 +273,7 @@ def trouble(endpoint: str, directory: str) -> str:
             "drop connections?"
         )
     except (OSError, ValueError) as error:
-        if isinstance(error, OSError) and error.errno in AWAY:
+        if isinstance(error, OSError) and error.errno in UNREACHABLE:
             return (
                 f"{host} cannot be reached ({error.strerror}): is {host} switched on, is it in "
                 "this network, is the address right?"
@@ -289,7 +292,7 @@ def _tls_trouble(plain: socket.socket, host: str, directory: str) -> str:
     _load(context, directory)
     try:
         with context.wrap_socket(plain, server_hostname=host) as link:
-            link.settimeout(REFUSAL_S)
+            link.settimeout(REFUSAL_WAIT_S)
             link.recv(1)
     except ssl.SSLCertVerificationError as error:
         return _server_rejected(error, host, directory)
@@ -308,7 +311,7 @@ def _tls_trouble(plain: socket.socket, host: str, directory: str) -> str:
 def _server_rejected(error: ssl.SSLCertVerificationError, host: str, directory: str) -> str:
     """Return the message for a server whose certificate this client does not accept.
 
-    `directory` is the TLS directory of the client, with the certificate of its authority.
+    `directory` is the TLS_PREFIX directory of the client, with the certificate of its authority.
     """
     now = time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime())
     reason = error.verify_message
@@ -316,7 +319,7 @@ def _server_rejected(error: ssl.SSLCertVerificationError, host: str, directory: 
         case code if code == EXPIRED:
             return (
                 f"the certificate of {host} has expired, according to this machine's clock "
-                f"({now}); if the clock is right, {RENEW}"
+                f"({now}); if the clock is right, {RENEW_ADVICE}"
             )
         case code if code == NOT_YET:
             return (
@@ -338,21 +341,21 @@ def _server_rejected(error: ssl.SSLCertVerificationError, host: str, directory: 
         case code if code in BARRED:
             return (
                 f"the authority in {directory}/{CA} may not sign for the names in the certificate "
-                f"of {host} ({reason}); to make one without these names, {RENEW}"
+                f"of {host} ({reason}); to make one without these names, {RENEW_ADVICE}"
             )
         case code if code == WRONG_PURPOSE:
             return (
                 f"the certificate of {host} is not for a TLS server ({reason}); to make one for "
-                f"servers and clients, {RENEW}"
+                f"servers and clients, {RENEW_ADVICE}"
             )
-    return f"the certificate of {host} is not valid ({reason}); to make another one, {RENEW}"
+    return f"the certificate of {host} is not valid ({reason}); to make another one, {RENEW_ADVICE}"
 
 
 def _client_rejected(reason: str, host: str, directory: str) -> str:
     """Return the message for a server that does not accept the client's certificate.
 
-    `reason` is OpenSSL's name of the TLS alert that the server sent. `directory` is the TLS
-    directory of the client.
+    `reason` is OpenSSL's name of the TLS_PREFIX alert that the server sent. `directory` is the
+    TLS_PREFIX directory of the client.
     """
     certificate = f"{directory}/{CERTIFICATE}"
     if "CERTIFICATE_EXPIRED" in reason:

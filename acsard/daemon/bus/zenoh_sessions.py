@@ -1,4 +1,4 @@
-"""Opens the Zenoh sessions of the daemon, of the TLS gateway and of the client tools.
+"""Opens the Zenoh sessions of the daemon, of the TLS_PREFIX gateway and of the client tools.
 
 This module contains all settings of these sessions, each with its reason.
 """
@@ -13,7 +13,7 @@ from pathlib import Path
 
 import zenoh
 
-from acsard.core.config.settings import TLS, Config
+from acsard.core.config.settings import TLS_PREFIX, Config
 from acsard.core.messages.keys_and_roles import IMU, SPEED_LIMIT, full_key, source_keys
 from acsard.core.ros.transports import command_keys
 from acsard.daemon.bus.access import access_control, gateway_access
@@ -24,14 +24,15 @@ from acsard.host.terminal_modes import coloured
 COMMAND_RATE_HZ = 1000.0
 """Largest number of commands per second that a session accepts on each key. The limit is high
 enough for a zero command 1 ms after another command. It is low enough that a flood of commands does
-not make the daemon miss a control period. The TLS gateway also applies this limit to stops. If it
-drops a stop, it has passed another stop less than a millisecond before, so the robot stops
+not make the daemon miss a control period. The TLS_PREFIX gateway also applies this limit to stops.
+If it drops a stop, it has passed another stop less than a millisecond before, so the robot stops
 anyway."""
 
 MAX_SESSIONS = 256
-"""Largest number of connections of the daemon's session, and of the TLS gateway's session."""
+"""Largest number of connections of the daemon's session, and of the TLS_PREFIX gateway's
+session."""
 
-MESSAGE_BYTES = 65536
+MAX_MESSAGE_BYTES = 65536
 """Largest size of a message that a link accepts, bytes. Commands have a far lower limit."""
 
 
@@ -52,20 +53,20 @@ def daemon_session(config: Config) -> zenoh.Session:
         "queries_default_timeout": 3000,
     }
     settings |= _listening() | _limits(config, access_control(config))
-    if any(endpoint.startswith(TLS) for endpoint in bus.connect):
+    if any(endpoint.startswith(TLS_PREFIX) for endpoint in bus.connect):
         settings |= _tls(bus.tls)
     if bus.connect:
-        settings |= PATIENT
+        settings |= RETRY_SETTINGS
     return _opened(settings, bus.plain)
 
 
 def gateway_session(config: Config) -> zenoh.Session:
-    """Open the session of the TLS gateway, which is a Zenoh router.
+    """Open the session of the TLS_PREFIX gateway, which is a Zenoh router.
 
     Raises `InUseError` if the session cannot listen, for example on an address that is in use.
     """
     bus = config.bus
-    settings = _base("router") | PATIENT | _tls(bus.tls) | _listening()
+    settings = _base("router") | RETRY_SETTINGS | _tls(bus.tls) | _listening()
     # Limit only PUT messages. Otherwise a flood of DELETE messages, which are not stops, would use
     # up the limit of the stops. The daemon's own session does not limit stops.
     stops = _rate_limit("stops", ["put"], [full_key(config.robot.id, "stop")])
@@ -94,7 +95,7 @@ def certificate_trouble(authority: Path, certificate: Path, key: Path) -> str:
         "enable_mtls": True,
     }
     settings = _base("router") | {
-        "listen/endpoints": [f"{TLS}127.0.0.1:0"],
+        "listen/endpoints": [f"{TLS_PREFIX}127.0.0.1:0"],
         "transport/link/tls": files,
     }
     try:
@@ -120,10 +121,10 @@ def no_endpoint(text: str) -> UsageError:
 
 
 def _lacks_port(endpoint: str) -> bool:
-    return endpoint.startswith(("tcp/", TLS)) and not re.search(r":\d+(?=$|[?#])", endpoint)
+    return endpoint.startswith(("tcp/", TLS_PREFIX)) and not re.search(r":\d+(?=$|[?#])", endpoint)
 
 
-PATIENT = {"connect/timeout_ms": -1, "connect/exit_on_failure": False}
+RETRY_SETTINGS = {"connect/timeout_ms": -1, "connect/exit_on_failure": False}
 """Settings with which a session tries to connect again and again until it succeeds."""
 
 
@@ -133,7 +134,7 @@ def _listening() -> dict[str, object]:
     Such clients send nothing, send too much, or do not read.
     """
     return {
-        "transport/link/rx/max_message_size": MESSAGE_BYTES,
+        "transport/link/rx/max_message_size": MAX_MESSAGE_BYTES,
         "transport/unicast/accept_timeout": 1000,
         # With a limit of 32 pending connections, 300 idle connections keep an operator out for 2 s.
         # With a limit of 512 they do not. 512 pending connections take 3 MB.
@@ -170,7 +171,7 @@ def client_session(endpoint: str, tls: str = "") -> zenoh.Session:
 
     Args:
         endpoint: the endpoint, such as "tcp/127.0.0.1:7448".
-        tls: the directory with the client's certificate. Only a TLS endpoint, such as
+        tls: the directory with the client's certificate. Only a TLS_PREFIX endpoint, such as
             "tls/robot.local:7449", needs it.
 
     Raises:
@@ -189,7 +190,7 @@ def client_session(endpoint: str, tls: str = "") -> zenoh.Session:
         "timestamping/enabled": True,
         "transport/link/tx/queue/congestion_control/block/wait_before_close": 50_000,
     }
-    secured = endpoint.startswith(TLS)
+    secured = endpoint.startswith(TLS_PREFIX)
     if secured and not tls:
         raise CertificateError(
             f"{endpoint} requires a certificate: add --tls DIRECTORY (tls= in Python), the "
@@ -230,7 +231,7 @@ def _base(mode: str) -> dict[str, object]:
 
 
 def _tls(directory: str) -> dict[str, object]:
-    """Return Zenoh's TLS settings for the certificate files in `directory`.
+    """Return Zenoh's TLS_PREFIX settings for the certificate files in `directory`.
 
     With these settings, a link closes when the certificate at either end of the link expires.
     """

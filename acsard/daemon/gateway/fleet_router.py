@@ -5,8 +5,8 @@ certificate can still make a router hang with requests that the rules allow. Thi
 that it hangs, and restarts within 2 s (`listener_process.py`).
 
 The template `deploy/zenoh/router.json5` is for one robot. `router_file` repeats the template's
-lines between the marks ROBOT and END for each robot. It repeats the lines between PERSON and END
-PERSON for each certificate that may command.
+lines between the marks ROBOT and END for each robot. It repeats the lines between EXAMPLE_OPERATOR
+and END EXAMPLE_OPERATOR for each certificate that may command.
 """
 
 from __future__ import annotations
@@ -26,23 +26,23 @@ from acsard.daemon.gateway.listener_process import Events, Listener, Observation
 from acsard.host import clock
 from acsard.host.errors import InUseError, RouterFileError, UsageError
 
-EXAMPLE = "robot1"
+EXAMPLE_ROBOT = "robot1"
 """Id of the robot in the template."""
 
-IS_FOR = "// This file is for {}. To make a file for your own robots:\n"
+ROBOTS_COMMENT = "// This file is for {}. To make a file for your own robots:\n"
 """Comment near the top of the template and of the router's file. The ids of the robots replace
 {}."""
 
 _BLOCK = re.compile(r"^ *// ROBOT\n(.*?)^ *// END\n", re.M | re.S)
-_NAME = re.compile(rf"\b{EXAMPLE}\b")
+_NAME = re.compile(rf"\b{EXAMPLE_ROBOT}\b")
 
-PERSON: Role = "operator"
-"""Example name in the template's lines between PERSON and END PERSON. It is replaced by the common
-name of each certificate that may command."""
+EXAMPLE_OPERATOR: Role = "operator"
+"""Example name in the template's lines between EXAMPLE_OPERATOR and END EXAMPLE_OPERATOR. It is
+replaced by the common name of each certificate that may command."""
 
 _PERSONS = re.compile(r"^ *// PERSON\n(.*?)^ *// END PERSON\n", re.M | re.S)
 # Match a whole name or the last part of a key, but not the beginning of a robot's id "operator-1".
-_PERSON = re.compile(rf'(?<=[/" ]){PERSON}(?=")')
+_PERSON = re.compile(rf'(?<=[/" ]){EXAMPLE_OPERATOR}(?=")')
 
 
 def router_file(template: str, robots: Sequence[str], people: Mapping[Role, Sequence[str]]) -> str:
@@ -69,13 +69,15 @@ def router_file(template: str, robots: Sequence[str], people: Mapping[Role, Sequ
     text = _BLOCK.sub(
         lambda block: "".join(_with(_NAME, robot, block[1]) for robot in robots), template
     )
-    text = text.replace(IS_FOR.format(EXAMPLE), IS_FOR.format(", ".join(robots)))
+    text = text.replace(
+        ROBOTS_COMMENT.format(EXAMPLE_ROBOT), ROBOTS_COMMENT.format(", ".join(robots))
+    )
     for role in ROLES:
         listed = ", ".join(json.dumps(name) for name in (role, *people.get(role, ())))
         template_list = _SUBJECT.format(f"{role}s", f'"{role}"')
         text = text.replace(template_list, _SUBJECT.format(f"{role}s", listed))
     # The template has separate lines for the certificate "maintainer", which may command too.
-    commanders = [PERSON, *people.get("operator", ()), *people.get("maintainer", ())]
+    commanders = [EXAMPLE_OPERATOR, *people.get("operator", ()), *people.get("maintainer", ())]
     names = [json.dumps(name)[1:-1] for name in commanders]
     return _PERSONS.sub(
         lambda block: "".join(_with(_PERSON, name, block[1]) for name in names), text
@@ -102,7 +104,7 @@ CERTIFICATE_FILES = ("root_ca_certificate", "listen_certificate", "listen_privat
 """Names of the settings in Zenoh's `transport/link/tls` that name the certificate files of a
 listening endpoint."""
 
-AN_ADDRESS = re.compile(r"^(tcp|tls|udp|quic|ws)/[^?#]*")
+ENDPOINT_ADDRESS = re.compile(r"^(tcp|tls|udp|quic|ws)/[^?#]*")
 """Matches the protocol and the address of an endpoint, without its settings."""
 
 _VALUE_ERROR = re.compile(
@@ -193,7 +195,7 @@ class Router(Listener):
         If so, only the addresses in the file are wrong. Zenoh's own error does not show this.
         """
         config = zenoh.Config.from_file(str(self._file))
-        free = [AN_ADDRESS.sub(r"\1/127.0.0.1:0", endpoint) for endpoint in self._endpoints]
+        free = [ENDPOINT_ADDRESS.sub(r"\1/127.0.0.1:0", endpoint) for endpoint in self._endpoints]
         config.insert_json5("listen/endpoints", json.dumps(free))
         config.insert_json5("connect/endpoints", "[]")
         config.insert_json5("plugins_loading/enabled", "false")

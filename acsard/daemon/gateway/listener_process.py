@@ -30,20 +30,20 @@ from acsard.host.logs import Log
 from acsard.host.rate_limits import Bucket, Rate
 from acsard.host.systemd import Systemd
 
-STUCK_NS = NS_PER_S
+STUCK_AFTER_NS = NS_PER_S
 """Time without a new observation after which Zenoh counts as stuck, ns. An observation takes a
 millisecond."""
 
-FIRST_NS = 5 * NS_PER_S
+FIRST_CONNECTION_NS = 5 * NS_PER_S
 """Time within which the daemon must connect after the session was opened, ns. Otherwise this
-process restarts. The time is longer than `ALONE_NS`, because all clients connect at the same moment
-after a restart."""
+process restarts. The time is longer than `LOST_DAEMON_NS`, because all clients connect at the same
+moment after a restart."""
 
-ALONE_NS = NS_PER_S
+LOST_DAEMON_NS = NS_PER_S
 """Time within which the daemon must connect again after its connection was lost, ns. Otherwise this
 process restarts."""
 
-REPORTS = Rate(1 / 60)
+REPORT_RATE = Rate(1 / 60)
 """Largest rate of the log event that reports that all connections are in use: one a minute."""
 
 MAX_UNANSWERED = 4
@@ -51,7 +51,7 @@ MAX_UNANSWERED = 4
 within 1 s each, the gateway's connection to the daemon counts as dead: the connection is open, but
 its data does not reach the daemon."""
 
-NAMES = 5
+MAX_NAMED = 5
 """Largest number of clients that the event about used-up connections names: those with the most
 connections."""
 
@@ -95,9 +95,9 @@ class SessionHealth:
             events: names of the log events.
         """
         self._most, self._events = most, events
-        self._linked_ns, self._patience_ns = opened_ns, FIRST_NS
-        self._last_ns, self._silence = 0, Silence(STUCK_NS)
-        self._reports = Bucket(REPORTS)
+        self._linked_ns, self._patience_ns = opened_ns, FIRST_CONNECTION_NS
+        self._last_ns, self._silence = 0, Silence(STUCK_AFTER_NS)
+        self._reports = Bucket(REPORT_RATE)
         self.full = 0
         """Number of observations in which all connections were in use."""
 
@@ -128,7 +128,7 @@ class SessionHealth:
         new, self._last_ns = observed.at_ns != self._last_ns, observed.at_ns
         stuck = self._silence.too_long(new, passed_ns)
         if observed.linked:
-            self._linked_ns, self._patience_ns = observed.at_ns, ALONE_NS
+            self._linked_ns, self._patience_ns = observed.at_ns, LOST_DAEMON_NS
         if stuck:
             text = (
                 "Zenoh in this process does not respond, because a client keeps it too busy; the "
@@ -155,14 +155,14 @@ def connection_counts(holders: Sequence[str]) -> str:
 
     `holders` contains the name of the client of each connection, or "" if the name is unknown.
     """
-    most = Counter(holders).most_common(NAMES)
+    most = Counter(holders).most_common(MAX_NAMED)
     return ", ".join(f"{count} by {name or 'an unnamed client'}" for name, count in most)
 
 
-PERIOD_S = 0.25
+CHECK_PERIOD_S = 0.25
 """Time between two observations of the session, and between two checks by the main thread, s."""
 
-MEMORY_BYTES = 192 << 20
+MAX_MEMORY_BYTES = 192 << 20
 """Limit of the data memory of this process, bytes. The process needs 35 MB, or 72 MB if all
 connections are in use. An attack can use another 600 MB in each second, too fast for a periodic
 check. So the kernel enforces the limit: it refuses more memory, which ends the process."""
@@ -281,14 +281,15 @@ class ListenerProcess:
         self._leaving = True
 
     def _wait(self) -> bool:
-        """Send signs of life, wait for `PERIOD_S`, and return whether the process must end."""
+        """Send signs of life, wait for `CHECK_PERIOD_S`, and return whether the process must
+        end."""
         self._manager.alive()
         parent = self._parent
         if parent is None:
-            select.select([], [], [], PERIOD_S)
+            select.select([], [], [], CHECK_PERIOD_S)
             return self._leaving
         parent.beat()
-        readable, _, _ = select.select([parent.fd], [], [], PERIOD_S)
+        readable, _, _ = select.select([parent.fd], [], [], CHECK_PERIOD_S)
         return self._leaving or (bool(readable) and parent.gone())
 
     def _open(self) -> SessionHealth:
@@ -311,7 +312,7 @@ class ListenerProcess:
                 if event is not None:
                     self._log.event(event)
                 self._listener.report(session, observed, health)
-                pause.wait(PERIOD_S)
+                pause.wait(CHECK_PERIOD_S)
         except BaseException as error:  # noqa: BLE001 - raised by `run`, which ends the process
             self._error = error
 
@@ -319,7 +320,7 @@ class ListenerProcess:
 def _confine() -> None:
     """Limit the memory and lower the priority of this process, as far as the system permits it."""
     with contextlib.suppress(OSError, ValueError):
-        resource.setrlimit(resource.RLIMIT_DATA, (MEMORY_BYTES, MEMORY_BYTES))
+        resource.setrlimit(resource.RLIMIT_DATA, (MAX_MEMORY_BYTES, MAX_MEMORY_BYTES))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     with contextlib.suppress(OSError):
         os.nice(NICE)

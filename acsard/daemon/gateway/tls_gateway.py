@@ -30,15 +30,15 @@ from acsard.daemon.gateway.listener_process import (
 )
 from acsard.host import clock
 
-CONNECT_S = 1.0
+CONNECT_TIMEOUT_S = 1.0
 
-PROBE_NS = NS_PER_S
+PROBE_TIMEOUT_NS = NS_PER_S
 """Time between two queries to the daemon, ns. A query that has not ended when the next query is due
 counts as unanswered."""
 
 QUERY_TIMEOUT_S = 60.0
-"""Time after which Zenoh itself ends a query to the daemon, s. It is much longer than `PROBE_NS`,
-after which the query counts as unanswered."""
+"""Time after which Zenoh itself ends a query to the daemon, s. It is much longer than
+`PROBE_TIMEOUT_NS`, after which the query counts as unanswered."""
 
 
 class Gateway(Listener):
@@ -69,7 +69,7 @@ class Gateway(Listener):
         """Return whether the daemon accepts connections. The gateway is opened only then."""
         host, _, port = reachable(self._config.bus.plain[0]).partition("/")[2].rpartition(":")
         try:
-            with socket.create_connection((host.strip("[]"), int(port)), CONNECT_S):
+            with socket.create_connection((host.strip("[]"), int(port)), CONNECT_TIMEOUT_S):
                 return True
         except OSError:
             return False
@@ -116,16 +116,16 @@ class DaemonProbe:
         self._key, self._asked_ns, self._unanswered = key, 0, 0
         self._ended = threading.Event()
         """Set when a query has ended, with or without a reply, since the last query was sent. An
-        earlier query that ends late sets it too. A query that ends within `PROBE_NS` has reached
-        the daemon."""
+        earlier query that ends late sets it too. A query that ends within `PROBE_TIMEOUT_NS` has
+        reached the daemon."""
 
     def unanswered(self, session: zenoh.Session, now_ns: int) -> int:
         """Send the next query if it is due, and return the number of consecutive failed queries.
 
-        A query fails if it does not end within `PROBE_NS`. `now_ns` is the present monotonic time,
-        ns.
+        A query fails if it does not end within `PROBE_TIMEOUT_NS`. `now_ns` is the present
+        monotonic time, ns.
         """
-        if now_ns - self._asked_ns < PROBE_NS:
+        if now_ns - self._asked_ns < PROBE_TIMEOUT_NS:
             return self._unanswered
         if self._asked_ns:
             self._unanswered = 0 if self._ended.is_set() else self._unanswered + 1

@@ -15,14 +15,14 @@ from acsard.daemon.serial.device import close, draining, open_raw, refusal
 from acsard.host import clock
 from acsard.host.processes import Holder, master_of, waited_ns
 
-SEND_S = 0.5
+SEND_TIMEOUT_S = 0.5
 """Longest time for which `send` waits until the driver has accepted all bytes, s. A line needs only
 50 ms, even at the lowest baud rate."""
 
-DRAIN_S = 0.5
+DRAIN_TIMEOUT_S = 0.5
 """Longest time for which `close` waits until the driver has sent the last stop lines, s."""
 
-CLOSE_S = 1.0
+CLOSE_TIMEOUT_S = 1.0
 """Longest time for which `close` waits until the device is closed, s. Some drivers take 30 s,
 because they first try to send the bytes in their buffer."""
 
@@ -63,14 +63,14 @@ class BlockingPort:
     def close(self) -> None:
         """Wait until the last bytes are sent, then unlock and close the port.
 
-        The wait takes at most `DRAIN_S` plus `CLOSE_S`.
+        The wait takes at most `DRAIN_TIMEOUT_S` plus `CLOSE_TIMEOUT_S`.
         """
         device, self._device = self._device, None
         if device is None:
             return
-        for pause in draining(device.fileno(), clock.mono_ns() + int(DRAIN_S * NS_PER_S)):
+        for pause in draining(device.fileno(), clock.mono_ns() + int(DRAIN_TIMEOUT_S * NS_PER_S)):
             time.sleep(pause)
-        close(device, wait_s=CLOSE_S)
+        close(device, wait_s=CLOSE_TIMEOUT_S)
         device.close()
 
     def now_ns(self) -> int:
@@ -89,10 +89,10 @@ class BlockingPort:
     def send(self, data: bytes) -> None:
         """Write all of `data`.
 
-        Raises `WireLostError` if the port is lost, or if it accepts no byte for `SEND_S`.
+        Raises `WireLostError` if the port is lost, or if it accepts no byte for `SEND_TIMEOUT_S`.
         """
         fd = self._fileno()
-        deadline_ns = clock.mono_ns() + int(SEND_S * NS_PER_S)
+        deadline_ns = clock.mono_ns() + int(SEND_TIMEOUT_S * NS_PER_S)
         while data:
             try:
                 data = data[os.write(fd, data) :]

@@ -30,22 +30,22 @@ OPEN_TIMEOUT_S = 5.0
 """Time limit of a call that opens a device, s. After this time the call counts as hung. The daemon
 does not try to open the same device again until that call has returned."""
 
-BACK_OFF_S = (0.05, 0.1, 0.2)
+REOPEN_PAUSES_S = (0.05, 0.1, 0.2)
 """Pauses between the attempts to reopen the port, s. The last pause is repeated. The first pauses
 are short, because udev soon sets the group of a new device."""
 
-PERMISSION_PATIENCE_S = 2.0
+PERMISSION_TIMEOUT_S = 2.0
 """Time for which the starting daemon waits until udev grants access to the device, s. If the daemon
 still has no access after this time, its start fails."""
 
-HUNG = "the driver of the serial port did not answer"
+DRIVER_HUNG = "the driver of the serial port did not answer"
 
-FAREWELL_S = 0.15
+FINAL_STOP_TIMEOUT_S = 0.15
 """Longest time for sending the last STOP, s. It is twice the time of a line at the lowest baud
 rate, plus a margin."""
 
 
-AT_ONCE = 4096
+MAX_READ_BYTES = 4096
 """Largest number of bytes in one read. It is the size of a driver's buffer."""
 
 
@@ -118,7 +118,7 @@ class SerialPort:
         if late is not None and self._transport is not None:
             # If the port is lost, the reader notices and reports it.
             with suppress(serial.SerialException):
-                data = self._transport.serial.read(AT_ONCE)
+                data = self._transport.serial.read(MAX_READ_BYTES)
                 self._received += [Received(late, data)] if data else []
         if not self._received:
             return ()
@@ -155,7 +155,7 @@ class SerialPort:
     # Opening and reopening.
 
     async def __aenter__(self) -> SerialPort:
-        deadline_ns = clock.now().mono_ns + int(PERMISSION_PATIENCE_S * 1e9)
+        deadline_ns = clock.now().mono_ns + int(PERMISSION_TIMEOUT_S * 1e9)
         while True:
             try:
                 await self._open()
@@ -168,7 +168,7 @@ class SerialPort:
             if not denied:
                 self._complain(refused)
                 return self
-            await asyncio.sleep(BACK_OFF_S[-1])
+            await asyncio.sleep(REOPEN_PAUSES_S[-1])
 
     async def keep_open(self) -> None:
         """Reopen the port whenever it is closed, until this task is cancelled."""
@@ -181,14 +181,14 @@ class SerialPort:
                     break
                 except OSError as error:
                     self._complain(refusal(self._path, error))
-                    await asyncio.sleep(BACK_OFF_S[min(attempt, len(BACK_OFF_S) - 1)])
+                    await asyncio.sleep(REOPEN_PAUSES_S[min(attempt, len(REOPEN_PAUSES_S) - 1)])
 
     async def _open(self) -> None:
         path, baud_rate, opening = self._path, self._baud_rate, self._opening
         at = os.stat(path)
         which = at.st_dev, at.st_ino
         if which in opening:
-            raise OSError(errno.EIO, HUNG)
+            raise OSError(errno.EIO, DRIVER_HUNG)
         opening.add(which)
 
         def open_port() -> serial.Serial:
@@ -203,7 +203,7 @@ class SerialPort:
             opening.discard(which)
             raise OSError(errno.EIO, str(error)) from None
         except TimeoutError:
-            raise OSError(errno.EIO, HUNG) from None
+            raise OSError(errno.EIO, DRIVER_HUNG) from None
         self._lost.clear()
         self._fd = device.fileno()
         self._output = SerialOutput(baud_rate, self._stop, self._period_ns)
@@ -260,9 +260,9 @@ class SerialPort:
     async def __aexit__(self, *_: object) -> None:
         """Send STOP as the last line, and close the port, even after an exception.
 
-        Sending takes at most `FAREWELL_S`.
+        Sending takes at most `FINAL_STOP_TIMEOUT_S`.
         """
-        deadline_ns = clock.now().mono_ns + int(FAREWELL_S * 1e9)
+        deadline_ns = clock.now().mono_ns + int(FINAL_STOP_TIMEOUT_S * 1e9)
         while self.is_open and self.offer(self._stop, clock.now()) == "superseded":
             if clock.now().mono_ns > deadline_ns:
                 break

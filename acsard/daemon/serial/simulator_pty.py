@@ -132,7 +132,7 @@ class SimPty:
             self._timer.set(due_ns)
 
 
-POSE = "sim/pose"
+TRUE_POSE_KEY = "sim/pose"
 
 
 class Simulated(SimPty):
@@ -152,7 +152,7 @@ class Simulated(SimPty):
 
     def current(self, key: str) -> Message | None:
         """Return the newest true pose, or None if no pose is known or `key` is not `sim/pose`."""
-        return true_pose(*self._last) if key == POSE and self._last is not None else None
+        return true_pose(*self._last) if key == TRUE_POSE_KEY and self._last is not None else None
 
     def _see(self, sight: Sight) -> None:
         now, bus = clock.now(), self._bus
@@ -160,8 +160,8 @@ class Simulated(SimPty):
         self._last = sight, wall_ns
         if bus is None:
             return
-        if POSE in bus.wanted:
-            bus.publish(POSE, true_pose(sight, wall_ns))
+        if TRUE_POSE_KEY in bus.wanted:
+            bus.publish(TRUE_POSE_KEY, true_pose(sight, wall_ns))
         # The daemon receives this sample from the bus, like a sample of a gyro on a real robot.
         if self._gyro:
             measured_ns = wall_ns - self._delay_ns

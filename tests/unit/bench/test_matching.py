@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from acsard.bench.far_end import NumberedMcu
 from acsard.bench.matching import (
-    PATIENCE_NS,
-    STEPS,
+    CYCLE_LENGTH,
+    LOSS_TIMEOUT_NS,
     Fed,
     Record,
     Sample,
@@ -34,13 +34,13 @@ ONE, TWO = b"ap05.00,bp05.00,cp05.00,dp05.00", b"ap05.02,bp05.02,cp05.02,dp05.02
 
 
 def test_the_speeds_of_one_round_all_differ_and_fit_the_line() -> None:
-    speeds = [staircase(number) for number in range(STEPS)]
-    assert len({f"{speed:05.2f}" for speed in speeds}) == STEPS
+    speeds = [staircase(number) for number in range(CYCLE_LENGTH)]
+    assert len({f"{speed:05.2f}" for speed in speeds}) == CYCLE_LENGTH
     assert all(0.0 < speed < 20.0 for speed in speeds)
 
 
 def test_neighbouring_speeds_are_close_also_from_one_round_to_the_next() -> None:
-    speeds = [staircase(number) for number in range(2 * STEPS + 1)]
+    speeds = [staircase(number) for number in range(2 * CYCLE_LENGTH + 1)]
     assert max(abs(b - a) for a, b in pairwise(speeds)) < 0.03
 
 
@@ -77,7 +77,7 @@ def test_a_command_is_timed_to_the_first_line_with_its_speed() -> None:
 def test_a_command_without_a_line_in_time_is_left_out() -> None:
     assert commands_to_lines([(100, ONE)], []) == []
     assert commands_to_lines([(100, ONE)], [(99, ONE)]) == []
-    assert commands_to_lines([(100, ONE)], [(100 + PATIENCE_NS, ONE)]) == []
+    assert commands_to_lines([(100, ONE)], [(100 + LOSS_TIMEOUT_NS, ONE)]) == []
 
 
 def test_a_sample_is_timed_from_the_line_with_its_speed() -> None:
@@ -96,9 +96,9 @@ def test_a_sample_that_repeats_a_line_or_matches_no_line_is_left_out() -> None:
 
 
 def test_the_same_speed_a_round_later_is_another_line() -> None:
-    said = [(number * 10, staircase(number) / 20) for number in range(2 * STEPS)]
+    said = [(number * 10, staircase(number) / 20) for number in range(2 * CYCLE_LENGTH)]
     samples = [(at_ns + 3, speed) for at_ns, speed in said]
-    assert lines_to_samples(said, samples) == [Fed(3, 0)] * (2 * STEPS)
+    assert lines_to_samples(said, samples) == [Fed(3, 0)] * (2 * CYCLE_LENGTH)
 
 
 def test_a_speed_is_recognised_in_spite_of_rounding() -> None:

@@ -9,7 +9,7 @@ from acsard.calibration.calibration_report import NAMES, keys, parts, report
 from acsard.core.config.parsing import parse
 from acsard.core.config.settings import DriveConfig
 from acsard.core.config.toml_text import excerpt
-from acsard.terminal.output import SENTENCES, plain
+from acsard.terminal.output import MAX_TEXT_WIDTH, plain
 from tests.unit.calibration.cut import calibrated, table, usual
 
 FOUND = calibrated(table(usual(), places=False))
@@ -39,7 +39,7 @@ def test_the_deviation_of_an_unmeasured_scale_is_not_written() -> None:
 
 
 def test_the_text_states_the_improvement_and_the_remaining_error() -> None:
-    told = plain(*parts(REPORT, FOUND, "acsard.toml", guided=False), width=SENTENCES)
+    told = plain(*parts(REPORT, FOUND, "acsard.toml", guided=False), width=MAX_TEXT_WIDTH)
     assert "wheel_separation_multiplier   " in told
     assert f"heading error after a turn of 360 deg: {REPORT.turn_error_before:.0f} deg now" in told
     assert "remaining error" in told

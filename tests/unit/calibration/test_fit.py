@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from acsard.calibration.fit import COUNT, USUAL, Base, Fit, P, fit, huber, of_rows
+from acsard.calibration.fit import PARAMETER_COUNT, PRIOR_STD, Base, Fit, P, fit, huber, of_rows
 from acsard.calibration.heading import Rates, rates
 from acsard.calibration.multipliers import Multipliers, configured, multipliers
 from tests.unit.calibration.cut import BASE, ideal, ready, table
 
-START = np.array([1.0, 1.0, 1.0, *[0.0] * (COUNT - 3)])
+START = np.array([1.0, 1.0, 1.0, *[0.0] * (PARAMETER_COUNT - 3)])
 TRUTH = np.array([0.99, 1.01, 0.7])
 
 
@@ -26,7 +26,7 @@ def fitted(rng: np.random.Generator, shared: float, own: float, blocks: int = 20
     seen = columns @ TRUTH + noise
 
     def source(parameters):  # type: ignore[no-untyped-def]
-        jacobian = np.zeros((len(block), COUNT))
+        jacobian = np.zeros((len(block), PARAMETER_COUNT))
         jacobian[:, :3] = columns
         residual = seen - columns @ parameters[:3]
         return of_rows(jacobian, residual, np.ones(len(block)), block, blocks)
@@ -54,14 +54,14 @@ def test_standard_deviations_cover_the_truth_however_errors_are_correlated(
 
 def test_errors_that_last_for_a_whole_run_widen_the_deviations_by_run() -> None:
     """Each of six runs of four blocks has errors of its own, which a deviation by blocks misses."""
-    known, runs = np.diag([0.0] * 3 + [1.0] * (COUNT - 3)), np.repeat(np.arange(6), 4)
-    normal = np.zeros((24, COUNT, COUNT))
+    known, runs = np.diag([0.0] * 3 + [1.0] * (PARAMETER_COUNT - 3)), np.repeat(np.arange(6), 4)
+    normal = np.zeros((24, PARAMETER_COUNT, PARAMETER_COUNT))
     normal[:, range(3), range(3)] = 1.0
     z: dict[bool, list[float]] = {True: [], False: []}
     for seed in range(30):
         errors = np.random.default_rng(seed).normal(0.0, 0.02, (6, 3))[runs]
         mean = errors.mean(axis=0)
-        score = np.pad(errors - mean, ((0, 0), (0, COUNT - 3)))
+        score = np.pad(errors - mean, ((0, 0), (0, PARAMETER_COUNT - 3)))
         found = Fit(START, normal, score, known, tuple(P)[:3], True, {})
         for by_run, told in z.items():
             std = np.sqrt(np.diag(found.covariance(runs.tolist() if by_run else ())))
@@ -87,10 +87,10 @@ def test_the_normal_equations_of_the_three_parameters_are_well_conditioned() -> 
 
 def fit_of(rate: float) -> Fit:
     """Return a fit with nearly exact parameters."""
-    parameters = np.array([0.99, 1.01, 0.625, rate, *[0.0] * (COUNT - 4)])
-    normal = np.tile(np.eye(COUNT) * 1e12, (12, 1, 1))
-    known, score = np.zeros((COUNT, COUNT)), np.zeros((12, COUNT))
-    return Fit(parameters, normal, score, known, tuple(P)[:4], True, USUAL)
+    parameters = np.array([0.99, 1.01, 0.625, rate, *[0.0] * (PARAMETER_COUNT - 4)])
+    normal = np.tile(np.eye(PARAMETER_COUNT) * 1e12, (12, 1, 1))
+    known, score = np.zeros((PARAMETER_COUNT, PARAMETER_COUNT)), np.zeros((12, PARAMETER_COUNT))
+    return Fit(parameters, normal, score, known, tuple(P)[:4], True, PRIOR_STD)
 
 
 def multipliers_of(fitted: Fit, rate: Rates) -> Multipliers:
@@ -132,7 +132,7 @@ def test_the_errors_of_track_ratio_and_scale_are_separated() -> None:
 
 def test_blocks_add_up_to_the_normal_equations_of_all_rows() -> None:
     rng = np.random.default_rng(1)
-    jacobian, residual = rng.normal(size=(50, COUNT)), rng.normal(size=50)
+    jacobian, residual = rng.normal(size=(50, PARAMETER_COUNT)), rng.normal(size=50)
     weight, block = rng.uniform(size=50), rng.integers(0, 6, 50)
     made = of_rows(jacobian, residual, weight, block, 7)
     assert np.allclose(made.normal.sum(axis=0), jacobian.T @ np.diag(weight) @ jacobian)

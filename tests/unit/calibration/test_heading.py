@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from acsard.calibration import heading
-from acsard.calibration.fit import COUNT, P, huber
+from acsard.calibration.fit import PARAMETER_COUNT, P, huber
 from acsard.calibration.heading import of_gyro, of_yaw, rows
 from acsard.calibration.log_table import LogError
 from acsard.calibration.runs import blocks
@@ -109,7 +109,7 @@ def test_degrees_are_distinguished_from_radians(wrapped: bool) -> None:
         of_yaw(runs, 0.05 / 0.3)
 
 
-AT = np.array([0.9, 1.1, 0.6, 0.05, *[0.0] * (COUNT - 4)])
+AT = np.array([0.9, 1.1, 0.6, 0.05, *[0.0] * (PARAMETER_COUNT - 4)])
 
 
 def test_least_squares_find_both_sides_whatever_their_sign() -> None:

@@ -24,7 +24,7 @@ from msgspec import Struct, structs
 from acsard.calibration import ros_bag_log
 from acsard.calibration.calibration_report import keys, parts, report
 from acsard.calibration.log_table import LogError, RefusedError, Table
-from acsard.calibration.odometry_noise import COUNT, START, Source, Windows
+from acsard.calibration.odometry_noise import INITIAL_NOISE, SOURCE_COUNT, Source, Windows
 from acsard.calibration.plausibility import RATIO, TRACK
 from acsard.calibration.ros_bag_log import Choice
 from acsard.calibration.solve import Calibration, calibrate
@@ -33,7 +33,7 @@ from acsard.core.link.feedback import Feedback
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.odometry import Odometry
 from acsard.core.values import WheelSpeeds
-from acsard.terminal.output import SENTENCES, plain
+from acsard.terminal.output import MAX_TEXT_WIDTH, plain
 from tests.unit.calibration.bags import imu, in_order, joint_states
 from tests.unit.calibration.cut import log_of_runs, table
 from tests.unit.calibration.robots import (
@@ -369,7 +369,7 @@ def test_noise_is_written_beside_the_geometry_and_reported(found: Calibration) -
     assert after.yaw_variance_per_radian < before.yaw_variance_per_radian / 10
     assert after.distance_variance_per_metre < before.distance_variance_per_metre
     made = report("a.csv", found, DriveConfig(), "")
-    told = plain(*parts(made, found, "f", guided=False), width=SENTENCES)
+    told = plain(*parts(made, found, "f", guided=False), width=MAX_TEXT_WIDTH)
     assert (
         "random heading error after 10 m of driving, according to the odometry messages: " in told
     )
@@ -411,10 +411,10 @@ def test_a_log_with_only_a_gyro_gives_no_distance_noise() -> None:
 def test_the_search_finds_the_noise_that_made_the_residuals() -> None:
     """The windows have steps of noise per radian, noise that lasts, and that of the sensor."""
     rng, size, count = np.random.default_rng(3), 8, 600
-    effects = np.zeros((count, COUNT, size, size))
+    effects = np.zeros((count, SOURCE_COUNT, size, size))
     sums = np.minimum.outer(np.arange(1.0, size + 1), np.arange(1.0, size + 1))
     lasting = np.outer(np.arange(1.0, size + 1), np.arange(1.0, size + 1))
-    true = np.zeros(COUNT)
+    true = np.zeros(SOURCE_COUNT)
     for source, matrix, amount in (
         (Source.SKID, sums, 2e-3), (Source.TRACK, lasting, 1e-3),
         (Source.HEADING, np.eye(size), 3e-3),
@@ -425,7 +425,7 @@ def test_the_search_finds_the_noise_that_made_the_residuals() -> None:
         rng.multivariate_normal(np.zeros(size), np.tensordot(true, effects[0], 1), count),
         effects, np.zeros((count, size, size)), np.zeros(3),
     )  # fmt: skip
-    noise = windows.search(START, np.ones(COUNT, dtype=bool))
+    noise = windows.search(INITIAL_NOISE, np.ones(SOURCE_COUNT, dtype=bool))
     used = true > 0.0
     assert noise[used] == pytest.approx(true[used], rel=0.2)
     assert windows.at_least(noise)[used] == pytest.approx(noise[used], rel=0.05)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from acsard.calibration import positions
-from acsard.calibration.fit import COUNT, Base, P
+from acsard.calibration.fit import PARAMETER_COUNT, Base, P
 from acsard.calibration.positions import StartingPoint, search, segments
 from acsard.calibration.runs import Block, blocks
 from tests.unit.calibration.cut import BASE, ideal, log_of, table, usual
@@ -40,7 +40,7 @@ def test_derivatives_are_those_of_the_position_of_the_sensor() -> None:
     run, _ = of(ideal())
     steps, t = positions.wheel_steps(run), np.arange(5.0, 20.0, 0.7)
     place, derivatives = positions.path(steps, BASE, OFF).at(t, OFF)
-    for index in range(COUNT):
+    for index in range(PARAMETER_COUNT):
         more = OFF.copy()
         more[index] += 1e-5
         moved, _ = positions.path(steps, BASE, more).at(t, more)

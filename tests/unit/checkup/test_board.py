@@ -6,7 +6,7 @@ import pytest
 
 from acsard.checkup.board import Board, Operator, Wire
 from acsard.checkup.findings import StoppedError
-from acsard.checkup.motion import MOTOR_S, PATIENCE_S, SPEED, ZERO
+from acsard.checkup.motion import MOTOR_TIMEOUT_S, SLOWING_TIMEOUT_S, SPEED, ZERO
 from acsard.core.config.settings import Config, McuConfig, SimConfig
 from acsard.core.simulator.fake_mcu import FakeMcu
 from acsard.core.simulator.virtual_wire import VirtualWire
@@ -83,7 +83,7 @@ def test_a_motor_that_zeros_do_not_stop_ends_the_check() -> None:
             board.rest()
         sent = len(robot.sent)
     assert end.value.finding.name == "stop"
-    assert f"{2 * MOTOR_S:g} s" in end.value.finding.figure
+    assert f"{2 * MOTOR_TIMEOUT_S:g} s" in end.value.finding.figure
     assert "motor a (front right)" in end.value.finding.text
     assert robot.sent[-1].startswith(b"\r\n")  # one line, then silence
     assert not robot.sent[-2].startswith(b"\r\n")
@@ -152,7 +152,7 @@ def test_the_check_waits_for_wheels_that_slow_down_and_blames_no_comma(sent: boo
         board.rest()
         assert not board.latched
         assert board.comma is sent
-        assert MOTOR_S < board.now_s - began_s < PATIENCE_S
+        assert MOTOR_TIMEOUT_S < board.now_s - began_s < SLOWING_TIMEOUT_S
 
 
 def test_the_wait_for_wheels_that_slow_down_has_an_end() -> None:
@@ -162,7 +162,7 @@ def test_the_wait_for_wheels_that_slow_down_has_an_end() -> None:
         board.drive((0.0, 0.0, 0.0, SPEED), 4.0)
         began = robot.now_ns()
         board.rest()  # the second wait succeeds
-        assert PATIENCE_S * 1e9 < robot.now_ns() - began < 2 * PATIENCE_S * 1e9
+        assert SLOWING_TIMEOUT_S * 1e9 < robot.now_ns() - began < 2 * SLOWING_TIMEOUT_S * 1e9
         assert not board.latched
         assert not board.comma
 

@@ -6,7 +6,7 @@ import pytest
 
 from acsard.checkup import checkup_report, lateness
 from acsard.checkup.checkup_report import report, summary
-from acsard.checkup.findings import REST, Finding
+from acsard.checkup.findings import SKIPPED_STEPS, Finding
 from acsard.core.config.contradictions import contradictions
 from acsard.core.config.parsing import parse
 from acsard.core.config.settings import Config
@@ -26,7 +26,7 @@ def test_a_board_passes_if_it_answered_and_no_step_failed() -> None:
     ("more", "passed"),
     [
         ([lateness.finding("watchdog", 0.08)], False),
-        ([Finding(REST, "SKIPPED", "2 steps", "the check ended early: link")], False),
+        ([Finding(SKIPPED_STEPS, "SKIPPED", "2 steps", "the check ended early: link")], False),
         ([lateness.finding("trailing comma", 0.08), Finding("trailing comma", "PASS")], True),
         ([Finding("round trip", "SKIPPED")], True),
     ],

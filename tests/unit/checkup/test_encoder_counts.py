@@ -164,7 +164,7 @@ def test_if_lines_are_lost_only_configured_or_identified_counts_are_proposed(
     configured: int, verdict: str, keys: dict[str, object]
 ) -> None:
     with Robot("no_sample", link_check="auto", encoder_counts=configured).board() as board:
-        board.sampled, board.lost = True, line_loss.MOST / 4
+        board.sampled, board.lost = True, line_loss.MAX_LOSS / 4
         board.replies = replies(3200)
         finding = encoder_counts.finding(board, [0])
         assert (finding.verdict, finding.keys) == (verdict, keys)
@@ -173,5 +173,5 @@ def test_if_lines_are_lost_only_configured_or_identified_counts_are_proposed(
         # a count that the board states itself needs no measurement
         board.identity = {"counts": "3200"}
         assert encoder_counts.finding(board, [0]).keys == {"mcu.encoder_counts": 3200}
-        board.lost = 2 * line_loss.MOST
+        board.lost = 2 * line_loss.MAX_LOSS
         assert encoder_counts.finding(board, [0]).keys == {}

@@ -6,8 +6,16 @@ from typing import Any
 
 import pytest
 
-from acsard.checkup.lateness import LEAST_S, PAUSE_S, SPOILS_S, Lateness, finding, judged, spoilt
-from acsard.checkup.motion import PERIOD_S
+from acsard.checkup.lateness import (
+    MAX_LATENESS_S,
+    MAX_PAUSE_S,
+    MIN_DELAY_S,
+    Lateness,
+    finding,
+    judged,
+    spoilt,
+)
+from acsard.checkup.motion import LINE_PERIOD_S
 from acsard.checkup.outcomes import Unsure, find
 from tests.each import each
 from tests.unit.checkup.robots import Busy, Robot, Starved
@@ -15,7 +23,7 @@ from tests.unit.checkup.robots import Busy, Robot, Starved
 
 def test_the_largest_lateness_since_a_time_is_reported() -> None:
     lateness = Lateness()
-    for late_s, now_s in ((0.3, 1.0), (0.02, 2.0), (0.05, 3.0), (LEAST_S / 2, 4.0)):
+    for late_s, now_s in ((0.3, 1.0), (0.02, 2.0), (0.05, 3.0), (MIN_DELAY_S / 2, 4.0)):
         lateness.look(late_s, now_s)
     assert [lateness.since(s) for s in (0.0, 1.0, 1.5, 3.0, 3.5)] == [0.3, 0.3, 0.05, 0.05, 0.0]
 
@@ -23,15 +31,15 @@ def test_the_largest_lateness_since_a_time_is_reported() -> None:
 @each(
     ("outcome", "late_s", "doubted"),
     [
-        ("watchdog: late", SPOILS_S, True),
-        ("watchdog: late", 0.9 * SPOILS_S, False),
-        ("watchdog: right", SPOILS_S, False),
-        ("watchdog: right", PAUSE_S, True),
+        ("watchdog: late", MAX_LATENESS_S, True),
+        ("watchdog: late", 0.9 * MAX_LATENESS_S, False),
+        ("watchdog: right", MAX_LATENESS_S, False),
+        ("watchdog: right", MAX_PAUSE_S, True),
         ("watchdog: none", 10.0, False),
-        ("reply rate: slow", SPOILS_S, True),
+        ("reply rate: slow", MAX_LATENESS_S, True),
         ("lost lines: none", 10.0, False),
         ("motor: reversed, not seen", 10.0, False),
-        ("motor: size", SPOILS_S, False),
+        ("motor: size", MAX_LATENESS_S, False),
         ("motor: size", 0.5, True),
     ],
 )
@@ -57,7 +65,7 @@ def test_a_step_that_is_not_judged_is_a_warning_without_keys() -> None:
 
 
 def test_lateness_is_measured_for_every_duration_of_listening() -> None:
-    for seconds in (PERIOD_S, 0.5):
+    for seconds in (LINE_PERIOD_S, 0.5):
         with Busy(late_s=0.08, every=7).board(rest=False) as board:
             for _ in range(7):
                 board.listen(seconds)

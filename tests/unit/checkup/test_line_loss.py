@@ -178,7 +178,7 @@ def test_without_a_motor_that_turns_the_lossy_direction_is_skipped() -> None:
 def test_if_no_lines_are_lost_no_motor_turns() -> None:
     robot = Robot()
     with robot.board() as board:
-        assert found(board, ALL, line_loss.MOST) is None
+        assert found(board, ALL, line_loss.MAX_LOSS) is None
     assert robot.mcu.vehicle.angles == [0.0] * 4
 
 

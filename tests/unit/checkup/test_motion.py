@@ -82,5 +82,5 @@ def test_a_motor_between_two_counts_turns_and_a_silent_one_stands(per_turn: int)
     for n in range(first + 1, len(replies)):
         assert motion.turning(replies[:n], replies[n - 1].at_s) == [1]
     end_s = replies[-1].at_s
-    assert motion.turning(replies, end_s + motion.COUNT_S + 0.01) == []
+    assert motion.turning(replies, end_s + motion.MAX_REPLY_AGE_S + 0.01) == []
     assert motion.turning([], end_s) == []

@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 
 from acsard.checkup import procedure
-from acsard.checkup.board import FAREWELL
-from acsard.checkup.findings import REST, Finding, WireLostError
+from acsard.checkup.board import FINAL_ZEROS
+from acsard.checkup.findings import SKIPPED_STEPS, Finding, WireLostError
 from acsard.checkup.motion import SPEED
 from acsard.core.config.settings import Config, McuConfig, SimConfig, WheelMap
 from acsard.core.link.codec import Codec
@@ -119,12 +119,12 @@ def test_a_wheel_without_an_encoder_is_not_commanded_backward() -> None:
 
 
 def test_the_question_warns_that_a_faulty_wheel_can_reach_full_speed() -> None:
-    assert "dead or reversed can reach full speed" in procedure.CONFIRM
+    assert "dead or reversed can reach full speed" in procedure.CONFIRMATION
 
 
 def test_every_step_has_a_finding() -> None:
     checked = check(person=True)
-    assert not [f for f in checked.findings if f.name == REST]
+    assert not [f for f in checked.findings if f.name == SKIPPED_STEPS]
     names = {"motors" if f.name.startswith("motor ") else f.name for f in checked.findings}
     assert names == set(procedure.STEPS)
 
@@ -346,8 +346,8 @@ def test_a_q_typed_while_a_motor_turns_ends_the_check(typed: str) -> None:
 
     with robot.faulty(), pytest.raises(KeyboardInterrupt):
         procedure.run(robot, Quits(robot), robot.config, lambda finding: None)
-    assert questions == [procedure.CONFIRM]
-    assert b"".join(robot.sent[-5:]).count(Codec(WheelMap()).stop) == FAREWELL
+    assert questions == [procedure.CONFIRMATION]
+    assert b"".join(robot.sent[-5:]).count(Codec(WheelMap()).stop) == FINAL_ZEROS
     assert robot.later() == [0.0] * 4
 
 
@@ -449,7 +449,7 @@ def test_after_a_stall_of_the_terminal_the_check_sends_no_line_that_turns_a_moto
     procedure.run(robot, Watches(robot), robot.config, tell, lambda: robot.asleep_ns)
     assert robot.stalled
     assert robot.turned_after == []
-    assert [finding.name for finding in found[-2:]] == ["stall", REST]
+    assert [finding.name for finding in found[-2:]] == ["stall", SKIPPED_STEPS]
 
 
 @pytest.mark.parametrize("asleep", [False, True], ids=["stopped", "suspended"])
@@ -582,7 +582,7 @@ def test_a_runaway_ends_the_check_before_any_faster_command() -> None:
     checked = Checked(robot)
     assert checked.failed == ["runaway"]
     assert "more than 6 rad/s" in checked["runaway"].text
-    assert "watchdog" in checked[REST].text
+    assert "watchdog" in checked[SKIPPED_STEPS].text
     told = [max(float(token[2:7]) for token in line.split(b",")[:4])
             for _, line in robot.mcu.heard if line.startswith(b"a")]  # fmt: skip
     # Motor a was commanded its 3 rad/s. Motor b got no command above the speed that already looked
@@ -656,7 +656,7 @@ def test_a_motor_that_runs_away_on_zeros_is_left_to_the_watchdog() -> None:
     robot = Regulates("reversed_encoder=b", lag=0.05)
     with robot.board() as board:
         board.drive((0.0, SPEED, 0.0, 0.0), 0.05)
-    assert 1 <= zeros_after(robot.sent) < FAREWELL
+    assert 1 <= zeros_after(robot.sent) < FINAL_ZEROS
     assert not any(robot.later())
 
 

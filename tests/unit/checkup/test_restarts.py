@@ -12,10 +12,10 @@ import pytest
 from acsard.checkup.motion import ZERO, Reply
 from acsard.checkup.procedure import AGAIN, MOST
 from acsard.checkup.restarts import (
-    AHEAD_S,
-    ASKED_S,
-    CLOCK,
-    UNANSWERED,
+    ANSWER_TIMEOUT_S,
+    CLOCK_RANGE_MS,
+    CLOCK_TOLERANCE_S,
+    RESTART_UNANSWERED_LINES,
     Restart,
     Restarts,
     finding,
@@ -191,7 +191,7 @@ def test_restarts_with_different_causes_get_the_general_remedy() -> None:
 
 
 def reply(at_s: float, mcu_ms: int) -> Reply:
-    return Reply(at_s, ZERO, b"", Reading(mcu_ms % CLOCK, (0, 0, 0, 0)))
+    return Reply(at_s, ZERO, b"", Reading(mcu_ms % CLOCK_RANGE_MS, (0, 0, 0, 0)))
 
 
 def heard(*replies: Reply) -> Restarts:
@@ -213,16 +213,16 @@ def test_the_name_sent_when_the_port_was_opened_is_not_a_restart() -> None:
 def test_the_name_of_the_board_is_a_restart_unless_it_was_requested() -> None:
     restarts = heard(reply(0.0, 0))
     restarts.asked(1.0)
-    assert restarts.look(NAME, 1.0 + ASKED_S, None) is None
+    assert restarts.look(NAME, 1.0 + ANSWER_TIMEOUT_S, None) is None
     assert (
-        sign(restarts.look(NAME, 1.1 + ASKED_S, None))
+        sign(restarts.look(NAME, 1.1 + ANSWER_TIMEOUT_S, None))
         == "the board sent its name without a request"
     )
 
 
 def test_a_text_is_a_restart_after_a_silence_and_a_debug_print_otherwise() -> None:
     restarts = heard(reply(0.0, 0))
-    for _ in range(UNANSWERED - 1):
+    for _ in range(RESTART_UNANSWERED_LINES - 1):
         restarts.sent(ZERO, 0.0)
     assert restarts.look(TEXT, 0.1, None) is None
     restarts.sent(ZERO, 0.1)
@@ -231,7 +231,7 @@ def test_a_text_is_a_restart_after_a_silence_and_a_debug_print_otherwise() -> No
     assert "text" in sign(restarts.look(TEXT, 0.2, None))
 
 
-@each("start_ms", [0, 40_000, CLOCK - 5_000])
+@each("start_ms", [0, 40_000, CLOCK_RANGE_MS - 5_000])
 @each("clock", [0.98, 1.0, 1.02])
 def test_a_clock_that_continues_is_not_a_restart_at_any_pace_or_at_its_overflow(
     start_ms: int, clock: float
@@ -243,14 +243,14 @@ def test_a_clock_that_continues_is_not_a_restart_at_any_pace_or_at_its_overflow(
 def test_replies_that_were_held_up_and_arrive_together_are_not_a_restart() -> None:
     late = [reply(1.5 + n / 1000, 100 + 100 * n) for n in range(14)]
     heard(reply(0.0, 0), *late, reply(1.6, 1600))
-    assert AHEAD_S > 1.5
+    assert CLOCK_TOLERANCE_S > 1.5
 
 
-@pytest.mark.parametrize("before_ms", [3_000, 20_000, 40_000, CLOCK - 1])
+@pytest.mark.parametrize("before_ms", [3_000, 20_000, 40_000, CLOCK_RANGE_MS - 1])
 def test_a_clock_that_restarted_is_a_restart_of_the_board(before_ms: int) -> None:
     restarts = heard(reply(10.0, before_ms))
     again = reply(12.1, 100)
-    gone_ms = (100 - before_ms) % CLOCK
+    gone_ms = (100 - before_ms) % CLOCK_RANGE_MS
     assert ("started again" in sign(restarts.look(b"", again.at_s, again))) == (gone_ms > 4100)
 
 

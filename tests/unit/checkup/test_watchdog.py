@@ -11,7 +11,7 @@ from acsard.checkup import dialect, watchdog
 from acsard.checkup.board import Board
 from acsard.checkup.findings import StoppedError
 from acsard.checkup.motion import SPEED
-from acsard.checkup.watchdog import UNKNOWN, Between, run
+from acsard.checkup.watchdog import NOT_MEASURED, Between, run
 from acsard.checkup.wheels import turn
 from acsard.core.config.settings import Config, SimConfig
 from acsard.core.simulator import protocol
@@ -162,7 +162,7 @@ def test_the_true_time_lies_within_the_measured_interval(
 
 @pytest.mark.parametrize("kind", ["plain_only", "no_sample", "free_running"])
 def test_the_watchdog_time_of_motors_that_never_stop_is_unknown(kind: str) -> None:
-    assert silence(Robot(kind, "no_watchdog"))[1] == UNKNOWN
+    assert silence(Robot(kind, "no_watchdog"))[1] == NOT_MEASURED
 
 
 def test_motors_that_turn_alone_but_not_together_end_the_check() -> None:

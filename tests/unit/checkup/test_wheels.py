@@ -6,7 +6,7 @@ import pytest
 from msgspec import structs
 
 from acsard.checkup import dialect, wheels
-from acsard.checkup.motion import GLANCE_S, PATIENCE_S, SPEED
+from acsard.checkup.motion import SHORT_MEASUREMENT_S, SLOWING_TIMEOUT_S, SPEED
 from acsard.checkup.wheels import Channel, Kind, encoder_finding, wheel_map
 from acsard.core.config.settings import Config, McuConfig, SimConfig, WheelMap
 from acsard.core.link.codec import Motors
@@ -134,7 +134,7 @@ def test_a_probe_is_short_and_commands_a_dead_motor_at_most_3_rad_s() -> None:
         assert wheels.probe(board, 1) == (0.0, 0.0, 0.0, 0.0)
         told = [line for line in robot.sent[before:] if b"bp00.00" not in line]
         assert {line[8:15] for line in told} == {b"bp01.50", b"bp03.00"}
-        assert len(told) <= 2 * (GLANCE_S / board.period_s + 1)
+        assert len(told) <= 2 * (SHORT_MEASUREMENT_S / board.period_s + 1)
         assert robot.now_ns() - began < 3e9
         assert wheels.probe(board, 0) is None
 
@@ -161,4 +161,4 @@ def test_a_motor_that_still_accelerates_is_driven_on_for_a_limited_time() -> Non
         with robot.board() as board:
             began = robot.now_ns()
             assert wheels.run_up(board, wheels.one(0, SPEED))[0] > speed
-            assert robot.now_ns() - began < 1.2e9 * PATIENCE_S
+            assert robot.now_ns() - began < 1.2e9 * SLOWING_TIMEOUT_S

@@ -15,7 +15,7 @@ from acsard.cli.run import options
 from acsard.core.config.parsing import parse
 from acsard.core.config.settings import Config
 from acsard.host import config_file
-from acsard.host.config_file import PLACES, find, writable
+from acsard.host.config_file import SEARCH_PATHS, find, writable
 from acsard.host.errors import Exit, MendableError, UsageError
 from tests.each import each
 
@@ -44,12 +44,12 @@ def _places(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Places:
     places.here.parent.mkdir()
     monkeypatch.chdir(places.here.parent)
     monkeypatch.delenv("ACSARD_CONFIG", raising=False)
-    monkeypatch.setattr(config_file, "PLACES", (PLACES[0], places.etc))
+    monkeypatch.setattr(config_file, "SEARCH_PATHS", (SEARCH_PATHS[0], places.etc))
     return places
 
 
 def test_the_file_is_searched_in_the_working_directory_and_in_etc() -> None:
-    assert [str(place) for place in PLACES] == ["acsard.toml", "/etc/acsard/acsard.toml"]
+    assert [str(place) for place in SEARCH_PATHS] == ["acsard.toml", "/etc/acsard/acsard.toml"]
 
 
 def test_the_option_wins_over_all_others(places: Places, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,7 +7,7 @@ import pytest
 from acsard.cli import main, parser
 from acsard.host import errors
 from acsard.host.errors import (
-    WORDS,
+    EXIT_TEXTS,
     Exit,
     ExitError,
     MendableError,
@@ -54,8 +54,8 @@ def test_the_help_names_every_code(capsys: pytest.CaptureFixture[str]) -> None:
         main(["--help"])
     told = capsys.readouterr().out
     assert all(f" {int(code)} " in told for code in Exit)
-    assert all(f"{code} {words}" in " ".join(told.split()) for code, words in WORDS.items())
-    assert set(WORDS) == set(Exit)
+    assert all(f"{code} {words}" in " ".join(told.split()) for code, words in EXIT_TEXTS.items())
+    assert set(EXIT_TEXTS) == set(Exit)
 
 
 @each("code", list(Exit))

@@ -37,7 +37,7 @@ def test_the_server_refuses_to_listen_beyond_this_machine() -> None:
 @pytest.mark.parametrize(
     ("text", "address"),
     [
-        (foxglove.DEFAULT, ("127.0.0.1", 8765)),
+        (foxglove.DEFAULT_ADDRESS, ("127.0.0.1", 8765)),
         ("localhost:9000", ("127.0.0.1", 9000)),
         ("127.1.2.3:1", ("127.1.2.3", 1)),
     ],

@@ -140,7 +140,7 @@ def test_write_without_a_file_is_refused_before_anything_moves(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("ACSARD_CONFIG", raising=False)
-    monkeypatch.setattr("acsard.host.config_file.PLACES", (Path("acsard.toml"),))
+    monkeypatch.setattr("acsard.host.config_file.SEARCH_PATHS", (Path("acsard.toml"),))
     args = parser(["mcu"]).parse_args(["mcu", "check", "--port", "sim", "--yes", "--write"])
     with pytest.raises(MendableError, match="no configuration file"):
         args.main(args)

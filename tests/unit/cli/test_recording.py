@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 from msgspec.structs import replace
 
-from acsard.cli.recording import SERVICE
+from acsard.cli.recording import SERVICE_DIRECTORY
 from acsard.core.config.settings import Config, RecordConfig
 from acsard.core.values import NS_PER_S, Event
 from acsard.host.errors import Exit
@@ -538,4 +538,4 @@ def test_the_default_directory_is_that_of_the_service() -> None:
     says = dict(row.partition("=")[::2] for row in unit.read_text().splitlines() if "=" in row)
     state = Path("/var/lib") / says["StateDirectory"]
     assert says["Environment"] == f"ACSARD_RECORD=%S/{says['StateDirectory']}/record"
-    assert state / "record" == SERVICE
+    assert state / "record" == SERVICE_DIRECTORY

@@ -14,7 +14,7 @@ import pytest
 
 from acsard.recording.file import Recording
 from acsard.recording.file_replay import steps
-from acsard.recording.recorded_steps import MICRO
+from acsard.recording.recorded_steps import US_PER_S
 from tests.scenarios.taped import chunks
 from tests.system.typed import typed
 from tests.unit.report.seen import column
@@ -39,7 +39,7 @@ def pictures(path: Path) -> dict[str, list[dict[str, Any]]]:
 def ends_at() -> tuple[float, float]:
     """Return the robot's last recorded position, m."""
     poses = [pose for step in steps(Recording(QUIET)) for pose in step.recorded.poses]
-    return poses[-1][0] / MICRO, poses[-1][1] / MICRO
+    return poses[-1][0] / US_PER_S, poses[-1][1] / US_PER_S
 
 
 @pytest.mark.slow

@@ -11,7 +11,7 @@ import pytest
 
 from acsard.cli import main
 from acsard.core.config.settings import Config
-from acsard.recording.time_span import TIMES
+from acsard.recording.time_span import TIME_EXAMPLES
 from tests.each import each
 from tests.scenarios.taped import Tape, recorded_world
 from tests.scenarios.world import START, World
@@ -305,8 +305,8 @@ def test_seconds_are_refused_for_all_recordings_and_not_recommended(
 ) -> None:
     code, _, err = recording(tmp_path, *words.split())
     assert (code, "either name one recording, as in " in err) == (2, True)
-    assert err.endswith(f", or write a time, for example {TIMES}")
-    assert "second" not in TIMES
+    assert err.endswith(f", or write a time, for example {TIME_EXAMPLES}")
+    assert "second" not in TIME_EXAMPLES
 
 
 @each(

@@ -10,7 +10,7 @@ from acsard.cli import parser, run
 from acsard.cli.common import tables
 from acsard.core.config.parsing import parse
 from acsard.core.config.settings import Config, McuConfig, WebConfig
-from acsard.machine.daemon_findings import OPTIONS
+from acsard.machine.daemon_findings import OPTION_KEYS
 from tests.each import each
 
 
@@ -37,7 +37,7 @@ def test_the_doctor_knows_every_key_that_options_set() -> None:
                      "--record", "d", "--listen", "tcp/127.0.0.1:1", "--connect", "tcp/127.0.0.1:2",
                      )  # fmt: skip
     keys = {f"{section}.{key}" for section, values in given.items() for key in values}
-    assert keys == set(OPTIONS)
+    assert keys == set(OPTION_KEYS)
 
 
 @each(

@@ -14,7 +14,7 @@ from acsard.cli import VERBS
 from acsard.cli.topics import ros_table
 from acsard.core.config.settings import CommandsConfig, Config, RosConfig, Source
 from acsard.core.messages.keys_and_roles import PUBLISHED
-from acsard.core.ros.transports import PARAMETERS, left_out, ros_names
+from acsard.core.ros.transports import PARAMETERS_PREFIX, left_out, ros_names
 
 
 def test_every_ros_name_is_listed_with_what_it_stands_for() -> None:
@@ -23,7 +23,7 @@ def test_every_ros_name_is_listed_with_what_it_stands_for() -> None:
     names = ros_names(RosConfig(namespace="robot1"), left_out(Config()))
     assert rows == [(f"/robot1/{n.name}", n.direction, n.type) for n in names]
     for row, name in zip(table.topics, names, strict=True):
-        if not name.native.startswith(PARAMETERS):
+        if not name.native.startswith(PARAMETERS_PREFIX):
             assert row.note.startswith(f"as {name.native}")
 
 

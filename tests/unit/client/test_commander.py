@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 
 from acsard.client.commander import (
-    DRIVES_NS,
-    GATHER_NS,
-    LONGEST_S,
+    BURST_WINDOW_NS,
+    DRIVING_TIMEOUT_NS,
+    MAX_OPEN_TIMEOUT_S,
     RELEASED_NS,
     SILENCE_NS,
     STALE_NS,
@@ -135,8 +135,8 @@ def test_a_speed_that_waited_too_long_is_not_sent(panel: Panel) -> None:
 def test_only_the_first_wish_after_a_silence_waits_for_a_burst(panel: Panel) -> None:
     panel.commander.take(Wish(AHEAD), panel.now)
     assert panel.commander.send(panel.now) == Wish(REST)
-    assert panel.commander.send(panel.now + GATHER_NS - 1) is None
-    assert panel.commander.send(panel.now + GATHER_NS) == Wish(AHEAD)
+    assert panel.commander.send(panel.now + BURST_WINDOW_NS - 1) is None
+    assert panel.commander.send(panel.now + BURST_WINDOW_NS) == Wish(AHEAD)
     panel.now += 100 * MS
     panel.commander.take(Wish(AHEAD), panel.now)
     assert panel.commander.send(panel.now) == Wish(AHEAD)
@@ -156,7 +156,7 @@ def test_a_sender_that_leaves_while_not_driving_sends_no_zero(panel: Panel) -> N
     panel.press(REST)
     assert panel.commander.end(panel.now) is None
     panel.press(AHEAD, times=2)
-    assert panel.commander.end(panel.now + int((LONGEST_S + 1.0) * NS_PER_S)) is None
+    assert panel.commander.end(panel.now + int((MAX_OPEN_TIMEOUT_S + 1.0) * NS_PER_S)) is None
 
 
 def test_a_sender_that_leaves_after_its_timeout_stops_no_other_driver(panel: Panel) -> None:
@@ -169,7 +169,7 @@ def test_a_sender_drives_while_its_newest_wish_has_a_speed(panel: Panel) -> None
     assert not panel.commander.drives(panel.now)
     panel.press(AHEAD)
     assert panel.commander.drives(panel.now)
-    assert not panel.commander.drives(panel.now + DRIVES_NS)
+    assert not panel.commander.drives(panel.now + DRIVING_TIMEOUT_NS)
     panel.press(REST)
     assert not panel.commander.drives(panel.now)
 
@@ -177,12 +177,12 @@ def test_a_sender_drives_while_its_newest_wish_has_a_speed(panel: Panel) -> None
 def test_a_wish_keeps_its_stamp_and_the_zero_before_it_is_stamped_earlier(panel: Panel) -> None:
     stamp_ns = 1000 * NS_PER_S
     panel.commander.take(Wish(AHEAD, stamp_ns), panel.now)
-    assert panel.commander.send(panel.now + 3) == Wish(REST, stamp_ns - GATHER_NS)
-    panel.now += GATHER_NS
+    assert panel.commander.send(panel.now + 3) == Wish(REST, stamp_ns - BURST_WINDOW_NS)
+    panel.now += BURST_WINDOW_NS
     assert panel.commander.send(panel.now) == Wish(AHEAD, stamp_ns)
-    panel.commander.take(Wish(LEFT, stamp_ns + 2 * GATHER_NS), panel.now)
-    assert panel.commander.send(panel.now) == Wish(LEFT, stamp_ns + 2 * GATHER_NS)
-    assert panel.commander.end(panel.now + 5) == Wish(REST, stamp_ns + 5 + 2 * GATHER_NS)
+    panel.commander.take(Wish(LEFT, stamp_ns + 2 * BURST_WINDOW_NS), panel.now)
+    assert panel.commander.send(panel.now) == Wish(LEFT, stamp_ns + 2 * BURST_WINDOW_NS)
+    assert panel.commander.end(panel.now + 5) == Wish(REST, stamp_ns + 5 + 2 * BURST_WINDOW_NS)
 
 
 def test_a_zero_is_stamped_earlier_than_a_command_that_need_not_wait() -> None:

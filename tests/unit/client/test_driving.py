@@ -13,9 +13,9 @@ import pytest
 import zenoh
 from msgspec.structs import replace
 
-from acsard.client.commander import GRACE_S, OPENED_S, objection
+from acsard.client.commander import GRACE_S, OPEN_TIMEOUT_S, objection
 from acsard.client.driving import SETTLED_S, UnheardError, drive
-from acsard.client.follower import FIRST_S, SILENT_S
+from acsard.client.follower import FIRST_STATE_TIMEOUT_S, SILENT_S
 from acsard.core.messages.schema import RobotState, SourceState, Time
 from acsard.core.values import NS_PER_S
 from acsard.host import clock
@@ -229,16 +229,16 @@ AGAINST: list[tuple[str, Says, type[Exception], str, float, bool]] = [
      "app is not one of commands.sources: nav; use one of these sources, or add app",
      SETTLED_S, False),
     ("no link", after(0, replace(STOPPED, mode="waiting", reason="waiting for the first lines")),
-     NotDrivenError, "first lines", OPENED_S, False),
+     NotDrivenError, "first lines", OPEN_TIMEOUT_S, False),
     ("link lost", after(1.0, replace(STOPPED, mode="waiting", reason="no line for 0.3 s")),
      NotDrivenError, "no line", 1.0 + GRACE_S, True),
     ("unheard", after(0, replace(STOPPED, mode="ready", sources=[source("a command", None)])),
-     UnheardError, "receives no command of source app", OPENED_S, False),
-    ("outranked", after(0, HIGHER), NotDrivenError, "has priority", OPENED_S, False),
+     UnheardError, "receives no command of source app", OPEN_TIMEOUT_S, False),
+    ("outranked", after(0, HIGHER), NotDrivenError, "has priority", OPEN_TIMEOUT_S, False),
     ("outranked on the way", after(0.9, HIGHER), NotDrivenError, "priority", 0.9 + GRACE_S, True),
-    ("another sender", after(0, replace(FOLLOWED, sender=OTHER)), NotDrivenError, OTHER, OPENED_S,
-     False),
-    ("dead", after(0, None), NoAnswerError, "nothing received", FIRST_S, False),
+    ("another sender", after(0, replace(FOLLOWED, sender=OTHER)), NotDrivenError, OTHER,
+     OPEN_TIMEOUT_S, False),
+    ("dead", after(0, None), NoAnswerError, "nothing received", FIRST_STATE_TIMEOUT_S, False),
     ("killed on the way", after(1.0, None), NoAnswerError, "nothing", 0.9 + SILENT_S, True),
 ]  # fmt: skip
 

@@ -10,16 +10,16 @@ import pytest
 from msgspec.structs import replace
 
 from acsard.client.follower import (
-    ASK_S,
-    FIRST_S,
-    FLEET_ASK_S,
+    FIRST_STATE_TIMEOUT_S,
+    FLEET_QUERY_PERIOD_S,
+    QUERY_PERIOD_S,
     SILENT_S,
     Follower,
     Watch,
     restarted,
 )
 from acsard.core.messages.schema import RobotState, Time
-from acsard.daemon.bus.subscription import QUEUED
+from acsard.daemon.bus.subscription import MAX_QUEUED_SAMPLES
 from tests.unit.top.screens import BEFORE, STATE, raw_sample, sample_of
 
 TICK = 0.01
@@ -52,24 +52,26 @@ def test_a_robot_that_publishes_often_is_never_queried() -> None:
 
 def test_a_robot_that_rarely_publishes_is_queried_at_even_intervals() -> None:
     times = asked(Follower(0.0), 0.0, 10.0)
-    assert times == pytest.approx([ASK_S * n for n in range(1, len(times) + 1)], abs=10 * TICK)
+    assert times == pytest.approx(
+        [QUERY_PERIOD_S * n for n in range(1, len(times) + 1)], abs=10 * TICK
+    )
     assert len(times) > 25
 
 
 def test_a_robot_that_never_sent_a_state_is_reported_silent_after_a_longer_time() -> None:
     follower = Follower(0.0)
-    assert not follower.silent(FIRST_S - TICK)
-    assert follower.silent(FIRST_S + TICK)
+    assert not follower.silent(FIRST_STATE_TIMEOUT_S - TICK)
+    assert follower.silent(FIRST_STATE_TIMEOUT_S + TICK)
     follower.published(STATE, 10.0)
     assert not follower.silent(10.0 + SILENT_S - TICK)
     assert follower.silent(10.0 + SILENT_S + TICK)
 
 
 def test_a_robot_that_is_rarely_queried_is_not_silent_between_its_answers() -> None:
-    follower, now = Follower(0.0, FLEET_ASK_S), 0.0
+    follower, now = Follower(0.0, FLEET_QUERY_PERIOD_S), 0.0
     follower.published(at(1), now)
     for sec in range(2, 10):
-        (now,) = asked(follower, now, now + 1.5 * FLEET_ASK_S)
+        (now,) = asked(follower, now, now + 1.5 * FLEET_QUERY_PERIOD_S)
         now += 0.5
         assert not follower.silent(now)
         assert follower.answered(at(sec), now)
@@ -161,9 +163,9 @@ def test_a_state_published_after_the_answer_replaces_the_answer() -> None:
     robot.queue.append(sample_of(at(1)))
     watch.look(0.0)
     robot.answer = sample_of(at(2))
-    watch.look(ASK_S + 0.1)
+    watch.look(QUERY_PERIOD_S + 0.1)
     robot.queue.append(sample_of(at(3)))
-    assert watch.look(ASK_S + 0.2) == [at(3)]
+    assert watch.look(QUERY_PERIOD_S + 0.2) == [at(3)]
     assert watch.state == at(3)
 
 
@@ -173,9 +175,9 @@ def test_a_state_that_was_published_before_the_answer_comes_first() -> None:
     robot.queue.append(sample_of(at(1)))
     watch.look(0.0)
     robot.answer = sample_of(at(3))
-    watch.look(ASK_S + 0.1)
+    watch.look(QUERY_PERIOD_S + 0.1)
     robot.queue.append(sample_of(at(2)))
-    assert watch.look(ASK_S + 0.2) == [at(2), at(3)]
+    assert watch.look(QUERY_PERIOD_S + 0.2) == [at(2), at(3)]
 
 
 def test_unreadable_messages_are_counted_until_a_readable_one_arrives() -> None:
@@ -192,7 +194,7 @@ def test_unreadable_messages_are_counted_until_a_readable_one_arrives() -> None:
 def test_a_flood_of_messages_does_not_block_the_caller() -> None:
     robot = Robot()
     watch = Watch(robot, 0.0)
-    robot.queue.extend([UNREADABLE] * (QUEUED + 7))
+    robot.queue.extend([UNREADABLE] * (MAX_QUEUED_SAMPLES + 7))
     watch.look(0.0)
     assert len(robot.queue) == 7
 

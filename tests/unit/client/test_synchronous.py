@@ -11,7 +11,7 @@ import zenoh
 
 from acsard import client
 from acsard.client import Client, NoAnswerError
-from acsard.client.commander import LONGEST_S, SPACING_S, no_command
+from acsard.client.commander import MAX_OPEN_TIMEOUT_S, MIN_SPACING_S, no_command
 from acsard.client.driving import UnheardError
 from acsard.core.config.settings import DriveConfig, JointsConfig
 from acsard.core.incoming.commands import Arrival, Receiver
@@ -88,7 +88,7 @@ def test_two_clients_of_one_connection_keep_the_spacing_between_commands(session
     begun = time.monotonic()
     for each in (one, other) * 5:
         each.send(0.0)
-    assert time.monotonic() - begun > 8.9 * SPACING_S
+    assert time.monotonic() - begun > 8.9 * MIN_SPACING_S
 
 
 def test_the_commands_of_two_threads_leave_in_their_order_and_with_the_pause(
@@ -101,7 +101,7 @@ def test_the_commands_of_two_threads_leave_in_their_order_and_with_the_pause(
     def slow(key: str, payload: bytes, **rest: Any) -> None:
         if not began.is_set():
             began.set()
-            time.sleep(10 * SPACING_S)
+            time.sleep(10 * MIN_SPACING_S)
         put(key, payload, **rest)
         puts_s.append(time.monotonic())
 
@@ -114,7 +114,7 @@ def test_the_commands_of_two_threads_leave_in_their_order_and_with_the_pause(
     thread.join()
     assert [one.sequence for one in session.heard] == [1, 2, 3]
     assert session.heard[-1].twist == REST
-    assert puts_s[1] - puts_s[0] >= SPACING_S
+    assert puts_s[1] - puts_s[0] >= MIN_SPACING_S
 
 
 @pytest.mark.timeout(10)
@@ -162,7 +162,7 @@ def test_after_the_longest_timeout_the_end_of_a_connection_sends_no_zero(
     robot.send(0.0)
     robot.send(0.3)
     sent, asleep_ns = len(session.heard), clock.asleep_ns()
-    monkeypatch.setattr(clock, "asleep_ns", lambda: asleep_ns + int(LONGEST_S * NS_PER_S))
+    monkeypatch.setattr(clock, "asleep_ns", lambda: asleep_ns + int(MAX_OPEN_TIMEOUT_S * NS_PER_S))
     robot.end()
     assert len(session.heard) == sent
 

@@ -24,7 +24,7 @@ from acsard.core.config.settings import (
     Source,
     WheelMap,
 )
-from acsard.core.guard import MARGIN_NS, Guard, Memory
+from acsard.core.guard import RAMP_MARGIN_NS, Guard, Memory
 from acsard.core.link.checked_line import seal
 from acsard.core.link.codec import Codec
 from acsard.core.motion.kinematics import Kinematics
@@ -409,7 +409,7 @@ def test_a_constant_speed_after_a_stop_is_cut_short_after_the_longest_ramp() -> 
     trips = [clocked.trip(ms, "stopped") for ms in range(10, 600_000, 10)]
     first = next(n for n, trip in enumerate(trips) if trip)
     assert trips[first] == LATE
-    assert (first + 1) * 10 == 10 + 500 + MARGIN_NS // MS + 10
+    assert (first + 1) * 10 == 10 + 500 + RAMP_MARGIN_NS // MS + 10
     # no motion may start again after the stop that was sent
     assert set(trips[first + 1 :]) == {GROWS}
 

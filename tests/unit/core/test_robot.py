@@ -23,7 +23,7 @@ from acsard.core.config.settings import (
     Source,
 )
 from acsard.core.link.codec import Codec
-from acsard.core.motion.arbiter_text import MAX_SENDER, waiting
+from acsard.core.motion.arbiter_text import MAX_SENDER_LENGTH, waiting
 from acsard.core.robot import Robot
 from acsard.core.values import (
     NS_PER_S,
@@ -1460,7 +1460,7 @@ def test_a_refused_command_is_reported_with_its_reason_and_its_sender() -> None:
     told = [event for _ in range(150) for event in bench.step(refusals=(refusal,)).events]
     first, second = told
     assert first.text.startswith("malformed: cmd/app")
-    assert (first.by, first.count) == ("a" * MAX_SENDER, 1)
+    assert (first.by, first.count) == ("a" * MAX_SENDER_LENGTH, 1)
     assert second.text.startswith("100 x malformed; the last: ")
 
 

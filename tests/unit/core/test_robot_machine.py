@@ -32,9 +32,9 @@ from acsard.core.config.settings import (
     Source,
 )
 from acsard.core.guard import Guard
-from acsard.core.link.sample_time import BRIDGED_S
+from acsard.core.link.sample_time import MAX_FILLED_GAP_S
 from acsard.core.motion.arbiter_text import waiting
-from acsard.core.motion.odometry import TAKEN_BACK
+from acsard.core.motion.odometry import MAX_RECOMPUTED_LINES
 from acsard.core.robot import Robot
 from acsard.core.values import (
     NS_PER_S,
@@ -212,7 +212,7 @@ class RobotMachine(RuleBasedStateMachine):
         self.told_link, self.was_open, self.last_opened = "down", False, 0
         self.pose, self.sampled_ns = Pose(), self.now_ns - NS_PER_S
         self.fastest = 0.0
-        self.steps: deque[float] = deque(maxlen=TAKEN_BACK + 1)
+        self.steps: deque[float] = deque(maxlen=MAX_RECOMPUTED_LINES + 1)
         """Largest possible motion of each of the last lines, m."""
         self.left_out: tuple[str, ...] = ()
         self.lates = 0
@@ -674,7 +674,7 @@ class RobotMachine(RuleBasedStateMachine):
             dt = (estimate.at.mono_ns - self.sampled_ns) / NS_PER_S
             assert dt >= 0.0
             # Missing lines are filled in, but not more than a second of them.
-            dt = min(dt, BRIDGED_S) + 2 * self.period_ms / 1000
+            dt = min(dt, MAX_FILLED_GAP_S) + 2 * self.period_ms / 1000
             fastest, self.fastest = max(fastest, self.fastest), fastest
             self.steps.append(fastest * dt)
             most = sum(self.steps) if found else fastest * dt

@@ -228,7 +228,7 @@ def test_a_slow_start_does_not_overwrite_the_file_of_another_daemon(
         assert goes.wait(10.0)
         return usual(self, now)
 
-    monkeypatch.setattr(module, "START_S", 0.05)
+    monkeypatch.setattr(module, "HANG_TIMEOUT_S", 0.05)
     monkeypatch.setattr(LatchFile, "_read", late)
     second, latches = started(tmp_path)
     assert latches.stop
@@ -317,7 +317,7 @@ def test_a_flood_of_stops_is_written_at_a_pace(
         file.keep(Latches(stop=Latch(number, NOW.wall_ns, "joe", "stopped by joe")))
         time.sleep(0.005)
     end(file)
-    assert len(contents) <= (time.monotonic() - began) / module.PACE_S + 2
+    assert len(contents) <= (time.monotonic() - began) / module.MIN_WRITE_PAUSE_S + 2
     assert b'"number": 39' in contents[-1]
 
 
@@ -401,7 +401,7 @@ def test_the_close_waits_for_a_stuck_disk_only_until_its_timeout(
     file.keep(STOP)
     began = time.monotonic()
     file.close()
-    assert module.CLOSE_S <= time.monotonic() - began < module.CLOSE_S + 5.0
+    assert module.CLOSE_TIMEOUT_S <= time.monotonic() - began < module.CLOSE_TIMEOUT_S + 5.0
 
 
 OFF = Latches(
@@ -414,7 +414,7 @@ def test_a_disk_that_does_not_write_at_the_start_loses_no_latch_that_was_read(
     tmp_path: Path, started: Started, stuck: Stuck, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / NAME).write_bytes(encode("acsar", OFF))
-    monkeypatch.setattr(module, "START_S", 0.05)
+    monkeypatch.setattr(module, "HANG_TIMEOUT_S", 0.05)
     monkeypatch.setattr(module, "replace", stuck.replace)
     file, latches = started(tmp_path)
     assert latches.stop
@@ -432,7 +432,7 @@ def test_a_disk_that_syncs_slowly_does_not_stop_the_robot_at_the_start(
 ) -> None:
     (tmp_path / NAME).write_bytes(encode("acsar", OFF))
     goes = threading.Event()
-    monkeypatch.setattr(module, "START_S", 0.2)
+    monkeypatch.setattr(module, "HANG_TIMEOUT_S", 0.2)
     monkeypatch.setattr(module, "sync", lambda path: goes.wait(10.0))
     try:
         assert started(tmp_path)[1] == OFF.after_restart()
@@ -477,7 +477,7 @@ def test_a_stop_that_was_written_during_a_sync_is_synced_before_the_end(
         goes.wait(10.0)
 
     monkeypatch.setattr(module, "sync", slow)
-    monkeypatch.setattr(module, "CLOSE_S", 10.0)
+    monkeypatch.setattr(module, "CLOSE_TIMEOUT_S", 10.0)
     file.keep(FAULT)
     assert syncs.wait(10.0)
     file.keep(STOP)
@@ -495,11 +495,11 @@ def test_a_sync_that_hangs_is_reported_until_it_ends(
     goes = threading.Event()
     monkeypatch.setattr(module, "sync", lambda path: goes.wait(10.0))
     file, _ = started(tmp_path)
-    monkeypatch.setattr(module, "START_S", 0.05)
+    monkeypatch.setattr(module, "HANG_TIMEOUT_S", 0.05)
     try:
         file.keep(STOP)
         until(lambda: file.holds(STOP))
-        until(lambda: module.HANGS in file.trouble)
+        until(lambda: module.DISK_HANGS in file.trouble)
     finally:
         goes.set()
     until(lambda: file.trouble == "")
@@ -512,7 +512,7 @@ def fails_to_sync(path: Path) -> None:
 def test_a_first_sync_that_fails_is_reported_and_tried_again(
     tmp_path: Path, started: Started, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module, "RETRY_S", 0.01)
+    monkeypatch.setattr(module, "RETRY_PAUSE_S", 0.01)
     monkeypatch.setattr(module, "sync", fails_to_sync)
     file, _ = started(tmp_path)
     until(lambda: "Input/output error" in file.trouble)
@@ -529,7 +529,7 @@ def test_a_first_sync_that_fails_does_not_undo_a_stop_that_came_meanwhile(
         assert goes.wait(10.0)
         fails_to_sync(path)
 
-    monkeypatch.setattr(module, "RETRY_S", 0.01)
+    monkeypatch.setattr(module, "RETRY_PAUSE_S", 0.01)
     monkeypatch.setattr(module, "sync", fails_late)
     file, _ = started(tmp_path)
     file.keep(STOP)
@@ -576,7 +576,7 @@ def test_a_file_that_was_not_read_at_the_start_is_read_before_it_is_written(
         assert goes.wait(10.0)
         return usual(path)
 
-    monkeypatch.setattr(module, "START_S", 0.05)
+    monkeypatch.setattr(module, "HANG_TIMEOUT_S", 0.05)
     monkeypatch.setattr(module, "_content", late)
     file, latches = started(tmp_path)
     assert latches.stop
@@ -637,16 +637,16 @@ def test_a_disk_that_hangs_later_is_reported_once_and_so_is_its_recovery(
 ) -> None:
     file, first = started(tmp_path)
     until(lambda: file.holds(first))
-    monkeypatch.setattr(module, "START_S", 0.05)
+    monkeypatch.setattr(module, "HANG_TIMEOUT_S", 0.05)
     monkeypatch.setattr(module, "replace", stuck.replace)
     file.keep(STOP)
     until(lambda: file.trouble)
     path = tmp_path / NAME
     where = f"the latch file ({path}) cannot be written"
-    assert file.trouble == f"a stop would not survive a restart: {where}: {module.HANGS}"
+    assert file.trouble == f"a stop would not survive a restart: {where}: {module.DISK_HANGS}"
     (event,) = file.news()
     assert (event.name, event.level) == ("latch_file", "warning")
-    assert module.HANGS in event.text
+    assert module.DISK_HANGS in event.text
     assert file.news() == []
     stuck.goes.set()
     until(lambda: file.trouble == "")
@@ -669,7 +669,7 @@ def test_a_disk_that_hangs_and_then_fails_is_not_reported_as_recovered(
 
     file, first = started(tmp_path)
     until(lambda: file.holds(first))
-    monkeypatch.setattr(module, "START_S", 0.05)
+    monkeypatch.setattr(module, "HANG_TIMEOUT_S", 0.05)
     monkeypatch.setattr(module, "replace", fails_late)
     file.keep(STOP)
     until(lambda: file.trouble)
@@ -684,7 +684,7 @@ def test_a_disk_that_hangs_and_then_fails_is_not_reported_as_recovered(
 def test_a_full_disk_is_reported_once_and_retried_until_a_write_succeeds(
     tmp_path: Path, file: LatchFile, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module, "RETRY_S", 0.01)
+    monkeypatch.setattr(module, "RETRY_PAUSE_S", 0.01)
     tries = []
 
     def fails(*words: object, **more: object) -> None:
@@ -701,7 +701,7 @@ def test_a_full_disk_is_reported_once_and_retried_until_a_write_succeeds(
         "left on device"
     )
     assert file.trouble == said
-    again = f"{said}; the daemon tries again every {module.RETRY_S:g} s"
+    again = f"{said}; the daemon tries again every {module.RETRY_PAUSE_S:g} s"
     assert news == [Event("latch_file", again, "warning")]
     monkeypatch.setattr(module, "replace", replace_file)
     until(lambda: file.trouble == "")

@@ -13,7 +13,7 @@ from msgspec.structs import replace
 from acsard.core.motion.lifecycle import Lifecycle
 from acsard.core.values import NS_PER_S, Event, Instant, Latch, Latches
 from acsard.daemon.latch_rules import (
-    ANSWER_NS,
+    MAX_ANSWER_DELAY_NS,
     MAX_BYTES,
     Handover,
     LatchFileError,
@@ -329,7 +329,7 @@ def test_at_shutdown_the_handover_waits_for_the_keeper_up_to_the_answer_timeout(
     keeper = Keeper()
     handover = Handover(ALL, keeper)
     handover.wait()
-    assert keeper.waits == [(ALL, ANSWER_NS / NS_PER_S)]
+    assert keeper.waits == [(ALL, MAX_ANSWER_DELAY_NS / NS_PER_S)]
 
 
 def test_the_handover_reports_the_events_and_the_trouble_of_the_keeper() -> None:

@@ -43,16 +43,16 @@ def times(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     """The file of the thread's times. A busy machine must not add a cause of its own."""
     path = tmp_path / "schedstat"
     path.write_bytes(b"0 0 1\n")
-    monkeypatch.setattr(late_watch, "OWN_TIMES", str(path))
+    monkeypatch.setattr(late_watch, "THREAD_TIMES_FILE", str(path))
     return path
 
 
 @contextmanager
 def watching(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[LateWatch, PlannedKernel]]:
     monkeypatch.setattr(late_watch, "PAUSE_NS", 0)
-    monkeypatch.setattr(late_watch, "EVERY_S", 0.02)
+    monkeypatch.setattr(late_watch, "READ_PERIOD_S", 0.02)
     # On a busy machine the test may wait while the watch reads many times.
-    monkeypatch.setattr(late_watch, "HISTORY", 1000)
+    monkeypatch.setattr(late_watch, "MAX_READINGS", 1000)
     kernel = PlannedKernel()
     with LateWatch(kernel) as watch:
         until(lambda: watch._readings, 5.0, "the first reading")
@@ -89,7 +89,9 @@ def test_a_late_period_is_reported_with_its_cause(monkeypatch: pytest.MonkeyPatc
 def test_times_that_cannot_be_read_stop_no_control_step(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(late_watch, "OWN_TIMES", str(tmp_path))  # a directory opens, and no more
+    monkeypatch.setattr(
+        late_watch, "THREAD_TIMES_FILE", str(tmp_path)
+    )  # a directory opens, and no more
     with watching(monkeypatch) as (watch, kernel):
         kernel.reading = Reading(asleep_ns=2000 * MS)
         period(watch, 30 * MS, 2)
@@ -187,7 +189,7 @@ def test_the_loop_s_scheduler_times_are_the_differences_between_two_periods() ->
 def test_a_kernel_without_schedstat_and_a_process_without_threads_are_no_error(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(late_watch, "OWN_TIMES", "/nonexistent/schedstat")
+    monkeypatch.setattr(late_watch, "THREAD_TIMES_FILE", "/nonexistent/schedstat")
 
     def refuse(_: threading.Thread) -> None:
         raise RuntimeError("can't start new thread")

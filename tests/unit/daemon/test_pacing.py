@@ -7,12 +7,12 @@ from itertools import pairwise
 from hypothesis import given
 from hypothesis import strategies as st
 
-from acsard.daemon.pacing import BREATH_NS, IDLE_WAKES, Pace
+from acsard.daemon.pacing import MAX_IDLE_WAKES, REPLY_TIME_NS, Pace
 
 MS = 1_000_000
 WIRE_NS = 3 * MS
 PERIOD_NS = 10 * MS
-GAP_NS = WIRE_NS + BREATH_NS
+GAP_NS = WIRE_NS + REPLY_TIME_NS
 
 
 class Paced:
@@ -114,7 +114,7 @@ def test_without_a_changed_command_there_is_no_retry() -> None:
 
 def test_messages_without_effect_wake_the_loop_a_limited_number_of_times_a_period() -> None:
     paced = ticked()
-    for _ in range(IDLE_WAKES):
+    for _ in range(MAX_IDLE_WAKES):
         paced.hears(5 * MS, news=False)
         assert paced.pace.listens
     paced.hears(5 * MS, news=False)

@@ -10,7 +10,7 @@ import pytest
 
 from acsard.core.messages.encodings import encode
 from acsard.core.messages.schema import String
-from acsard.daemon.bus.zenoh_sessions import MESSAGE_BYTES
+from acsard.daemon.bus.zenoh_sessions import MAX_MESSAGE_BYTES
 from acsard.daemon.robot_description import MAX_BYTES, robot_description
 from acsard.host.errors import Exit, ExitError
 from tests.each import each
@@ -106,4 +106,4 @@ def test_the_longest_description_fits_into_a_message_of_each_encoding(
     assert "shorten the URDF" in refusal(written(tmp_path, text(accepted + 500)))
     message = String(text(accepted))
     for form in ("json", "msgpack", "cdr"):
-        assert len(encode(message, form)) < MESSAGE_BYTES - 512
+        assert len(encode(message, form)) < MAX_MESSAGE_BYTES - 512

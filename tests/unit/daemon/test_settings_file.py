@@ -34,7 +34,7 @@ Started = Callable[..., SettingsFile]
 @pytest.fixture
 def started(monkeypatch: pytest.MonkeyPatch) -> Iterator[Started]:
     """Yield a function that starts to watch a file, and end all of them afterwards."""
-    monkeypatch.setattr(module, "LOOK_S", 0.01)
+    monkeypatch.setattr(module, "CHECK_PERIOD_S", 0.01)
     files: list[SettingsFile] = []
 
     def start(file: Path | None, config: Config, options: dict[str, object]) -> SettingsFile:
@@ -135,7 +135,7 @@ def test_the_text_is_short_when_every_setting_differs(tmp_path: Path, started: S
     )
     made = started(file, Config(), {})
     until(lambda: " more" in made.differ)
-    assert len(made.differ) <= module.MAX_TEXT
+    assert len(made.differ) <= module.MAX_TEXT_LENGTH
 
 
 # a `set` that is to be kept
@@ -327,8 +327,8 @@ def test_a_disk_that_hangs_gets_an_answer_and_a_late_result_changes_nothing(
     else:
         made.keep(REQUEST, 0)
     assert begun.wait(10.0)
-    assert made.results(module.PATIENCE_NS, []) == []
-    (answer,) = made.results(module.PATIENCE_NS + 1, [])
+    assert made.results(module.REPLY_TIMEOUT_NS, []) == []
+    (answer,) = made.results(module.REPLY_TIMEOUT_NS + 1, [])
     assert isinstance(answer, Answer)
     assert not answer.success
     assert "the disk did not answer within 2.5 s" in answer.message
@@ -342,7 +342,7 @@ def test_a_disk_that_hangs_gets_an_answer_and_a_late_result_changes_nothing(
 def test_a_request_that_the_robot_received_is_not_reported_as_not_set(made: SettingsFile) -> None:
     """While a speed limit is in force, a `set` may wait for the step after the one before it."""
     check(made)
-    assert made.results(module.PATIENCE_NS + 1, []) == []
+    assert made.results(module.REPLY_TIMEOUT_NS + 1, []) == []
     assert made.obeyed(OBEYED)
 
 
@@ -384,7 +384,7 @@ def test_a_pipe_in_place_of_the_file_is_not_read(file: Path, made: SettingsFile)
 def test_a_request_that_is_checked_too_late_is_not_obeyed(made: SettingsFile) -> None:
     made.keep(REQUEST, 0)
     until(lambda: made._results.waiting)
-    (answer,) = made.results(module.PATIENCE_NS + 1, [])
+    (answer,) = made.results(module.REPLY_TIMEOUT_NS + 1, [])
     assert isinstance(answer, Answer)
     assert not answer.success
     assert answer.message.startswith("nothing is set")
@@ -402,12 +402,12 @@ def test_too_many_requests_are_refused_and_overdue_ones_take_no_more_time(
 
     monkeypatch.setattr(module, "keepable", slow)
     made = started(file, Config(), {})
-    for number in range(1, module.JOBS + 11):
+    for number in range(1, module.MAX_JOBS + 11):
         made.keep(replace(REQUEST, id=number), 0)
     until(lambda: checked)
     refused = [one.id for one in made.results(0, []) if isinstance(one, Answer)]
-    assert refused == [*range(module.JOBS + 1, module.JOBS + 11)]
-    assert len(made.results(module.PATIENCE_NS + 1, [])) == module.JOBS
+    assert refused == [*range(module.MAX_JOBS + 1, module.MAX_JOBS + 11)]
+    assert len(made.results(module.REPLY_TIMEOUT_NS + 1, [])) == module.MAX_JOBS
     hangs.set()
     until(lambda: not made._box.waiting)
     made.keep(replace(REQUEST, id=99), 0)
@@ -425,7 +425,7 @@ def test_changed_settings_do_not_displace_a_change_of_the_file(
     read = SettingsFile._read
     monkeypatch.setattr(SettingsFile, "_read", lambda self: hangs.wait() and read(self))
     assert made.obeyed(OBEYED)
-    for _ in range(2 * module.JOBS):
+    for _ in range(2 * module.MAX_JOBS):
         made.use(with_speed(config, 0.8))
     hangs.set()
     assert result(made) == Answer(7, True, f"{OBEYED.message}; written to {file}")

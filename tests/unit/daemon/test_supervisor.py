@@ -52,7 +52,7 @@ def program(monkeypatch: pytest.MonkeyPatch, where: Path, text: str) -> None:
 def test_a_program_that_falls_silent_is_killed(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr("acsard.host.child.SILENT_NS", 0)
+    monkeypatch.setattr("acsard.host.child.SILENCE_TIMEOUT_NS", 0)
     pid = tmp_path / "pid"
     stops = f"import os; os.write(0, b'.'); open({str(pid)!r}, 'w').write(str(os.getpid())); "
     program(monkeypatch, tmp_path, stops + "os.kill(os.getpid(), 19)")
@@ -75,7 +75,7 @@ def test_a_router_that_cannot_start_is_not_restarted(
 def test_a_router_that_once_ran_is_started_again_when_its_files_are_wrong(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, code: int
 ) -> None:
-    monkeypatch.setattr("acsard.daemon.supervisor.LATER_S", 0.01)
+    monkeypatch.setattr("acsard.daemon.supervisor.LONG_RESTART_PAUSE_S", 0.01)
     began = tmp_path / "began"
     ends = f"import os; p = {str(began)!r}; new = not os.path.exists(p); open(p, 'a').close(); "
     program(monkeypatch, tmp_path, ends + f"raise SystemExit(1 if new else {code})")

@@ -10,7 +10,7 @@ import pytest
 import zenoh
 
 from acsard.client import Client
-from acsard.client.commander import GATHER_NS, STALE_NS, Wish
+from acsard.client.commander import BURST_WINDOW_NS, STALE_NS, Wish
 from acsard.core import values
 from acsard.core.config.settings import DriveConfig, JointsConfig
 from acsard.core.incoming.commands import Arrival, Receiver
@@ -124,7 +124,7 @@ def test_a_stamp_is_passed_on_and_the_added_zeros_use_the_same_clock(viewers: Vi
     viewers.drives.withdrawn(1, 2)
     heard = viewers.heard(1, 3)
     assert [one.twist.linear for one in heard] == [0.0, 0.3, 0.0]
-    assert [one.stamp_ns for one in heard[:2]] == [long_ago_ns - GATHER_NS, long_ago_ns]
+    assert [one.stamp_ns for one in heard[:2]] == [long_ago_ns - BURST_WINDOW_NS, long_ago_ns]
     assert len({one.clock for one in heard}) == 1
     assert heard[2].stamp_ns is not None
     assert 0 <= heard[2].stamp_ns - long_ago_ns < HOLD_S * NS_PER_S

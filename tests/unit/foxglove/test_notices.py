@@ -8,7 +8,7 @@ import pytest
 
 from acsard.client.commander import GRACE_S
 from acsard.core.values import NS_PER_S
-from acsard.foxglove.notices import AGAIN, WAITING, Notices, Objections
+from acsard.foxglove.notices import MAX_WAITING, REPEAT_RATE, Notices, Objections
 from acsard.host import clock
 
 OBJECTS_NS = int(GRACE_S * NS_PER_S)
@@ -39,7 +39,7 @@ def shown(notices: Notices, *, newcomers: bool = False) -> list[str]:
 def test_a_notice_is_repeated_only_after_a_while_and_a_lasting_one_always(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    notices, again_ns = Notices(lambda text: None, lambda: None), int(NS_PER_S / AGAIN.hz)
+    notices, again_ns = Notices(lambda text: None, lambda: None), int(NS_PER_S / REPEAT_RATE.hz)
     for at_ns in (0, again_ns - 1, again_ns):
         monkeypatch.setattr(clock, "mono_ns", lambda at_ns=at_ns: at_ns)
         notices.say("warning", "drive", "too slow")
@@ -61,10 +61,10 @@ def test_a_new_viewer_gets_the_lasting_statuses_until_they_are_over() -> None:
 def test_the_newest_notices_wait_for_the_viewers_and_each_wakes_the_main_thread() -> None:
     wakes: list[int] = []
     notices = Notices(lambda text: None, lambda: wakes.append(1))
-    for number in range(WAITING + 3):
+    for number in range(MAX_WAITING + 3):
         notices.say("info", "test", str(number))
-    assert shown(notices) == [str(number) for number in range(3, WAITING + 3)]
-    assert len(wakes) == WAITING + 3
+    assert shown(notices) == [str(number) for number in range(3, MAX_WAITING + 3)]
+    assert len(wakes) == MAX_WAITING + 3
 
 
 # why commands do not drive

@@ -17,8 +17,8 @@ from acsard.core.values import AcsardError
 from acsard.foxglove.drives import Drives
 from acsard.foxglove.notices import Notices
 from acsard.foxglove.server import (
-    POLL_NS,
-    WISHES,
+    MAX_WAITING_CHANGES,
+    POLL_PERIOD_NS,
     Listener,
     Settings,
     Shown,
@@ -71,7 +71,7 @@ def settings_after(monkeypatch: pytest.MonkeyPatch, *calls: tuple[str, list[str]
     listener = Listener(Shown(lambda: None), cast(Drives, None), made)
     for name, keys in calls:
         getattr(listener, f"on_parameters_{name}")(keys)
-    later_ns = clock.mono_ns() + 2 * POLL_NS
+    later_ns = clock.mono_ns() + 2 * POLL_PERIOD_NS
     monkeypatch.setattr(clock, "mono_ns", lambda: later_ns)
     return made
 
@@ -103,10 +103,12 @@ def test_a_change_that_fails_gives_the_viewers_the_present_value_and_the_reason(
 def test_changes_beyond_the_limit_are_refused_with_a_reason() -> None:
     robot = Robot()
     made, words = of_robot(robot)
-    for _ in range(WISHES + 1):
+    for _ in range(MAX_WAITING_CHANGES + 1):
         made.set({KEY: 7.0})
-    assert words() == [f"not set: {WISHES} earlier changes wait for the daemon; try again"]
-    for number in range(1, WISHES + 1):
+    assert words() == [
+        f"not set: {MAX_WAITING_CHANGES} earlier changes wait for the daemon; try again"
+    ]
+    for number in range(1, MAX_WAITING_CHANGES + 1):
         made.refresh(here=True)
         # Each round of the bridge makes one change, because each may wait for the daemon.
         assert len(robot.asked) == number

@@ -105,7 +105,7 @@ def test_a_child_that_is_released_before_its_start_ends_immediately() -> None:
 
 
 def test_a_child_without_a_first_sign_of_life_is_killed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "START_NS", 0)
+    monkeypatch.setattr(module, "START_TIMEOUT_NS", 0)
     child = Child(program("import time; time.sleep(100)"))
     assert child.run() == -signal.SIGKILL
     assert "stopped or hung" in child.silent
@@ -114,8 +114,8 @@ def test_a_child_without_a_first_sign_of_life_is_killed(monkeypatch: pytest.Monk
 def test_a_stopped_child_without_signs_of_life_is_killed(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(module, "START_NS", 3600 * NS_PER_S)
-    monkeypatch.setattr(module, "SILENT_NS", 0)
+    monkeypatch.setattr(module, "START_TIMEOUT_NS", 3600 * NS_PER_S)
+    monkeypatch.setattr(module, "SILENCE_TIMEOUT_NS", 0)
     child = Child(program(ALIVE + "os.kill(os.getpid(), 19)"))
     assert child.run() == -signal.SIGKILL
     assert "stopped or hung" in child.silent
@@ -123,8 +123,8 @@ def test_a_stopped_child_without_signs_of_life_is_killed(
 
 @pytest.mark.slow
 def test_a_child_that_gives_signs_of_life_is_not_killed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "BEAT_S", 0.4)
-    monkeypatch.setattr(module, "SILENT_NS", 9 * NS_PER_S // 10)
+    monkeypatch.setattr(module, "HEARTBEAT_S", 0.4)
+    monkeypatch.setattr(module, "SILENCE_TIMEOUT_NS", 9 * NS_PER_S // 10)
     child = Child(program("import os, time\nfor _ in range(15): os.write(0, b'.'); time.sleep(.1)"))
     assert (child.run(), child.silent) == (0, "")
 

@@ -8,7 +8,7 @@ import pytest
 
 from acsard.core.values import NS_PER_S
 from acsard.host import clock
-from acsard.host.clock import MOMENT_NS, Asleep, asleep_ns
+from acsard.host.clock import MIN_SUSPEND_NS, Asleep, asleep_ns
 
 WALL_NS = 1_800_000_000_000_000_000
 
@@ -61,17 +61,17 @@ def test_an_instant_is_in_whole_microseconds(monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_each_suspend_is_reported_once() -> None:
-    slept = [5 * MOMENT_NS]
+    slept = [5 * MIN_SUSPEND_NS]
     asleep = Asleep(lambda: slept[0])
     assert not asleep.was()
     for _ in range(2):
-        slept[0] += MOMENT_NS
+        slept[0] += MIN_SUSPEND_NS
         assert asleep.was()
         assert not asleep.was()
 
 
 def test_a_preemption_between_the_two_clock_readings_is_not_reported_as_a_suspend() -> None:
-    readings = [0, 3 * MOMENT_NS, 0, 0]
+    readings = [0, 3 * MIN_SUSPEND_NS, 0, 0]
     asleep = Asleep(lambda: readings.pop(0))
     assert not asleep.was()
     assert not asleep.was()

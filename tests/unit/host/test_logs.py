@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from acsard.core.config.settings import LogConfig
 from acsard.core.values import Event
-from acsard.host.logs import MAX_VALUE, JournalStream, Log, is_journal, render
+from acsard.host.logs import MAX_VALUE_LENGTH, JournalStream, Log, is_journal, render
 from tests.each import each
 
 
@@ -236,7 +236,7 @@ def test_control_characters_of_a_logged_text_are_replaced(
 
 def test_a_long_value_is_truncated(tmp_path: Path) -> None:
     (line,) = entries(tmp_path, Event("command_refused", "x" * 10_000))
-    assert len(line["text"]) == MAX_VALUE
+    assert len(line["text"]) == MAX_VALUE_LENGTH
 
 
 def test_an_event_below_the_level_is_not_written(tmp_path: Path) -> None:

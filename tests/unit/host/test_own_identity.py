@@ -8,8 +8,14 @@ import sys
 
 import pytest
 
-from acsard.core.messages.signature import MAX_NAME, MOST, Signature, public_name, unpack
-from acsard.daemon.bus.inbox import ATTACHMENT_BYTES
+from acsard.core.messages.signature import (
+    MAX_INT64,
+    MAX_NAME_LENGTH,
+    Signature,
+    public_name,
+    unpack,
+)
+from acsard.daemon.bus.inbox import MAX_ATTACHMENT_BYTES
 from acsard.host.own_identity import own_name, sender_id
 
 
@@ -40,10 +46,10 @@ def test_a_user_without_a_name_is_shown_as_a_number(monkeypatch: pytest.MonkeyPa
 def test_a_sender_id_is_unique_and_fits_into_an_attachment(name: str) -> None:
     one, other = sender_id(name), sender_id(name)
     assert one != other
-    assert one.rpartition("/")[0] == name[:MAX_NAME]
-    signature = Signature(one, MOST, MOST)
+    assert one.rpartition("/")[0] == name[:MAX_NAME_LENGTH]
+    signature = Signature(one, MAX_INT64, MAX_INT64)
     assert unpack(signature.pack()) == signature
-    assert len(signature.pack()) <= ATTACHMENT_BYTES
+    assert len(signature.pack()) <= MAX_ATTACHMENT_BYTES
 
 
 def test_a_program_that_keeps_its_secret_keeps_its_public_name() -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from acsard import __version__
-from acsard.host.version import COMMIT_FILE, DIGITS, commit_of, version
+from acsard.host.version import COMMIT_FILE, HASH_DIGITS, commit_of, version
 from tests.pages import ROOT
 
 
@@ -56,7 +56,7 @@ def test_without_a_readable_clone_the_commit_is_empty(tmp_path: Path) -> None:
 
 def test_the_version_of_a_clone_names_its_commit() -> None:
     commit = commit_of(ROOT)
-    assert version() == (f"{__version__}+g{commit[:DIGITS]}" if commit else __version__)
+    assert version() == (f"{__version__}+g{commit[:HASH_DIGITS]}" if commit else __version__)
 
 
 @pytest.mark.slow

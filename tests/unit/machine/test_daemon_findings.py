@@ -35,7 +35,7 @@ from acsard.host.errors import CertificateError, NoAnswerError
 from acsard.machine import daemon_findings
 from acsard.machine.daemon_findings import (
     GYRO_MENDS,
-    SHOWN,
+    MAX_KEYS,
     Running,
     certificate,
     check,
@@ -133,8 +133,8 @@ def test_for_a_different_file_only_the_first_differences_are_listed() -> None:
     )
     by_option, finding = compared(running(runs), FILE)
     assert by_option.text.count(", not ") == 4
-    assert finding.text.count(", not ") == SHOWN
-    assert f"and {len(differences(runs, FILE)) - 4 - SHOWN} more" in finding.text
+    assert finding.text.count(", not ") == MAX_KEYS
+    assert f"and {len(differences(runs, FILE)) - 4 - MAX_KEYS} more" in finding.text
 
 
 NOW = 1_800_000_000_000_000_000

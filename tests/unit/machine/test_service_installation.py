@@ -12,13 +12,13 @@ import pytest
 from acsard.host.errors import MendableError
 from acsard.machine.service_installation import (
     GATEWAY,
-    GONE,
     GROUP,
-    INSTALLED,
+    INSTALL_COMMANDS,
     PAGE,
+    REMOVE_COMMANDS,
     SETPRIV,
-    STATES,
-    STOP,
+    STATE_DIRECTORIES,
+    STOP_PROGRAM,
     UNIT,
     File,
     Found,
@@ -95,7 +95,7 @@ def test_a_missing_group_or_program_of_the_units_is_reported_with_a_remedy() -> 
 
 ETC = Path("/etc/x")
 UNIT_FILE = File(ETC / UNIT, b"unit")
-STOP_FILE = File(ETC / STOP, b"stop", 0o755)
+STOP_FILE = File(ETC / STOP_PROGRAM, b"stop", 0o755)
 RULES = File(ETC / "rules", b"rules")
 OWN = File(ETC / "acsard.toml", b"first", kept=True)
 GATEWAY_FILE = File(ETC / GATEWAY, b"gateway")
@@ -121,18 +121,21 @@ NOTHING: Found = {file.path: None for file in ALL}
 
 
 def test_a_first_installation_writes_all_files_and_then_runs_the_commands() -> None:
-    assert installing(ALL, NOTHING, (), force=False) == [*map(Write, ALL), *INSTALLED]
+    assert installing(ALL, NOTHING, (), force=False) == [*map(Write, ALL), *INSTALL_COMMANDS]
 
 
 def test_the_daemon_starts_before_the_page_whose_unit_mounts_its_directory() -> None:
-    steps = list(INSTALLED)
+    steps = list(INSTALL_COMMANDS)
     everything = Run(("systemctl", "enable", "--now", UNIT, GATEWAY, PAGE))
     alone = Run(("systemctl", "start", UNIT), may_fail=True)
     assert steps.index(alone) < steps.index(everything)
 
 
 def test_unchanged_files_are_kept_and_the_commands_run_again() -> None:
-    assert installing(ALL, there(), (), force=False) == [*(Keep(f.path) for f in ALL), *INSTALLED]
+    assert installing(ALL, there(), (), force=False) == [
+        *(Keep(f.path) for f in ALL),
+        *INSTALL_COMMANDS,
+    ]
 
 
 def test_a_file_with_a_wrong_mode_is_written_again_unless_its_content_differs() -> None:
@@ -183,7 +186,7 @@ def test_an_edited_configuration_is_never_replaced(force: bool) -> None:
 def test_all_unchanged_files_are_removed() -> None:
     removed = [Remove(file.path) for file in ALL]
     leaving = Run(("systemctl", "disable", "--now", PAGE, GATEWAY, UNIT))
-    assert uninstalling(ALL, there(), (), force=False) == [leaving, *removed, *GONE]
+    assert uninstalling(ALL, there(), (), force=False) == [leaving, *removed, *REMOVE_COMMANDS]
 
 
 def test_a_missing_unit_is_not_disabled() -> None:
@@ -193,7 +196,7 @@ def test_a_missing_unit_is_not_disabled() -> None:
 
 
 def test_without_installed_files_no_unit_is_stopped_and_no_file_is_removed() -> None:
-    assert uninstalling(ALL, NOTHING, (), force=False) == [*GONE]
+    assert uninstalling(ALL, NOTHING, (), force=False) == [*REMOVE_COMMANDS]
 
 
 def kept(found: Found, *, force: bool) -> set[Path]:
@@ -254,10 +257,10 @@ def test_a_purge_reinstalls_a_unit_so_that_systemd_can_clean_its_state() -> None
 
 @pytest.mark.parametrize("purge", [False, True])
 def test_recordings_and_invitations_are_kept_unless_purged(purge: bool) -> None:
-    steps = uninstalling(ALL, there(), (), force=False, purge=purge, stateful=STATES)
+    steps = uninstalling(ALL, there(), (), force=False, purge=purge, stateful=STATE_DIRECTORIES)
     kept = {step.path for step in steps if isinstance(step, Keep)}
     cleans = {Run(("systemctl", "clean", "--what=state", unit)) for unit in (UNIT, PAGE)}
-    assert kept == (set() if purge else {where for where, _ in STATES.values()})
+    assert kept == (set() if purge else {where for where, _ in STATE_DIRECTORIES.values()})
     assert cleans & {*steps} == (cleans if purge else set())
     if purge:  # the units have stopped, but systemd still knows them
         assert {*steps[1:3]} == cleans

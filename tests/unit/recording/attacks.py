@@ -15,7 +15,7 @@ import struct
 import sys
 
 from acsard.core.robot import Robot
-from acsard.recording.state import PROTOCOL, StateError, thaw
+from acsard.recording.state import PICKLE_PROTOCOL, StateError, thaw
 from acsard.recording.unpickling import MAX_BYTES, MAX_KEY, MAX_OPCODES
 
 EXTENSION = 201
@@ -34,7 +34,7 @@ def named(module: str, name: str) -> bytes:
 
 def whole(body: bytes) -> bytes:
     """Return a pickle with its first and last opcodes."""
-    return pickle.PROTO + bytes([PROTOCOL]) + body + pickle.STOP
+    return pickle.PROTO + bytes([PICKLE_PROTOCOL]) + body + pickle.STOP
 
 
 def doubled(times: int) -> bytes:
@@ -176,7 +176,7 @@ ATTACKS = {name: whole(body) for name, body in BODIES.items()} | {
     "one dict copied again and again": whole(counted_again(18_000, 28_000)),
     "keys of one hash": whole(of_one_hash(40_000)),
     "nothing": b"",
-    "the first half": pickle.dumps(list(range(50)), PROTOCOL)[:60],
+    "the first half": pickle.dumps(list(range(50)), PICKLE_PROTOCOL)[:60],
 }
 
 

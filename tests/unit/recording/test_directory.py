@@ -14,17 +14,17 @@ from acsard.core.values import NS_PER_S, Instant
 from acsard.recording import directory
 from acsard.recording.directory import (
     DIRECTORY_MODE,
-    KEPT,
-    NEAR,
+    KEPT_SUFFIX,
+    NEAR_SUFFIX,
     OPEN_DIRECTORY_MODE,
-    PART,
+    PART_SUFFIX,
     Ring,
     Run,
     listed,
 )
 from acsard.recording.end_record import read_end
 from acsard.recording.file import About, Recording, Writing
-from acsard.recording.retention import KEPT_FILES, LEAST_BYTES, STEADY_NS, Kind
+from acsard.recording.retention import MAX_KEPT_FILES, MIN_FILE_BYTES, STEADY_CLOCK_NS, Kind
 
 DAY_NS = 86_400_000_000_000
 NOW_NS = 1_800_000_000_000_000_000
@@ -48,7 +48,7 @@ def record(one: Ring, size: int = 10, kind: Kind = "plain", days: int = 0) -> Pa
 
 def later(one: Ring) -> None:
     """Trim after the clock has run steadily for long enough."""
-    for mono_ns in (0, STEADY_NS):
+    for mono_ns in (0, STEADY_CLOCK_NS):
         now = Instant(mono_ns, NOW_NS + mono_ns)
         one.tend(now)
     one.trim(now)
@@ -103,7 +103,7 @@ def test_every_user_may_read_the_directory_of_a_service_but_not_open_its_lock(
     monkeypatch.setenv("ACSARD_RECORD", str(where))
     ring(where).close()
     assert modes(where) == {0o640}, "everybody gets there, not only root"
-    monkeypatch.setattr(directory, "PRIVATE", tmp_path)
+    monkeypatch.setattr(directory, "PRIVATE_STATE", tmp_path)
     before = os.umask(0o077)
     try:
         one = ring(where)
@@ -121,7 +121,7 @@ def test_recording_works_in_a_directory_of_another_user(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("ACSARD_RECORD", ".")
-    monkeypatch.setattr(directory, "PRIVATE", tmp_path)
+    monkeypatch.setattr(directory, "PRIVATE_STATE", tmp_path)
     monkeypatch.chdir(tmp_path)
     tmp_path.chmod(0o777)
     child = os.fork()
@@ -187,12 +187,12 @@ def test_old_files_go_except_the_last_fifty_with_an_incident(
     tmp_path: Path,
 ) -> None:
     one = ring(tmp_path, days=2.0)
-    kept = [record(one, kind="kept", days=3) for _ in range(KEPT_FILES + 3)]
+    kept = [record(one, kind="kept", days=3) for _ in range(MAX_KEPT_FILES + 3)]
     fresh = record(one, kind="kept", days=1)
     old, new = record(one, days=3), record(one, days=1)
     one.close()
     later(ring(tmp_path, days=2.0))
-    assert [path.exists() for path in kept] == [False] * 4 + [True] * (KEPT_FILES - 1)
+    assert [path.exists() for path in kept] == [False] * 4 + [True] * (MAX_KEPT_FILES - 1)
     assert [path.exists() for path in (fresh, old, new)] == [True, False, True]
 
 
@@ -204,12 +204,12 @@ def test_no_file_of_this_run_is_too_old_and_a_clock_that_was_just_set_is_not_tru
     before.close()
     one = ring(tmp_path, days=2.0)
     mine = record(one, days=3)
-    for mono_ns, jump_ns in ((0, 0), (STEADY_NS - 1, 0), (STEADY_NS, 400 * DAY_NS)):
+    for mono_ns, jump_ns in ((0, 0), (STEADY_CLOCK_NS - 1, 0), (STEADY_CLOCK_NS, 400 * DAY_NS)):
         now = Instant(mono_ns, NOW_NS + mono_ns + jump_ns)
         one.tend(now)
         one.trim(now)
         assert old.exists()
-    for mono_ns in (STEADY_NS + 1, 2 * STEADY_NS + 1):
+    for mono_ns in (STEADY_CLOCK_NS + 1, 2 * STEADY_CLOCK_NS + 1):
         now = Instant(mono_ns, NOW_NS + mono_ns)
         one.tend(now)
         one.trim(now)
@@ -225,7 +225,7 @@ def test_a_jump_of_the_clock_does_not_make_earlier_files_older(tmp_path: Path) -
     assert mine.stat().st_mtime_ns == ended_ns + 20 * DAY_NS
     one.close()
     again = ring(tmp_path, days=2.0)
-    for mono_ns in (0, STEADY_NS):
+    for mono_ns in (0, STEADY_CLOCK_NS):
         now = Instant(mono_ns, NOW_NS + 21 * DAY_NS + mono_ns)
         again.tend(now)
         again.trim(now)
@@ -275,7 +275,7 @@ def test_a_finished_file_can_be_retained_later(tmp_path: Path) -> None:
     path = record(one)
     one.retain(path)
     (near,) = listed(tmp_path)
-    assert near.name == path.name.replace(".mcap", NEAR)
+    assert near.name == path.name.replace(".mcap", NEAR_SUFFIX)
     for _ in range(2):
         one.retain(near)
     assert listed(tmp_path) == [near]
@@ -293,7 +293,7 @@ def test_a_file_that_a_crash_cut_is_finished_and_protected(tmp_path: Path) -> No
     one.close()
     again = ring(tmp_path)
     (path,) = listed(tmp_path)
-    assert path.name.endswith(KEPT)
+    assert path.name.endswith(KEPT_SUFFIX)
     recording = Recording(path)
     assert [data for _, _, data in recording.messages()] == [b"whole"]
     assert recording.whole
@@ -318,8 +318,8 @@ def test_a_crash_retains_the_minute_before_it_but_not_all_files_if_the_clock_was
     one.close()
     again = ring(tmp_path)
     *earlier, cut = listed(tmp_path)
-    assert [path.name.endswith(NEAR) for path in earlier] == [retained] * 3
-    assert cut.name.endswith(KEPT)
+    assert [path.name.endswith(NEAR_SUFFIX) for path in earlier] == [retained] * 3
+    assert cut.name.endswith(KEPT_SUFFIX)
     again.close()
 
 
@@ -343,7 +343,7 @@ def test_two_daemons_cannot_record_to_the_same_directory(tmp_path: Path) -> None
     writing = one.begin(about())
     with pytest.raises(OSError, match="another daemon records into this directory"):
         ring(tmp_path)
-    assert writing.path.name.endswith(PART)
+    assert writing.path.name.endswith(PART_SUFFIX)
     assert writing.path.exists()
     one.close()
     ring(tmp_path).close()
@@ -365,7 +365,7 @@ def test_a_cut_file_that_this_version_cannot_read_stays_and_is_reported(
     tmp_path: Path, event: bytes
 ) -> None:
     """The file comes from a later version, or contains an event that no version writes."""
-    part = tmp_path / f"000007-20270115T080000Z{PART}"
+    part = tmp_path / f"000007-20270115T080000Z{PART_SUFFIX}"
     writing = Writing(part, replace(about(), format="acsard/99") if not event else about())
     writing.add("events" if event else "steps", NOW_NS, event or b"later")
     writing.flush()
@@ -374,14 +374,14 @@ def test_a_cut_file_that_this_version_cannot_read_stays_and_is_reported(
     one = Ring(RecordConfig(str(tmp_path)))
     (path,) = listed(tmp_path)
     assert path.read_bytes() == before
-    assert path.name.endswith(KEPT)
+    assert path.name.endswith(KEPT_SUFFIX)
     (said,) = one.messages
     assert path.name in said
     assert ("acsard/99" if not event else "an event that cannot be read") in said
 
 
 def test_an_incomplete_copy_is_deleted(tmp_path: Path) -> None:
-    (left := tmp_path / f".000007-20270115T080000Z{PART}.new").write_bytes(b"half")
+    (left := tmp_path / f".000007-20270115T080000Z{PART_SUFFIX}.new").write_bytes(b"half")
     Ring(RecordConfig(str(tmp_path)), run=Run())
     assert not left.exists()
 
@@ -393,7 +393,7 @@ def test_a_recording_that_could_not_be_deleted_does_not_count_as_freed(
         raise PermissionError(str(path))
 
     one = ring(tmp_path)
-    record(one, 2 * LEAST_BYTES)
+    record(one, 2 * MIN_FILE_BYTES)
     with monkeypatch.context() as patch:
         patch.setattr(Path, "unlink", refuse)
         one.trim(None, refused=True)
@@ -433,4 +433,4 @@ def test_a_file_that_another_process_removes_meanwhile_does_no_harm(
     removed = [third]
     again = ring(tmp_path)
     assert again.cut_ns is not None
-    assert [path.name.endswith(KEPT) for path in listed(tmp_path)] == [True]
+    assert [path.name.endswith(KEPT_SUFFIX) for path in listed(tmp_path)] == [True]

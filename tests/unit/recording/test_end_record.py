@@ -11,7 +11,13 @@ import zstandard
 from mcap.records import Chunk, DataEnd, Footer, Header, Metadata, MetadataIndex
 
 from acsard.core.config.settings import Config
-from acsard.recording.end_record import END, TAIL_BYTES, EndRecord, as_metadata, read_end
+from acsard.recording.end_record import (
+    END_RECORD_NAME,
+    TAIL_BYTES,
+    EndRecord,
+    as_metadata,
+    read_end,
+)
 from acsard.recording.mcap_records import MAGIC, encoded
 from tests.scenarios.taped import Tape
 from tests.scenarios.world import World
@@ -32,7 +38,7 @@ BOMB = Chunk(
 
 
 FRONT = MAGIC + encoded(Header("", ""))
-BACK = encoded(Metadata(END, as_metadata(LAST)), DataEnd(0))
+BACK = encoded(Metadata(END_RECORD_NAME, as_metadata(LAST)), DataEnd(0))
 
 
 def footer(summary_at: int) -> bytes:
@@ -43,7 +49,7 @@ def footer(summary_at: int) -> bytes:
 def test_a_chunk_that_unpacks_to_megabytes_is_not_unpacked(case: str, tmp_path: Path) -> None:
     path, data = tmp_path / "a.mcap", FRONT + encoded(BOMB) + BACK
     if case == "index of a chunk":
-        data += encoded(MetadataIndex(len(FRONT), 100, END)) + footer(len(data))
+        data += encoded(MetadataIndex(len(FRONT), 100, END_RECORD_NAME)) + footer(len(data))
     else:
         data += footer(len(FRONT) if case == "summary of chunks" else 0)
     path.write_bytes(data)
@@ -64,7 +70,7 @@ def test_the_end_record_lies_well_within_the_bytes_that_are_searched(
     data = path.read_bytes()
     assert read_end(path) is not None
     # The summary has the record's name as well, behind the record itself.
-    name = struct.pack("<I", len(END)) + END.encode()
+    name = struct.pack("<I", len(END_RECORD_NAME)) + END_RECORD_NAME.encode()
     assert len(data) - data.index(name) < TAIL_BYTES / 16
 
 
@@ -77,7 +83,10 @@ def test_the_end_record_lies_well_within_the_bytes_that_are_searched(
         pytest.param(FRONT + BACK + footer(0)[:-1], id="cut"),
         pytest.param(FRONT + BACK + footer(0) + b"\0", id="bytes behind the end"),
         pytest.param(bytes(8) + BACK + footer(0), id="no beginning"),
-        pytest.param(FRONT + encoded(Metadata(END, {"said": "x"}), DataEnd(0)) + footer(0), id="x"),
+        pytest.param(
+            FRONT + encoded(Metadata(END_RECORD_NAME, {"said": "x"}), DataEnd(0)) + footer(0),
+            id="x",
+        ),
         pytest.param(FRONT + BACK.replace(b"wall_ns", b"wall\xff\xff\xff") + footer(0), id="text"),
     ],
 )
@@ -91,6 +100,9 @@ def test_the_time_to_search_many_names_of_the_record_is_proportional_to_their_nu
     tmp_path: Path,
 ) -> None:
     """Only the last one that has the form of the record is decoded."""
-    path, name = tmp_path / "a.mcap", struct.pack("<I", len(END)) + END.encode()
+    path, name = (
+        tmp_path / "a.mcap",
+        struct.pack("<I", len(END_RECORD_NAME)) + END_RECORD_NAME.encode(),
+    )
     path.write_bytes(FRONT + BACK + name * 4000 + footer(0))
     assert read_end(path) == LAST

@@ -19,7 +19,15 @@ from acsard.core.config.toml_text import document
 from acsard.core.values import NS_PER_S, Instant
 from acsard.host.errors import RecordingError
 from acsard.recording.end_record import EndRecord, read_end
-from acsard.recording.file import CHUNK_BYTES, HOW_TO_READ, MODE, About, Recording, Writing, rewrite
+from acsard.recording.file import (
+    CHUNK_BYTES,
+    FILE_MODE,
+    HOW_TO_READ,
+    About,
+    Recording,
+    Writing,
+    rewrite,
+)
 from acsard.recording.file_replay import config_of, replay_file, steps
 from acsard.recording.recorded_steps import status_of
 from acsard.recording.rows import encode
@@ -120,7 +128,7 @@ def test_an_idle_day_takes_less_than_90_mb_and_a_day_of_driving_less_than_400(
 
 
 def test_only_the_service_and_its_group_may_read_a_recording(whole: Path) -> None:
-    assert whole.stat().st_mode & 0o777 == MODE == 0o640
+    assert whole.stat().st_mode & 0o777 == FILE_MODE == 0o640
 
 
 @pytest.mark.parametrize(

@@ -18,8 +18,8 @@ from acsard.recording.mcap_records import (
     LAST_BLOCK,
     MAGIC,
     MAX_MESSAGE_BYTES,
-    PARAMETERS,
-    ZSTD,
+    ZSTD_NAME_FIELD,
+    ZSTD_PARAMETERS,
     GrowingChunk,
     Message,
     chunk_places,
@@ -106,7 +106,7 @@ def test_damage_never_changes_a_message_and_damage_in_the_head_costs_no_message(
 def test_each_compression_name_may_belong_to_the_head_of_a_chunk() -> None:
     assert list(chunk_places(bytes(100) + COMPLETE + COMPLETE, 0)) == [100, 100 + len(COMPLETE)]
     assert read_chunk(bytes(100), 0) is None
-    assert read_chunk(ZSTD, 0) is None
+    assert read_chunk(ZSTD_NAME_FIELD, 0) is None
 
 
 @pytest.mark.slow
@@ -127,7 +127,7 @@ def test_the_time_to_read_a_chunk_is_proportional_to_the_number_of_its_blocks() 
 def test_the_time_to_read_chunks_that_claim_megabytes_is_proportional_to_their_number() -> None:
     """Each claims a message of 4 MB that does not end, so each must be decompressed."""
     inside = struct.pack("<BQ", 5, MAX_MESSAGE_BYTES - 100) + bytes(MAX_MESSAGE_BYTES - 200)
-    packed = zstandard.ZstdCompressor(compression_params=PARAMETERS).compress(inside)
+    packed = zstandard.ZstdCompressor(compression_params=ZSTD_PARAMETERS).compress(inside)
     data = MAGIC + (GROWING_HEAD + packed[:-20]) * 1000
     began = time.process_time()
     assert [found.messages for found in walk(data)] == [[]]

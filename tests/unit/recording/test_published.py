@@ -11,7 +11,7 @@ from msgspec.structs import replace
 from acsard.core.config.settings import Config
 from acsard.core.messages.schema import Time
 from acsard.core.robot import Robot
-from acsard.recording.published import MEASURED, Published, Publisher
+from acsard.recording.published import MEASURED_ROWS, Published, Publisher
 from acsard.recording.replay import replay_step
 from acsard.recording.timeline import TimelineWriter
 from tests.scenarios.taped import Tape
@@ -72,7 +72,7 @@ def test_values_that_a_recording_lacks_are_not_published() -> None:
         row.name for m in published if m.channel.name == "diagnostics" for row in m.message.status
     }
     assert rows
-    assert not rows & MEASURED
+    assert not rows & MEASURED_ROWS
     states = [m.message for m in published if m.channel.name == "state"]
     assert all(one.latencies == {} and one.certificate_expiry == "" for one in states)
 

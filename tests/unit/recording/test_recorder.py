@@ -25,7 +25,7 @@ from acsard.core.robot import Robot
 from acsard.core.values import Event, Inputs, Instant, Latch, Latches, Outputs
 from acsard.recording import recorder as module
 from acsard.recording import retention, step_writer
-from acsard.recording.directory import KEPT, Ring, listed
+from acsard.recording.directory import KEPT_SUFFIX, Ring, listed
 from acsard.recording.end_record import how_it_ends, read_end
 from acsard.recording.export import export
 from acsard.recording.file import About, Recording, Writing, rewrite
@@ -52,7 +52,7 @@ class Bench:
         megabytes: float = 10.0,
         latches: Latches = Latches(),  # noqa: B008
     ) -> None:
-        monkeypatch.setattr(module, "FLUSH_S", 1000.0)
+        monkeypatch.setattr(module, "SYNC_PAUSE_S", 1000.0)
         monkeypatch.setattr(module, "CLOSE_S", 20.0)
         self.said: list[Event] = []
         self.where = where
@@ -154,7 +154,7 @@ def test_if_the_queue_is_full_steps_are_lost_and_counted_and_the_loop_never_wait
     assert len(numbers) == bench.world.steps - missing
     for path in (before, after):
         assert replay_file(Recording(path)).comparison.same
-    assert after.name.endswith(KEPT) == before.name.endswith(KEPT)
+    assert after.name.endswith(KEPT_SUFFIX) == before.name.endswith(KEPT_SUFFIX)
 
 
 @contextmanager
@@ -286,7 +286,7 @@ def test_the_minute_before_and_after_an_incident_is_retained(
 ) -> None:
     minute = 6  # one tenth of a minute in s, to save time
     monkeypatch.setattr(step_writer, "MAX_FILE_NS", minute * 10**9 // 3)
-    monkeypatch.setattr(retention, "AROUND_NS", minute * 10**9)
+    monkeypatch.setattr(retention, "INCIDENT_MARGIN_NS", minute * 10**9)
     bench = Bench(tmp_path, monkeypatch)
 
     def rest(seconds: float) -> None:
@@ -417,7 +417,7 @@ def test_a_bug_of_the_daemon_is_recorded_with_the_inputs_of_the_failed_step(
         ended = replay_file(Recording(path)).failed_step
     last, number = read_end(path), bench.world.steps
     why = f"in step {number}, ZeroDivisionError: {BUG}"
-    assert path.name.endswith(KEPT)
+    assert path.name.endswith(KEPT_SUFFIX)
     assert last is not None
     assert (last.cut, last.why) == ("bug", why)
     assert how_it_ends(last.cut, last.why) == f"cut: an internal error ended the daemon: {why}"
@@ -517,7 +517,7 @@ def test_a_jump_of_the_clock_costs_no_recording(
     It gets the time only while it drives.
     """
     monkeypatch.setattr(step_writer, "MAX_FILE_NS", 2_000_000_000)
-    monkeypatch.setattr(retention, "AROUND_NS", 0)
+    monkeypatch.setattr(retention, "INCIDENT_MARGIN_NS", 0)
     seen = set[str]()
 
     def there() -> set[str]:
@@ -545,7 +545,7 @@ def test_a_file_that_the_disk_cut_keeps_its_retention_class(bench: Bench) -> Non
     bench.recorder._writer._fail(OSError(errno.ENOSPC, "No space left on device"))
     bench.drive(step_writer.RETRY_ROUNDS + 3.0)
     first, second = bench.end()
-    assert first.name.endswith(KEPT)
+    assert first.name.endswith(KEPT_SUFFIX)
     last = read_end(first)
     assert last is not None
     assert last.cut == "disk"
@@ -839,7 +839,7 @@ def test_the_control_loop_only_appends_to_the_queue(
         sync(handle)
 
     monkeypatch.setattr(os, "fsync", hangs)
-    monkeypatch.setattr(module, "FLUSH_S", 0.01)
+    monkeypatch.setattr(module, "SYNC_PAUSE_S", 0.01)
     monkeypatch.setattr(module, "CLOSE_S", 20.0)
     tape, world = recorded_world()
     world.drive(0.5, seconds=0.5)

@@ -13,10 +13,10 @@ import pytest
 from mcap.reader import make_reader
 
 from acsard.core.config.settings import Config
-from acsard.recording.end_record import END, read_end
+from acsard.recording.end_record import END_RECORD_NAME, read_end
 from acsard.recording.file import CHUNK_BYTES, HOW_TO_READ, About, Recording, Writing
 from acsard.recording.mcap_records import GROWING_HEAD, LAST_BLOCK
-from acsard.recording.recovery import NOTHING_BYTES, recover
+from acsard.recording.recovery import MAX_DELETED_BYTES, recover
 from tests.scenarios.taped import Tape, chunks
 from tests.scenarios.world import World
 
@@ -160,7 +160,7 @@ def test_chunks_whose_beginning_is_damaged_are_not_thrown_away(data: bytes, tmp_
     part, whole = tmp_path / "a.part", tmp_path / "a.mcap"
     (begin, end), *_ = chunks(data)
     part.write_bytes(data[:8] + bytes(begin - 8) + data[begin:end])
-    assert part.stat().st_size < NOTHING_BYTES
+    assert part.stat().st_size < MAX_DELETED_BYTES
     assert "cannot finish a recording" in recover(part, whole, "crash", room=True)
     assert list(tmp_path.iterdir()) == [whole]
 
@@ -201,7 +201,7 @@ def test_a_short_file_with_a_bad_sector_at_its_beginning_stays_and_is_reported(
     part, whole, bad = tmp_path / "a.part", tmp_path / "a.mcap", bytearray(growing)
     begin = growing.index(GROWING_HEAD) + len(GROWING_HEAD) if at == "chunk" else 0
     bad[begin : begin + 512] = bytes(512)
-    assert len(bad) < NOTHING_BYTES
+    assert len(bad) < MAX_DELETED_BYTES
     part.write_bytes(bad)
     assert "its file now has the name a.mcap" in recover(part, whole, "crash", room)
     assert whole.read_bytes() == bad
@@ -280,8 +280,8 @@ def test_a_recovery_in_place_writes_the_statistics_and_the_index_of_a_finished_f
     assert found[0][0].message_count == len(messages(whole))
     how = HOW_TO_READ.name
     # The copy repeats its beginning at its end, for which a full disk may have no room.
-    assert found[0][1:] == ([how, "acsard", END], ["acsard.toml"])
-    assert found[1][1:] == ([how, "acsard", "acsard", END], ["acsard.toml"] * 2)
+    assert found[0][1:] == ([how, "acsard", END_RECORD_NAME], ["acsard.toml"])
+    assert found[1][1:] == ([how, "acsard", "acsard", END_RECORD_NAME], ["acsard.toml"] * 2)
 
 
 def test_a_recovery_in_place_holds_one_chunk_in_memory_and_not_the_unpacked_file(
@@ -311,6 +311,6 @@ def test_an_empty_file_is_removed_and_an_unreadable_file_is_reported(tmp_path: P
         assert told in said
         assert bool(said) == bool(told)
         assert list(tmp_path.iterdir()) == []
-    part.write_bytes(b"\x89MC" + bytes(NOTHING_BYTES))
+    part.write_bytes(b"\x89MC" + bytes(MAX_DELETED_BYTES))
     assert "cannot finish a recording" in recover(part, whole, "crash", room=True)
     assert list(tmp_path.iterdir()) == [whole]

@@ -9,10 +9,10 @@ import math
 
 from acsard.core.values import NS_PER_S, Instant
 from acsard.recording.retention import (
-    AROUND_NS,
-    KEPT_FILES,
-    LEAST_BYTES,
-    STEADY_NS,
+    INCIDENT_MARGIN_NS,
+    MAX_KEPT_FILES,
+    MIN_FILE_BYTES,
+    STEADY_CLOCK_NS,
     Bounds,
     ClockWatch,
     Disk,
@@ -41,14 +41,19 @@ def test_nothing_is_deleted_while_there_is_room() -> None:
 
 def test_the_oldest_files_go_first_and_protected_files_last() -> None:
     ended = files("kept", "near", "plain", "plain", "plain")
-    bounds = Bounds(3000 + LEAST_BYTES, -math.inf)
+    bounds = Bounds(3000 + MIN_FILE_BYTES, -math.inf)
     assert to_delete(ended, bounds, WIDE) == {"3", "4"}
-    assert to_delete(ended, bounds._replace(size=1000 + LEAST_BYTES), WIDE) == {"1", "3", "4", "5"}
+    assert to_delete(ended, bounds._replace(size=1000 + MIN_FILE_BYTES), WIDE) == {
+        "1",
+        "3",
+        "4",
+        "5",
+    }
 
 
 def test_near_files_are_protected_while_their_incident_is_protected() -> None:
     turns: list[Kind] = ["plain", "kept"]
-    ended = files("near", "kept", "near", *turns * KEPT_FILES)
+    ended = files("near", "kept", "near", *turns * MAX_KEPT_FILES)
     old = Bounds(10**10, math.inf)
     assert to_delete(ended, old, WIDE) == {one.name for one in ended if one.kind != "kept"} | {"2"}
     assert {"1", "3"} & to_delete(ended[:-1], old, WIDE) == set()
@@ -83,7 +88,7 @@ def test_a_disk_that_refuses_despite_free_space_gets_one_file_deleted() -> None:
 def test_a_disk_that_keeps_refusing_gets_no_protected_file_and_at_most_one_more() -> None:
     assert to_delete(files("kept", "plain", "plain"), BOUNDS, WIDE, freed=1) == {"2"}
     assert to_delete(files("kept", "near"), BOUNDS, WIDE, freed=1) == set()
-    assert to_delete(files("kept", "plain"), BOUNDS, WIDE, freed=LEAST_BYTES) == set()
+    assert to_delete(files("kept", "plain"), BOUNDS, WIDE, freed=MIN_FILE_BYTES) == set()
     low = Disk(100_000, 300)
     assert to_delete(files("kept", "near", size=400), BOUNDS, low, freed=1) == {"1", "2"}
 
@@ -91,7 +96,7 @@ def test_a_disk_that_keeps_refusing_gets_no_protected_file_and_at_most_one_more(
 def test_a_file_may_take_a_hundredth_of_the_total_size() -> None:
     assert share(10**9, 0, WIDE) == 10**7
     assert share(10**9, 10**8, Disk(10**9, 15 * 10**7)) == 2 * 10**6
-    assert share(10**9, 0, Disk(10**6, 0)) == LEAST_BYTES
+    assert share(10**9, 0, Disk(10**6, 0)) == MIN_FILE_BYTES
 
 
 def test_other_programs_keep_a_gigabyte_of_a_large_disk() -> None:
@@ -102,13 +107,18 @@ def test_other_programs_keep_a_gigabyte_of_a_large_disk() -> None:
 
 def test_a_clock_is_trusted_a_while_after_its_last_jump() -> None:
     clock = ClockWatch()
-    assert not clock.trusted(Instant(STEADY_NS, 0))
+    assert not clock.trusted(Instant(STEADY_CLOCK_NS, 0))
     assert clock.jump_ns(Instant(0, DAY_NS)) == 0
-    assert not clock.trusted(Instant(STEADY_NS - 1, DAY_NS))
-    assert clock.jump_ns(Instant(STEADY_NS, DAY_NS + STEADY_NS + NS_PER_S)) == 0  # the clock drifts
-    assert clock.trusted(Instant(STEADY_NS, DAY_NS))
-    assert clock.jump_ns(Instant(STEADY_NS, 3 * DAY_NS + STEADY_NS + NS_PER_S)) == 2 * DAY_NS
-    assert not clock.trusted(Instant(STEADY_NS + 1, 3 * DAY_NS))
+    assert not clock.trusted(Instant(STEADY_CLOCK_NS - 1, DAY_NS))
+    assert (
+        clock.jump_ns(Instant(STEADY_CLOCK_NS, DAY_NS + STEADY_CLOCK_NS + NS_PER_S)) == 0
+    )  # the clock drifts
+    assert clock.trusted(Instant(STEADY_CLOCK_NS, DAY_NS))
+    assert (
+        clock.jump_ns(Instant(STEADY_CLOCK_NS, 3 * DAY_NS + STEADY_CLOCK_NS + NS_PER_S))
+        == 2 * DAY_NS
+    )
+    assert not clock.trusted(Instant(STEADY_CLOCK_NS + 1, 3 * DAY_NS))
 
 
 def kind(around: IncidentWindow[str]) -> Kind:
@@ -119,12 +129,12 @@ def kind(around: IncidentWindow[str]) -> Kind:
 def test_a_file_that_ended_less_than_a_minute_before_an_incident_is_retained_once() -> None:
     around = IncidentWindow[str]()
     for number in range(4):
-        around.begin(number * AROUND_NS // 2)
-        around.end(str(number), (number + 1) * AROUND_NS // 2)
-    around.begin(2 * AROUND_NS)
-    assert around.happened(2 * AROUND_NS + 1) == ["2", "3"]
+        around.begin(number * INCIDENT_MARGIN_NS // 2)
+        around.end(str(number), (number + 1) * INCIDENT_MARGIN_NS // 2)
+    around.begin(2 * INCIDENT_MARGIN_NS)
+    assert around.happened(2 * INCIDENT_MARGIN_NS + 1) == ["2", "3"]
     assert kind(around) == "kept"
-    assert around.happened(2 * AROUND_NS + 2) == []
+    assert around.happened(2 * INCIDENT_MARGIN_NS + 2) == []
 
 
 def test_a_file_that_begins_less_than_a_minute_after_an_incident_is_near() -> None:
@@ -133,12 +143,12 @@ def test_a_file_that_begins_less_than_a_minute_after_an_incident_is_near() -> No
     assert kind(around) == "plain"
     around.happened(10)
     around.end("it", 20)
-    around.begin(9 + AROUND_NS)
+    around.begin(9 + INCIDENT_MARGIN_NS)
     assert kind(around) == "near"
-    around.end("near", 10 + AROUND_NS)
-    around.begin(10 + AROUND_NS)
+    around.end("near", 10 + INCIDENT_MARGIN_NS)
+    around.begin(10 + INCIDENT_MARGIN_NS)
     assert kind(around) == "plain"
-    assert around.happened(10 + AROUND_NS) == []
+    assert around.happened(10 + INCIDENT_MARGIN_NS) == []
 
 
 def test_incidents_count_over_a_restart() -> None:
@@ -156,9 +166,9 @@ def test_incidents_count_over_a_restart() -> None:
 
 def test_a_crash_before_this_run_is_an_incident() -> None:
     around = IncidentWindow[str]()
-    around.earlier_happened(-AROUND_NS)
+    around.earlier_happened(-INCIDENT_MARGIN_NS)
     around.begin(0)
     assert kind(around) == "plain"
-    around.earlier_happened(1 - AROUND_NS)
+    around.earlier_happened(1 - INCIDENT_MARGIN_NS)
     around.begin(0)
     assert kind(around) == "near"

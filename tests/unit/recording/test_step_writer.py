@@ -13,7 +13,7 @@ from acsard.recording.directory import listed
 from acsard.recording.file import Recording
 from acsard.recording.file_replay import steps
 from acsard.recording.mcap_records import MAX_MESSAGE_BYTES
-from acsard.recording.step_writer import BATCH, StepWriter
+from acsard.recording.step_writer import MAX_BATCH_STEPS, StepWriter
 from tests.scenarios.taped import Tape
 from tests.scenarios.world import World
 
@@ -30,7 +30,7 @@ def test_a_second_above_the_largest_message_is_divided_and_read_back(tmp_path: P
         )
         for taken in tape.taken[:50]
     ]
-    assert len(items) < BATCH
+    assert len(items) < MAX_BATCH_STEPS
     config = replace(Config(), record=RecordConfig(str(tmp_path), 100.0))
     writer = StepWriter(config, lambda event: None, lambda: None, 0)
     writer.write([*items], False)

@@ -16,7 +16,7 @@ import pytest
 from acsard.core.guard import Memory
 from acsard.core.motion.modes import Mode
 from acsard.core.values import Twist
-from acsard.recording.state import TABLE, freeze, part_class, thaw
+from acsard.recording.state import DISPATCH_TABLE, freeze, part_class, thaw
 from acsard.recording.unpickling import MAX_BYTES, MAX_DEPTH, MAX_OPCODES, MAX_PARTS, unpickle
 from tests.each import each
 from tests.recordings.__main__ import CHECKED
@@ -74,7 +74,7 @@ def test_a_value_is_read_back_unchanged(value: object) -> None:
 
 def pickled(value: object) -> bytes:
     class Pickler(pickle.Pickler):
-        dispatch_table = TABLE
+        dispatch_table = DISPATCH_TABLE
 
     written = io.BytesIO()
     Pickler(written, 5).dump(value)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from acsard.core.thinning import Span
-from acsard.report.command_sources import OTHERS
+from acsard.report.command_sources import OTHER_SOURCES
 from tests.scenarios.world import World
 from tests.unit.report.driven import drive_of_two, report_of
 
@@ -46,7 +46,7 @@ def test_a_source_that_sends_during_a_fault_has_only_the_fault_as_reason() -> No
 
 
 def test_a_source_that_is_not_configured_is_refused_among_the_others() -> None:
-    (refused,) = spans(OTHERS)
+    (refused,) = spans(OTHER_SOURCES)
     assert refused.kind == "refused"
     assert refused.words == "this source is not in commands.sources"
 

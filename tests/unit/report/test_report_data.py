@@ -8,7 +8,7 @@ from itertools import pairwise
 import pytest
 
 from acsard.core.values import NS_PER_S
-from acsard.recording.recorded_steps import MICRO
+from acsard.recording.recorded_steps import US_PER_S
 from acsard.report.report_data import FIRST, LAST, Lateness, Mark, Marks, SerialCounts
 from acsard.report.report_text import Origin, notes
 from tests.scenarios.world import START, World
@@ -20,10 +20,10 @@ ORIGIN = Origin("a.mcap", "r", "1", "3")
 def test_the_path_and_its_length_are_the_recorded_poses() -> None:
     report, steps = drive_of_two()
     poses = [pose for step in steps for pose in step.recorded.poses]
-    way = sum(math.hypot(b[0] - a[0], b[1] - a[1]) for a, b in pairwise(poses)) / MICRO
+    way = sum(math.hypot(b[0] - a[0], b[1] - a[1]) for a, b in pairwise(poses)) / US_PER_S
     assert report.metres == pytest.approx(way)
     last = report.path.places()[-1]
-    assert (last.x, last.y, last.yaw) == tuple(value / MICRO for value in poses[-1])
+    assert (last.x, last.y, last.yaw) == tuple(value / US_PER_S for value in poses[-1])
 
 
 def test_the_commanded_limited_and_measured_speeds_are_drawn() -> None:

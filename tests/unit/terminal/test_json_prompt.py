@@ -16,7 +16,7 @@ import pytest
 
 from acsard.checkup.findings import Finding
 from acsard.terminal import json_prompt
-from acsard.terminal.json_prompt import LINE_BYTES, JsonPrompt
+from acsard.terminal.json_prompt import MAX_LINE_BYTES, JsonPrompt
 from acsard.terminal.prompt import Ask, ended_by_signals
 
 DISTANCE = Ask("How far?", "m", 0.5, 3.0)
@@ -193,7 +193,7 @@ def test_a_line_without_an_end_ends_the_prompt(
     with program.hears(JsonPrompt()) as person:
 
         def flood(number: int) -> None:
-            for _ in range(LINE_BYTES // 4096 + 1):
+            for _ in range(MAX_LINE_BYTES // 4096 + 1):
                 program.say(raw=b"x" * 4096)
 
         program.answers = [flood]
@@ -204,8 +204,8 @@ def test_a_line_without_an_end_ends_the_prompt(
 def test_silence_of_the_program_ends_a_motion_and_keepalives_continue_it(
     program: Program, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(json_prompt, "HEARD_S", 0.25)
-    monkeypatch.setattr(json_prompt, "LISTEN_S", 0.02)
+    monkeypatch.setattr(json_prompt, "MAX_INPUT_SILENCE_S", 0.25)
+    monkeypatch.setattr(json_prompt, "POLL_S", 0.02)
     program.answers = ["start"]
     with program.hears(JsonPrompt()) as person:
         person.start("Go.")
@@ -221,8 +221,8 @@ def test_silence_of_the_program_ends_a_motion_and_keepalives_continue_it(
 def test_a_question_waits_without_a_timeout(
     program: Program, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(json_prompt, "HEARD_S", 0.05)
-    monkeypatch.setattr(json_prompt, "LISTEN_S", 0.01)
+    monkeypatch.setattr(json_prompt, "MAX_INPUT_SILENCE_S", 0.05)
+    monkeypatch.setattr(json_prompt, "POLL_S", 0.01)
 
     def late(number: int) -> None:
         threading.Timer(0.3, program.say, [{"answer": number, "value": 1.0}]).start()
@@ -277,7 +277,7 @@ def test_an_unwritable_result_is_not_offered_and_has_a_reason(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("ACSARD_CONFIG", raising=False)
-    monkeypatch.setattr("acsard.host.config_file.PLACES", (Path("acsard.toml"),))
+    monkeypatch.setattr("acsard.host.config_file.SEARCH_PATHS", (Path("acsard.toml"),))
     with program.hears(JsonPrompt()) as lines:
         assert not lines.offer(None, OFFERED)
         assert not lines.offer(None, OFFERED, "the daemon runs with another")

@@ -8,7 +8,7 @@ from msgspec.structs import replace
 
 from acsard.core.motion.modes import Mode
 from acsard.top.drive_screen import HELP, Teleop, lines, news, parting
-from acsard.top.text import MODES
+from acsard.top.text import MODE_STYLES
 from tests.each import each
 from tests.unit.top.screens import STATE
 
@@ -50,7 +50,9 @@ def test_every_width_shows_the_whole_reason_the_units_of_the_pose_and_the_help(
 
 def test_only_the_mode_has_its_colour_and_not_the_reason_below_it() -> None:
     shown = lines(of(mode="waiting", reason=LONG), 40)
-    coloured = [span for line in shown for span in line.spans if span.style == MODES["waiting"]]
+    coloured = [
+        span for line in shown for span in line.spans if span.style == MODE_STYLES["waiting"]
+    ]
     assert [shown[1].plain[span.start : span.end] for span in coloured] == [" WAITING "]
 
 

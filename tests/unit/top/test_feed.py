@@ -10,7 +10,7 @@ import pytest
 from msgspec.structs import replace
 
 from acsard.client import Client, Subscription
-from acsard.client.follower import FIRST_S, SILENT_S
+from acsard.client.follower import FIRST_STATE_TIMEOUT_S, SILENT_S
 from acsard.core.messages.encodings import DecodeError
 from acsard.core.messages.schema import Info, RobotState, Time
 from acsard.daemon.bus.address import Address
@@ -127,7 +127,7 @@ def test_a_state_of_another_version_is_reported_as_such(robot: Robot) -> None:
 
 def test_a_silence_is_reported_sooner_once_a_state_has_arrived(robot: Robot) -> None:
     feed = feed_of(robot)
-    robot.now += FIRST_S - 0.01
+    robot.now += FIRST_STATE_TIMEOUT_S - 0.01
     assert not feed.seen().silent
     robot.now += 0.02
     assert feed.seen().silent

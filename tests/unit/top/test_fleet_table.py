@@ -15,12 +15,12 @@ from msgspec.structs import replace
 
 from acsard.client import fleet as fleets
 from acsard.client.fleet import Row
-from acsard.client.follower import FLEET_ASK_S
+from acsard.client.follower import FLEET_QUERY_PERIOD_S
 from acsard.core.messages.schema import BatterySummary, Info, Time
 from acsard.core.values import NS_PER_S
 from acsard.daemon.bus.address import Address
 from acsard.host import clock as clocks
-from acsard.top.fleet_table import HEADS, Roster, table
+from acsard.top.fleet_table import COLUMN_HEADS, Roster, table
 from tests.each import each
 from tests.unit.top.screens import STATE, sample_of
 
@@ -29,7 +29,7 @@ ROW = Row("robot1", True, replace(STATE, reason="driving: commanded by app"), 0.
 
 def test_a_line_has_every_column_of_a_robot() -> None:
     head, line = table([ROW], 120)
-    assert head.split() == [one for one in HEADS if one != "BATTERY"]
+    assert head.split() == [one for one in COLUMN_HEADS if one != "BATTERY"]
     assert line.split() == [
         "robot1", "driving", "+0.50", "up", "+1.2", "-0.5", "+57°", "0.1.0", "0.1", "s",
         "commanded", "by", "app",
@@ -118,7 +118,7 @@ def test_a_warning_that_is_in_the_reason_is_not_repeated() -> None:
 
 def test_a_narrow_terminal_lacks_the_version_first() -> None:
     rows = [replace(ROW, state=replace(READY, recording_error=FULL))]
-    heads = [one for one in HEADS if one != "BATTERY"]
+    heads = [one for one in COLUMN_HEADS if one != "BATTERY"]
     for width, missing in ((100, ""), (90, "VERSION"), (80, "PLACE"), (60, "LINK")):
         if missing:
             heads.remove(missing)
@@ -367,7 +367,7 @@ def test_the_fleet_is_complete_once_each_named_robot_is_present_and_has_answered
     # the first query may be answered by a storage, the second one only by the robot
     for _ in range(2):
         fleet.rows()
-        clock.now += FLEET_ASK_S
+        clock.now += FLEET_QUERY_PERIOD_S
     assert fleet.whole is whole
 
 

@@ -17,7 +17,7 @@ from acsard.core.messages.schema import RobotState, SourceState
 from acsard.core.values import NS_PER_S, REST, Twist
 from acsard.daemon.bus.address import Address
 from acsard.host import clock
-from acsard.top.keyboard import HOLD_S, OVER, REPEAT_S, Keyboard, Ride, split
+from acsard.top.keyboard import KEY_HOLD_S, RELEASE_REASON, REPEAT_S, Keyboard, Ride, split
 from tests.each import each
 from tests.unit.top.screens import STATE, sample_of
 
@@ -65,12 +65,12 @@ def test_each_key_drives_in_its_direction(key: str, linear: int, angular: int) -
 
 def test_a_press_drives_for_its_hold_then_come_three_zeros_then_silence() -> None:
     keys = pressed("i", 10.0)
-    assert keys.wish(10.0 + HOLD_S - 0.001) == Twist(0.5, 0.0)
-    assert [keys.wish(10.0 + HOLD_S) for _ in range(5)] == [REST] * 3 + [None] * 2
+    assert keys.wish(10.0 + KEY_HOLD_S - 0.001) == Twist(0.5, 0.0)
+    assert [keys.wish(10.0 + KEY_HOLD_S) for _ in range(5)] == [REST] * 3 + [None] * 2
 
 
 def test_the_hold_is_longer_than_the_delay_of_a_keyboard_and_no_longer_than_a_second() -> None:
-    assert 0.5 < HOLD_S <= 1.0
+    assert 0.5 < KEY_HOLD_S <= 1.0
 
 
 def test_a_repeated_press_extends_the_hold() -> None:
@@ -78,7 +78,7 @@ def test_a_repeated_press_extends_the_hold() -> None:
     for n in range(20):
         keys.press("i", 10.0 + n * 0.5)
         assert keys.wish(10.0 + n * 0.5 + 0.499) == Twist(0.5, 0.0)
-    assert keys.wish(19.5 + HOLD_S) == REST
+    assert keys.wish(19.5 + KEY_HOLD_S) == REST
 
 
 @each(("delay", "hz"), [(0.25, 30.0), (0.5, 30.0), (0.5, 10.9), (0.25, 5.0)])
@@ -97,14 +97,14 @@ def test_a_held_key_drives_without_a_break_and_stops_soon_after_its_release(
 def test_two_taps_are_no_held_key() -> None:
     keys = pressed("i", 10.0)
     keys.press("i", 10.15)
-    assert keys.wish(10.15 + HOLD_S - 0.001) == Twist(0.5, 0.0)
+    assert keys.wish(10.15 + KEY_HOLD_S - 0.001) == Twist(0.5, 0.0)
 
 
 def test_another_key_changes_the_direction_immediately() -> None:
     keys = pressed("i", 10.0)
     keys.press("j", 10.1)
     assert keys.wish(10.1) == Twist(0.0, 2.0)
-    assert keys.wish(10.0 + HOLD_S) == Twist(0.0, 2.0)
+    assert keys.wish(10.0 + KEY_HOLD_S) == Twist(0.0, 2.0)
 
 
 @each("key", [" ", "k", "p", "\x1b", "\x1b[H", "I", "\n", "�", ""])
@@ -134,7 +134,7 @@ def test_a_speed_key_while_driving_acts_immediately_and_does_not_extend_the_hold
     keys = pressed("u", 10.0)
     keys.press("w", 10.5)
     assert keys.wish(10.5) == Twist(0.5 * 1.1, 2.0)
-    assert keys.wish(10.0 + HOLD_S) == REST
+    assert keys.wish(10.0 + KEY_HOLD_S) == REST
 
 
 @each(
@@ -283,7 +283,7 @@ def test_a_press_does_not_drive_for_the_rest_of_its_hold_after_a_stall(
     drive.step(times=10)
     drive.ride.step("i")
     sent = len(robot.sent)
-    drive.now += (GRACE_S + HOLD_S) / 2
+    drive.now += (GRACE_S + KEY_HOLD_S) / 2
     drive.step(times=10)
     assert robot.sent[sent:] == [0.0] * ZEROS
 
@@ -442,7 +442,7 @@ def test_the_operator_is_informed_that_a_held_key_no_longer_drives(
     assert held.ride.seen().objection == "stopped by request"
     held.robot.said.append(sample_of(replace(STATE, mode="ready", source="")))
     held.step("i", times=12)
-    assert held.ride.seen().objection == OVER
+    assert held.ride.seen().objection == RELEASE_REASON
     held.step(" ")
     assert held.ride.seen().objection == ""
 

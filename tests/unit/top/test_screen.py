@@ -20,7 +20,7 @@ from acsard.core.messages.schema import (
 )
 from acsard.core.motion.modes import Mode
 from acsard.daemon.latencies import NAMES
-from acsard.top.text import MODES, ScreenData
+from acsard.top.text import MODE_STYLES, ScreenData
 from tests.each import each
 from tests.unit.top.screens import INFO, MEASURED, SEEN, STATE, line_with, lines_of, of, painted
 
@@ -45,13 +45,15 @@ def test_every_mode_has_a_badge_of_its_colour_and_its_reason(mode: Mode) -> None
     seen = of(mode=mode.value, reason="because")
     assert lines_of(seen)[1].strip() == f"{mode.value.upper()}   because"
     background = {"green": 42, "blue": 44, "yellow": 43, "white": 47, "red": 41}
-    colour = background[MODES[mode.value].rpartition(" ")[2]]
+    colour = background[MODE_STYLES[mode.value].rpartition(" ")[2]]
     assert re.search(rf"\x1b\[[0-9;]*{colour}m {mode.value.upper()} ", painted(seen))
 
 
 def test_stopped_and_fault_share_a_style_that_no_other_mode_has() -> None:
-    assert MODES["stopped"] == MODES["fault"]
-    assert len({MODES[m] for m in ("driving", "ready", "waiting", "stopped", "inactive")}) == 5
+    assert MODE_STYLES["stopped"] == MODE_STYLES["fault"]
+    assert (
+        len({MODE_STYLES[m] for m in ("driving", "ready", "waiting", "stopped", "inactive")}) == 5
+    )
 
 
 def test_the_reason_does_not_repeat_the_mode() -> None:
@@ -189,7 +191,7 @@ spread = st.builds(Spread, integer, number, number, number)
 states = st.builds(
     RobotState,
     stamp=st.builds(Time, st.integers(-(2**31), 2**31 - 1), st.integers(0, 10**9 - 1)),
-    mode=st.sampled_from(list(MODES)) | anything,
+    mode=st.sampled_from(list(MODE_STYLES)) | anything,
     reason=anything, x=number, y=number, yaw=number, linear=number, angular=number,
     wheels=st.lists(number, max_size=6), link=anything, source=anything,
     sources=st.lists(

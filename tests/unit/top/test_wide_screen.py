@@ -9,7 +9,7 @@ from msgspec.structs import replace
 
 from acsard.core.messages.schema import Latency, SourceState, Time
 from acsard.daemon.latencies import NAMES
-from acsard.top.wide_screen import FIGURES
+from acsard.top.wide_screen import LATENCY_ROWS
 from tests.each import each
 from tests.unit.top.screens import (
     BEFORE,
@@ -145,8 +145,8 @@ def test_each_figure_is_shown_for_the_last_minute_and_since_the_start() -> None:
     for name in NAMES:
         told = re.split(r"\s{2,}|(?<=s) ", line_with(name).removeprefix(name).strip())
         assert told[-6:] == ["63 µs", "891 µs", "9.7 ms", "56 µs", "112 µs", "8.0 ms"]
-        assert FIGURES[name][0] in line_with(name)
-        assert FIGURES[name][1] in line_with(name, width=116)
+        assert LATENCY_ROWS[name][0] in line_with(name)
+        assert LATENCY_ROWS[name][1] in line_with(name, width=116)
 
 
 @pytest.mark.parametrize("figures", [{}, dict.fromkeys(NAMES, UNMEASURED)])

@@ -19,7 +19,7 @@ import pytest
 from aiohttp.test_utils import make_mocked_request
 
 from acsard.machine.authority import Authority
-from acsard.web.answers import INLINED, PAGE, PIECE, Files, _unpacked, cut, sent
+from acsard.web.answers import INLINED, PAGE_DIRECTORY, PIECE_BYTES, Files, _unpacked, cut, sent
 
 
 @pytest.fixture
@@ -87,8 +87,8 @@ def test_the_page_has_stop_and_its_style_in_itself_and_allows_them_by_their_hash
         "script-src": re.findall(rb"<script>(.*?)</script>", page.body, re.DOTALL),
         "style-src": re.findall(rb"<style>(.*?)</style>", page.body, re.DOTALL),
     }
-    assert found["script-src"] == [(PAGE / "stop.js").read_bytes()]
-    assert found["style-src"] == [(PAGE / "style.css").read_bytes()]
+    assert found["script-src"] == [(PAGE_DIRECTORY / "stop.js").read_bytes()]
+    assert found["style-src"] == [(PAGE_DIRECTORY / "style.css").read_bytes()]
     assert not any(loads in page.body for loads, _ in INLINED["index.html"].values())
     policy = dict(one.split(maxsplit=1) for one in page.policy.split("; ") if one)
     for name, (source,) in found.items():
@@ -137,7 +137,7 @@ def test_a_report_is_decompressed_in_pieces_that_take_little_memory() -> None:
     for body in (b"".join(b"%d " % number for number in range(300_000)), bytes(10_000_000), b""):
         pieces = list(_unpacked(gzip.compress(body)))
         assert b"".join(pieces) == body
-        assert max(map(len, pieces)) <= PIECE
+        assert max(map(len, pieces)) <= PIECE_BYTES
 
 
 @pytest.mark.parametrize("secure", [True, False])

@@ -19,7 +19,7 @@ from acsard.host import clock
 from acsard.host.threads import NoThreadError
 from acsard.web import app
 from acsard.web.acceptor import Acceptor
-from acsard.web.admission import WHO
+from acsard.web.admission import IDENTITY_KEY
 from acsard.web.app import Page, settings_in
 from acsard.web.camera import Camera
 from acsard.web.guide import Guide, Reach
@@ -77,7 +77,7 @@ async def test_the_age_of_a_picture_counts_a_suspend(
     slept_ns = clock.asleep_ns() + 3600 * NS_PER_S
     monkeypatch.setattr(clock, "asleep_ns", lambda: slept_ns)
     request = make_mocked_request("GET", "/api/camera")
-    request[WHO] = MAINTAINER
+    request[IDENTITY_KEY] = MAINTAINER
     await page.picture(request)
     page._camera.close()
     assert int(headers["Age-Ms"]) >= 3_600_000

@@ -9,8 +9,8 @@ import pytest
 from msgspec.structs import replace
 
 from acsard.web.callers import (
-    HERE,
-    MOST_TOKENS,
+    LOCAL_NAME,
+    MAX_TOKENS,
     Asked,
     RefusedError,
     Who,
@@ -29,7 +29,7 @@ from tests.each import each
 
 NAMES = frozenset({"robot.local", "192.168.1.7"})
 
-MAINTAINER = Who("maintainer", HERE)
+MAINTAINER = Who("maintainer", LOCAL_NAME)
 """The identity of a client on the robot itself."""
 
 
@@ -162,7 +162,7 @@ def test_a_page_reads_its_own_cookie_first_and_no_other_robot_s_cookie() -> None
 def test_a_limited_number_of_cookies_is_read_and_includes_the_page_s_own() -> None:
     shown = {cookie_name("robot1", port): str(port) for port in range(9000)}
     told = tokens_in(shown, "robot1", 8443)
-    assert (len(told), told[0]) == (MOST_TOKENS, "8443")
+    assert (len(told), told[0]) == (MAX_TOKENS, "8443")
 
 
 def test_an_ipv6_address_counts_by_its_network_and_an_ipv4_address_by_itself() -> None:
@@ -203,4 +203,4 @@ def test_a_token_may_be_the_name_of_a_subprotocol() -> None:
     assert tokens_offered("acsard, acsard.token.a-B_9") == ["a-B_9"]
     assert tokens_offered("acsard") == tokens_offered("") == tokens_offered("token.x") == []
     many = ", ".join(f"acsard.token.{n}" for n in range(500))
-    assert tokens_offered(many) == [str(n) for n in range(MOST_TOKENS)]
+    assert tokens_offered(many) == [str(n) for n in range(MAX_TOKENS)]

@@ -18,8 +18,8 @@ from acsard.core.messages.encodings import encode, encoding_name
 from acsard.core.messages.schema import ServiceReply
 from acsard.web.callers import RefusedError
 from acsard.web.calls import (
-    ELSEWHERE_AT_ONCE,
-    MERGE_S,
+    MAX_REMOTE_STOPS,
+    MIN_STOP_INTERVAL_S,
     STOPS_AT_ONCE,
     Calls,
     Ending,
@@ -27,7 +27,7 @@ from acsard.web.calls import (
     Stops,
 )
 from acsard.web.fleet_rows import Fleet
-from acsard.web.limits import STOPS_ELSEWHERE
+from acsard.web.limits import REMOTE_STOP_RATE
 from acsard.web.robots import Robots
 from tests.unit.web.test_callers import MAINTAINER
 from tests.unit.web.test_fleet_rows import quiet, robots, row
@@ -151,9 +151,9 @@ async def test_a_stop_of_another_robot_is_sent_however_many_replies_are_pending(
         async def stop(robot: str, client: int = 0) -> ServiceReply:
             return await calls.call(replace(MAINTAINER, token=f"{client}"), "stop", {}, robot)
 
-        first = [asyncio.create_task(stop("r2", n)) for n in range(ELSEWHERE_AT_ONCE)]
+        first = [asyncio.create_task(stop("r2", n)) for n in range(MAX_REMOTE_STOPS)]
         async with asyncio.timeout(PATIENCE_S):
-            while len(held) < ELSEWHERE_AT_ONCE:
+            while len(held) < MAX_REMOTE_STOPS:
                 await asyncio.sleep(0.01)
             beyond = await stop("r3")
             while not told:
@@ -186,10 +186,10 @@ async def test_stops_of_one_client_to_one_robot_are_merged_without_a_loss() -> N
         await asyncio.gather(*(asked() for _ in range(100)))
     assert len(sent) == 4
     # The time begins shortly before a stop is sent.
-    assert all(later - sooner > 0.9 * MERGE_S for sooner, later in pairwise(sent))
+    assert all(later - sooner > 0.9 * MIN_STOP_INTERVAL_S for sooner, later in pairwise(sent))
     await asyncio.gather(*(merged.ask((f"viewer {n}", "r2"), stop) for n in range(9)))
     assert len(sent) == 13
-    await asyncio.sleep(2 * MERGE_S)
+    await asyncio.sleep(2 * MIN_STOP_INTERVAL_S)
     assert not merged._rests
 
 
@@ -203,7 +203,7 @@ async def test_a_stop_that_comes_as_the_pause_ends_is_sent_and_so_are_the_later_
 
     await merged.ask("viewer", stop)
     # The event loop is late, so it runs the next stop and the end of the pause in one turn.
-    time.sleep(2 * MERGE_S)
+    time.sleep(2 * MIN_STOP_INTERVAL_S)
     for _ in range(2):
         async with asyncio.timeout(PATIENCE_S):
             assert (await asyncio.create_task(merged.ask("viewer", stop))).success
@@ -234,7 +234,7 @@ async def test_stops_to_silent_robots_are_limited_and_an_answering_robot_is_stop
                 await stop(f"x{n}")
             except RefusedError:
                 refused += 1
-        assert refused > 100 - 2 * STOPS_ELSEWHERE.most
+        assert refused > 100 - 2 * REMOTE_STOP_RATE.most
         assert await stop("r2")
         assert told["r2"] == 2
 

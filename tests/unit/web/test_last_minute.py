@@ -15,7 +15,7 @@ from acsard.core.messages.schema import (
     Vector3,
 )
 from acsard.core.values import NS_PER_S
-from acsard.web.last_minute import LASTS_NS, ROWS, STEP_NS, Minute, Plotted
+from acsard.web.last_minute import MAX_ROWS, MINUTE_NS, STEP_NS, Minute, Plotted
 from tests.each import each
 
 SPREAD = Spread(10, 5.0, 20.0, 80.0)
@@ -57,8 +57,8 @@ def test_a_row_has_what_each_line_of_the_plots_shows() -> None:
 
 def test_the_plots_show_only_the_last_minute_of_a_longer_run() -> None:
     told = lived(150.0).plotted(150 * NS_PER_S)
-    assert 0.98 * LASTS_NS / STEP_NS < len(told.age) <= LASTS_NS // STEP_NS + 1
-    assert max(told.age) <= LASTS_NS // 1_000_000
+    assert 0.98 * MINUTE_NS / STEP_NS < len(told.age) <= MINUTE_NS // STEP_NS + 1
+    assert max(told.age) <= MINUTE_NS // 1_000_000
     assert told.age == sorted(told.age, reverse=True)
     assert told.linear[-1] == 150.0
     assert {len(column) for column in columns(told)} == {len(told.age)}
@@ -67,8 +67,8 @@ def test_the_plots_show_only_the_last_minute_of_a_longer_run() -> None:
 @each("look_ns", [1_000_000, 30_000_000, 90_000_000, 110_000_000])
 def test_the_plots_are_bounded_and_cover_a_minute_at_any_sampling_interval(look_ns: int) -> None:
     told = lived(100.0, look_ns).plotted(100 * NS_PER_S)
-    assert len(told.age) <= ROWS
-    assert max(told.age) > 0.98 * LASTS_NS / 1_000_000
+    assert len(told.age) <= MAX_ROWS
+    assert max(told.age) > 0.98 * MINUTE_NS / 1_000_000
 
 
 def test_an_unknown_value_is_null() -> None:

@@ -9,27 +9,27 @@ import pytest
 from acsard.core.values import NS_PER_S
 from acsard.host.rate_limits import Buckets
 from acsard.web.limits import (
-    COMMANDS,
+    COMMAND_RATE,
     CONNECTIONS,
     CONNECTIONS_ALIKE,
-    CONNECTIONS_HERE,
     CONNECTIONS_OF_ONE,
     CONNECTIONS_OF_TOKEN,
     GUESSES,
     GUESSES_OF_ONE,
-    HANDSHAKES,
-    HOLD_S,
+    HANDSHAKE_RATE,
+    MAX_LOCAL_SOCKETS,
+    MIN_CONNECTIONS,
     OPENINGS,
     PICTURES,
-    REQUESTS,
+    REFUSAL_DELAY_S,
+    REQUEST_RATE,
+    RESERVED_CONNECTIONS,
     SOCKETS,
     SOCKETS_HERE,
-    SOCKETS_LEAST,
-    SOCKETS_OF_BROWSER,
     SOCKETS_OF_ONE,
     SOCKETS_OF_TOKEN,
     STOPS,
-    STRANGERS,
+    STRANGER_RATE,
     Seats,
     Shares,
     Sockets,
@@ -93,8 +93,8 @@ def test_local_browsers_have_reserved_connections() -> None:
     for n in range(2 * CONNECTIONS):
         seats.enter(f"127.0.0.{n % 9}", f"token{n}")
     assert seats.missing("127.0.0.1", "another")
-    told = [seats.enter("127.0.0.1", "") for _ in range(CONNECTIONS_HERE + 1)]
-    assert told[:-1] == [""] * CONNECTIONS_HERE
+    told = [seats.enter("127.0.0.1", "") for _ in range(MAX_LOCAL_SOCKETS + 1)]
+    assert told[:-1] == [""] * MAX_LOCAL_SOCKETS
     assert "on the robot itself" in told[-1]
     seats.leave("127.0.0.1", "")
     assert not seats.enter("::1", "")
@@ -127,20 +127,20 @@ def test_the_manual_states_the_limits_of_the_connections() -> None:
         f"one network (with any tokens), {CONNECTIONS_OF_TOKEN} with one token (from all its "
         f"networks), and {CONNECTIONS_ALIKE} with one token from one network"
     ) in told
-    assert f"another {CONNECTIONS_HERE} WebSockets for the machine itself" in told
+    assert f"another {MAX_LOCAL_SOCKETS} WebSockets for the machine itself" in told
     assert f"room for {SOCKETS} TCP connections from other machines" in told
     assert f"for another {SOCKETS_HERE} from the machine itself" in told
     fewest = next(files for files in range(4096) if sockets_for(files) == SOCKETS)
     assert f"fewer than {fewest} files" in told
     assert f"A network with {SOCKETS_OF_ONE} such connections" in told
     assert f"A token keeps {SOCKETS_OF_TOKEN} connections" in told
-    assert f"{COMMANDS.hz:g} commands a second, and {COMMANDS.most:g} at once" in told
-    assert f"Some requests wait {HOLD_S:g} s beyond a rate" in told
+    assert f"{COMMAND_RATE.hz:g} commands a second, and {COMMAND_RATE.most:g} at once" in told
+    assert f"Some requests wait {REFUSAL_DELAY_S:g} s beyond a rate" in told
     assert f"{STOPS.hz:g} stops or `whoami` a second of one token in one network" in told
     assert f"{PICTURES.hz:g} pictures, {OPENINGS.hz:g} new WebSockets" in told
-    assert f"{STRANGERS.hz:g} requests a second of one network without a token" in told
-    assert f"{STRANGERS.most:g} of the requests without a token may come at once" in told
-    shakes = HANDSHAKES
+    assert f"{STRANGER_RATE.hz:g} requests a second of one network without a token" in told
+    assert f"{STRANGER_RATE.most:g} of the requests without a token may come at once" in told
+    shakes = HANDSHAKE_RATE
     assert f"begin {shakes.most:g} TLS handshakes at once, then {shakes.hz:g} a second" in told
     most, hz = GUESSES_OF_ONE.most, GUESSES_OF_ONE.hz
     assert f"may try {most:g} wrong tokens at once, then one every {1 / hz:g} s" in told
@@ -148,7 +148,7 @@ def test_the_manual_states_the_limits_of_the_connections() -> None:
 
 
 def test_each_token_has_its_own_rate_limit() -> None:
-    paces, most = Buckets(REQUESTS), int(REQUESTS.most)
+    paces, most = Buckets(REQUEST_RATE), int(REQUEST_RATE.most)
     taken = [paces.take("one", 0) for _ in range(most + 1)]
     assert taken == [True] * most + [False]
     assert paces.take("another", 0)
@@ -229,7 +229,7 @@ def test_if_all_connections_have_shown_a_token_the_token_with_the_most_gives_a_p
 def test_no_token_loses_the_connections_of_one_browser() -> None:
     sockets = _filled("a", "b", "c", "d", "e")
     for n in range(SOCKETS):
-        sockets.prove(f"stranger {n}", f"token {n // SOCKETS_OF_BROWSER}")
+        sockets.prove(f"stranger {n}", f"token {n // RESERVED_CONNECTIONS}")
     assert sockets.enter("phone", "phone") == "phone"
     sockets.leave("phone")  # it has no place to give back
     sockets.leave("stranger 9")
@@ -239,6 +239,6 @@ def test_no_token_loses_the_connections_of_one_browser() -> None:
 def test_connections_stay_below_the_limit_of_open_files() -> None:
     assert sockets_for(65536) == sockets_for(2048) == sockets_for(1024) == SOCKETS
     for files in (384, 512, 768):
-        assert SOCKETS_LEAST <= sockets_for(files) < SOCKETS
+        assert MIN_CONNECTIONS <= sockets_for(files) < SOCKETS
         assert sockets_for(files) + SOCKETS_HERE < files
-    assert sockets_for(64) == SOCKETS_LEAST
+    assert sockets_for(64) == MIN_CONNECTIONS

@@ -7,7 +7,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from acsard.core.messages.schema import BatterySummary, Latency, RobotState, Spread, Time
 from acsard.core.messages.state_warnings import WHATS
-from acsard.web.metrics import KNOWN, NAMED, Counts, text
+from acsard.web.metrics import MAX_COUNTED_CLIENTS, MAX_NAMED, Counts, text
 
 SPREAD = Spread(10, 5.0, 20.0, 80.0)
 
@@ -133,12 +133,12 @@ def test_each_line_names_the_client_with_the_most_refusals_since_the_last_line()
 
 def test_a_client_with_many_addresses_does_not_lengthen_the_line() -> None:
     counts = Counts()
-    for n in range(2 * KNOWN):
+    for n in range(2 * MAX_COUNTED_CLIENTS):
         counts.refuse("bad_token", f"2001:db8::{n:x}")
     for _ in range(2):
         counts.refuse("bad_token", "2001:db8::1")
     told = counts.news()
     assert told is not None
-    assert told.text.count(" from ") == NAMED + 1
+    assert told.text.count(" from ") == MAX_NAMED + 1
     assert "; 3 from 2001:db8::1, " in told.text
-    assert told.text.endswith(f", {2 * KNOWN - NAMED} from others")
+    assert told.text.endswith(f", {2 * MAX_COUNTED_CLIENTS - MAX_NAMED} from others")

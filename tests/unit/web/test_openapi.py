@@ -17,7 +17,7 @@ from acsard.core.messages.permissions import SERVICE_ROLES, least_role
 from acsard.web.app import ROUTES
 from acsard.web.openapi import FROM_ROBOT, TO_ROBOT, document
 from acsard.web.routes import PARAMETERS, asked
-from acsard.web.socket_messages import KINDS, FrameError, decode
+from acsard.web.socket_messages import MESSAGE_TYPES, FrameError, decode
 from tests.each import each
 
 WHOLE = document("1.2.3", ROUTES)
@@ -74,7 +74,7 @@ MESSAGES = [one for one in re.findall(r"`(\{.*?\})`", TO_IT) if "..." not in one
 
 
 def test_the_page_has_a_message_of_each_kind() -> None:
-    assert {type(decode(one)) for one in MESSAGES} == set(KINDS.values())
+    assert {type(decode(one)) for one in MESSAGES} == set(MESSAGE_TYPES.values())
 
 
 @each("message", [*MESSAGES, "{}", '{"ping": 1, "call": "stop"}', '{"cmd": {}}'])
@@ -126,6 +126,6 @@ def test_each_path_names_the_least_role_that_may_use_it() -> None:
 
 def test_each_message_to_the_robot_names_the_least_role_that_may_send_it() -> None:
     schemas = WHOLE["components"]["schemas"]
-    least = {kind: schemas[kind.__name__]["x-least-role"] for kind in KINDS.values()}
-    assert least == {kind: kind.least for kind in KINDS.values()}
+    least = {kind: schemas[kind.__name__]["x-least-role"] for kind in MESSAGE_TYPES.values()}
+    assert least == {kind: kind.least for kind in MESSAGE_TYPES.values()}
     assert set(least.values()) == {"viewer", "operator", "maintainer"}

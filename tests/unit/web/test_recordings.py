@@ -14,9 +14,9 @@ import pytest
 from acsard.core.values import NS_PER_S
 from acsard.web import recordings as reports
 from acsard.web.recordings import (
-    BYTES,
-    KEEP_NS,
-    NICE,
+    CHILD_NICE,
+    KEEP_REPORT_NS,
+    MAX_REPORT_BYTES,
     BlackBox,
     Recording,
     Reports,
@@ -53,7 +53,7 @@ async def test_many_requests_at_once_read_the_disk_once(
     monkeypatch.setattr(box, "_place", lambda: tmp_path)
     assert await asyncio.gather(*(box.rows() for _ in range(40))) == [[]] * 40
     assert looked == [tmp_path]
-    monkeypatch.setattr(reports, "LISTED_NS", -1)
+    monkeypatch.setattr(reports, "MIN_LIST_INTERVAL_NS", -1)
     await box.rows()
     assert len(looked) == 2
 
@@ -126,7 +126,10 @@ async def test_a_report_is_made_again_only_if_its_recording_has_grown() -> None:
         ("{}['x']", "KeyError: 'x'"),
         ("import os; os.kill(os.getpid(), 9)", "most likely because memory ran out"),
         ("import os; os.kill(os.getpid(), 15)", "was ended by signal 15"),
-        (f"import sys; sys.stdout.write('x' * {BYTES + 1})", "draw a part of the recording"),
+        (
+            f"import sys; sys.stdout.write('x' * {MAX_REPORT_BYTES + 1})",
+            "draw a part of the recording",
+        ),
     ],
 )
 async def test_a_failed_report_has_its_reason_and_the_next_request_starts_it_again(
@@ -147,7 +150,7 @@ async def test_a_missing_report_program_is_reported() -> None:
 
 
 async def test_a_report_that_takes_too_long_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(reports, "DRAW_S", 0.05)
+    monkeypatch.setattr(reports, "DRAW_TIMEOUT_S", 0.05)
     told = await become(drawn_by(WAITS), A, "ready", "failed")
     assert "acsard recording report" in told.text
 
@@ -165,7 +168,7 @@ async def test_a_report_process_has_low_priority_limited_memory_and_is_killed_fi
     found = drawn_by(TELLS)
     await become(found, Path("/0"), "ready")
     priority, memory, first = gzip.decompress(found.drawn("0") or b"").split()
-    assert (int(priority), int(memory)) == (max(NICE, os.nice(0)), reports.MEMORY)
+    assert (int(priority), int(memory)) == (max(CHILD_NICE, os.nice(0)), reports.MAX_CHILD_MEMORY)
     assert first == b"1000"
 
 
@@ -181,7 +184,7 @@ async def test_a_report_without_further_requests_is_cancelled_and_its_process_en
             await asyncio.sleep(0.01)
         found.tidy()
         assert found.ask(A, (1, 0)).report == "drawing"
-        monkeypatch.setattr(reports, "ALONE_NS", -NS_PER_S)
+        monkeypatch.setattr(reports, "ABANDONED_NS", -NS_PER_S)
         found.tidy()
         while Path(f"/proc/{told.read_text()}").exists():
             await asyncio.sleep(0.01)
@@ -196,9 +199,9 @@ async def test_an_opened_report_is_kept_for_another_quarter_of_an_hour(
     found = drawn_by(DRAWS)
     await become(found, A, "ready")
     for _ in range(3):
-        now_ns += KEEP_NS - NS_PER_S
+        now_ns += KEEP_REPORT_NS - NS_PER_S
         found.tidy()
         assert found.drawn("a.mcap")
-    now_ns += KEEP_NS + NS_PER_S
+    now_ns += KEEP_REPORT_NS + NS_PER_S
     found.tidy()
     assert found.drawn("a.mcap") is None

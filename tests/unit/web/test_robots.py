@@ -9,14 +9,14 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
-from acsard.client.follower import ASK_S, FIRST_S, SILENT_S, Watch
+from acsard.client.follower import FIRST_STATE_TIMEOUT_S, QUERY_PERIOD_S, SILENT_S, Watch
 from acsard.core.messages.schema import Time
 from acsard.core.values import NS_PER_S
 from acsard.daemon.bus.address import Address
 from acsard.host import clock
 from acsard.web import robots
 from acsard.web.metrics import Counts
-from acsard.web.robots import LOOK_S, About, Robots, _Asking
+from acsard.web.robots import PROCESS_PERIOD_S, About, Robots, _Asking
 from tests.unit.client.test_follower import UNREADABLE, Robot
 from tests.unit.top.screens import STATE, sample_of
 
@@ -32,7 +32,7 @@ class World:
         self.asked = 0
         monkeypatch.setattr(clock, "mono_ns", lambda: round((self.now - self.asleep) * NS_PER_S))
         monkeypatch.setattr(clock, "asleep_ns", lambda: round(self.asleep * NS_PER_S))
-        monkeypatch.setattr(robots, "LOOK_S", 0.0)
+        monkeypatch.setattr(robots, "PROCESS_PERIOD_S", 0.0)
 
         async def at_once(call: Callable[[], Any], timeout: float | None) -> Any:
             return call()
@@ -65,7 +65,7 @@ class World:
                 if self.robots.gone != before:
                     before = self.robots.gone
                     found.append((self.now - began, before))
-                self.now += LOOK_S
+                self.now += PROCESS_PERIOD_S
             assert not watching.done()
             watching.cancel()
 
@@ -96,7 +96,7 @@ def test_a_robot_that_falls_silent_is_reported_within_its_time(world: World) -> 
     (_, here), (at, gone) = found
     assert here == ""
     assert "nothing is received from the daemon at tcp/x:1" in gone
-    assert 4.9 + SILENT_S - LOOK_S <= at <= 5.0 + SILENT_S + 2 * LOOK_S
+    assert 4.9 + SILENT_S - PROCESS_PERIOD_S <= at <= 5.0 + SILENT_S + 2 * PROCESS_PERIOD_S
 
 
 def test_a_robot_that_publishes_once_in_ten_seconds_is_queried_and_is_not_gone(
@@ -105,19 +105,19 @@ def test_a_robot_that_publishes_once_in_ten_seconds_is_queried_and_is_not_gone(
     world.answers = world.state
     found = world.told(30.0, lambda t: world.state() if round(t * 10) % 100 == 0 else None)
     assert [gone for _, gone in found] == [""]
-    assert world.asked > 30.0 / (2 * ASK_S + 2 * LOOK_S)
+    assert world.asked > 30.0 / (2 * QUERY_PERIOD_S + 2 * PROCESS_PERIOD_S)
 
 
 def test_a_daemon_of_another_version_is_reported_as_such(world: World) -> None:
     ((at, gone),) = world.told(10.0, lambda t: UNREADABLE)
     assert "another version" in gone
-    assert at <= FIRST_S + 2 * LOOK_S
+    assert at <= FIRST_STATE_TIMEOUT_S + 2 * PROCESS_PERIOD_S
 
 
 def test_a_robot_that_returns_is_present_without_delay(world: World) -> None:
     found = world.told(10.0, lambda t: None if 2.0 < t < 6.0 else world.state())
     assert [bool(gone) for _, gone in found] == [False, True, False]
-    assert found[-1][0] <= 6.0 + 2 * LOOK_S
+    assert found[-1][0] <= 6.0 + 2 * PROCESS_PERIOD_S
 
 
 def test_a_robot_whose_last_state_is_older_than_a_suspend_is_silent_immediately(
@@ -134,4 +134,4 @@ def test_a_robot_whose_last_state_is_older_than_a_suspend_is_silent_immediately(
     (_, here), (at, gone) = world.told(70.0, publishes)
     assert here == ""
     assert "nothing is received" in gone
-    assert 65.0 <= at <= 65.0 + 2 * LOOK_S
+    assert 65.0 <= at <= 65.0 + 2 * PROCESS_PERIOD_S

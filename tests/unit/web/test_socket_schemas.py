@@ -16,9 +16,9 @@ from acsard.core.values import Role
 from acsard.terminal import json_prompt
 from acsard.web import socket_messages
 from acsard.web.last_minute import Minute
-from acsard.web.openapi import KEYS, LINES, SENT, VALUE
+from acsard.web.openapi import GUIDE_MESSAGES, KEYS, SENT_MESSAGES, VALUE_PREFIX
 from acsard.web.socket_sender import Following
-from acsard.web.streams import KEYS as FOLLOWED
+from acsard.web.streams import VIEWER_KEYS as FOLLOWED
 from tests.described import FRAMES, GUIDES, SCHEMAS, kinds, spoilt, taken
 from tests.each import each
 from tests.unit.core.messages.examples import OUTPUTS, SNAPSHOT, START
@@ -58,7 +58,7 @@ def as_told(message: object) -> Any:
 
 def test_every_key_that_may_be_followed_is_described() -> None:
     assert set(KEYS) == FOLLOWED
-    assert {one.removeprefix(VALUE) for one in FRAMES if one.startswith(VALUE)} == {
+    assert {one.removeprefix(VALUE_PREFIX) for one in FRAMES if one.startswith(VALUE_PREFIX)} == {
         key.replace("/", ".") for key in KEYS
     }
 
@@ -78,9 +78,9 @@ def test_each_line_of_a_check_or_calibration_is_as_described(line: Struct) -> No
 
 
 def test_each_kind_of_sent_message_has_an_example() -> None:
-    assert {type(one) for one in SAID} == set(SENT)
-    assert {type(one) for one in GUIDED} == set(LINES)
-    assert len(GUIDES) == len(LINES)
+    assert {type(one) for one in SAID} == set(SENT_MESSAGES)
+    assert {type(one) for one in GUIDED} == set(GUIDE_MESSAGES)
+    assert len(GUIDES) == len(GUIDE_MESSAGES)
 
 
 @pytest.mark.parametrize("role", get_args(Role))

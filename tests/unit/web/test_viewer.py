@@ -17,7 +17,7 @@ from acsard.daemon.bus.address import Address
 from acsard.host import clock
 from acsard.web.callers import Who
 from acsard.web.guide import Guide, Reach
-from acsard.web.limits import COMMANDS
+from acsard.web.limits import COMMAND_RATE
 from acsard.web.metrics import Counts
 from acsard.web.robots import About, Robots
 from acsard.web.viewer import Parts, Viewer, ViewerCommands
@@ -73,7 +73,7 @@ def test_a_token_that_commands_without_end_is_refused_except_a_zero_after_a_spee
     rest = Wish(Twist(0.0, 0.0), 1000, steady=True)
     assert commands.give("token", "teleop", driving, sender, AHEAD)
     given = [commands.give("token", "app", flooding, sender, rest) for _ in range(1000)]
-    assert COMMANDS.most - 1 <= given.count(True) < COMMANDS.most + 100
+    assert COMMAND_RATE.most - 1 <= given.count(True) < COMMAND_RATE.most + 100
     assert not commands.give("token", "teleop", driving, sender, AHEAD)
     # A source may have a timeout of 10 s, so a zero matters for that long.
     later_ns = clock.mono_ns() + 9 * NS_PER_S

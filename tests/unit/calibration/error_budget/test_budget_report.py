@@ -9,7 +9,7 @@ from msgspec.structs import replace
 
 from acsard.calibration.error_budget.budget import Basis, Budget, Cause, Share
 from acsard.calibration.error_budget.budget_report import advice, parts
-from acsard.terminal.output import SENTENCES, plain
+from acsard.terminal.output import MAX_TEXT_WIDTH, plain
 from tests.each import each
 
 DRIVEN = Budget(
@@ -25,7 +25,7 @@ def of(*shares: tuple[Cause, float | None, Basis], **fields: Any) -> Budget:
 
 
 def text(budget: Budget) -> str:
-    return plain(*parts(budget), width=SENTENCES)
+    return plain(*parts(budget), width=MAX_TEXT_WIDTH)
 
 
 KNOWN: tuple[Cause, float, Basis] = ("parameters", 5.0, "settings")
@@ -81,7 +81,7 @@ def test_the_table_has_every_cause_and_their_sum() -> None:
     assert next(row for row in rows if row.startswith("time")).split()[1:3] == ["30", "30.00"]
     assert next(row for row in rows if row.startswith("slip")).endswith("[odometry]")
     assert next(row for row in rows if row.startswith("all")).split()[1:3] == ["50", "50.00"]
-    assert max(map(len, rows)) <= SENTENCES
+    assert max(map(len, rows)) <= MAX_TEXT_WIDTH
 
 
 def test_an_unknown_share_is_a_dash_and_a_tiny_share_is_not_a_zero() -> None:

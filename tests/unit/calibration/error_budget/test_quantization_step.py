@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from acsard.calibration.error_budget.quantization_step import FINEST, quantization_step
+from acsard.calibration.error_budget.quantization_step import MIN_STEP, quantization_step
 
 PERIOD = 0.01
 
@@ -48,4 +48,4 @@ def test_a_few_damaged_lines_do_not_hide_the_step_but_many_do() -> None:
 
 
 def test_a_step_that_chance_could_explain_is_not_found() -> None:
-    assert found(reported(FINEST * 0.95, list(range(1, 120)))) == 0.0
+    assert found(reported(MIN_STEP * 0.95, list(range(1, 120)))) == 0.0

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from acsard.calibration.guided.drive_plan import (
-    FASTEST_WHEEL,
+    MAX_ROLLING_SPEED,
     USUAL_SPEED,
     GuideError,
     Leg,
@@ -48,7 +48,7 @@ def test_no_command_exceeds_the_limits_or_the_slow_speed_of_the_plan(
     assert ahead.linear <= min(USUAL_SPEED, linear) + 1e-12
     assert abs(spin.angular) <= angular * (1 + 1e-12)
     rolls = abs(spin.angular) * multiplier * separation / 2
-    assert rolls <= min(FASTEST_WHEEL, wheel * 0.05) * (1 + 1e-12)
+    assert rolls <= min(MAX_ROLLING_SPEED, wheel * 0.05) * (1 + 1e-12)
     assert ahead.linear <= wheel * 0.05
     assert math.copysign(1, spin.angular) == math.copysign(1, rate)
 

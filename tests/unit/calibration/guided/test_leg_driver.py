@@ -8,11 +8,11 @@ import msgspec
 import pytest
 
 from acsard.calibration.guided.drive_plan import Leg, Move
-from acsard.calibration.guided.leg_driver import HELD_UP, LegDriver, Phase
-from acsard.client.commander import OPENED_S
+from acsard.calibration.guided.leg_driver import STALL_REASON, LegDriver, Phase
+from acsard.client.commander import OPEN_TIMEOUT_S
 from acsard.client.follower import QUIET_S
 from acsard.core.config.settings import DriveConfig
-from acsard.core.link.link_diagnosis import HOST
+from acsard.core.link.link_diagnosis import HOST_STALL
 from acsard.core.messages.schema import RobotState, SourceState, Time
 from acsard.core.values import REST, Twist
 from tests.each import each
@@ -96,7 +96,7 @@ def test_nothing_moves_until_the_daemon_accepts_the_zeros() -> None:
     world = World(LEG)
     waiting = [SourceState("app", 50, 0.01, "send a zero first: app must send a zero")]
     world.tells = changed(sources=waiting, mode="ready", source="", sender="")
-    world.run(OPENED_S + 0.5)
+    world.run(OPEN_TIMEOUT_S + 0.5)
     assert set(world.said) == {REST}
     assert "send a zero first" in world.driver.halted
 
@@ -161,7 +161,7 @@ def of_two(leg: Leg, sender: str) -> World:
 
 def test_a_link_that_was_lost_because_this_computer_did_not_run_is_a_passing_disturbance() -> None:
     world = World(Leg("", "", (Move(10.0, 0.3),))).until_moving()
-    world.tells = changed(mode="waiting", reason=f"{HOST} 0.4 s")
+    world.tells = changed(mode="waiting", reason=f"{HOST_STALL} 0.4 s")
     assert world.run(1.0).driver.disturbed
 
 
@@ -170,7 +170,7 @@ def test_the_calibration_that_the_daemon_follows_continues_beside_another_one() 
 
 
 def test_a_calibration_that_must_wait_names_the_driving_program_and_moves_nothing() -> None:
-    world = of_two(LEG, OTHER).run(OPENED_S + 0.5)
+    world = of_two(LEG, OTHER).run(OPEN_TIMEOUT_S + 0.5)
     assert set(world.said) == {REST}
     assert world.driver.halted.startswith(
         f"another program, {OTHER}, drives the robot as source app"
@@ -207,7 +207,7 @@ def test_a_daemon_that_falls_silent_halts_the_leg() -> None:
 def test_a_calibration_that_was_held_up_halts_and_does_not_blame_the_daemon() -> None:
     world = World(Leg("", "", (Move(10.0, 0.3),))).until_moving()
     assert world.driver.step(world.now + QUIET_S + TICK) == REST
-    assert world.driver.halted == HELD_UP
+    assert world.driver.halted == STALL_REASON
     assert world.driver.disturbed
 
 
@@ -220,7 +220,7 @@ def test_a_calibration_that_was_held_up_does_not_continue_on_queued_messages() -
     world.now += 1.5
     world.run(TICK)
     assert world.said[-1] == REST
-    assert world.driver.halted == HELD_UP
+    assert world.driver.halted == STALL_REASON
     assert set(world.run(3.0).said[-100:]) == {REST}
 
 
@@ -228,7 +228,7 @@ def test_a_calibration_that_was_held_up_before_its_first_move_does_not_start_it(
     world = World(LEG).run(0.1)
     world.now += 1.5
     assert set(world.run(3.0).said) == {REST}
-    assert world.driver.halted == HELD_UP
+    assert world.driver.halted == STALL_REASON
     assert world.driver.disturbed
 
 
@@ -236,7 +236,7 @@ def test_a_key_pressed_while_the_calibration_was_held_up_does_not_end_a_turn_wel
     world = World(TURN).until_moving()
     world.now += 1.5
     world.driver.key(" ", world.now)
-    assert world.driver.halted == HELD_UP
+    assert world.driver.halted == STALL_REASON
     assert not world.driver.disturbed  # the person may have wanted it to stop
 
 

@@ -12,7 +12,14 @@ from functools import cache
 import numpy as np
 import pytest
 
-from acsard.calibration.guided.drive_plan import MOST_S, NEEDS, WIDEST, GuideError, Slant, setup
+from acsard.calibration.guided.drive_plan import (
+    MAX_DRIVE_S,
+    MAX_TRACK_RATIO,
+    NEEDS,
+    GuideError,
+    Slant,
+    setup,
+)
 from acsard.calibration.guided.methods import METHODS, side_of_square
 from acsard.calibration.guided.runner import guide
 from acsard.calibration.log_table import LogError, RefusedError
@@ -85,7 +92,7 @@ def test_standard_deviations_cover_the_truth(way: str, count: int) -> None:
 def test_ninety_seconds_of_driving_are_enough(way: str, count: int) -> None:
     seconds = [player.driven_s for _, _, player, _ in robots(way, count)]
     print(f"{way}: {min(seconds):.0f} to {max(seconds):.0f} s driven")
-    assert max(seconds) <= MOST_S
+    assert max(seconds) <= MAX_DRIVE_S
 
 
 @each_way
@@ -94,7 +101,7 @@ def test_no_track_makes_a_method_longer_than_its_limit(way: str, separation: flo
     made = setup(Config(drive=DriveConfig(wheel_separation=separation)))
     tracks = [1.0 + 0.05 * step for step in range(31)]
     longest = max(sum(leg.seconds for leg in METHODS[way].legs(made, track)) for track in tracks)
-    assert METHODS[way].longest_s(made) == longest <= MOST_S
+    assert METHODS[way].longest_s(made) == longest <= MAX_DRIVE_S
 
 
 @each_way
@@ -170,7 +177,7 @@ def test_the_names_of_a_method_are_unique_and_refer_to_its_earlier_legs(way: str
 
 @each_way
 def test_legs_before_the_track_is_known_do_not_depend_on_it(way: str) -> None:
-    narrow, wide = (METHODS[way].legs(usual_setup(), track) for track in (1.0, WIDEST))
+    narrow, wide = (METHODS[way].legs(usual_setup(), track) for track in (1.0, MAX_TRACK_RATIO))
     for one, other in zip(narrow, wide, strict=True):
         assert one == other
         if any(measure.quantity == "turned" for measure in one.measures):

@@ -9,7 +9,7 @@ import pytest
 
 from acsard.calibration.guided import robot_on_bus
 from acsard.calibration.guided.drive_plan import DisturbedError, Leg, Move
-from acsard.calibration.guided.leg_driver import HELD_UP
+from acsard.calibration.guided.leg_driver import STALL_REASON
 from acsard.calibration.guided.robot_on_bus import Recorder, RobotOnBus, Sample, times
 from acsard.calibration.log_table import LogError
 from acsard.core.config.settings import Config, JointsConfig
@@ -177,7 +177,7 @@ class States:
 def test_a_leg_does_not_continue_after_a_suspend(monkeypatch: pytest.MonkeyPatch) -> None:
     laptop: Any = Laptop(monkeypatch)
     robot = RobotOnBus(laptop, Config(), laptop)
-    with pytest.raises(DisturbedError, match=HELD_UP):
+    with pytest.raises(DisturbedError, match=STALL_REASON):
         robot.ride(Leg("ahead", "", (Move(20.0, 0.3),)))
     assert laptop.asleep
     assert set(laptop.sent) == {0.0}

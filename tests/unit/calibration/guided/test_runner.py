@@ -8,8 +8,8 @@ import pytest
 from acsard.calibration.guided.drive_plan import DisturbedError, Leg
 from acsard.calibration.guided.methods import METHODS
 from acsard.calibration.guided.runner import (
-    MOST_REPEATS,
-    MOST_SIMULATED_REPEATS,
+    MAX_REPEATS,
+    MAX_SIMULATED_REPEATS,
     begins_again,
     guide,
 )
@@ -70,11 +70,11 @@ class Disturbed:
 def test_a_disturbed_leg_is_repeated_and_the_result_is_right(
     way: str, leg: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    drive = Disturbed(way, leg, MOST_REPEATS)
+    drive = Disturbed(way, leg, MAX_REPEATS)
     values = drive.found().multipliers.values
     expected = Disturbed(way, leg, 0).found().multipliers
     robot = drive.player.robot
-    assert drive.driven.count(leg) == 1 + MOST_REPEATS
+    assert drive.driven.count(leg) == 1 + MAX_REPEATS
     assert values[0] == pytest.approx(robot.chi * (1 + 0.5 * robot.rate), rel=0.05)
     assert np.all(np.abs(values - expected.values) < 4 * expected.std)
     said = " ".join(capsys.readouterr().err.split())
@@ -83,15 +83,15 @@ def test_a_disturbed_leg_is_repeated_and_the_result_is_right(
 
 
 def test_a_leg_that_is_disturbed_three_times_ends_the_drive() -> None:
-    drive = Disturbed("gyro", "turns", MOST_REPEATS + 1)
+    drive = Disturbed("gyro", "turns", MAX_REPEATS + 1)
     with pytest.raises(DisturbedError, match="stopped"):
         drive.found()
-    assert drive.driven == ["straight", *["turns"] * (MOST_REPEATS + 1)]
+    assert drive.driven == ["straight", *["turns"] * (MAX_REPEATS + 1)]
 
 
 def test_on_the_simulator_a_leg_is_repeated_more_often_without_putting_it_back(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    drive = Disturbed("gyro", "turns", MOST_SIMULATED_REPEATS)
+    drive = Disturbed("gyro", "turns", MAX_SIMULATED_REPEATS)
     assert drive.found(simulated=True).multipliers.values[0] > 0.9
     assert "put the robot back" not in capsys.readouterr().err

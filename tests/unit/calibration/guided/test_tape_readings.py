@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 
 from acsard.calibration.calibration_report import keys, parts, report
 from acsard.calibration.fit import P
-from acsard.calibration.guided.drive_plan import WIDEST, GuideError, Quantity
-from acsard.calibration.guided.methods import MOST_SPIN_S, once_round, turns
+from acsard.calibration.guided.drive_plan import MAX_TRACK_RATIO, GuideError, Quantity
+from acsard.calibration.guided.methods import MAX_SPIN_S, once_round, turns
 from acsard.calibration.guided.tape_readings import (
     Reading,
     calibrated,
@@ -141,19 +141,19 @@ def test_impossible_distances_from_a_line_are_refused() -> None:
         slant(0.1, 0.5, 0.25)
 
 
-@pytest.mark.parametrize("track", [1.0, 1.7, WIDEST])
+@pytest.mark.parametrize("track", [1.0, 1.7, MAX_TRACK_RATIO])
 def test_a_first_turn_lasts_long_enough_for_the_widest_track(track: float) -> None:
     move = once_round(usual_setup(), "").moves[-1]
     assert move.angular * move.seconds / track > 2 * math.pi
 
 
-@pytest.mark.parametrize("track", [1.0, 1.7, WIDEST])
+@pytest.mark.parametrize("track", [1.0, 1.7, MAX_TRACK_RATIO])
 @pytest.mark.parametrize("rate", [0.6, 1.2])
 def test_the_number_of_turns_fits_into_the_time_for_turning(track: float, rate: float) -> None:
     setup = usual_setup()
     count = turns(setup, rate, track, 3)
     assert 1 <= count <= 3
-    assert setup.turn(2 * math.pi * count, rate, track).seconds <= MOST_SPIN_S
+    assert setup.turn(2 * math.pi * count, rate, track).seconds <= MAX_SPIN_S
 
 
 def once(chi: float) -> Reading:

@@ -12,9 +12,9 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from acsard.core.config.motion_rules import LONGEST_RAMP_S, LONGEST_STOP_S, problems
+from acsard.core.config.motion_rules import MAX_RAMP_S, MAX_STOP_S, problems
 from acsard.core.config.settings import (
-    LONGEST_REPLY_S,
+    MAX_REPLY_PERIOD_S,
     Config,
     DriveConfig,
     FeedbackConfig,
@@ -67,7 +67,7 @@ def mended(config: Config, line: str) -> Config:
     drives,
     limits,
     thousandths(0.1, 99.99),
-    thousandths(0.0, LONGEST_REPLY_S),
+    thousandths(0.0, MAX_REPLY_PERIOD_S),
     st.just(0.0) | thousandths(0.01, 3.0),
 )
 def test_following_the_advice_of_each_problem_leads_to_a_valid_configuration(
@@ -117,7 +117,7 @@ def test_every_accepted_robot_comes_to_rest_in_time_from_any_reachable_speed(
     limiter = Limiter(config.limits, Kinematics(config.drive))
     for _ in range(20):
         limiter.follow(Twist(way[0] * 10.0, way[1] * 50.0), 10.0)
-    longest = LONGEST_STOP_S if stop else LONGEST_RAMP_S
+    longest = MAX_STOP_S if stop else MAX_RAMP_S
     for _ in range(round(longest / DT) + 1):
         limiter.coast(DT, stop)
     assert limiter.twist == REST

@@ -19,8 +19,8 @@ from msgspec.structs import replace
 
 from acsard.core.config.settings import CommandsConfig, DriveConfig, JointsConfig
 from acsard.core.incoming.commands import (
-    BOUND_NS,
-    MAX_BOUND,
+    BINDING_NS,
+    MAX_BINDINGS,
     MAX_COMMAND_BYTES,
     Arrival,
     Bindings,
@@ -31,7 +31,7 @@ from acsard.core.incoming.commands import (
 from acsard.core.messages.encodings import FORMATS, DecodeError, Format, encode
 from acsard.core.messages.schema import JointState, TwistStamped
 from acsard.core.messages.schema import Twist as TwistMessage
-from acsard.core.messages.signature import DIGITS, MAX_NAME, public_name
+from acsard.core.messages.signature import HASH_DIGITS, MAX_NAME_LENGTH, public_name
 from acsard.core.motion.arbiter import Arbiter
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.ros.attachments import Attachment
@@ -948,7 +948,7 @@ def test_a_sender_id_is_never_taken_for_a_session_that_stamps_for_others() -> No
 
 def test_the_first_certificate_keeps_a_sender_id_while_it_sends() -> None:
     bindings = Bindings()
-    for at_ns in range(0, 5 * BOUND_NS, BOUND_NS // 2):
+    for at_ns in range(0, 5 * BINDING_NS, BINDING_NS // 2):
         assert bindings.other("a", "anna", at_ns) is None
         assert bindings.other("a", "ben", at_ns + 1) == "anna"
         assert bindings.other("a", "", at_ns + 1) == "anna"
@@ -964,20 +964,20 @@ def test_a_sender_id_without_a_certificate_is_bound_to_this_machine() -> None:
 def test_a_binding_ends_after_a_silence_and_refused_commands_do_not_extend_it() -> None:
     bindings = Bindings()
     bindings.other("a", "anna", 0)
-    assert bindings.other("a", "ben", BOUND_NS) == "anna"
-    assert bindings.other("a", "ben", BOUND_NS + 1) is None
-    assert bindings.other("a", "anna", BOUND_NS + 2) == "ben"
+    assert bindings.other("a", "ben", BINDING_NS) == "anna"
+    assert bindings.other("a", "ben", BINDING_NS + 1) is None
+    assert bindings.other("a", "anna", BINDING_NS + 2) == "ben"
 
 
 def test_a_flood_of_sender_ids_is_bounded_in_memory_and_active_senders_stay_bound() -> None:
     bindings = Bindings()
     bindings.other("a", "anna", 0)
-    for number in range(4 * MAX_BOUND):
+    for number in range(4 * MAX_BINDINGS):
         bindings.other(f"other {number}", "ben", number)
         if number % 100 == 0:
             assert bindings.other("a", "anna", number) is None
     assert bindings.other("a", "ben", number) == "anna"
-    assert len(bindings._seen) <= MAX_BOUND
+    assert len(bindings._seen) <= MAX_BINDINGS
 
 
 # the name of a caller
@@ -1028,7 +1028,7 @@ def test_a_caller_through_a_bridge_is_unnamed() -> None:
 )
 def test_a_caller_name_cannot_imitate_the_text_around_it(name: str, kept: str) -> None:
     who = caller_name("native", signed_as(f"{name}/s3cret"))
-    assert who == f"{kept}/{public_name(f'{name}/s3cret')[-DIGITS:]} (native)"
+    assert who == f"{kept}/{public_name(f'{name}/s3cret')[-HASH_DIGITS:]} (native)"
 
 
 @given(st.binary(max_size=100) | st.text(max_size=100).map(signed_as))
@@ -1036,6 +1036,6 @@ def test_any_attachment_gives_a_short_printable_name(attachment: bytes) -> None:
     who = caller_name("native", attachment)
     name = who.removesuffix(" (native)")
     assert who == f"{name} (native)"
-    assert 1 <= len(name) <= MAX_NAME + 1 + DIGITS
+    assert 1 <= len(name) <= MAX_NAME_LENGTH + 1 + HASH_DIGITS
     assert name.isprintable()
     assert not set(name) & set('(),="\n')

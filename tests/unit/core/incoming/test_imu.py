@@ -13,7 +13,13 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from acsard.core.incoming.commands import Arrival
-from acsard.core.incoming.imu import FOLLOWED_NS, MAX_RATE, OWN, GyroFollower, reading
+from acsard.core.incoming.imu import (
+    MAX_RATE,
+    SILENCE_TIMEOUT_NS,
+    SIMULATOR_SENDER,
+    GyroFollower,
+    reading,
+)
 from acsard.core.messages.encodings import FORMATS, DecodeError, Format, encode, encoding_name
 from acsard.core.messages.schema import Header, Imu, Quaternion, Time, Vector3
 from acsard.core.messages.signature import Signature
@@ -120,17 +126,22 @@ class Daemon:
 def test_the_first_of_two_gyros_is_followed_until_it_is_silent() -> None:
     daemon = Daemon()
     assert daemon.hears(0.1, 0, "one")
-    assert not daemon.hears(0.2, FOLLOWED_NS // 2, "other")
-    assert daemon.hears(0.1, FOLLOWED_NS - 1, "one")
-    assert not daemon.hears(0.2, 2 * FOLLOWED_NS - 2, "other")
+    assert not daemon.hears(0.2, SILENCE_TIMEOUT_NS // 2, "other")
+    assert daemon.hears(0.1, SILENCE_TIMEOUT_NS - 1, "one")
+    assert not daemon.hears(0.2, 2 * SILENCE_TIMEOUT_NS - 2, "other")
     assert daemon.counters == {"imu_second_sender": 2}
-    assert daemon.hears(0.2, 2 * FOLLOWED_NS, "other")
-    assert not daemon.hears(0.1, 2 * FOLLOWED_NS + 1, "one")
+    assert daemon.hears(0.2, 2 * SILENCE_TIMEOUT_NS, "other")
+    assert not daemon.hears(0.1, 2 * SILENCE_TIMEOUT_NS + 1, "one")
 
 
 def test_the_first_sample_of_another_gyro_is_marked_as_new() -> None:
     told, anew = GyroFollower(), []
-    heard = [(0, "one"), (1, "one"), (FOLLOWED_NS + 1, "other"), (FOLLOWED_NS + 2, "other")]
+    heard = [
+        (0, "one"),
+        (1, "one"),
+        (SILENCE_TIMEOUT_NS + 1, "other"),
+        (SILENCE_TIMEOUT_NS + 2, "other"),
+    ]
     for at_ns, who in heard:
         sample = told.receive(turning(0.1, at_ns, who), Counter(), [])
         assert sample is not None
@@ -140,7 +151,7 @@ def test_the_first_sample_of_another_gyro_is_marked_as_new() -> None:
 
 def test_a_gyro_that_returns_after_a_silence_is_not_marked_as_new() -> None:
     told = GyroFollower()
-    for at_ns in (0, 10 * FOLLOWED_NS):
+    for at_ns in (0, 10 * SILENCE_TIMEOUT_NS):
         sample = told.receive(turning(0.1, at_ns, "one"), Counter(), [])
         assert sample == GyroSample(at_ns, None, 0.1)
 
@@ -148,12 +159,14 @@ def test_a_gyro_that_returns_after_a_silence_is_not_marked_as_new() -> None:
 def test_a_robot_with_its_own_gyro_never_follows_another_one() -> None:
     counters, events = Counter[str](), list[Event]()
     told = GyroFollower(own=True)
-    for who in ("other", OWN):
+    for who in ("other", SIMULATOR_SENDER):
         # The second one has the simulator's secret as the id of its session.
         assert told.receive(turning(0.2, 0, who), counters, events) is None
-    own = replace(turning(0.1, 10 * FOLLOWED_NS, ""), attachment=Signature(OWN).pack())
+    own = replace(
+        turning(0.1, 10 * SILENCE_TIMEOUT_NS, ""), attachment=Signature(SIMULATOR_SENDER).pack()
+    )
     assert told.receive(own, counters, events) is not None
-    assert told.receive(turning(0.2, 20 * FOLLOWED_NS, "other"), counters, events) is None
+    assert told.receive(turning(0.2, 20 * SILENCE_TIMEOUT_NS, "other"), counters, events) is None
     assert counters == {"imu_second_sender": 3}
     assert "simulat" in events[0].text
 

@@ -568,7 +568,7 @@ def test_an_unreadable_parameter_request_is_answered_with_a_refusal(service: str
     assert (reply.ok, reply.attachment) == (True, echo if via == "rmw" else b"")
 
 
-@pytest.mark.parametrize("service", rcl.SETTING)
+@pytest.mark.parametrize("service", rcl.SETTING_SERVICES)
 def test_a_parameter_set_twice_in_a_request_is_refused_with_all_its_results(
     service: str,
 ) -> None:
@@ -651,7 +651,7 @@ def test_replies_to_native_callers_name_the_services_by_their_keys() -> None:
 
 
 @each("via", ["bridge", "rmw"])
-@each("service", rcl.SETTING)
+@each("service", rcl.SETTING_SERVICES)
 def test_a_request_to_set_parameters_goes_to_the_robot_and_returns_its_answer(
     service: str, via: str
 ) -> None:

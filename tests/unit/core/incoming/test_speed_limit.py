@@ -16,7 +16,12 @@ from acsard.core.config.live import changed
 from acsard.core.config.parsing import ConfigError
 from acsard.core.config.settings import Config
 from acsard.core.incoming.commands import Arrival, Via
-from acsard.core.incoming.speed_limit import PAUSE_NS, SETTING, SpeedLimiter, decode_limit
+from acsard.core.incoming.speed_limit import (
+    LOWERED_SETTING,
+    MIN_INTERVAL_NS,
+    SpeedLimiter,
+    decode_limit,
+)
 from acsard.core.messages.encodings import FORMATS, DecodeError, Format, encode, encoding_name
 from acsard.core.messages.schema import Header, SpeedLimit, Time
 from acsard.core.ros.attachments import Attachment
@@ -85,11 +90,11 @@ def test_a_refused_message_is_reported_with_its_reason_and_keeps_the_earlier_lim
     for one in REFUSED[reason]:
         limiter, refusals = SpeedLimiter(Config()), list[Refusal]()
         limiter.receive(said(0.5), 1.0, refusals)
-        limiter.requests((), PAUSE_NS)
+        limiter.requests((), MIN_INTERVAL_NS)
         limiter.receive(one, 1.0, refusals)
         assert [refusal.reason for refusal in refusals] == [reason]
         assert refusals[0].text.startswith("speed_limit: ")
-        assert limiter.requests((), 2 * PAUSE_NS) == ((), []), "the earlier limit stays"
+        assert limiter.requests((), 2 * MIN_INTERVAL_NS) == ((), []), "the earlier limit stays"
 
 
 DAMAGE = st.lists(st.tuples(st.integers(0, 200), st.binary(max_size=8)), min_size=1, max_size=4)
@@ -119,7 +124,7 @@ class Robot:
         self.config = Config()
         self.limiter = SpeedLimiter(self.config)
         self.events: list[Event] = []
-        self.now_ns = 10 * PAUSE_NS
+        self.now_ns = 10 * MIN_INTERVAL_NS
         self.peak = 0.0
         """Highest speed that was allowed at any moment of the last step, m/s."""
 
@@ -128,7 +133,7 @@ class Robot:
 
     def step(self, *wishes: Mapping[str, Plain], at_rest: bool = True) -> dict[int, Answer]:
         """Take a step with a `set` for each of these wishes, and return the answers by number."""
-        self.now_ns += PAUSE_NS
+        self.now_ns += MIN_INTERVAL_NS
         requests = [
             Request("set", number, settings=dict(wish)) for number, wish in enumerate(wishes, 1)
         ]
@@ -177,7 +182,7 @@ def test_a_set_below_the_limit_applies_immediately_and_stays_when_the_limit_ends
     robot = Robot()
     robot.limit(0.5)
     robot.step()
-    assert robot.step({SETTING: 0.2})[1].success
+    assert robot.step({LOWERED_SETTING: 0.2})[1].success
     assert (robot.speed, robot.limiter.text) == (0.2, "")
     robot.limit(0.0)
     robot.step()
@@ -188,7 +193,7 @@ def test_a_set_above_the_limit_waits_for_its_end_and_the_answer_says_so() -> Non
     robot = Robot()
     robot.limit(0.3)
     robot.step()
-    answer = robot.step({SETTING: 0.8})[1]
+    answer = robot.step({LOWERED_SETTING: 0.8})[1]
     text = (
         "limits.linear_speed = 0.8 will apply when the limit of 0.3 m/s ends "
         "(speed_limit, unnamed (native))"
@@ -205,7 +210,7 @@ def test_the_answer_also_names_the_settings_that_apply_immediately() -> None:
     robot = Robot()
     robot.limit(0.3)
     robot.step()
-    answer = robot.step({SETTING: 0.8, "limits.linear_acceleration": 0.5})[1]
+    answer = robot.step({LOWERED_SETTING: 0.8, "limits.linear_acceleration": 0.5})[1]
     told = "limits.linear_acceleration = 0.5 (was 1.0); limits.linear_speed = 0.8 will apply when"
     assert told in answer.message
 
@@ -213,7 +218,7 @@ def test_the_answer_also_names_the_settings_that_apply_immediately() -> None:
 def test_a_limit_and_a_higher_set_in_one_step_leave_the_limit_in_force() -> None:
     robot = Robot()
     robot.limit(0.3)
-    robot.step({SETTING: 1.4})
+    robot.step({LOWERED_SETTING: 1.4})
     assert robot.speed == 0.3
     robot.limit(0.0)
     robot.step()
@@ -231,7 +236,15 @@ def test_a_set_that_contradicts_the_setting_under_the_limit_is_refused() -> None
     assert robot.config.limits.linear_deceleration == Config().limits.linear_deceleration
 
 
-@each("wish", [{SETTING: 11.0}, {SETTING: "fast"}, {SETTING: -1.0}, {"limits.nothing": 1.0}])
+@each(
+    "wish",
+    [
+        {LOWERED_SETTING: 11.0},
+        {LOWERED_SETTING: "fast"},
+        {LOWERED_SETTING: -1.0},
+        {"limits.nothing": 1.0},
+    ],
+)
 def test_an_invalid_set_is_refused_in_the_same_way_with_and_without_a_limit(
     wish: dict[str, Plain],
 ) -> None:
@@ -247,7 +260,7 @@ def test_two_sets_of_one_step_are_processed_one_after_the_other() -> None:
     robot = Robot()
     robot.limit(0.3)
     robot.step()
-    first = robot.step({"limits.linear_deceleration": 0.2}, {SETTING: 1.2})
+    first = robot.step({"limits.linear_deceleration": 0.2}, {LOWERED_SETTING: 1.2})
     assert list(first) == [1]
     assert first[1].success
     second = robot.step()
@@ -259,7 +272,7 @@ def test_a_flood_of_messages_changes_the_limit_at_most_ten_times_a_second() -> N
     limiter, changes = SpeedLimiter(Config()), 0
     for step in range(200):
         limiter.receive(said(0.2 + 0.001 * step), 1.0, [])
-        taken, _ = limiter.requests((), 10 * PAUSE_NS + step * PAUSE_NS // 10)
+        taken, _ = limiter.requests((), 10 * MIN_INTERVAL_NS + step * MIN_INTERVAL_NS // 10)
         changes += len(taken)
         config = Config() if not taken else changed(Config(), taken[0].settings, True)[0]
         if taken:
@@ -268,8 +281,9 @@ def test_a_flood_of_messages_changes_the_limit_at_most_ten_times_a_second() -> N
 
 
 WISHES = st.dictionaries(
-    st.sampled_from([SETTING, "limits.linear_deceleration", "limits.linear_stop_deceleration",
-                     "limits.wheel_speed", "limits.linear_acceleration"]),
+    st.sampled_from([LOWERED_SETTING, "limits.linear_deceleration",
+                     "limits.linear_stop_deceleration", "limits.wheel_speed",
+                     "limits.linear_acceleration"]),
     st.floats(0.01, 60.0) | st.just("x"),
     min_size=1,
     max_size=2,

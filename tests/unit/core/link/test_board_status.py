@@ -14,7 +14,7 @@ from acsard.core.link.board_status import STATUS, BoardStatus, decode_status, me
 from acsard.core.link.checked_line import unseal
 from acsard.core.link.codec import Codec, FrameError
 from acsard.core.motion.bumpers import Bumpers
-from acsard.core.motion.emergency_stop import SILENT_S, EmergencyStop
+from acsard.core.motion.emergency_stop import SILENCE_TIMEOUT_S, EmergencyStop
 from acsard.core.simulator import protocol
 from acsard.core.values import NS_PER_S
 from tests.each import each
@@ -252,6 +252,6 @@ def test_a_false_press_needs_half_a_second_of_damage() -> None:
             last_ns = now_ns
         estop.look(reports, now_ns)
         presses += bool(estop.pressed_now)
-        runs += now_ns - last_ns == int(SILENT_S * NS_PER_S) + step_ns
+        runs += now_ns - last_ns == int(SILENCE_TIMEOUT_S * NS_PER_S) + step_ns
     assert presses == runs
     assert 100 < presses < 1000

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from acsard.core.link.checked_line import Checked, Reading, seal, unseal
 from acsard.core.link.codec import FrameError
-from acsard.core.link.lines import MAX_LINE
+from acsard.core.link.lines import MAX_LINE_BYTES
 from tests.each import each
 from tests.vectors.lines import SEED_LINE
 
@@ -68,7 +68,7 @@ def test_the_example_of_the_protocol_is_right() -> None:
 
 def test_a_sampled_reply_contains_milliseconds_and_four_counts() -> None:
     line = closed(SAMPLE[:-5])
-    assert len(line) + 2 == 62 < MAX_LINE
+    assert len(line) + 2 == 62 < MAX_LINE_BYTES
     reading = Reading(0x0FA0, (0x0001, 0xFFFF, 0x8000, 0x7FFF))
     assert unseal(line) == Checked(SEED_LINE, 7, reading)
 

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from acsard.core.config.settings import WheelMap
 from acsard.core.link.codec import Codec
 from acsard.core.link.echo_detector import (
-    LINES,
-    REPORTS,
+    COMPARED_LINES,
+    MIN_REPEATED_LINES,
     EchoDetector,
 )
 from acsard.core.values import WheelSpeeds
@@ -52,14 +52,14 @@ def written(speed: float) -> bytes:
 
 def test_twenty_equal_reports_through_a_change_of_speed_are_an_echo() -> None:
     bench = Echoes()
-    assert not any(bench.exchange(0.0) for _ in range(REPORTS - 1))
+    assert not any(bench.exchange(0.0) for _ in range(MIN_REPEATED_LINES - 1))
     assert bench.exchange(5.0)
 
 
 def test_fewer_than_twenty_equal_reports_are_not_an_echo_despite_speed_changes() -> None:
     bench = Echoes()
-    found = [bench.exchange(speed) for speed in (0, *range(REPORTS - 1))]
-    assert found == [False] * (REPORTS - 1) + [True]
+    found = [bench.exchange(speed) for speed in (0, *range(MIN_REPEATED_LINES - 1))]
+    assert found == [False] * (MIN_REPEATED_LINES - 1) + [True]
 
 
 @pytest.mark.parametrize("speed", [0.0, 10.0])
@@ -71,7 +71,7 @@ def test_without_a_change_of_speed_no_report_is_an_echo(speed: float) -> None:
 def test_small_speed_changes_add_up_to_an_echo() -> None:
     bench = Echoes()
     found = [bench.exchange(step % 2 * 0.5) for step in range(40)]
-    assert found.index(True) == REPORTS - 1
+    assert found.index(True) == MIN_REPEATED_LINES - 1
     bench = Echoes()
     found = [bench.exchange(5.0 + step % 2 * 0.05) for step in range(80)]
     assert found.index(True) in (40, 41)  # 40 changes of 0.05 rad/s, with float rounding
@@ -79,14 +79,14 @@ def test_small_speed_changes_add_up_to_an_echo() -> None:
 
 def test_a_differing_report_restarts_the_count_of_equal_reports() -> None:
     bench = Echoes()
-    for speed in range(REPORTS - 1):
+    for speed in range(MIN_REPEATED_LINES - 1):
         assert not bench.exchange(speed)
     assert not bench.exchange(30.0, 29.99)
-    found = [bench.exchange(speed) for speed in (0, *range(REPORTS - 1))]
-    assert found == [False] * (REPORTS - 1) + [True]
+    found = [bench.exchange(speed) for speed in (0, *range(MIN_REPEATED_LINES - 1))]
+    assert found == [False] * (MIN_REPEATED_LINES - 1) + [True]
 
 
-@each("lag", range(LINES))
+@each("lag", range(COMPARED_LINES))
 def test_an_echo_is_found_at_every_lag_of_the_kept_lines(lag: int) -> None:
     bench = Echoes()
     found = [bench.exchange(step // 7 % 40 * 0.5, lag=lag) for step in range(200)]
@@ -101,7 +101,7 @@ def test_an_echo_that_arrives_in_batches_is_found() -> None:
         bench.send(step)
         bench.send(step)
         found += [bench.report(step), bench.report(step)]
-    assert found.index(True) == REPORTS - 1
+    assert found.index(True) == MIN_REPEATED_LINES - 1
 
 
 DRIVE = [*[0.0] * 30, *[0.2 * n for n in range(50)]]
@@ -172,7 +172,7 @@ def test_a_motor_that_reaches_a_new_speed_within_some_reports_is_not_an_echo(oth
 
 def test_a_report_that_equals_a_line_older_than_the_kept_ones_is_not_an_echo() -> None:
     bench = Echoes()
-    assert not any(bench.exchange(step // 7 % 40 * 0.5, lag=LINES) for step in range(2000))
+    assert not any(bench.exchange(step // 7 % 40 * 0.5, lag=COMPARED_LINES) for step in range(2000))
 
 
 def test_reports_at_another_rate_than_the_lines_are_not_an_echo() -> None:
@@ -193,10 +193,10 @@ def test_the_mean_of_two_lines_is_not_an_echo() -> None:
 
 def test_forgetting_restarts_the_count_of_equal_reports() -> None:
     bench = Echoes()
-    for speed in range(REPORTS - 1):
+    for speed in range(MIN_REPEATED_LINES - 1):
         assert not bench.exchange(speed)
     bench.detector.forget()
-    assert not bench.report(REPORTS - 2)
+    assert not bench.report(MIN_REPEATED_LINES - 2)
     assert not bench.exchange(1.0)
 
 

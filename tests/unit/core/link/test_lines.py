@@ -10,14 +10,14 @@ import pickle
 from hypothesis import given
 from hypothesis import strategies as st
 
-from acsard.core.link.lines import MAX_LINE, LineReader
+from acsard.core.link.lines import MAX_LINE_BYTES, LineReader
 from tests.each import each
 from tests.vectors.lines import SEED_LINE, SEED_REPLY, ZERO
 
 pieces = st.one_of(
     st.sampled_from([SEED_LINE + b"\r\n", SEED_REPLY + b"\n", ZERO + b"\r\n"]),
     st.sampled_from([b"\n", b"\r\n", b"\r", b"\r\r\n", SEED_LINE[:17], b"\x00\xff"]),
-    st.integers(MAX_LINE - 3, 3 * MAX_LINE).map(lambda n: b"x" * n),
+    st.integers(MAX_LINE_BYTES - 3, 3 * MAX_LINE_BYTES).map(lambda n: b"x" * n),
     st.binary(max_size=40),
 )
 """Anything that a wire may carry: lines, line ends, halves, runs near the maximum length, noise."""
@@ -76,10 +76,12 @@ def test_the_lines_are_the_text_split_at_newlines_without_empty_and_over_long_on
     data: bytes,
 ) -> None:
     *ended, _ = (data + b"\n").split(b"\n")
-    allowed = [line for line in ended if len(line) + 1 <= MAX_LINE and line not in (b"", b"\r")]
+    allowed = [
+        line for line in ended if len(line) + 1 <= MAX_LINE_BYTES and line not in (b"", b"\r")
+    ]
     reader = LineReader()
     assert feed(reader, data + b"\n") == [line.removesuffix(b"\r") for line in allowed]
-    assert reader.too_long == sum(len(line) + 1 > MAX_LINE for line in ended)
+    assert reader.too_long == sum(len(line) + 1 > MAX_LINE_BYTES for line in ended)
 
 
 def test_the_longest_line_has_128_bytes_with_its_end() -> None:
@@ -108,7 +110,7 @@ def test_noise_without_newline_never_grows_memory() -> None:
     reader, empty = LineReader(), len(pickle.dumps(LineReader()))
     for size in (1, 100, 127, 128, 10_000, 1_000_000) * 10:
         reader.feed(b"\xff" * size)
-        assert len(pickle.dumps(reader)) < empty + MAX_LINE + 16
+        assert len(pickle.dumps(reader)) < empty + MAX_LINE_BYTES + 16
 
 
 def test_each_over_long_line_counts() -> None:

@@ -12,10 +12,10 @@ import pytest
 from acsard.core.config.settings import McuConfig
 from acsard.core.link.lines import LineReader
 from acsard.core.link.link_diagnosis import (
+    FIRST_DIAGNOSIS_NS,
     LOOK_MENDS,
-    LOST,
-    PATIENCE_NS,
-    WINDOW,
+    MAX_UNANSWERED_FRACTION,
+    WINDOW_LINES,
     Heard,
     Lateness,
     Look,
@@ -23,7 +23,7 @@ from acsard.core.link.link_diagnosis import (
     UnansweredLines,
     is_ours,
 )
-from acsard.core.link.link_state import WORDS
+from acsard.core.link.link_state import STATE_TEXTS
 from tests.unit.core.link.test_session import GOOD, Bench
 
 MS = 1_000_000
@@ -140,7 +140,7 @@ def after(*steps_ms: int, good: bool = False, simulated: bool = False) -> Latene
 
 
 def test_silence_during_punctual_steps_is_blamed_on_the_board() -> None:
-    assert after(*[10] * 11).words("stale") == WORDS["stale"]
+    assert after(*[10] * 11).words("stale") == STATE_TEXTS["stale"]
     assert after(*[49] * 3).late_s == 0.0
 
 
@@ -153,7 +153,7 @@ def test_a_host_stall_is_reported_with_its_length() -> None:
 
 def test_a_good_line_ends_the_host_stall() -> None:
     assert after(800, 10, good=True).late_s == 0.0
-    assert after(800, good=True).words("stale") == WORDS["stale"]
+    assert after(800, good=True).words("stale") == STATE_TEXTS["stale"]
 
 
 def test_a_late_simulator_is_not_reported_as_a_silent_microcontroller() -> None:
@@ -164,14 +164,14 @@ def test_a_late_simulator_is_not_reported_as_a_silent_microcontroller() -> None:
 def test_a_link_that_is_not_stale_is_reported_unchanged_despite_a_host_stall() -> None:
     late = after(800)
     assert [late.words(state) for state in ("up", "booting", "down")] == [
-        WORDS["up"], WORDS["booting"], WORDS["down"]
+        STATE_TEXTS["up"], STATE_TEXTS["booting"], STATE_TEXTS["down"]
     ]  # fmt: skip
 
 
 def test_the_text_of_a_silence_shows_whether_the_host_caused_it() -> None:
     ours = [after(800), after(800, simulated=True), after(10, simulated=True)]
     assert all(is_ours(lateness.words("stale")) for lateness in ours)
-    assert not any(is_ours(words) for words in (WORDS["stale"], "", after(800).words("down")))
+    assert not any(is_ours(words) for words in (STATE_TEXTS["stale"], "", after(800).words("down")))
 
 
 def heard(data: bytes) -> Heard:
@@ -197,7 +197,7 @@ def test_the_diagnosis_says_what_was_received_how_it_looks_and_what_to_do(
 def test_the_diagnosis_comes_after_three_seconds_and_again_only_when_it_changes() -> None:
     hearing, told = SilenceDiagnosis(), []
     for tick in range(100):
-        now_ns = tick * PATIENCE_NS // 10
+        now_ns = tick * FIRST_DIAGNOSIS_NS // 10
         if tick > 50:
             hearing.now.take(b"\x00")
         if hearing.judge(now_ns):
@@ -206,7 +206,7 @@ def test_the_diagnosis_comes_after_three_seconds_and_again_only_when_it_changes(
     assert told == [(10, "nothing"), (60, "garbage")]
     hearing.forget()
     assert hearing.heard is None
-    assert not hearing.judge(10 * PATIENCE_NS)
+    assert not hearing.judge(10 * FIRST_DIAGNOSIS_NS)
 
 
 def sparse(bench: Bench) -> Heard:
@@ -259,19 +259,19 @@ def events_of(every: int, windows: int = 3, period: float = 0.0, linked: bool = 
     answered = UnansweredLines(period)
     events = [
         answered.look(sent, sent - sent // every if every else sent, linked)
-        for sent in range(windows * WINDOW + 1)
+        for sent in range(windows * WINDOW_LINES + 1)
     ]
     return [event.text for event in events if event is not None]
 
 
 def test_a_loss_of_a_fifth_of_the_lines_is_reported_once_with_its_figures() -> None:
     (text,) = events_of(5)
-    assert f"answered only {WINDOW * 4 // 5} of {WINDOW} lines" in text
+    assert f"answered only {WINDOW_LINES * 4 // 5} of {WINDOW_LINES} lines" in text
     assert "`acsard mcu check`" in text
 
 
 def test_the_few_losses_of_a_sound_link_are_not_reported() -> None:
-    assert events_of(0) == events_of(int(1 / LOST) + 1) == []
+    assert events_of(0) == events_of(int(1 / MAX_UNANSWERED_FRACTION) + 1) == []
 
 
 def test_losses_are_not_judged_for_a_free_running_board_or_without_a_link() -> None:
@@ -280,6 +280,6 @@ def test_losses_are_not_judged_for_a_free_running_board_or_without_a_link() -> N
 
 def test_losses_are_reported_again_after_the_link_was_down() -> None:
     answered, events = UnansweredLines(0.0), []
-    for sent in range(3 * WINDOW):
-        events.append(answered.look(sent, sent // 2, sent != WINDOW + 10))
+    for sent in range(3 * WINDOW_LINES):
+        events.append(answered.look(sent, sent // 2, sent != WINDOW_LINES + 10))
     assert len([event for event in events if event]) == 2

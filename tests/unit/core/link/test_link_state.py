@@ -6,7 +6,15 @@ from typing import get_args
 
 import pytest
 
-from acsard.core.link.link_state import BAD_LINES, GOOD_LINES, TABLE, WORDS, Link, Sign, State
+from acsard.core.link.link_state import (
+    BAD_LINES,
+    GOOD_LINES,
+    STATE_TEXTS,
+    TRANSITIONS,
+    Link,
+    Sign,
+    State,
+)
 
 MS = 1_000_000
 QUIET_NS = 100 * MS
@@ -33,8 +41,8 @@ class Bench:
 
 
 def test_every_state_has_a_text_and_goes_down_when_the_port_closes() -> None:
-    assert set(WORDS) == set(get_args(State))
-    assert {state for state, sign in TABLE if sign == "closed"} == set(WORDS) - {"down"}
+    assert set(STATE_TEXTS) == set(get_args(State))
+    assert {state for state, sign in TRANSITIONS if sign == "closed"} == set(STATE_TEXTS) - {"down"}
 
 
 def test_the_link_does_not_come_up_while_it_may_not_rise() -> None:

@@ -15,13 +15,13 @@ from acsard.core.config.settings import McuConfig
 from acsard.core.link.checked_line import Checked, Reading
 from acsard.core.link.codec import FrameError
 from acsard.core.link.negotiation import (
-    BLIND_PERIOD_NS,
-    FEW_SAMPLES,
-    LATE_NS,
-    MENDS,
-    TABLE,
-    TRIES,
-    WINDOW,
+    ADVICE,
+    ANSWER_TIMEOUT_NS,
+    MAX_OPEN_LINES,
+    MAX_REPLIES_WITHOUT_SAMPLE,
+    MAX_UNANSWERED_QUESTIONS,
+    SILENT_BOARD_PERIOD_NS,
+    TRANSITIONS,
     Negotiation,
     Throttle,
 )
@@ -166,7 +166,7 @@ def test_unanswered_checked_questions_end_in_the_plain_state() -> None:
     bench.ask()
     bench.check.heard_plain()
     asked = bench.ask(1000)
-    assert [kind(line) for line in asked] == ["checked"] * (1 + TRIES)
+    assert [kind(line) for line in asked] == ["checked"] * (1 + MAX_UNANSWERED_QUESTIONS)
     assert (bench.check.state, bench.check.in_force) == ("plain", "plain")
     assert bench.check.seal(GO, bench.now_ns) == GO
 
@@ -176,7 +176,9 @@ def test_the_board_is_asked_three_times_with_samples_and_then_three_times_withou
     bench.ask()
     bench.check.heard_plain()
     asked = bench.ask(2000)
-    assert [kind(line) for line in asked] == ["sampled"] * TRIES + ["checked"] * TRIES
+    assert [kind(line) for line in asked] == ["sampled"] * MAX_UNANSWERED_QUESTIONS + [
+        "checked"
+    ] * MAX_UNANSWERED_QUESTIONS
     assert bench.check.state == "plain"
 
 
@@ -220,8 +222,8 @@ def test_a_required_check_that_is_refused_is_asked_for_ever_with_its_reason() ->
     bench.check.heard_plain()
     assert len(bench.ask(5000)) > 50
     assert (bench.check.asking, bool(bench.check.trouble)) == (True, True)
-    assert 'mcu.link_check = "require"' in MENDS[bench.check.trouble]
-    assert 'mcu.link_check = "auto"' in MENDS[bench.check.trouble]
+    assert 'mcu.link_check = "require"' in ADVICE[bench.check.trouble]
+    assert 'mcu.link_check = "auto"' in ADVICE[bench.check.trouble]
     (question,) = bench.ask(40)
     bench.reply(sequence_of(question))
     assert (bench.check.state, bench.check.trouble) == ("checked", "")
@@ -233,7 +235,7 @@ def test_a_board_that_answered_with_a_check_is_not_accepted_without_it() -> None
     bench.check.heard_plain()
     bench.ask(5000)
     assert bench.check.asking
-    assert "damaged" in MENDS[bench.check.trouble]
+    assert "damaged" in ADVICE[bench.check.trouble]
 
 
 def test_a_new_opening_forgets_that_a_board_had_the_check() -> None:
@@ -253,7 +255,7 @@ def test_an_unsent_plain_question_leaves_the_question_before_it_valid() -> None:
 
 
 def test_no_transition_leads_into_or_out_of_the_off_state() -> None:
-    assert "off" not in {state for state, _ in TABLE} | set(TABLE.values())
+    assert "off" not in {state for state, _ in TRANSITIONS} | set(TRANSITIONS.values())
 
 
 # sequences
@@ -277,7 +279,7 @@ def test_only_the_last_line_can_be_marked_as_not_sent() -> None:
 def test_a_late_answer_is_stale_even_while_newer_lines_wait() -> None:
     bench = Bench().checked()
     (old,) = bench.drive()
-    bench.now_ns += LATE_NS + 1
+    bench.now_ns += ANSWER_TIMEOUT_NS + 1
     (new,) = bench.drive()
     assert bench.stale(old)
     bench.reply(new)
@@ -307,9 +309,9 @@ def test_an_answer_makes_earlier_sequences_stale() -> None:
 
 def test_an_answer_is_accepted_up_to_the_time_limit_and_stale_after_it() -> None:
     bench = Bench().checked()
-    assert LATE_NS == 300 * MS  # the timeout of the MCU's own watchdog
+    assert ANSWER_TIMEOUT_NS == 300 * MS  # the timeout of the MCU's own watchdog
     first, second = bench.drive(2)
-    bench.now_ns += LATE_NS
+    bench.now_ns += ANSWER_TIMEOUT_NS
     bench.reply(first)
     bench.now_ns += 1
     assert bench.stale(second)
@@ -317,7 +319,7 @@ def test_an_answer_is_accepted_up_to_the_time_limit_and_stale_after_it() -> None
 
 def test_only_the_lines_within_the_window_can_be_answered() -> None:
     bench = Bench().checked()
-    sequences = bench.drive(WINDOW + 1)
+    sequences = bench.drive(MAX_OPEN_LINES + 1)
     assert bench.stale(sequences[0])
     bench.reply(sequences[1])
 
@@ -361,10 +363,10 @@ def test_an_answer_without_a_sample_ends_the_sample_requests() -> None:
 
 def test_samples_that_stop_coming_are_no_longer_requested() -> None:
     bench = Bench(SAMPLES).checked(READING)
-    for _ in range(FEW_SAMPLES - 1):
+    for _ in range(MAX_REPLIES_WITHOUT_SAMPLE - 1):
         bench.reply(bench.drive()[0])
     bench.reply(bench.drive()[0], READING)
-    for _ in range(FEW_SAMPLES):
+    for _ in range(MAX_REPLIES_WITHOUT_SAMPLE):
         assert bench.check.in_force == "checked with samples"
         bench.reply(bench.drive()[0])
     assert bench.check.in_force == "checked"
@@ -376,7 +378,7 @@ def test_a_new_negotiation_is_not_checked_yet(mcu: McuConfig) -> None:
 
 
 def test_the_pace_of_questions_is_bounded() -> None:
-    assert BLIND_PERIOD_NS == 100 * MS
+    assert SILENT_BOARD_PERIOD_NS == 100 * MS
     bench = Bench(REQUIRE)
     bench.check.heard_plain()
     assert len(bench.ask(1000)) <= 25
@@ -390,7 +392,7 @@ def test_an_echo_of_a_question_is_reported_and_ends_no_negotiation() -> None:
             for line in bench.ask():
                 assert bench.check.echoed(line[:-2])
         assert (bench.check.asking, bool(bench.check.trouble)) == (True, True)
-        assert "the daemon's own lines come back" in MENDS[bench.check.trouble]
+        assert "the daemon's own lines come back" in ADVICE[bench.check.trouble]
         bench.check.begin(fresh=True)
         assert not bench.check.trouble
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from acsard.core.link.feedback import Feedback
-from acsard.core.link.quantization import BLOCK, FIRST, CountRecovery, Steps
+from acsard.core.link.quantization import BLOCK_STEPS, FIRST_STEPS, CountRecovery, Steps
 from acsard.core.values import Instant, WheelSpeeds
 from tests.unit.core.link.counted import PERIOD, Array, angles, counted
 
@@ -83,13 +83,13 @@ def steps_after(speeds: list[float], steps: Steps | None = None) -> Steps:
     return steps
 
 
-def fine_speeds(count: int = 2 * BLOCK) -> list[float]:
+def fine_speeds(count: int = 2 * BLOCK_STEPS) -> list[float]:
     dice = random.Random(1)
     return [round(10 + dice.uniform(-0.2, 0.2) + 0.02 * i, 2) for i in range(count)]
 
 
 def test_the_quantization_step_is_unknown_until_enough_steps_were_seen() -> None:
-    speeds = [0.1 * (i % 2) for i in range(FIRST)]
+    speeds = [0.1 * (i % 2) for i in range(FIRST_STEPS)]
     steps = steps_after(speeds)
     assert steps.size == math.inf
     steps.add(0.2)
@@ -104,7 +104,7 @@ def test_the_quantization_step_is_not_learned_from_rest_or_flicker() -> None:
 @pytest.mark.parametrize("counts", [16, 20, 96])
 def test_the_quantization_step_of_whole_counts_is_one_count(counts: int) -> None:
     quantum, dice = math.tau / counts / 0.01, random.Random(2)
-    steps = steps_after([quantum * dice.randint(0, 1) for _ in range(6 * BLOCK)])
+    steps = steps_after([quantum * dice.randint(0, 1) for _ in range(6 * BLOCK_STEPS)])
     assert steps.size == pytest.approx(quantum)
 
 
@@ -122,13 +122,13 @@ def test_a_filter_reduces_the_quantization_step_by_its_share(share: float) -> No
 
 
 def test_one_damaged_line_does_not_change_the_quantization_step() -> None:
-    steps = steps_after(fine_speeds(2 * BLOCK + 8))
+    steps = steps_after(fine_speeds(2 * BLOCK_STEPS + 8))
     steps_after([40.0, 12.0], steps)
     assert steps.size < 0.5
 
 
 def test_a_quantization_step_that_does_not_recur_is_forgotten() -> None:
-    steps = steps_after([0.0, 30.0] * BLOCK)
+    steps = steps_after([0.0, 30.0] * BLOCK_STEPS)
     assert steps.size == 30.0
-    steps_after(fine_speeds(3 * BLOCK), steps)
+    steps_after(fine_speeds(3 * BLOCK_STEPS), steps)
     assert steps.size < 0.5

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from acsard.core.link.checked_line import ASK_NOTHING, ASK_SAMPLE, seal
+from acsard.core.link.checked_line import ECHO_MARK, SAMPLE_REQUEST, seal
 from acsard.core.link.serial_output import SerialOutput
 from tests.each import each
 
@@ -83,7 +83,7 @@ def test_a_line_older_than_a_period_is_not_sent(period_ms: int) -> None:
     assert wire.offer(GO, 300 + period_ms, made_ms=300) == "sent"
 
 
-@each("letters", [None, b"", ASK_NOTHING, ASK_SAMPLE])
+@each("letters", [None, b"", ECHO_MARK, SAMPLE_REQUEST])
 @each("stop", [STOP, COMMA_STOP])
 def test_a_stop_of_any_form_is_never_too_old(stop: bytes, letters: bytes | None) -> None:
     line = stop if letters is None else seal(stop, 7, letters)
@@ -93,7 +93,7 @@ def test_a_stop_of_any_form_is_never_too_old(stop: bytes, letters: bytes | None)
 
 
 @pytest.mark.parametrize(
-    "line", [GO, seal(GO, 7), b"ap00.00,bp00.00,cp00.00,dp00.01\r\n", seal(GO, 7, ASK_SAMPLE)]
+    "line", [GO, seal(GO, 7), b"ap00.00,bp00.00,cp00.00,dp00.01\r\n", seal(GO, 7, SAMPLE_REQUEST)]
 )
 def test_a_line_that_turns_a_wheel_is_not_a_stop(line: bytes) -> None:
     assert Wire().started().offer(line, 1000, made_ms=100) == "superseded"

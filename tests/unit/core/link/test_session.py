@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from acsard.core.config.settings import McuConfig, WheelMap
 from acsard.core.config.wire_time import wire_ns
 from acsard.core.link.checked_line import seal
-from acsard.core.link.feedback import APART_NS, Feedback
+from acsard.core.link.feedback import MIN_INTERVAL_NS, Feedback
 from acsard.core.link.link_state import BAD_LINES, GOOD_LINES
 from acsard.core.link.session import LONG_GAP_NS, McuSession
 from acsard.core.values import NS_PER_S, STILL, Instant, Received, WheelSpeeds
@@ -270,8 +270,8 @@ def test_a_line_is_never_older_than_the_previous_line() -> None:
     (second,) = bench.wait(1, GOOD + GOOD[:20])  # 20.8 ms of wire time within 1 ms
     # The stamps must also differ. A reader of the transforms takes the second of two with one stamp
     # for an echo.
-    assert second.at.mono_ns == first.at.mono_ns + APART_NS
-    assert second.at.wall_ns == first.at.wall_ns + APART_NS
+    assert second.at.mono_ns == first.at.mono_ns + MIN_INTERVAL_NS
+    assert second.at.wall_ns == first.at.wall_ns + MIN_INTERVAL_NS
     assert second.dt == 0.0
 
 
@@ -290,7 +290,7 @@ def test_without_gaps_the_dts_add_up_to_the_time_between_first_and_last_line(
         data = GOOD * (lines + 1)
         heard += bench.wait(ms, data[: 33 * lines + cut], data[33 * lines + cut :])
     total = (heard[-1].at.mono_ns - heard[0].at.mono_ns) / NS_PER_S
-    apart = len(heard) * APART_NS / NS_PER_S
+    apart = len(heard) * MIN_INTERVAL_NS / NS_PER_S
     assert sum(f.dt for f in heard) == pytest.approx(total, abs=apart)
     assert all(f.dt >= 0.0 and f.gap == 0.0 for f in heard)
     assert all(a.at.mono_ns < b.at.mono_ns for a, b in pairwise(heard))

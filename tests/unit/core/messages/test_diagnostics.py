@@ -16,12 +16,17 @@ from acsard.core.config.settings import (
     RobotConfig,
     SafetyConfig,
 )
-from acsard.core.messages.diagnostics import ERROR, OK, REFUSED_S, WARN, diagnostics
+from acsard.core.messages.diagnostics import ERROR, OK, SHOW_REFUSAL_S, WARN, diagnostics
 from acsard.core.messages.schema import DiagnosticStatus
-from acsard.core.motion.battery import MISSING as MISSING_BATTERY
-from acsard.core.motion.bumpers import SILENT as SILENT_BUMPERS
+from acsard.core.motion.battery import MISSING_REASON as MISSING_BATTERY
+from acsard.core.motion.bumpers import SILENT_REASON as SILENT_BUMPERS
 from acsard.core.motion.bumpers import missing
-from acsard.core.motion.emergency_stop import DRIVER_FAULT, MISSING, PRESSED, SILENT
+from acsard.core.motion.emergency_stop import (
+    DRIVER_FAULT_REASON,
+    MISSING_REASON,
+    PRESSED_REASON,
+    SILENT_REASON,
+)
 from acsard.core.values import (
     BatteryLevel,
     BatteryStatus,
@@ -92,8 +97,8 @@ def test_a_configured_gyro_has_a_row_in_each_of_its_states(does: Any) -> None:
     [
         ("", OK, "no emergency-stop input"),
         ("released", OK, "emergency stop released"),
-        ("pressed", WARN, PRESSED),
-        ("silent", ERROR, SILENT),
+        ("pressed", WARN, PRESSED_REASON),
+        ("silent", ERROR, SILENT_REASON),
     ],
 )
 def test_a_board_that_sends_status_lines_has_a_row(estop: Any, level: int, message: str) -> None:
@@ -108,7 +113,7 @@ def test_a_board_that_sends_status_lines_has_a_row(estop: Any, level: int, messa
 def test_a_required_emergency_stop_has_a_row_before_the_board_reports_it() -> None:
     config = replace(CONFIG, safety=SafetyConfig(estop="required"))
     one = row("board", config)
-    assert (one.level, one.message) == (ERROR, MISSING)
+    assert (one.level, one.message) == (ERROR, MISSING_REASON)
     assert row("board", config, snapshot=seen(estop="released")).level == OK
 
 
@@ -138,7 +143,7 @@ def test_ignored_bumpers_need_no_row() -> None:
 
 def test_a_motor_drivers_fault_is_an_error_of_the_board() -> None:
     one = row("board", snapshot=seen(board={"motor_driver": "fault"}))
-    assert (one.level, one.message) == (ERROR, f"no emergency-stop input; {DRIVER_FAULT}")
+    assert (one.level, one.message) == (ERROR, f"no emergency-stop input; {DRIVER_FAULT_REASON}")
 
 
 BATTERY = replace(CONFIG, battery=BatteryConfig(warning_below=22.0, stop_below=21.0))
@@ -332,7 +337,7 @@ def test_two_senders_of_one_source_are_a_warning_that_names_the_source() -> None
 
 
 def test_a_refused_source_makes_the_commands_a_warning_with_the_reason() -> None:
-    one = row("commands", snapshot=seen(refused_age_s=REFUSED_S / 2))
+    one = row("commands", snapshot=seen(refused_age_s=SHOW_REFUSAL_S / 2))
     assert (one.level, one.message) == (WARN, "commanded by app; refused: source nav: held up")
-    later = row("commands", snapshot=seen(refused_age_s=REFUSED_S))
+    later = row("commands", snapshot=seen(refused_age_s=SHOW_REFUSAL_S))
     assert (later.level, later.message) == (OK, "commanded by app")

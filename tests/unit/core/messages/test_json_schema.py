@@ -14,7 +14,7 @@ from acsard.core.config.settings import Config, JointsConfig, McuConfig, Odometr
 from acsard.core.incoming.commands import Arrival, Receiver
 from acsard.core.incoming.imu import GyroFollower
 from acsard.core.incoming.queries import interfaces, topic_table
-from acsard.core.link.link_state import TABLE as LINKS
+from acsard.core.link.link_state import TRANSITIONS as LINKS
 from acsard.core.messages.encodings import DecodeError, encode
 from acsard.core.messages.json_schema import SCHEMAS
 from acsard.core.messages.keys_and_roles import PUBLISHED, TOPICS

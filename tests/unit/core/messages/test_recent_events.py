@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from acsard.core.messages.recent_events import LAST, RecentEvents
+from acsard.core.messages.recent_events import MAX_ROWS, RecentEvents
 from acsard.core.messages.schema import Events, Time
 from acsard.core.motion.arbiter_text import missed
 from acsard.core.values import NS_PER_S, Event, Instant
@@ -68,7 +68,7 @@ def test_events_that_are_news_are_never_combined() -> None:
 
 def test_the_oldest_events_are_dropped_when_the_list_is_full() -> None:
     happened = RecentEvents()
-    for second in range(LAST + 5):
+    for second in range(MAX_ROWS + 5):
         happened.add([Event("commander", f"{second}")], at(second))
-    assert [one.text for one in told(happened).events] == [str(n) for n in range(5, LAST + 5)]
-    assert told(happened).total == LAST + 5
+    assert [one.text for one in told(happened).events] == [str(n) for n in range(5, MAX_ROWS + 5)]
+    assert told(happened).total == MAX_ROWS + 5

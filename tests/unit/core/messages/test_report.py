@@ -48,7 +48,7 @@ from acsard.core.messages.schema import (
     Vector3,
 )
 from acsard.core.motion.arbiter_text import missed
-from acsard.core.motion.gyro import WORDS
+from acsard.core.motion.gyro import STATUS_TEXTS
 from acsard.core.values import (
     BatteryStatus,
     Estimate,
@@ -690,7 +690,7 @@ def test_without_a_gyro_the_state_is_off_and_diagnostics_have_no_row() -> None:
 )
 def test_the_state_of_the_gyro_is_reported_with_its_level(does: GyroDoes, level: int) -> None:
     state, (row,) = with_gyro(GyroStatus(does))
-    assert (state.gyro, row.level, row.message) == (does, level, WORDS[does])
+    assert (state.gyro, row.level, row.message) == (does, level, STATUS_TEXTS[does])
     assert {pair.key for pair in row.values} == {"delay_s"}
 
 
@@ -708,7 +708,7 @@ def test_the_learned_track_is_shown_beside_the_configured_one() -> None:
     assert (
         state.effective_track == "learned 1.800 ± 0.090 (only reported), configured 1.500 (in use)"
     )
-    assert row.message == f"{WORDS['used']}; effective track: {state.effective_track}"
+    assert row.message == f"{STATUS_TEXTS['used']}; effective track: {state.effective_track}"
     state, (row,) = with_gyro(replace(learned, track_use="used"))
     assert {pair.key: pair.value for pair in row.values} == shown | {"multiplier_in_use": "1.800"}
     assert state.effective_track == "learned 1.800 ± 0.090 (in use), configured 1.500"

@@ -24,7 +24,7 @@ from acsard.core.messages.schema import (
     TwistWithCovariance,
     Vector3,
 )
-from acsard.core.messages.short_texts import SHORT, place, short, speeds
+from acsard.core.messages.short_texts import SHORT_TEXTS, place, short, speeds
 from tests.each import each
 
 HEADER = Header(Time(), "odom")
@@ -95,4 +95,4 @@ def test_a_battery_is_shown_as_voltage_current_and_charge() -> None:
 
 
 def test_common_message_types_have_a_short_text() -> None:
-    assert {kind.__name__ for kind in SHORT} >= {"Odometry", "RobotState", "PoseStamped"}
+    assert {kind.__name__ for kind in SHORT_TEXTS} >= {"Odometry", "RobotState", "PoseStamped"}

@@ -9,7 +9,13 @@ import msgspec
 from hypothesis import given
 from hypothesis import strategies as st
 
-from acsard.core.messages.signature import DIGITS, MAX_NAME, Signature, public_name, unpack
+from acsard.core.messages.signature import (
+    HASH_DIGITS,
+    MAX_NAME_LENGTH,
+    Signature,
+    public_name,
+    unpack,
+)
 from tests.each import each
 
 WHOLE = {"sender": "joystick-7", "stamp": 1_795_154_884_365_624_370, "sequence": 12}
@@ -65,7 +71,7 @@ def test_unpacking_any_bytes_raises_no_error(attachment: bytes) -> None:
         ("mallory (rmw 00)/x", "mallory ?rmw 00?"),
         ("a\nACSARD_EVENT=stop/x", "a?ACSARD_EVENT?stop"),
         ("J\u00fcrgen/x", "J\u00fcrgen"),
-        ("x" * 50 + "/s3cret", "x" * MAX_NAME),
+        ("x" * 50 + "/s3cret", "x" * MAX_NAME_LENGTH),
     ],
 )
 def test_a_public_name_is_the_name_without_the_secret_and_a_hash_of_both(
@@ -84,7 +90,7 @@ def test_the_public_name_of_a_sender_id_without_a_name_is_only_a_hash(sender: st
 def test_any_sender_id_has_a_short_printable_public_name_that_is_not_its_own(sender: str) -> None:
     name = public_name(sender)
     assert name != sender
-    assert len(name) <= MAX_NAME + 1 + DIGITS
+    assert len(name) <= MAX_NAME_LENGTH + 1 + HASH_DIGITS
     assert name.isprintable()
     assert not set(name) & set('(),="[]\n')
     assert public_name(name) != name

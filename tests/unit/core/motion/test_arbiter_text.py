@@ -8,7 +8,7 @@ import pytest
 
 from acsard.core.motion.arbiter import Choice, Objection
 from acsard.core.motion.arbiter_text import (
-    MAX_SENDER,
+    MAX_SENDER_LENGTH,
     REFUSED,
     CommandEvents,
     chosen,
@@ -202,7 +202,7 @@ def test_the_event_of_a_refusal_has_its_reason_its_text_and_its_sender() -> None
         "command_refused",
         "source app: late",
         "warning",
-        ("joe" * 100)[:MAX_SENDER],
+        ("joe" * 100)[:MAX_SENDER_LENGTH],
         "stale",
         news=False,
     )

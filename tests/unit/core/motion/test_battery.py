@@ -10,7 +10,13 @@ from hypothesis import strategies as st
 
 from acsard.core.config.settings import BatteryConfig
 from acsard.core.link.board_status import BoardStatus
-from acsard.core.motion.battery import SILENT, SILENT_S, TIME_CONSTANT_S, Battery, words
+from acsard.core.motion.battery import (
+    SILENCE_TIMEOUT_S,
+    SILENT_REASON,
+    TIME_CONSTANT_S,
+    Battery,
+    words,
+)
 from acsard.core.values import BatteryLevel, BatteryStatus
 from tests.each import each
 
@@ -169,7 +175,7 @@ def test_the_stop_is_reported_once_and_held_until_the_hysteresis() -> None:
 def test_an_exchanged_battery_ends_the_stop_within_seconds() -> None:
     pack = Pack()
     pack.at(20.5, 30.0)
-    pack.quiet(SILENT_S + 0.1)
+    pack.quiet(SILENCE_TIMEOUT_S + 0.1)
     assert pack.battery.held
     assert pack.at(25.0, 3.2) == "ok"
     assert not pack.battery.held
@@ -263,11 +269,11 @@ def test_several_lines_of_one_read_count_once() -> None:
 def test_the_level_of_a_silent_board_is_unknown_and_stops_nothing() -> None:
     pack = Pack()
     pack.at(24.0, 10.0)
-    assert pack.quiet(SILENT_S) == "ok"
+    assert pack.quiet(SILENCE_TIMEOUT_S) == "ok"
     assert pack.quiet(0.2) == "unknown"
     assert pack.status == BatteryStatus("unknown")
     assert pack.quiet(600.0) == "unknown"
-    assert pack.events == [("battery", "24.00 V"), ("battery", SILENT)]
+    assert pack.events == [("battery", "24.00 V"), ("battery", SILENT_REASON)]
     assert (pack.stops, pack.battery.held) == (0, False)
     assert pack.at(24.0, 3.0) == "unknown"
     assert pack.at(24.0, 0.1) == "ok"
@@ -288,7 +294,7 @@ def test_a_silence_does_not_release_a_stop() -> None:
     assert pack.quiet(600.0) == "unknown"
     assert pack.battery.held
     # A clear would be refused, so the event does not advise it.
-    assert pack.events[-1] == ("battery", SILENT)
+    assert pack.events[-1] == ("battery", SILENT_REASON)
     assert pack.at(20.0, 10.0) == "stop"
     assert pack.stops == 1
 

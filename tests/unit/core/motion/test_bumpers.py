@@ -10,7 +10,7 @@ import pytest
 
 from acsard.core.config.settings import Place, SafetyConfig
 from acsard.core.link.board_status import BoardStatus
-from acsard.core.motion.bumpers import DIRECTIONS, SILENT, Bumpers, missing, pressed_words
+from acsard.core.motion.bumpers import DIRECTIONS, SILENT_REASON, Bumpers, missing, pressed_words
 from acsard.core.motion.emergency_stop import CHECK, RELEASE
 from acsard.core.values import REST, Event, Twist
 
@@ -164,10 +164,10 @@ def test_half_a_second_of_silence_latches_with_both_choices(
     assert pins.quiet(500) != "silent"
     assert pins.step("") == "silent"
     assert pins.bumpers.pressed == (True, True)
-    assert pins.bumpers.pressed_now == pins.bumpers.held == SILENT
+    assert pins.bumpers.pressed_now == pins.bumpers.held == SILENT_REASON
     assert pins.bumpers.mend == CHECK
     assert not pins.bumpers.limiting
-    assert pins.events[-1].text == f"{SILENT}; {CHECK}, then call srv/clear"
+    assert pins.events[-1].text == f"{SILENT_REASON}; {CHECK}, then call srv/clear"
     assert pins.step("..") == "released"
 
 

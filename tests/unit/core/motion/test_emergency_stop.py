@@ -11,10 +11,10 @@ from acsard.core.config.settings import EstopUse
 from acsard.core.link.board_status import BoardStatus
 from acsard.core.motion.emergency_stop import (
     CHECK,
-    PRESSED,
+    PRESSED_REASON,
     RELEASE,
-    SILENT,
-    TABLE,
+    SILENT_REASON,
+    TRANSITIONS,
     EmergencyStop,
     Sign,
 )
@@ -61,16 +61,18 @@ def test_the_table_is_the_one_drawn_by_hand() -> None:
     assert {state or "unknown" for state in get_args(EstopState)} == {row[0] for row in rows}
     assert set(get_args(Sign)) == set(head)
     for state, sign in product(get_args(EstopState), get_args(Sign)):
-        assert (TABLE.get((state, sign), state) or "unknown") == drawn[state or "unknown", sign]
+        assert (TRANSITIONS.get((state, sign), state) or "unknown") == drawn[
+            state or "unknown", sign
+        ]
 
 
 def test_each_state_that_counts_as_pressed_has_words_and_a_remedy() -> None:
     pin = Input()
     pin.step(True)
-    assert (pin.estop.why, pin.estop.mend) == (PRESSED, RELEASE)
+    assert (pin.estop.why, pin.estop.mend) == (PRESSED_REASON, RELEASE)
     pin.step(False)
     pin.quiet(510)
-    assert (pin.estop.why, pin.estop.mend) == (SILENT, CHECK)
+    assert (pin.estop.why, pin.estop.mend) == (SILENT_REASON, CHECK)
 
 
 def test_an_input_that_is_never_reported_is_never_pressed() -> None:
@@ -83,9 +85,9 @@ def test_a_press_counts_immediately_until_the_release() -> None:
     pin = Input()
     pin.step(False)
     assert pin.step(True) == "pressed"
-    assert pin.estop.pressed_now == pin.estop.why == PRESSED
+    assert pin.estop.pressed_now == pin.estop.why == PRESSED_REASON
     assert pin.step(True) == "pressed"
-    assert (pin.estop.pressed_now, pin.estop.why) == ("", PRESSED)
+    assert (pin.estop.pressed_now, pin.estop.why) == ("", PRESSED_REASON)
     assert pin.step(False) == "released"
     assert (pin.estop.why, pin.estop.pressed) == ("", (False,))
     assert pin.events == ["emergency_stop_released", "emergency_stop", "emergency_stop_released"]
@@ -95,13 +97,13 @@ def test_a_press_and_its_release_in_one_read_still_count() -> None:
     pin = Input()
     pin.step(False)
     assert pin.step(True, False) == "released"
-    assert (pin.estop.pressed_now, pin.estop.why) == (PRESSED, "")
+    assert (pin.estop.pressed_now, pin.estop.why) == (PRESSED_REASON, "")
 
 
 def test_the_first_report_may_be_a_press() -> None:
     pin = Input()
     assert pin.step(True) == "pressed"
-    assert pin.estop.pressed_now == PRESSED
+    assert pin.estop.pressed_now == PRESSED_REASON
 
 
 @each("before", [True, False])
@@ -133,11 +135,11 @@ def test_half_a_second_without_the_input_counts_as_pressed() -> None:
     pin.step(False)
     assert pin.quiet(500) == "released"
     assert pin.step(None) == "silent"
-    assert pin.estop.pressed_now == pin.estop.why == SILENT
+    assert pin.estop.pressed_now == pin.estop.why == SILENT_REASON
     assert pin.quiet(1000) == "silent"
     assert pin.estop.pressed_now == ""
     assert pin.step(True) == "pressed"
-    assert pin.estop.pressed_now == PRESSED
+    assert pin.estop.pressed_now == PRESSED_REASON
     assert pin.quiet(1000) == "pressed"
     assert pin.step(False) == "released"
 

@@ -10,7 +10,13 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from acsard.core.config.settings import DriveConfig, OdometryConfig
-from acsard.core.motion.error_model import LEAST, ErrorModel, Noise, TwistUncertainty, columns
+from acsard.core.motion.error_model import (
+    MIN_TWIST_VARIANCE,
+    ErrorModel,
+    Noise,
+    TwistUncertainty,
+    columns,
+)
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.learned_track import CONFIGURED, Track
 from acsard.core.values import REST, Twist
@@ -145,7 +151,7 @@ def test_the_rounding_to_two_decimals_gives_the_least_variance_of_the_turn_rate(
     # difference of the sides.
     variances = uncertainty().of(Twist(0.5, 0.0), 0.01)
     assert variances.angular == pytest.approx(0.05**2 * 1e-4 / 12 / 0.3**2)
-    assert variances.linear == LEAST > 0.05**2 * 1e-4 / 48
+    assert variances.linear == MIN_TWIST_VARIANCE > 0.05**2 * 1e-4 / 48
 
 
 def test_counts_are_coarser_than_decimals() -> None:
@@ -218,14 +224,14 @@ def test_coarse_encoders_see_rest_only_after_a_while() -> None:
     coarse = uncertainty(counts=20)
     early, late = coarse.at_rest(0.3), coarse.at_rest(60.0)
     assert early.linear > 1e-5
-    assert late.linear == LEAST
+    assert late.linear == MIN_TWIST_VARIANCE
     assert early.angular > late.angular
 
 
 def test_the_lateral_variance_is_the_configured_one_except_at_rest() -> None:
     config = OdometryConfig(twist_covariance_diagonal=(1.0, 0.25, 1.0, 1.0, 1.0, 1.0))
     assert uncertainty(config).of(REST, 0.01).lateral == 0.25
-    assert uncertainty(config).at_rest(1.0).lateral == LEAST
+    assert uncertainty(config).at_rest(1.0).lateral == MIN_TWIST_VARIANCE
 
 
 def test_the_ratio_s_error_makes_one_side_larger_and_the_other_smaller() -> None:

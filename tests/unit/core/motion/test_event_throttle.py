@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from acsard.core.motion.event_throttle import BURST, MOST, EventThrottle, together
+from acsard.core.motion.event_throttle import BURST, MAX_LISTED, EventThrottle, together
 from acsard.core.values import NS_PER_S, Event
 
 MS = 1_000_000
@@ -72,8 +72,8 @@ def test_kinds_and_senders_that_do_not_fit_are_reported_as_others() -> None:
     many = [refused(f"reason{n}", by=f"sender{n}") for n in range(1000)]
     (line,) = EventThrottle().lines(many, 0)
     assert line.count == 1000
-    assert f"{1000 - MOST} x others" in line.text
-    assert line.by.endswith(f"sender{MOST - 1}, others")
+    assert f"{1000 - MAX_LISTED} x others" in line.text
+    assert line.by.endswith(f"sender{MAX_LISTED - 1}, others")
 
 
 def test_an_event_may_count_for_many() -> None:
@@ -138,7 +138,7 @@ def test_joined_lines_of_many_senders_name_only_a_few() -> None:
     line = refused(by="")
     for number in range(100):
         line = together(line, refused(by=f"sender{number}"))
-    assert line.by.split(", ") == [*(f"sender{n}" for n in range(MOST)), "others"]
+    assert line.by.split(", ") == [*(f"sender{n}" for n in range(MAX_LISTED)), "others"]
 
 
 events = st.builds(

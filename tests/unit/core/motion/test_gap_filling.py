@@ -11,10 +11,10 @@ from acsard.core.config.settings import FeedbackConfig
 from acsard.core.link.codec import Motors
 from acsard.core.link.feedback import Feedback
 from acsard.core.motion.gap_filling import (
-    GUESS,
+    ACCELERATION_SPAN_S,
+    ASSUMED_ACCELERATION,
+    AT_REST,
     MAX_LOST_S,
-    NOWHERE,
-    SPAN,
     Confirmation,
     Gaps,
     Rolled,
@@ -50,7 +50,7 @@ def test_a_line_turns_the_wheels_by_its_speed_times_its_duration() -> None:
 def test_wheels_at_rest_roll_no_angle() -> None:
     rolled = Rolling().take(Feedback(AT, WheelSpeeds(), 0.01), WheelSpeeds())
     assert rolled.pieces == ()
-    assert rolled.turned == NOWHERE
+    assert rolled.turned == AT_REST
 
 
 def test_a_bridged_time_has_the_mean_of_the_speeds_around_it() -> None:
@@ -331,9 +331,9 @@ CRUISE = Twist(0.5, 0.5)
 
 
 def test_the_acceleration_is_guessed_until_it_is_measured() -> None:
-    along, yaw = Gaps().unseen(SPAN, CRUISE, CRUISE)
-    assert along == pytest.approx((GUESS.linear * SPAN**2 / 2) ** 2)
-    assert yaw == pytest.approx((GUESS.angular * SPAN**2 / 2) ** 2)
+    along, yaw = Gaps().unseen(ACCELERATION_SPAN_S, CRUISE, CRUISE)
+    assert along == pytest.approx((ASSUMED_ACCELERATION.linear * ACCELERATION_SPAN_S**2 / 2) ** 2)
+    assert yaw == pytest.approx((ASSUMED_ACCELERATION.angular * ACCELERATION_SPAN_S**2 / 2) ** 2)
 
 
 def test_a_steady_drive_makes_gaps_certain() -> None:
@@ -353,7 +353,7 @@ def test_the_uncertainty_of_a_gap_follows_the_measured_accelerations_of_a_jerky_
     gaps = Gaps()
     for i in range(30_000):
         gaps.follow(Twist(0.4 if i // 10 % 2 else 0.6, 0.0), 0.01)
-    along, yaw = gaps.unseen(SPAN, CRUISE, CRUISE)
+    along, yaw = gaps.unseen(ACCELERATION_SPAN_S, CRUISE, CRUISE)
     assert 0.004**2 < along < 0.02**2
     assert yaw < 1e-5
 

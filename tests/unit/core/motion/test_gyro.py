@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from acsard.core.motion.gyro import SILENT_NS, WORDS, Gyro, Turn
-from acsard.core.motion.learned_track import LEAST
+from acsard.core.motion.gyro import SILENCE_TIMEOUT_NS, STATUS_TEXTS, Gyro, Turn
+from acsard.core.motion.learned_track import MIN_TRACK_STD
 from acsard.core.simulator.noise import gauss
 from acsard.core.values import NS_PER_S, GyroDoes, GyroSample
 
@@ -309,7 +309,7 @@ def test_the_last_turn_rate_continues_for_a_moment_without_samples() -> None:
     bench.run(REST_FIRST)
     bench.run(1.0, 0.5)
     bench.silent = True
-    bench.run(SILENT_NS / NS_PER_S - DT, 0.5)
+    bench.run(SILENCE_TIMEOUT_NS / NS_PER_S - DT, 0.5)
     assert bench.says() == "used"
     assert bench.told == pytest.approx(bench.true, abs=1e-6)
 
@@ -424,7 +424,7 @@ def test_the_deviation_of_the_learned_track_is_a_share_of_the_track() -> None:
     one, other = even.gyro.learned, uneven.gyro.learned
     assert one is not None
     assert other is not None
-    assert one.deviation == LEAST
+    assert one.deviation == MIN_TRACK_STD
     assert other.share == pytest.approx(1.7, rel=0.05)
     assert other.deviation == pytest.approx(0.2 / 1.7, rel=0.3)
 
@@ -448,4 +448,4 @@ def test_the_variance_of_the_turn_is_that_of_its_errors() -> None:
 
 
 def test_every_state_of_the_gyro_has_a_text() -> None:
-    assert set(WORDS) == set(GyroDoes.__args__)  # type: ignore[attr-defined]
+    assert set(STATUS_TEXTS) == set(GyroDoes.__args__)  # type: ignore[attr-defined]

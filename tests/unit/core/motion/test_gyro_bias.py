@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from acsard.core.motion.gyro_bias import KNOWN_S, MAX_BIAS, WALK, Bias
+from acsard.core.motion.gyro_bias import BIAS_RANDOM_WALK, LEARNING_TIME_S, MAX_BIAS, Bias
 from acsard.core.simulator.noise import gauss
 
 DT = 0.01
@@ -25,13 +25,13 @@ def rested(seconds: float, bias: float = 0.01, noise: float = 0.0, seed: int = 1
 
 @given(st.floats(-0.9 * MAX_BIAS, 0.9 * MAX_BIAS))
 def test_the_bias_of_a_gyro_without_noise_is_exact_after_the_shortest_rest(bias: float) -> None:
-    learned = rested(KNOWN_S + DT, bias)
+    learned = rested(LEARNING_TIME_S + DT, bias)
     assert learned.known
     assert learned.value == pytest.approx(bias, abs=1e-6)
 
 
 def test_the_bias_is_unknown_until_the_robot_has_rested_long_enough() -> None:
-    assert not rested(KNOWN_S - DT).known
+    assert not rested(LEARNING_TIME_S - DT).known
 
 
 def test_the_error_of_the_bias_is_that_of_a_mean_and_matches_the_variance() -> None:
@@ -52,7 +52,7 @@ def test_the_variance_of_the_bias_grows_by_its_random_walk_while_the_robot_drive
     before = learned.variance
     for _ in range(1000):
         learned.drift(0.1)
-    assert learned.variance - before == pytest.approx(WALK**2 * 100)
+    assert learned.variance - before == pytest.approx(BIAS_RANDOM_WALK**2 * 100)
 
 
 def test_a_bias_that_has_walked_is_found_again() -> None:

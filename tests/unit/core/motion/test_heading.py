@@ -17,7 +17,7 @@ from acsard.core.link.feedback import Feedback
 from acsard.core.motion.gyro import Gyro, Turn
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.odometry import Odometry
-from acsard.core.motion.uncertainty import GYRO_SCALE
+from acsard.core.motion.uncertainty import GYRO_SCALE_STD
 from acsard.core.values import NS_PER_S, GyroSample, Instant, Twist, WheelSpeeds
 from tests.unit.core.motion.liars import fold
 
@@ -204,20 +204,20 @@ def proved(scale: float) -> Turning:
 @pytest.mark.slow
 @pytest.mark.parametrize("turns", [2, 20])
 def test_the_error_of_a_gyros_scale_grows_with_the_turns(turns: int) -> None:
-    bench = proved(1 + GYRO_SCALE)
+    bench = proved(1 + GYRO_SCALE_STD)
     off, variance = bench.off, bench.yaw_variance
     bench.run(turns * math.tau / 2.0, Twist(0.0, 2.0))
     bench.run(1.0, Twist())
     off, variance = bench.off - off, bench.yaw_variance - variance
-    assert off == pytest.approx(GYRO_SCALE * turns * math.tau, rel=0.05)
+    assert off == pytest.approx(GYRO_SCALE_STD * turns * math.tau, rel=0.05)
     assert off**2 / variance == pytest.approx(1.0, rel=0.25)
 
 
 def test_the_error_of_a_gyros_scale_cancels_when_the_robot_turns_back() -> None:
-    bench = proved(1 + GYRO_SCALE)
+    bench = proved(1 + GYRO_SCALE_STD)
     off, variance = bench.off, bench.yaw_variance
     for rate in (2.0, -2.0):
         bench.run(10.0, Twist(0.0, rate))
     bench.run(1.0, Twist())
     assert bench.off == pytest.approx(off, abs=0.01)
-    assert bench.yaw_variance - variance < (GYRO_SCALE * 20.0) ** 2 / 20
+    assert bench.yaw_variance - variance < (GYRO_SCALE_STD * 20.0) ** 2 / 20

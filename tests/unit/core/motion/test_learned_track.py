@@ -8,9 +8,9 @@ from __future__ import annotations
 import pytest
 
 from acsard.core.motion.learned_track import (
-    BOUNDS,
     CERTAIN,
     CONFIGURED,
+    TRACK_RATIO_RANGE,
     UNCERTAIN,
     LearnedTrack,
     Track,
@@ -59,7 +59,7 @@ def test_a_learned_track_in_use_is_dropped_only_if_it_becomes_clearly_uncertain(
         assert (track.used == CONFIGURED) is (use != "used")
 
 
-@pytest.mark.parametrize("share", [0.99 * BOUNDS[0], 1.01 * BOUNDS[1]])
+@pytest.mark.parametrize("share", [0.99 * TRACK_RATIO_RANGE[0], 1.01 * TRACK_RATIO_RANGE[1]])
 def test_a_learned_track_too_far_from_the_configured_one_is_reported_and_not_used(
     share: float,
 ) -> None:
@@ -73,7 +73,9 @@ def test_a_learned_track_too_far_from_the_configured_one_is_reported_and_not_use
     assert told(track) is None
 
 
-@pytest.mark.parametrize(("bound", "inwards"), [(BOUNDS[0], 1.0), (BOUNDS[1], -1.0)])
+@pytest.mark.parametrize(
+    ("bound", "inwards"), [(TRACK_RATIO_RANGE[0], 1.0), (TRACK_RATIO_RANGE[1], -1.0)]
+)
 def test_a_learned_track_at_a_bound_is_not_switched_on_and_off(
     bound: float, inwards: float
 ) -> None:
@@ -100,7 +102,7 @@ def test_a_learned_track_too_far_off_is_reported_once_while_it_is_nearly_certain
     track, seen = LearnedTrack(1.0), []
     for _ in range(10):
         for deviation in (0.99 * CERTAIN, 1.01 * CERTAIN):
-            track.look(Track(2 * BOUNDS[1], deviation))
+            track.look(Track(2 * TRACK_RATIO_RANGE[1], deviation))
             seen.append(told(track))
     assert seen == ["too far off", *[None] * 19]
 

@@ -14,8 +14,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from acsard.core.motion.emergency_stop import CHECK, PRESSED, RELEASE, SILENT
-from acsard.core.motion.lifecycle import LOOK_FIRST_S, Lifecycle, utc
+from acsard.core.motion.emergency_stop import CHECK, PRESSED_REASON, RELEASE, SILENT_REASON
+from acsard.core.motion.lifecycle import LATCH_REQUIRED_S, Lifecycle, utc
 from acsard.core.motion.modes import Mode, RefusedError, mode_of
 from acsard.core.values import NS_PER_S, Instant, Latch, Latches
 from tests.each import each
@@ -51,9 +51,9 @@ def activate(life: Lifecycle, seconds: float, number: int | None = None) -> bool
     return life.activate(number, ns(seconds), at(seconds))
 
 
-def press(life: Lifecycle, seconds: float, why: str = PRESSED) -> None:
+def press(life: Lifecycle, seconds: float, why: str = PRESSED_REASON) -> None:
     life.press(why, at(seconds))
-    life.hold(why, CHECK if why == SILENT else RELEASE, ns(seconds))
+    life.hold(why, CHECK if why == SILENT_REASON else RELEASE, ns(seconds))
 
 
 def number(life: Lifecycle) -> int:
@@ -211,11 +211,11 @@ def test_a_press_keeps_the_name_of_the_client_that_stopped_the_robot() -> None:
     seen = number(life)
     press(life, 2.0)
     life.hold("", "", ns(3.0))
-    both = f"{PRESSED} (latched at {AT}:02 UTC); also stopped by ann at {AT}:01 UTC"
+    both = f"{PRESSED_REASON} (latched at {AT}:02 UTC); also stopped by ann at {AT}:01 UTC"
     assert life.why == f"{both}; call srv/clear"
     with pytest.raises(RefusedError) as caught:
         clear(life, 9.0, seen)
-    assert f"still stopped ({PRESSED}) and stopped by ann: look at" in str(caught.value)
+    assert f"still stopped ({PRESSED_REASON}) and stopped by ann: look at" in str(caught.value)
     assert clear(life, 9.0, number(life)).startswith("cleared; ")
     assert mode(life) is Mode.READY
     press(life, 10.0)
@@ -241,7 +241,8 @@ def test_a_cause_that_comes_many_times_is_named_once_under_the_newest_number() -
     assert numbers == sorted(set(numbers))
     life.hold("", "", ns(60.0))
     assert life.why == (
-        f"{PRESSED} (latched at {AT}:49 UTC); also stopped by ann at {AT}:49 UTC; call srv/clear"
+        f"{PRESSED_REASON} (latched at {AT}:49 UTC); also stopped by ann at {AT}:49 UTC; call "
+        f"srv/clear"
     )
 
 
@@ -251,10 +252,11 @@ def test_the_reason_after_many_stops_names_the_first_clients_the_last_and_each_p
     life.hold("", "", ns(0.6))
     for client in range(1000):
         stop(life, 1.0 + client / 100, f"client {client}")
-    press(life, 20.0, SILENT)
+    press(life, 20.0, SILENT_REASON)
     life.hold("", "", ns(21.0))
     stop(life, 30.0, "joe")
-    assert re.findall(r"(client \d+|joe|silent|pressed) ", life.why.replace(SILENT, "silent")) == [
+    why = life.why.replace(SILENT_REASON, "silent")
+    assert re.findall(r"(client \d+|joe|silent|pressed) ", why) == [
         "joe", "silent", "client 3", "client 2", "client 1", "client 0", "pressed",
     ]  # fmt: skip
 
@@ -264,10 +266,10 @@ def test_a_stop_in_the_step_of_a_press_is_named_although_it_arrived_before_the_p
     press(life, 1.0)
     pressed = number(life)
     life.stop("ann", ns(0.999), at(1.0))
-    assert life.why.startswith(f"stopped by ann at {AT}:01 UTC; also {PRESSED} (latched at ")
+    assert life.why.startswith(f"stopped by ann at {AT}:01 UTC; also {PRESSED_REASON} (latched at ")
     latched = life.latches
     assert number(life) > pressed
-    press(life, 1.1, SILENT)
+    press(life, 1.1, SILENT_REASON)
     pressed = number(life)
     life.stop("ann", ns(0.999), at(1.2))  # the same request again, with its reply
     assert number(life) == pressed
@@ -293,15 +295,17 @@ def test_every_cause_survives_restarts() -> None:
     for _ in range(3):
         life = Lifecycle(active=True, latches=life.latches.after_restart())
         assert life.why == (
-            f"{PRESSED} (latched at {AT}:02 UTC, before the restart); also was stopped by ann at "
+            f"{PRESSED_REASON} (latched at {AT}:02 UTC, before the restart); also was stopped by "
+            f"ann at "
             f"{AT}:01 UTC, before the restart; call srv/clear"
         )
-    press(life, 5.0, SILENT)
+    press(life, 5.0, SILENT_REASON)
     life = Lifecycle(active=True, latches=life.latches.after_restart())
     press(life, 6.0)
     life.hold("", "", ns(7.0))
     assert life.why == (
-        f"{PRESSED} (latched at {AT}:06 UTC); also {SILENT} (latched at {AT}:05 UTC, before the "
+        f"{PRESSED_REASON} (latched at {AT}:06 UTC); also {SILENT_REASON} (latched at {AT}:05 "
+        f"UTC, before the "
         f"restart); also was stopped by ann at {AT}:01 UTC, before the restart; call srv/clear"
     )
 
@@ -367,7 +371,7 @@ def test_a_release_without_a_number_is_refused_until_two_seconds_after_the_latch
         "that you have seen"
     )
     assert mode(life) is held.mode
-    assert release(life, 1.0 + LOOK_FIRST_S)
+    assert release(life, 1.0 + LATCH_REQUIRED_S)
     assert (mode(life), life.latches) == (Mode.READY, Latches())
 
 
@@ -471,7 +475,8 @@ def test_a_fault_keeps_the_stop_and_each_is_cleared_separately() -> None:
     with pytest.raises(RefusedError, match="a latch was cleared less than 2 s ago"):
         clear(life, 6.9)  # the same clear request, delivered twice by the network
     assert (
-        clear(life, 5.0 + LOOK_FIRST_S) == "cleared; each sender must send a zero before it drives"
+        clear(life, 5.0 + LATCH_REQUIRED_S)
+        == "cleared; each sender must send a zero before it drives"
     )
     assert mode(life) is Mode.READY
 
@@ -516,11 +521,13 @@ def test_a_pressed_emergency_stop_is_latched_and_says_what_to_do() -> None:
     life = ready()
     press(life, 1.0)
     assert mode(life) is Mode.STOPPED
-    latched = f"{PRESSED} (latched at {AT}:01 UTC)"
+    latched = f"{PRESSED_REASON} (latched at {AT}:01 UTC)"
     assert life.why == f"{latched}; release it at the robot, then call srv/clear"
     with pytest.raises(RefusedError) as caught:
         clear(life, 9.0, number(life))
-    assert str(caught.value) == f"{PRESSED}: release it at the robot, then call srv/clear again"
+    assert (
+        str(caught.value) == f"{PRESSED_REASON}: release it at the robot, then call srv/clear again"
+    )
     life.hold("", "", ns(9.2))
     with pytest.raises(RefusedError, match="before the cause of the stop or fault had ended"):
         life.clear(number(life), ns(9.2), at(9.3))
@@ -531,9 +538,10 @@ def test_a_pressed_emergency_stop_is_latched_and_says_what_to_do() -> None:
 
 def test_a_silent_input_names_the_board_and_its_cable() -> None:
     life = ready()
-    press(life, 1.0, SILENT)
+    press(life, 1.0, SILENT_REASON)
     assert life.why == (
-        f"{SILENT} (latched at {AT}:01 UTC); check the board and its cable, then call srv/clear"
+        f"{SILENT_REASON} (latched at {AT}:01 UTC); check the board and its cable, then call "
+        f"srv/clear"
     )
 
 
@@ -541,7 +549,7 @@ def test_a_stop_and_a_fault_beside_a_pressed_emergency_stop_are_named_with_it() 
     life = ready()
     press(life, 1.0)
     stop(life, 2.0, "joe")
-    stopped = f"stopped by joe at {AT}:02 UTC; also {PRESSED} (latched at {AT}:01 UTC)"
+    stopped = f"stopped by joe at {AT}:02 UTC; also {PRESSED_REASON} (latched at {AT}:01 UTC)"
     assert life.why == f"{stopped}; release it at the robot, then call srv/clear"
     life.fault("a wheel is dead", at(3.0))
     assert life.why == (
@@ -551,7 +559,7 @@ def test_a_stop_and_a_fault_beside_a_pressed_emergency_stop_are_named_with_it() 
     life.hold("", "", ns(8.0))
     assert clear(life, 9.0) == (
         "fault cleared, but the robot is still stopped by joe and "
-        f"stopped ({PRESSED}): call srv/clear again"
+        f"stopped ({PRESSED_REASON}): call srv/clear again"
     )
     assert life.why == f"{stopped}; call srv/clear"
 
@@ -592,7 +600,8 @@ def test_a_press_after_a_release_is_a_new_latch() -> None:
         clear(life, 9.0, seen)
     assert str(caught.value) == (
         f"this call names latch {seen}, but srv/clear would release another latch; the robot is "
-        f"still stopped ({PRESSED}): look at the robot, then call srv/clear again with the present "
+        f"still stopped ({PRESSED_REASON}): look at the robot, then call srv/clear again with the "
+        f"present "
         "`latch` in `state`"
     )
 
@@ -603,7 +612,9 @@ def test_a_plain_clear_is_refused_right_after_a_press() -> None:
     life.hold("", "", ns(1.2))
     with pytest.raises(RefusedError) as caught:
         clear(life, 1.5)
-    assert str(caught.value).startswith(f"the robot was stopped ({PRESSED}) 0.5 s ago: look at")
+    assert str(caught.value).startswith(
+        f"the robot was stopped ({PRESSED_REASON}) 0.5 s ago: look at"
+    )
     assert clear(life, 3.0)
 
 
@@ -732,7 +743,7 @@ REQUESTS: dict[str, Do] = {
 }
 
 TRIGGERS = FACTS | REQUESTS
-PAUSES = (0.5, LOOK_FIRST_S + 1.0)
+PAUSES = (0.5, LATCH_REQUIRED_S + 1.0)
 """Seconds before a trigger: one while a plain clear is still refused, and one after that."""
 
 
@@ -770,8 +781,8 @@ def explore() -> list[Edge]:
         life, now = queue.popleft()
         # A latch older than two seconds is a separate state, because a plain clear is accepted
         # there.
-        stopped = now - life._stopped_ns / NS_PER_S < LOOK_FIRST_S
-        switched_off = now - life._off_ns / NS_PER_S < LOOK_FIRST_S
+        stopped = now - life._stopped_ns / NS_PER_S < LATCH_REQUIRED_S
+        switched_off = now - life._off_ns / NS_PER_S < LATCH_REQUIRED_S
         if (state_of(life), stopped, switched_off) in seen:
             continue
         seen.add((state_of(life), stopped, switched_off))
@@ -876,7 +887,7 @@ def test_a_clear_that_names_another_latch_or_came_before_it_releases_nothing() -
 
 def test_a_plain_clear_is_refused_until_two_seconds_after_a_stop() -> None:
     for edge in explore():
-        if edge.trigger == "clear without a number" and edge.pause_s > LOOK_FIRST_S:
+        if edge.trigger == "clear without a number" and edge.pause_s > LATCH_REQUIRED_S:
             assert edge.refused == (edge.before.shutting_down or edge.before.pressed)
 
 
@@ -947,7 +958,7 @@ def test_switching_on_by_number_is_refused_exactly_while_a_latch_holds_or_the_da
     None
 ):
     for edge in explore():
-        late = edge.trigger == "activate without a number" and edge.pause_s > LOOK_FIRST_S
+        late = edge.trigger == "activate without a number" and edge.pause_s > LATCH_REQUIRED_S
         if edge.trigger == "activate by number" or late:
             before = edge.before
             assert edge.refused == (before.shutting_down or before.fault or before.stopped)

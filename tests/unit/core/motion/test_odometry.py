@@ -19,7 +19,7 @@ from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.learned_track import Track
 from acsard.core.motion.odometry import Odometry
 from acsard.core.motion.path import arc
-from acsard.core.motion.uncertainty import MAX_VARIANCE, NOWHERE
+from acsard.core.motion.uncertainty import MAX_VARIANCE, UNKNOWN_POSE
 from acsard.core.values import Estimate, Instant, Pose, PoseCovariance, Twist, WheelSpeeds
 from tests.each import each
 from tests.unit.core.motion.liars import fold
@@ -444,14 +444,14 @@ def test_a_gap_at_an_unknown_place_makes_the_whole_pose_unknown() -> None:
     robot = odometry(OdometryConfig(distance_variance_per_metre=10.0))
     before = robot.fold(feedback(40.0, 40.0, 1e9)).covariance
     assert before.xx == 1e9 > before.yawyaw
-    assert robot.fold(feedback(40.0, 40.0, 0.0, gap=5.0)).covariance == NOWHERE
+    assert robot.fold(feedback(40.0, 40.0, 0.0, gap=5.0)).covariance == UNKNOWN_POSE
 
 
 def test_a_robot_of_unknown_heading_knows_its_place_until_it_moves() -> None:
     start = (1e-6, 1e-6, 1e6, 1e6, 1e6, 1e9)
     robot = odometry(OdometryConfig(pose_covariance_diagonal=start))
     assert robot.fold(feedback(0.0, 0.0, 0.01)).covariance.xx == pytest.approx(1e-6)
-    assert robot.fold(feedback(4.0, 4.0, 0.01)).covariance == NOWHERE
+    assert robot.fold(feedback(4.0, 4.0, 0.01)).covariance == UNKNOWN_POSE
 
 
 def test_a_gap_of_years_leaves_a_variance_of_1e9_and_no_more() -> None:
@@ -459,7 +459,7 @@ def test_a_gap_of_years_leaves_a_variance_of_1e9_and_no_more() -> None:
     robot.fold(feedback(4.5, 7.5, 0.0))
     covariance = robot.fold(feedback(4.5, 7.5, 0.0, gap=1e9)).covariance
     assert (covariance.xx, covariance.yy, covariance.yawyaw) == (1e9, 1e9, 1e9)
-    assert robot.fold(feedback(4.5, 7.5, 1.0, gap=1.0)).covariance == NOWHERE
+    assert robot.fold(feedback(4.5, 7.5, 1.0, gap=1.0)).covariance == UNKNOWN_POSE
 
 
 @pytest.mark.slow

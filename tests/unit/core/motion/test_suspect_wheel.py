@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from acsard.core.motion.suspect_wheel import WORDS, Stuck, Suspect, WheelFault, was_faulty
-from acsard.core.motion.wheel_witness import COMMANDED, Expected
+from acsard.core.motion.suspect_wheel import FAULT_TEXTS, Stuck, Suspect, WheelFault, was_faulty
+from acsard.core.motion.wheel_witness import MIN_COMMANDED_SPEED, Expected
 from tests.each import each
 
 DT = 0.01
@@ -21,7 +21,7 @@ Known = tuple[Expected, float | None]
 def told(speed: float, slow: float | None = None, gyro: float | None = None) -> Known:
     expected = Expected()
     expected.commanded, expected.speed = speed, speed if slow is None else slow
-    expected.clear = expected.settled = speed >= COMMANDED
+    expected.clear = expected.settled = speed >= MIN_COMMANDED_SPEED
     return expected, gyro
 
 
@@ -128,7 +128,7 @@ def test_an_earlier_line_belongs_to_the_fault_if_it_has_the_sign_of_the_fault(
 
 
 def test_every_wheel_fault_has_a_text() -> None:
-    assert set(WORDS) == set(WheelFault.__args__)  # type: ignore[attr-defined]
+    assert set(FAULT_TEXTS) == set(WheelFault.__args__)  # type: ignore[attr-defined]
 
 
 SLOW_S = 0.25

@@ -12,10 +12,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from acsard.core.motion.wheel_residual import MEMORY_S, UNEQUAL, Residual
+from acsard.core.motion.wheel_residual import MAX_LASTING_DIFFERENCE, TIME_CONSTANT_S, Residual
 
 DT = 0.01
-KEEP = MEMORY_S / (MEMORY_S + DT)
+KEEP = TIME_CONSTANT_S / (TIME_CONSTANT_S + DT)
 FINE = math.tau / 3200
 
 
@@ -57,7 +57,7 @@ def test_wheels_of_unequal_size_agree_once_their_ratio_is_learned() -> None:
 def test_the_learned_ratio_stays_within_the_limit_for_unequal_tyres() -> None:
     residual = Residual()
     rolled(residual, 14.0, 10.0, 600.0)
-    assert residual.ratio == pytest.approx(UNEQUAL)
+    assert residual.ratio == pytest.approx(MAX_LASTING_DIFFERENCE)
     assert not residual.add(0.14, 0.10, KEEP, DT, FINE)
 
 

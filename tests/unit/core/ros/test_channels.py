@@ -16,14 +16,14 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from acsard.core.messages.cdr_types import plain
 from acsard.core.messages.schema import Header, Time, Twist, TwistStamped, Vector3
 from acsard.core.ros.channels import (
+    ACSARD_PREFIX,
     BY_KEY,
     CHANNELS,
     CMD_VEL_IN,
     DEFINITIONS,
-    LOG,
-    OURS,
-    RULE,
-    STATE,
+    LOG_CHANNEL,
+    SEPARATOR_LINE,
+    STATE_CHANNEL,
     Channel,
     nested,
     published_channels,
@@ -86,8 +86,8 @@ def test_each_channel_is_encoded_as_its_definition_says(channel: Channel) -> Non
 
 def test_a_robot_state_is_read_back_from_its_encoding_unchanged() -> None:
     store = get_typestore(Stores.EMPTY)
-    store.register(get_types_from_msg(STATE.schema, STATE.schema_name))
-    read: Any = store.deserialize_cdr(STATE.encode(ROBOT_STATE), STATE.schema_name)
+    store.register(get_types_from_msg(STATE_CHANNEL.schema, STATE_CHANNEL.schema_name))
+    read: Any = store.deserialize_cdr(STATE_CHANNEL.encode(ROBOT_STATE), STATE_CHANNEL.schema_name)
     assert (read.mode, read.x, read.header.stamp.sec) == ("driving", 1.0, 5)
     assert [one.name for one in read.sources] == ["app", "nav"]
 
@@ -106,11 +106,11 @@ def test_a_key_that_the_robot_does_not_publish_has_no_channel() -> None:
 
 def test_events_and_commands_have_a_channel_beside_the_keys() -> None:
     twist = TwistStamped(Header(Time(1)), Twist(Vector3(x=0.5), Vector3()))
-    assert LOG.encode(log(Event("started", "up"), Time())).startswith(b"\0\1\0\0")
+    assert LOG_CHANNEL.encode(log(Event("started", "up"), Time())).startswith(b"\0\1\0\0")
     assert len(CMD_VEL_IN.encode(twist)) == 68
 
 
-THEIRS = [name for name in DEFINITIONS if not name.startswith(OURS)]
+THEIRS = [name for name in DEFINITIONS if not name.startswith(ACSARD_PREFIX)]
 
 
 @each("name", DEFINITIONS)
@@ -134,7 +134,7 @@ def test_a_schema_text_has_the_constants_of_ros(name: str) -> None:
 
 
 def test_the_default_quaternion_is_the_identity_rotation() -> None:
-    first, *_ = schema_text("geometry_msgs/msg/Quaternion").split(RULE)
+    first, *_ = schema_text("geometry_msgs/msg/Quaternion").split(SEPARATOR_LINE)
     read = parse_message_string("geometry_msgs", "Quaternion", first)
     assert {field.name: field.default_value for field in read.fields} == {
         "x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0
@@ -143,7 +143,7 @@ def test_the_default_quaternion_is_the_identity_rotation() -> None:
 
 def test_a_schema_text_has_the_type_first_and_then_each_needed_type_once() -> None:
     text = schema_text("nav_msgs/msg/Odometry")
-    first, *others = text.split(f"{RULE}\nMSG: ")
+    first, *others = text.split(f"{SEPARATOR_LINE}\nMSG: ")
     assert first == (
         "std_msgs/Header header\nstring child_frame_id\n"
         "geometry_msgs/PoseWithCovariance pose\ngeometry_msgs/TwistWithCovariance twist\n"

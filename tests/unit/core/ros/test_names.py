@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from acsard.core.ros.channels import DEFINITIONS, OURS
+from acsard.core.ros.channels import ACSARD_PREFIX, DEFINITIONS
 from acsard.core.ros.names import (
     TYPE_HASHES,
     Node,
@@ -124,7 +124,11 @@ def split(text: str) -> list[Field]:
 
 def definitions() -> dict[str, list[Field]]:
     """Return the fields of every type by name; the fields of a service are its three messages."""
-    known = {name: [*fields] for name, fields in DEFINITIONS.items() if not name.startswith(OURS)}
+    known = {
+        name: [*fields]
+        for name, fields in DEFINITIONS.items()
+        if not name.startswith(ACSARD_PREFIX)
+    }
     for line in ros_types.MESSAGES.strip().splitlines():
         name, _, fields = line.partition(":")
         known[name] = split(fields)

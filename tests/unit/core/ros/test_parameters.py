@@ -174,7 +174,7 @@ def test_a_request_cut_anywhere_is_refused(service: str) -> None:
     }.get(service, rcl.Names(["robot.id"]))
     payload = Cdr(type(request)).encode(request)
     serve: Callable[[bytes], object] = partial(Parameters(TABLES).answer, service)
-    if service in rcl.SETTING:
+    if service in rcl.SETTING_SERVICES:
         serve = rcl.wished
     assert serve(payload)
     for end in range(len(payload)):

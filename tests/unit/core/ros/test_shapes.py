@@ -11,7 +11,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from acsard.core.messages.cdr import Cdr
 from acsard.core.messages.schema import LogEvent, RobotState, SourceState, Time
-from acsard.core.ros.channels import STATE as CHANNEL
+from acsard.core.ros.channels import STATE_CHANNEL as CHANNEL
 from acsard.core.ros.shapes import Counter, Log, Source, State, log, state
 from acsard.core.values import Event
 

@@ -16,7 +16,7 @@ from acsard.core.config.settings import (
 from acsard.core.messages.keys_and_roles import TOPICS
 from acsard.core.ros.names import TYPE_HASHES
 from acsard.core.ros.transports import (
-    PARAMETERS,
+    PARAMETERS_PREFIX,
     Endpoint,
     claims,
     command_keys,
@@ -128,7 +128,7 @@ def test_every_ros_name_belongs_to_a_row_of_the_topic_table() -> None:
     patterns = {topic.key.replace("<source>", ""): topic for topic in TOPICS}
     sources = {source.name for source in CommandsConfig().sources}
     for row in ros_names(RosConfig()):
-        if row.native.startswith(PARAMETERS):
+        if row.native.startswith(PARAMETERS_PREFIX):
             continue
         if row.direction == "in" and row.native not in ("imu", "speed_limit"):
             head, _, source = row.native.partition("/")

@@ -9,7 +9,7 @@ from msgspec.structs import replace
 
 from acsard.core.config.settings import Config, SimConfig
 from acsard.core.simulator.fake_mcu import MS, FakeMcu
-from acsard.core.simulator.simulated_robot import LOOK_NS, Sight, WatchedMcu
+from acsard.core.simulator.simulated_robot import OBSERVATION_PERIOD_NS, Sight, WatchedMcu
 
 TRUE = Config(sim=SimConfig(motor_time_constant=0.0))
 LINE = b"ap02.00,bn02.00,cn02.00,dp02.00\r\n"
@@ -31,7 +31,7 @@ def seen(config: Config = TRUE, seconds: float = 1.0, step_ms: int = 5) -> list[
 def test_the_robot_is_observed_every_10_ms_for_any_step_size() -> None:
     for step_ms in (1, 5, 20):
         assert [sight.at_ns for sight in seen(step_ms=step_ms)] == [
-            (n + 1) * LOOK_NS for n in range(100)
+            (n + 1) * OBSERVATION_PERIOD_NS for n in range(100)
         ]
 
 
@@ -51,9 +51,9 @@ def test_an_observed_board_answers_the_same_bytes() -> None:
 
 def test_the_next_observation_is_the_next_event_of_an_idle_board() -> None:
     mcu = WatchedMcu(TRUE, 7, lambda sight: None)
-    assert mcu.next_ns() == 7 + LOOK_NS
+    assert mcu.next_ns() == 7 + OBSERVATION_PERIOD_NS
     mcu.receive(7, LINE)
-    assert mcu.next_ns() < 7 + LOOK_NS
+    assert mcu.next_ns() < 7 + OBSERVATION_PERIOD_NS
 
 
 def test_an_ideal_gyro_measures_the_true_turn_rate() -> None:

@@ -36,7 +36,7 @@ from acsard.core.messages.keys_and_roles import (
     whoami_key,
 )
 from acsard.core.messages.permissions import SERVICE_ROLES, least_role
-from acsard.core.ros.transports import PARAMETERS, claims, endpoints
+from acsard.core.ros.transports import PARAMETERS_PREFIX, claims, endpoints
 from acsard.core.values import Role
 from acsard.daemon.bus.access import GRANTS, _Keys, access_control, gateway_access
 from tests.each import each
@@ -415,7 +415,7 @@ def test_every_ros_name_is_for_its_least_role_and_the_roles_above(
         elif endpoint.direction == "in":
             assert access.who("put", key) == FROM[LEAST.get(native, "operator")]
         else:
-            least = "maintainer" if native.startswith(PARAMETERS) else LEAST[native]
+            least = "maintainer" if native.startswith(PARAMETERS_PREFIX) else LEAST[native]
             assert access.who("query", key) == FROM[least]
             assert access.lets("viewer", "declare_queryable", key, "egress")
         if endpoint.token:

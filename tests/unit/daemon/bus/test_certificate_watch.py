@@ -11,7 +11,11 @@ import pytest
 
 from acsard.core.config.settings import BusConfig
 from acsard.daemon.bus import certificate_watch as module
-from acsard.daemon.bus.certificate_watch import FILES_LOOK_NS, CertificateFiles, watch_certificates
+from acsard.daemon.bus.certificate_watch import (
+    FILES_CHECK_PERIOD_NS,
+    CertificateFiles,
+    watch_certificates,
+)
 from acsard.daemon.bus.tls import ends, files_in
 from acsard.host import clock
 from acsard.machine.authority import Authority
@@ -31,7 +35,7 @@ class Files:
         self.authority.issue(self.where, "robot", [], 10)
 
     def renewed(self) -> bool:
-        self._now_ns += FILES_LOOK_NS
+        self._now_ns += FILES_CHECK_PERIOD_NS
         return self._files.renewed()
 
 
@@ -74,7 +78,7 @@ def test_the_files_are_not_checked_more_often_than_the_interval(
 ) -> None:
     files.renewed()
     files.issue()
-    monkeypatch.setattr(module, "FILES_LOOK_NS", 0)
+    monkeypatch.setattr(module, "FILES_CHECK_PERIOD_NS", 0)
     assert not any(files._files.renewed() for _ in range(10))
 
 
@@ -93,8 +97,8 @@ async def test_new_files_and_a_new_router_are_noticed_and_missing_ones_change_no
     authority = Authority.make(tmp_path, "test", 10)
     authority.issue(tmp_path, "robot", [], 10)
     router: list[int | None] = [None]
-    monkeypatch.setattr(module, "ENDS_LOOK_S", 0.0)
-    monkeypatch.setattr(module, "ROUTER_LOOKS", 2)
+    monkeypatch.setattr(module, "EXPIRY_CHECK_PERIOD_S", 0.0)
+    monkeypatch.setattr(module, "ROUTER_CHECK_EVERY", 2)
     monkeypatch.setattr(module, "peer_ends_ns", lambda endpoint, tls: router[0])
     known = ends(str(tmp_path))
     first = known[""]
@@ -123,7 +127,7 @@ async def test_a_disk_that_hangs_takes_one_thread(
         answers.wait()
         return {"": 8}
 
-    monkeypatch.setattr(module, "ENDS_LOOK_S", 0.0)
+    monkeypatch.setattr(module, "EXPIRY_CHECK_PERIOD_S", 0.0)
     monkeypatch.setattr(module, "ends", hang)
     known = {"": 7}
     task = asyncio.create_task(watch_certificates(BusConfig(tls=str(tmp_path)), known))
@@ -138,7 +142,7 @@ async def test_the_expiry_of_the_robots_own_certificate_is_left_to_its_gateway(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     Authority.make(tmp_path, "test", 10).issue(tmp_path, "robot", [], 10)
-    monkeypatch.setattr(module, "ENDS_LOOK_S", 0.0)
+    monkeypatch.setattr(module, "EXPIRY_CHECK_PERIOD_S", 0.0)
     known = {"": 7}
     bus = BusConfig(listen=("tcp/127.0.0.1:1", "tls/0.0.0.0:7449"), tls=str(tmp_path))
     task = asyncio.create_task(watch_certificates(bus, known))

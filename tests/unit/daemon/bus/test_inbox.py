@@ -11,7 +11,7 @@ import zenoh
 
 from acsard.core.incoming.queries import Reply
 from acsard.core.messages.keys_and_roles import IMU
-from acsard.daemon.bus.inbox import ARRIVALS, TICKETS, Inbox, Replies
+from acsard.daemon.bus.inbox import COMMAND_BUFFER, MAX_OPEN_QUERIES, Inbox, Replies
 
 
 class Loop:
@@ -77,9 +77,9 @@ def test_the_loop_finds_the_sample_that_woke_it() -> None:
 
 def test_a_flood_on_a_key_displaces_only_samples_of_that_key_and_is_counted() -> None:
     inbox, _ = an_inbox()
-    arrived(inbox, "cmd/nav", "stop", *["cmd/app"] * (ARRIVALS + 5))
+    arrived(inbox, "cmd/nav", "stop", *["cmd/app"] * (COMMAND_BUFFER + 5))
     taken = inbox.take(8)
-    assert [one.key for one in taken.arrivals] == ["stop", "cmd/nav", *["cmd/app"] * ARRIVALS]
+    assert [one.key for one in taken.arrivals] == ["stop", "cmd/nav", *["cmd/app"] * COMMAND_BUFFER]
     assert (taken.overrun, taken.overrun_sources) == (5, ("app",))
     arrived(inbox, "cmd/app")
     taken = inbox.take(8)
@@ -99,7 +99,7 @@ def test_a_slow_control_rate_has_larger_buffers_so_that_a_lawful_sender_loses_no
 
 def test_a_loop_that_wakes_up_finds_the_displaced_samples_counted() -> None:
     inbox, loop = an_inbox()
-    arrived(inbox, *["cmd/app"] * ARRIVALS)
+    arrived(inbox, *["cmd/app"] * COMMAND_BUFFER)
     found: list[int] = []
     loop.command = lambda: found.append(inbox.take(8).overrun)  # type: ignore[method-assign]
     arrived(inbox, "cmd/app")
@@ -180,10 +180,10 @@ def test_a_query_that_cannot_be_ended_blocks_no_other_reply() -> None:
 
 
 def test_the_number_of_tickets_is_limited_until_some_are_retired() -> None:
-    replies, queries = Replies(""), [Asked() for _ in range(2 * TICKETS)]
+    replies, queries = Replies(""), [Asked() for _ in range(2 * MAX_OPEN_QUERIES)]
     tickets = [replies.issue(query, "") for query in queries]  # type: ignore[arg-type]
     held = [ticket for ticket in tickets if ticket is not None]
-    assert len(held) == TICKETS
+    assert len(held) == MAX_OPEN_QUERIES
     for ticket in held:
         replies.retire(ticket)
     ended(replies)

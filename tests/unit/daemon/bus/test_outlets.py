@@ -14,7 +14,7 @@ import pytest
 import zenoh
 
 from acsard.core.messages.schema import Twist, Vector3
-from acsard.daemon.bus.outlets import HELD, STUCK_NS, Outlets
+from acsard.daemon.bus.outlets import BLOCKED_AFTER_NS, SLOT_MESSAGES, Outlets
 from acsard.host import clock
 
 TOPIC, KEY = "cmd_vel_out", "acsard/acsar/cmd_vel_out"
@@ -61,10 +61,10 @@ def test_messages_are_sent_in_order_while_the_bus_accepts_them() -> None:
     publisher = Publisher()
     publisher.free.set()
     outlets = started(publisher)
-    for number in range(HELD):
+    for number in range(SLOT_MESSAGES):
         publish(outlets, number)
     outlets.stop(WAIT_S)
-    assert publisher.sent == list(range(HELD))
+    assert publisher.sent == list(range(SLOT_MESSAGES))
     assert outlets.losses(clock.mono_ns()) == (0, False)
 
 
@@ -75,10 +75,10 @@ def test_while_the_bus_blocks_the_newest_messages_wait_and_the_others_are_counte
     assert publisher.entered.wait(WAIT_S)
     for number in range(1, 101):
         publish(outlets, number)
-    assert outlets.losses(clock.mono_ns())[0] == 100 - HELD
+    assert outlets.losses(clock.mono_ns())[0] == 100 - SLOT_MESSAGES
     publisher.free.set()
     outlets.stop(WAIT_S)
-    assert publisher.sent == [0, *range(101 - HELD, 101)]
+    assert publisher.sent == [0, *range(101 - SLOT_MESSAGES, 101)]
 
 
 def test_a_blocked_bus_is_reported_once_for_each_time_that_it_blocks() -> None:
@@ -87,11 +87,14 @@ def test_a_blocked_bus_is_reported_once_for_each_time_that_it_blocks() -> None:
     publish(outlets, 0)
     assert publisher.entered.wait(WAIT_S)
     now_ns = clock.mono_ns()
-    told = [outlets.losses(now_ns + late_ns)[1] for late_ns in (0, STUCK_NS + 1, 2 * STUCK_NS)]
+    told = [
+        outlets.losses(now_ns + late_ns)[1]
+        for late_ns in (0, BLOCKED_AFTER_NS + 1, 2 * BLOCKED_AFTER_NS)
+    ]
     assert told == [False, True, False]
     publisher.free.set()
     outlets.stop(WAIT_S)
-    assert outlets.losses(now_ns + 3 * STUCK_NS) == (0, False)
+    assert outlets.losses(now_ns + 3 * BLOCKED_AFTER_NS) == (0, False)
 
 
 def test_an_error_of_the_thread_ends_the_control_loop() -> None:

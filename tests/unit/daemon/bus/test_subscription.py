@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import zenoh
 
-from acsard.daemon.bus.subscription import QUEUED, Subscription, queue_on
+from acsard.daemon.bus.subscription import MAX_QUEUED_SAMPLES, Subscription, queue_on
 
 KEY, WILDCARD = "acsard/acsar/state", "acsard/**"
 
@@ -47,7 +47,7 @@ def test_a_subscription_without_a_key_yields_all_samples() -> None:
 
 
 def test_a_flood_on_other_keys_does_not_hold_the_caller() -> None:
-    queue = Queue(*[WILDCARD] * (QUEUED + 1), KEY)
+    queue = Queue(*[WILDCARD] * (MAX_QUEUED_SAMPLES + 1), KEY)
     subscription = Subscription(queue, KEY)
     assert subscription.try_recv() is None
     assert len(queue.held) == 2
@@ -146,7 +146,7 @@ async def test_a_sample_or_the_end_wakes_an_asyncio_reader() -> None:
 
 def test_the_newest_samples_of_a_flood_are_kept() -> None:
     handler, subscription = declared()
-    for number in range(QUEUED + 5):
+    for number in range(MAX_QUEUED_SAMPLES + 5):
         handler.callback(sample(number))
     handler.drop()
-    assert numbers(subscription) == list(range(5, QUEUED + 5))
+    assert numbers(subscription) == list(range(5, MAX_QUEUED_SAMPLES + 5))

@@ -6,10 +6,10 @@ The judgement logs incidents and gives the reasons to restart the gateway.
 from __future__ import annotations
 
 from acsard.daemon.gateway.listener_process import (
-    ALONE_NS,
-    FIRST_NS,
+    FIRST_CONNECTION_NS,
+    LOST_DAEMON_NS,
     MAX_UNANSWERED,
-    STUCK_NS,
+    STUCK_AFTER_NS,
     Observation,
     SessionHealth,
     connection_counts,
@@ -55,7 +55,9 @@ MOMENT = S // 4
 
 def test_an_observation_that_takes_too_long_restarts_the_gateway() -> None:
     health, stuck = SessionHealth(MOST, 0), look(S)
-    assert [health.restart_event(stuck, MOMENT) for _ in range(STUCK_NS // MOMENT + 1)][-1] is None
+    assert [health.restart_event(stuck, MOMENT) for _ in range(STUCK_AFTER_NS // MOMENT + 1)][
+        -1
+    ] is None
     over = health.restart_event(stuck, MOMENT)
     assert over is not None
     assert (over.name, over.level) == ("gateway_stuck", "error")
@@ -81,18 +83,18 @@ def test_a_connected_daemon_that_answers_no_query_restarts_the_gateway() -> None
 def test_a_lost_daemon_restarts_the_gateway() -> None:
     health = SessionHealth(MOST, 0)
     assert health.restart_event(look(S), MOMENT) is None
-    assert health.restart_event(look(S + ALONE_NS, linked=False), MOMENT) is None, (
+    assert health.restart_event(look(S + LOST_DAEMON_NS, linked=False), MOMENT) is None, (
         "it may come back"
     )
-    over = health.restart_event(look(S + ALONE_NS + 1, linked=False), MOMENT)
+    over = health.restart_event(look(S + LOST_DAEMON_NS + 1, linked=False), MOMENT)
     assert over is not None
     assert over.name == "gateway_lost_daemon"
 
 
 def test_after_the_start_the_daemon_has_more_time_to_connect() -> None:
     health = SessionHealth(MOST, S)
-    assert health.restart_event(look(S + FIRST_NS, linked=False), MOMENT) is None
-    assert health.restart_event(look(S + FIRST_NS + 1, linked=False), MOMENT) is not None
+    assert health.restart_event(look(S + FIRST_CONNECTION_NS, linked=False), MOMENT) is None
+    assert health.restart_event(look(S + FIRST_CONNECTION_NS + 1, linked=False), MOMENT) is not None
 
 
 def test_a_daemon_that_reconnects_in_time_causes_no_restart() -> None:
