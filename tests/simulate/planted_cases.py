@@ -74,8 +74,8 @@ CASES = (
         "case 7",
         "a clear that was sent before a stop and arrives after it releases that stop",
         LIFECYCLE,
-        "LOOK_FIRST_S = 2.0",
-        "LOOK_FIRST_S = 0.0",
+        "LATCH_REQUIRED_S = 2.0",
+        "LATCH_REQUIRED_S = 0.0",
         Edit(LIFECYCLE, "            if number != latch.number:", "            if False:"),
     ),
     fault(
@@ -89,8 +89,8 @@ CASES = (
         "case 9",
         "healthy motors that lag latch the fault `runaway`",
         WITNESS,
-        "nearing = off < self._nearest - NEARER",
-        "nearing = off < self._nearest - NEARER and not fast",
+        "nearing = off < self._nearest - MIN_APPROACH",
+        "nearing = off < self._nearest - MIN_APPROACH and not fast",
     ),
     fault(
         "case 10",

@@ -495,8 +495,8 @@ FAULTS = (
         "limits saturated",
         "a robot that turns harder at the limit of its wheels brakes harder than it may",
         LIMITS,
-        "if turns_faster and not faster:",
-        "if False:",
+        "kept, added = next((o for o in order if kinematics.fits(o[0], most)), both)",
+        "kept, added = REST, twist",
     ),
     fault(
         "kinematics curvature",

@@ -33,10 +33,6 @@ MOVES = 0.1
 STANDS = 0.001
 """Distance, m, and turn, rad, up to which the true pose has stayed the same."""
 
-VAGUE = 0.05
-"""Variance, m2, from which on a gap may be lost in it: the variance of a robot whose heading is
-nearly unknown also falls."""
-
 PROVED_RAD = 3.0
 """True turns, rad, within which a gyro has certainly proved itself: a turn of 0.1 rad to one side
 proves it, if its bias is known."""
@@ -107,9 +103,9 @@ class PoseWitness:
         self._last: tuple[int, Pose] | None = None
         self.latest: Pose | None = None
         """The pose of the last estimate, None if it was set since."""
-        self._before: tuple[int, Pose, Pose, float, float, float] | None = None
-        """Time, pose, true pose, true speed and the variances of place and heading at the last
-        estimate before a silence."""
+        self._before: tuple[int, Pose, Pose, float, tuple[float, ...]] | None = None
+        """Time, pose, true pose, true speed and covariance at the last estimate before a
+        silence."""
 
     def doubt(self, mute: bool = False) -> None:
         """The encoders missed a part of the drive: restart the comparison at the next estimate.
@@ -173,13 +169,13 @@ class PoseWitness:
             if not math.isfinite(ex + ey + eyaw + sum(covariance)):
                 raise BrokenError("the pose is finite", now_ns, f"{ex} {ey} {eyaw} {covariance}")
             self._one(now_ns, sampled_ns + offset_ns, (ex, ey, eyaw), covariance, lies)
-        sampled_ns, ex, ey, eyaw, (xx, _, _, yy, _, yawyaw), _ = estimates[-1]
+        sampled_ns, ex, ey, eyaw, covariance, _ = estimates[-1]
         self.latest = ex, ey, eyaw
         if silent_only:
             last_ns = sampled_ns + offset_ns
             # After a stall, the sample may be much older than this step.
             true = self._true_at(last_ns)
-            self._before = true and (last_ns, self.latest, true, self._speed, xx + yy, yawyaw)
+            self._before = true and (last_ns, self.latest, true, self._speed, covariance)
 
     def end_step(self) -> bool:
         """Forget the pose if it was set in this step, and return whether it was."""
@@ -249,14 +245,14 @@ class PoseWitness:
     def _gap(
         self,
         now_ns: int,
-        before: tuple[int, Pose, Pose, float, float, float],
+        before: tuple[int, Pose, Pose, float, tuple[float, ...]],
         estimate: Any,
         offset_ns: int,
         true_ns: int,
         true: Pose,
     ) -> None:
         """Judge the first estimate after a gap: its covariance grew by the motion in the gap."""
-        then_ns, pose, true_then, speed, variance, yaw_variance = before
+        then_ns, pose, true_then, speed, covariance = before
         sampled_ns, ex, ey, eyaw, (xx, _, _, yy, _, yawyaw), _ = estimate
         # A robot that stood may have been pushed in the gap, unless it stands where it stood.
         stood = speed < MOVES
@@ -270,8 +266,12 @@ class PoseWitness:
             if at_sample is None:
                 return
             true = at_sample
-        if variance > VAGUE:
-            variance = 0.0
+        # The error of the heading before the gap moves the pose during the gap. If the robot drives
+        # back, this makes the covariance of the place smaller.
+        old_xx, _, x_yaw, old_yy, y_yaw, yaw_variance = covariance
+        dx, dy = ex - pose[0], ey - pose[1]
+        variance = old_xx - 2 * dy * x_yaw + dy * dy * yaw_variance
+        variance += old_yy + 2 * dx * y_yaw + dx * dx * yaw_variance
         x, y, _ = _through((true_then, pose), true)
         off, sigma = math.hypot(ex - x, ey - y), math.sqrt(max(0.0, xx + yy - variance))
         if off > SIGMAS * sigma + ROOM_M + 0.1 * speed:

@@ -87,6 +87,14 @@ class Kinematics:
         scale = wheel_speed / fastest
         return Twist(twist.linear * scale, twist.angular * scale)
 
+    def fits(self, twist: Twist, wheel_speed: float) -> bool:
+        """Return whether no wheel turns faster than `wheel_speed` rad/s with this twist.
+
+        A difference that rounding can cause does not count.
+        """
+        speeds = self.wheel_speeds(twist)
+        return max(abs(speeds.front_right), abs(speeds.front_left)) <= wheel_speed * (1.0 + 1e-9)
+
     def room(self, kept: Twist, added: Twist, wheel_speed: float) -> float:
         """Return the largest fraction of `added`, 0 to 1, that can be added to the twist `kept`.
 

@@ -102,24 +102,29 @@ class Limiter:
         return twist
 
     def _fitted(self, twist: Twist) -> Twist:
-        """Return the next twist, reduced so that no wheel exceeds its speed limit."""
-        # Each axis changes at its own rate. In between, both axes together may need a faster wheel
-        # than at the start or at the goal. If one axis speeds up while the other one slows down,
-        # only the axis that speeds up is reduced. The other axis would exceed its deceleration. If
-        # the radii of the wheels differ, both axes may be reduced although both slow down.
+        """Return the next twist, changed so that no wheel exceeds its speed limit.
+
+        `twist` is the next twist within the limits of both axes. The result is between the present
+        twist and `twist` on each axis, so it is within these limits too.
+        """
         kinematics, most, now = self._kinematics, self._wheel_speed, self.twist
-        fitted = kinematics.saturate(twist, most)
-        if fitted is twist:
+        if kinematics.saturate(twist, most) is twist:
             return twist
-        linear, angular = Twist(twist.linear), Twist(angular=twist.angular)
-        faster = abs(twist.linear) > abs(now.linear)
-        turns_faster = abs(twist.angular) > abs(now.angular)
-        if turns_faster and not faster:
-            share = kinematics.room(linear, angular, most)
-            fitted = Twist(twist.linear, twist.angular * share)
-        elif faster and not turns_faster:
-            share = kinematics.room(angular, linear, most)
-            fitted = Twist(twist.linear * share, twist.angular)
+        # Each axis changes at its own rate. On the way to the goal, both axes together may need a
+        # faster wheel than at the start or at the goal. So one axis changes as far as it may, and
+        # the other one only as far as the wheels allow. An axis that slows down goes first, because
+        # braking must not wait for the other axis.
+        linear_first = Twist(twist.linear, now.angular), Twist(0.0, twist.angular - now.angular)
+        angular_first = Twist(now.linear, twist.angular), Twist(twist.linear - now.linear, 0.0)
+        both = now, Twist(twist.linear - now.linear, twist.angular - now.angular)
+        order = [linear_first, angular_first, both]
+        turns_slower = abs(twist.angular) < abs(now.angular)
+        if turns_slower and abs(twist.linear) >= abs(now.linear):
+            order = [angular_first, linear_first, both]
+        kept, added = next((o for o in order if kinematics.fits(o[0], most)), both)
+        share = kinematics.room(kept, added, most)
+        fitted = Twist(kept.linear + added.linear * share, kept.angular + added.angular * share)
+        # Remove what rounding has added.
         return kinematics.saturate(fitted, most)
 
     def coast(self, dt: float, stop: bool = False) -> Twist:

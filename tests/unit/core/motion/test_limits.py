@@ -197,19 +197,53 @@ def test_the_wheel_limit_counts_also_if_both_axes_speed_up() -> None:
 corners = st.builds(Twist, st.sampled_from((-1.0, 0.0, 1.0)), st.sampled_from((-4.0, 0.0, 4.0)))
 
 
-@given(wishes=st.lists(st.tuples(corners, periods), max_size=40), start=corners)
+@given(
+    wishes=st.lists(st.tuples(corners | mixed, periods), max_size=40),
+    start=corners,
+    left=st.just(1.0) | st.floats(0.8, 1.25),
+    braking=st.sampled_from((0.4, 4.0)),
+)
 def test_at_the_wheel_limit_too_each_axis_changes_by_no_more_than_its_limit(
-    wishes: list[tuple[Twist, float]], start: Twist
+    wishes: list[tuple[Twist, float]], start: Twist, left: float, braking: float
 ) -> None:
-    found = limiter(TALL)
+    kinematics = Kinematics(DriveConfig(left_wheel_radius_multiplier=left))
+    found = Limiter(msgspec.structs.replace(TALL, linear_deceleration=braking), kinematics)
     before = found.follow(start, 1000.0)
     for wish, dt in wishes:
         after = found.follow(wish, dt)
-        assert abs(before.linear) - abs(after.linear) <= 0.4 * dt + EPS
+        assert max(map(abs, kinematics.wheel_speeds(after).as_tuple())) <= 20.0 * (1 + EPS)
+        assert abs(before.linear) - abs(after.linear) <= braking * dt + EPS
         assert abs(before.angular) - abs(after.angular) <= 8.0 * dt + EPS
         assert abs(after.linear) - abs(before.linear) <= 0.5 * dt + EPS
         assert abs(after.angular) - abs(before.angular) <= 8.0 * dt + EPS
         before = after
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+@given(wishes=st.lists(st.tuples(mixed, periods), max_size=10), goal=mixed)
+def test_wheels_of_unequal_size_never_keep_the_robot_from_its_goal(
+    side: str, wishes: list[tuple[Twist, float]], goal: Twist
+) -> None:
+    kinematics = Kinematics(DriveConfig(**{f"{side}_wheel_radius_multiplier": 0.8}))
+    found = Limiter(TALL, kinematics)
+    for wish, dt in wishes:
+        found.follow(wish, dt)
+    last = followed(found, goal, 2000)[-1]
+    fresh = Limiter(TALL, kinematics).follow(goal, 1000.0)
+    assert pair(last) == approx(*pair(fresh))
+
+
+def test_a_small_wheel_at_its_limit_turns_the_robot_until_it_has_slowed_down() -> None:
+    # Without the turn the right wheel would be too fast, so the turn falls only as fast as the
+    # speed allows.
+    kinematics = Kinematics(DriveConfig(right_wheel_radius_multiplier=0.9))
+    found = Limiter(TALL, kinematics)
+    start = found.follow(Twist(-1.0, 0.2), 1000.0)
+    assert kinematics.wheel_speeds(start).front_right == pytest.approx(-20.0)
+    after = found.follow(Twist(-0.8, 0.0), 0.01)
+    assert abs(start.linear) - abs(after.linear) == pytest.approx(0.004)
+    assert kinematics.wheel_speeds(after).front_right == pytest.approx(-20.0)
+    assert 0.0 < after.angular < start.angular
 
 
 # acceleration and deceleration
