@@ -6,6 +6,7 @@ Before untrusted text is written to a terminal, it must go through `printable`, 
 
 from __future__ import annotations
 
+import json
 import math
 import re
 from collections.abc import Sequence
@@ -42,12 +43,11 @@ _ABOVE_ASCII = re.compile(r"[^\x00-\x7e]")
 
 
 def json_line(text: str) -> str:
-    """Escape the unprintable characters of a JSON text without changing the encoded value.
-
-    Characters above U+FFFF stay as they are.
-    """
+    """Escape the unprintable characters of a JSON text without changing the encoded value."""
     return _ABOVE_ASCII.sub(
-        lambda m: m[0] if m[0].isprintable() or ord(m[0]) > 0xFFFF else f"\\u{ord(m[0]):04x}", text
+        # JSON writes a character above U+FFFF as two escapes.
+        lambda m: m[0] if m[0].isprintable() else json.dumps(m[0])[1:-1],
+        text,
     )
 
 
@@ -76,7 +76,9 @@ def signed(value: float | None, decimals: int, width: int) -> str:
     if value is None or math.isnan(value):
         return "-".rjust(width)
     text = f"{round(value, decimals) + 0.0:+.{decimals}f}"  # + 0.0 turns "-0.00" into "+0.00"
-    return (text if len(text) <= width else f"{value:+.0e}").rjust(width)
+    return (
+        text if len(text) <= width else f"{value:+.0e}".replace("e+0", "e").replace("e+", "e")
+    ).rjust(width)
 
 
 _UNITS = (("d", 86_400), ("h", 3_600), ("min", 60), ("s", 1))

@@ -106,7 +106,9 @@ def kind_of(name: str) -> inspect.Type:
         if isinstance(kind, inspect.VarTupleType) and isinstance(
             kind.item_type, inspect.StructType
         ):
-            next(parts)
+            # Without a source, the configuration has the empty list itself as a setting.
+            if next(parts, None) is None:
+                return kind
             kind = kind.item_type
         if not isinstance(kind, inspect.StructType):
             return kind

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -110,3 +111,15 @@ def test_a_count_agrees_with_its_noun() -> None:
 def test_a_shortened_list_ends_with_the_number_of_omitted_items() -> None:
     assert listed(["a", "b"], 2) == "a, b"
     assert listed(["a", "b", "c", "d"], 2, "; ") == "a; b; and 2 more"
+
+
+def test_an_unprintable_character_beyond_16_bits_is_escaped_in_json() -> None:
+    line = json_line('"\U000e0001\U0001f916"')
+    assert line == '"\\udb40\\udc01\U0001f916"'
+    assert json.loads(line) == "\U000e0001\U0001f916"
+
+
+@pytest.mark.parametrize("value", [1000.0, -123456.0, 1e12])
+def test_a_number_that_is_too_long_keeps_its_width(value: float) -> None:
+    assert len(signed(value, 2, 5)) == 5
+    assert float(signed(value, 2, 5)) == pytest.approx(value, rel=0.5)

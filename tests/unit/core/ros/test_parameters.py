@@ -244,3 +244,8 @@ def test_every_key_has_a_description_and_is_read_only_unless_it_can_be_set(key: 
 
 def test_an_unknown_key_has_no_description() -> None:
     assert described("no.such", 0) == ParameterDescriptor("no.such", 0)
+
+
+def test_a_robot_without_command_sources_describes_the_empty_list() -> None:
+    row = described("commands.sources", rcl.STRING_ARRAY)
+    assert (row.name, row.read_only) == ("commands.sources", True)
