@@ -95,7 +95,7 @@ def test_a_duration_has_its_two_largest_units(seconds: float, text: str) -> None
 
 @each(
     ("value", "text"),
-    [(1.5, "  +1.50"), (-0.001, "  +0.00"), (-2.0, "  -2.00"), (1e12, " +1e+12"),
+    [(1.5, "  +1.50"), (-0.001, "  +0.00"), (-2.0, "  -2.00"), (1e12, "  +1e12"),
      (math.inf, "   +inf"), (math.nan, "      -")],
 )  # fmt: skip
 def test_a_number_is_shown_with_its_sign_in_a_fixed_width(value: float, text: str) -> None:
