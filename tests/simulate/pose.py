@@ -33,6 +33,10 @@ MOVES = 0.1
 STANDS = 0.001
 """Distance, m, and turn, rad, up to which the true pose has stayed the same."""
 
+VAGUE = 0.05
+"""Variance, m2, from which on a gap may be lost in it. After a gap that is too long to be filled,
+the pose stays where it was, but the covariance turns with a heading that is nearly unknown."""
+
 PROVED_RAD = 3.0
 """True turns, rad, within which a gyro has certainly proved itself: a turn of 0.1 rad to one side
 proves it, if its bias is known."""
@@ -272,6 +276,8 @@ class PoseWitness:
         dx, dy = ex - pose[0], ey - pose[1]
         variance = old_xx - 2 * dy * x_yaw + dy * dy * yaw_variance
         variance += old_yy + 2 * dx * y_yaw + dx * dx * yaw_variance
+        if old_xx + old_yy > VAGUE:
+            variance = 0.0
         x, y, _ = _through((true_then, pose), true)
         off, sigma = math.hypot(ex - x, ey - y), math.sqrt(max(0.0, xx + yy - variance))
         if off > SIGMAS * sigma + ROOM_M + 0.1 * speed:
