@@ -498,9 +498,9 @@ def _windows(
         for window in _of_drive(fold, seen):
             motions.append(window.motion)
             rows.append((number, *window.projected(known)))
-    rows = rows[:: 1 + len(rows) // MAX_WINDOWS]
     if not rows:
         return None
+    rows = rows[:: math.ceil(len(rows) / MAX_WINDOWS)]
     most = max(len(residual) for _, residual, _, _ in rows)
     metres, turned = np.mean([(one.metres, one.turned) for one in motions], axis=0)
     lasting = np.array([metres, metres / motions[0].track ** 2, turned])

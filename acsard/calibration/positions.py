@@ -10,6 +10,7 @@ The fit needs a track that is nearly right. `search` finds parameters from which
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
@@ -311,7 +312,7 @@ refined. If there are more segments, those with the largest extent are used.
 """
 
 MAX_POINTS = 80
-"""Approximate largest number of positions of a segment that the search uses, evenly spaced."""
+"""Largest number of positions of a segment that the search uses. They are evenly spaced."""
 
 MOST_REFINED, FAR_WORSE = 4, 20.0
 """Limits for the starting points that the search refines.
@@ -408,10 +409,10 @@ def _furthest(segments: Sequence[Segment], most: int) -> list[Segment]:
     reach = [extent(s.place) for s in segments]
     kept = [segments[i] for i in sorted(np.argsort(reach)[::-1][:most])]
     return [
-        replace(s, t=s.t[:: 1 + len(s.t) // MAX_POINTS],
-                place=s.place[:: 1 + len(s.t) // MAX_POINTS])
+        replace(s, t=s.t[::every], place=s.place[::every])
         for s in kept
-    ]  # fmt: skip
+        for every in [math.ceil(len(s.t) / MAX_POINTS)]
+    ]
 
 
 def _local_minima(tried: Sequence[StartingPoint]) -> list[StartingPoint]:

@@ -158,7 +158,7 @@ def _messages(file: Path, notes: list[str]) -> Iterator[RosMessage]:
 
 
 def _measured(log: Path) -> bytes:
-    """Return the CSV table of a black-box recording, up to its first gap.
+    """Return the CSV table of a black-box recording, as `measured` computes it.
 
     Raises `LogError` if the recording is unreadable or contains no gyro samples.
     """

@@ -305,6 +305,12 @@ class _Log:
             kind: [topic for topic in self._topics if topic.kind is kind]
             for kind in TYPES.values()
         }  # fmt: skip
+        for topic in of[JointState]:
+            if topic.name in names and not topic.wheels:
+                raise LogError(
+                    f"{self._no_wheels([topic])}. To use the wheels of another topic, leave out "
+                    f"--topic {printable(topic.name)}"
+                )
         wheels = self._one("the wheels", [topic for topic in of[JointState] if topic.wheels])
         if wheels is None:
             raise LogError(self._no_wheels(of[JointState]))

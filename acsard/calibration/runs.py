@@ -12,7 +12,7 @@ independent.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from functools import cached_property
 from itertools import pairwise
 
@@ -245,6 +245,7 @@ def runs(table: Table) -> Log:
     timed = np.isfinite(t)
     notes.add(f"{{}} of {len(t)} rows have no time and are left out", int((~timed).sum()))
     drives: list[tuple[str, Streams]] = []
+    taken = set(table.names)
     for number, name in enumerate(table.names):
         rows = np.flatnonzero(timed & (table.runs == number))
         parts = _restarts(t, rows, columns)
@@ -261,10 +262,15 @@ def runs(table: Table) -> Log:
             len(parts) - whole,
         )
         for at, part in enumerate(parts):
-            label = name or str(len(drives) + 1)
             streams = _streams(columns, part, notes)
-            if streams is not None:
-                drives.append((label if at == 0 or not name else f"{name}.{at + 1}", streams))
+            if streams is None:
+                continue
+            if not name:
+                label = _numbered("", len(drives) + 1, taken)
+            else:
+                label = name if at == 0 else _numbered(f"{name}.", at + 1, taken)
+            taken.add(label)
+            drives.append((label, streams))
     _remove_repeats(drives, notes)
     found = [_run(name, streams) for name, streams in drives]
     if not found:
@@ -279,6 +285,13 @@ def runs(table: Table) -> Log:
             "record the wheels at 5 Hz or more while the robot drives"
         )
     return Log(tuple(found), notes.sentences())
+
+
+def _numbered(prefix: str, number: int, taken: Collection[str]) -> str:
+    """Return `prefix` with the first number, from `number` on, that gives a name not in `taken`."""
+    while f"{prefix}{number}" in taken:
+        number += 1
+    return f"{prefix}{number}"
 
 
 def _sides(columns: dict[str, Floats], notes: Notes) -> tuple[Floats, Floats]:

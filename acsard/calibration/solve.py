@@ -343,10 +343,10 @@ def _known(best: Candidate, odometry: OdometryConfig) -> Deviations:
 def _noise(
     best: Candidate, known: Deviations, odometry: OdometryConfig, *, present: bool
 ) -> Noise | None:
-    """Return the noise of the odometry that this log shows, or None if the log does not show it.
+    """Return the noise of the odometry that was measured in this log; None if it was not measured.
 
-    If `present` is true, the path of the wheels is computed with the configured geometry.
-    Otherwise it is computed with the fitted geometry.
+    If `present` is true, the path of the wheels is computed with the configured geometry. Otherwise
+    it is computed with the fitted geometry.
     """
     made, fitted = best.made, best.fitted
     held = folds(fitted, made.parts, drives(made.runs), best.rate)

@@ -421,7 +421,10 @@ class Board:
 
     @property
     def silent_s(self) -> float:
-        """Time since the last reply, s. It is 0 before the first reply, and if `fled` is true."""
+        """Time since the board's last reply, s.
+
+        It is 0 before the first reply. It is also 0 after a motor has run away (`fled`).
+        """
         return self.now_s - self.replies[-1].at_s if self.replies and not self.fled else 0.0
 
     def _guard(self) -> None:

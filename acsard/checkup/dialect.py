@@ -93,10 +93,10 @@ def form(board: Board) -> Finding | None:
     If the board answers only lines with the other ending (a comma or none), use this ending from
     now on, and return a finding with the verdict FAIL. Otherwise return None.
     """
-    if board.own_clock or _answers(board, board.comma) or not _answers(board, not board.comma):
+    if _answers(board, board.comma) or not _answers(board, not board.comma):
         return None
-    if _answers(board, board.comma):
-        # The board answers both endings: its replies to the first lines were only late.
+    if _answers(board, board.comma) or board.listen(WATCHDOG_SILENCE_S):
+        # The replies to the first lines were only late, or the board reports by its own clock.
         return None
     board.comma = not board.comma
     return _comma_wrong(board, "refused")

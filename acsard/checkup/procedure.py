@@ -50,14 +50,15 @@ STEPS = (
     "damaged lines", "inputs",
 )  # fmt: skip
 """Names of all steps. After an early end of the check, the finding `SKIPPED_STEPS` lists the steps
-without a result."""
+without a result. If some motors have a result, it lists each of the other motors."""
 
 SILENT_STEPS: tuple[tuple[str, Callable[[Board], Finding | None]], ...] = (
     ("listening for 3 s at the configured baud rate, then at other baud rates", dialect.baud),
     ("asking the board for its name", dialect.identity),
+    # The later steps send lines with the ending that this step finds.
+    ("testing whether lines to the board need a comma at their end", dialect.form),
     ("measuring how often the board answers", dialect.rate),
     ("measuring how fast the board answers", dialect.trip),
-    ("testing whether lines to the board need a comma at their end", dialect.form),
     ("checking the format of the replies", dialect.replies),
     ("asking whether the board supports the link check", dialect.check),
     ("counting lost lines for 3 s or more", line_loss.finding),
@@ -129,7 +130,7 @@ def run(
         judged = lateness.judged(finding)
         if finding.name not in told or (judged and finding.name in unjudged):
             (unjudged.discard if judged else unjudged.add)(finding.name)
-            told.update((finding.name, "motors") if "motor " in finding.name else (finding.name,))
+            told.add(finding.name)
             tell(outcomes.plain(finding))
 
     why = ""
@@ -151,17 +152,21 @@ def run(
         why = "the check ended early: the serial line was lost"
     if seen:
         once(restarts.finding(config.mcu, seen))
-    rest = [step for step in STEPS if step not in told]
+    motors = [motor_name(config.mcu, motor) for motor in range(4)]
+    names = ["motors"] if told.isdisjoint(motors) else motors
+    steps = [name for step in STEPS for name in (names if step == "motors" else [step])]
+    rest = [step for step in steps if step not in told]
     if why and rest:
-        left = f"{why}; not tried: {', '.join(rest)}"
+        left = f"{why}; not finished: {', '.join(rest)}"
         tell(Finding(SKIPPED_STEPS, "SKIPPED", many(len(rest), "step"), left))
 
 
 class _Watched:
-    """The operator during the steps of the check.
+    """Watches during the check that the operator stays at the robot.
 
-    `look` ends the check if the operator quits, or after a stall of this program, because the
-    operator may have left the robot during the stall.
+    `look` ends the check if the operator quits. It also ends the check after a stall of this
+    program, because the operator may have left the robot during the stall. The other methods are
+    those of the operator's prompt.
     """
 
     def __init__(self, operator: Operator, board: Board, asleep_ns: Callable[[], int]) -> None:

@@ -142,10 +142,10 @@ def encoder_finding(mcu: McuConfig, channel: Channel) -> Finding:
 
 
 def _whose(mcu: McuConfig, channel: Channel) -> str:
-    """Return the end of the outcome's name that depends on the operator's answer.
+    """Return the suffix that the operator's answer adds to the name of an outcome.
 
-    It says what the operator saw, such as ", still", or which part is at fault: ", motor" or
-    ", encoder". Return "" if the outcome does not depend on the answer.
+    The suffix says what the operator saw, such as ", still", or which part is at fault: ", motor"
+    or ", encoder". It is "" if the outcome does not depend on the answer.
     """
     wheel, sign = wheel_of(mcu, channel.motor)
     seen = channel.wheel

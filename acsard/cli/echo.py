@@ -193,26 +193,44 @@ def _record(
 ) -> int:
     """Print the messages on several keys as rows of one CSV log, and return the exit code.
 
-    The exit code is 0 after Ctrl-C or after `most` rows. It is 1 if no message arrives for
+    The exit code is 0 after Ctrl-C or after `most` rows. It is 1 if no row was printed for
     `timeout` s. For both limits, None means that there is no limit. `heard` is called for each
-    message.
+    message. A message that does not fit into the log is left out. The first such message on each
+    key is reported on standard error.
     """
-    queues = [(robot.subscribe(key), decoder(key)) for key in keys]
+    queues = [(key, robot.subscribe(key), decoder(key)) for key in keys]
+    reported = set[str]()
     print(HEADER, flush=True)
     count, heard_s = 0, time.monotonic()
     try:
         while most is None or count < most:
             if timeout is not None and time.monotonic() - heard_s > timeout:
                 return int(Exit.FAILURE)
-            for queue, reader in queues:
+            for key, queue, reader in queues:
                 while (sample := queue.try_recv()) is not None and count != most:
-                    print(row(reader.decode(*encoded(sample)), clock.now().wall_ns))
-                    count, heard_s = count + 1, time.monotonic()
                     heard()
+                    try:
+                        line = row(reader.decode(*encoded(sample)), clock.now().wall_ns)
+                    except (DecodeError, ValueError) as error:
+                        if key not in reported:
+                            reported.add(key)
+                            _report_left_out(robot.key(key), key, error)
+                        continue
+                    print(line)
+                    count, heard_s = count + 1, time.monotonic()
             time.sleep(0.02)
     except KeyboardInterrupt:
         pass
     return int(Exit.OK)
+
+
+def _report_left_out(full_key: str, key: str, error: Exception) -> None:
+    print(
+        f"acsard: a message on {full_key} is left out of the log: "
+        f"{formatting.printable(str(error))}. Further such messages on this key are left out "
+        f"without a report. Mend the program that sends them; `acsard echo {key}` prints them",
+        file=sys.stderr,
+    )
 
 
 def _expected(robot: Client, ids: tuple[str, ...]) -> Collection[str]:

@@ -199,7 +199,8 @@ class Watch(Follower):
     def objection(self, source: str, sender: str, now: float) -> str:
         """Return why the robot does not follow the commands of a sender; "" if it follows them.
 
-        Also returns "" if no state has arrived yet and the robot does not count as silent.
+        While the first state has not arrived yet, the result is "" until the robot counts as
+        silent.
 
         Args:
             source: the command source of the sender's commands.

@@ -265,8 +265,12 @@ class Client:
             raise
 
     def zero_again(self) -> None:
-        """Send one more zero, because a busy daemon may have dropped the previous one."""
-        with suppress(NoAnswerError):
+        """Send one more zero, because a busy daemon may have dropped the previous one.
+
+        If the connection is closed, do nothing, so that the caller can raise the error that ended
+        its drive.
+        """
+        with suppress(zenoh.ZError):
             self.send(0.0)
 
     def call(self, service: str, **fields: float) -> schema.ServiceReply:
@@ -381,9 +385,13 @@ class Client:
     def put(
         self, twist: schema.Twist | schema.TwistStamped, signature: Signature, source: str = ""
     ) -> None:
-        """Forward a command of another sender. `signature` identifies that sender.
+        """Forward a command that another sender has given, for example a viewer of a web page.
 
-        `source` is the command source; "" means the source of this client.
+        Args:
+            twist: the command.
+            signature: the identity of the other sender, and the stamp of the command.
+            source: the command source on which the command is sent; "" for the source of this
+                client.
         """
         with self._puts.turn():
             self._publish(twist, signature, source or self.source)

@@ -234,7 +234,8 @@ def _recorder(
 def _keeper(config: Config, stack: AsyncExitStack) -> LatchFile | None:
     """Return the latch file. Return None for the built-in simulator, whose latches are not stored.
 
-    `stack` closes the file after the port, because a slow disk must not delay the last STOP.
+    `stack` closes the latch file later than the serial port. A slow disk then cannot delay the last
+    STOP line to the board.
     """
     if config.mcu.simulated:
         return None

@@ -106,12 +106,12 @@ class LateWatch:
         self._box = Mailbox[Late](MAX_QUEUED)
         self._news = Mailbox[Event](MAX_QUEUED, lambda: None)
         self._thread = threading.Thread(target=self._work, name="lateness", daemon=True)
-        self._times = b""
         try:
             self._file = os.open(THREAD_TIMES_FILE, os.O_RDONLY | os.O_CLOEXEC)
         except OSError:
             # This kernel does not measure the times of threads.
             self._file = -1
+        self._times = self._read_times()
         self._readings: deque[tuple[int, Reading]] = deque(maxlen=MAX_READINGS)
         """The last readings, each with the monotonic time at which it was complete, ns."""
         self._reported: dict[tuple[str, ...], int] = {}
@@ -148,13 +148,15 @@ class LateWatch:
                 the time is measured from the due time of the first missed period.
             missed: number of periods just before this one that got no step.
         """
-        before, times = self._times, b""
+        before, self._times = self._times, self._read_times()
+        if missed:
+            self._box.put(Late(now_ns, late_ns, before, self._times))
+
+    def _read_times(self) -> bytes:
         # Without these times, the thread still finds some of the causes.
         with suppress(OSError):
-            times = os.pread(self._file, 64, 0) if self._file >= 0 else b""
-        self._times = times
-        if missed:
-            self._box.put(Late(now_ns, late_ns, before, times))
+            return os.pread(self._file, 64, 0) if self._file >= 0 else b""
+        return b""
 
     def news(self) -> list[Event]:
         """Return the events about causes of late periods since the last call."""

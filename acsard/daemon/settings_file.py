@@ -45,8 +45,8 @@ REPLY_TIMEOUT_NS = 5 * NS_PER_S // 2
 shorter than the 3 s for which a client waits for a reply."""
 
 MAX_JOBS = 32
-"""Largest number of `set` requests with `keep` that wait for their reply. Further requests are
-refused immediately."""
+"""Largest number of `set` requests with `keep` that wait for their reply or for the change of the
+file. Further requests are refused immediately."""
 
 Signature = tuple[int, int, int]
 """Inode, size in bytes and modification time in ns of a file."""
@@ -70,7 +70,10 @@ class _Checked(Struct, frozen=True):
 
 
 class _Pending(Struct):
-    """A `set` request with the field `keep` that waits for its reply."""
+    """A `set` request with the field `keep` that waits for its reply or for the change of the file.
+
+    If the change takes too long, the client gets its reply before the file is changed.
+    """
 
     request: Request
     due_ns: int
@@ -80,6 +83,9 @@ class _Pending(Struct):
     """The prepared change of the file. It is None until the thread has checked the request."""
     answer: Answer | None = None
     """The robot's answer. It is None until the robot has used the settings."""
+    overdue: bool = False
+    """True if the client was told that the change of the file took too long. The thread may still
+    change the file."""
 
 
 class SettingsFile:
@@ -209,7 +215,8 @@ class SettingsFile:
                 pending.edit = one.edit
                 found.append(one.request)
                 continue
-            found.append(one)
+            if not pending.overdue:
+                found.append(one)
             del self._pending[number]
             if one.success:
                 keys = ", ".join(pending.request.settings)
@@ -221,10 +228,14 @@ class SettingsFile:
         overdue = [
             waits
             for waits in self._pending.values()
-            if now_ns > waits.due_ns and (waits.edit is None or waits.answer is not None)
+            if now_ns > waits.due_ns
+            and (waits.edit is None or waits.answer is not None)
+            and not waits.overdue
         ]
         for waits in overdue:
-            del self._pending[waits.request.id]
+            waits.overdue = True
+            if waits.answer is None:
+                del self._pending[waits.request.id]
         return [*found, *map(_overdue, overdue)]
 
     @property

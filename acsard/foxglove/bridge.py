@@ -36,6 +36,8 @@ from acsard.host import clock
 DAEMON_GONE_ID = "daemon"
 """Id of the status message that tells the viewers that the daemon is gone."""
 
+LEARN_RETRY_S = 1.0
+"""Shortest time between a failed query of the facts about the robot and the next one, s."""
 
 RELEASE_ADVICE = "release the button for two seconds, and press it again"
 """Advice to an operator whose panel must send a zero command (see `commander.RELEASED_NS`)."""
@@ -85,6 +87,12 @@ class Bridge:
         self._watch: Watch | None = None
         """Receives the robot's `state` while a viewer drives; None while no viewer drives."""
         self._here = self._was_here = True
+        self._outdated = False
+        """Whether the daemon has ended since the last query of the facts about the robot. It is not
+        enough to compare `_here` with `_was_here`: if the daemon restarts during one round, both
+        are true."""
+        self._retry_s = 0.0
+        """Earliest time of the next query of the facts about the robot, s."""
         key = robot.key("alive")
         self._token = robot.session.liveliness().declare_subscriber(key, self._alive, history=True)
 
@@ -124,12 +132,17 @@ class Bridge:
 
     def _alive(self, sample: zenoh.Sample) -> None:
         self._here = sample.kind == zenoh.SampleKind.PUT
+        if not self._here:
+            self._outdated = True
         self._wake.set()
 
     def _round(self) -> None:
         here = self._here
-        if here != self._was_here and (self._came_back() if here else self._went()):
-            self._was_here = here
+        if here and self._outdated and clock.steady_s() >= self._retry_s:
+            self._came_back()
+        elif self._was_here and not here:
+            self._went()
+        self._was_here = here
         driving = self._drives.driving()
         shown, fresh = self._shown.take()
         self._relay.follow(shown, fresh)
@@ -143,25 +156,27 @@ class Bridge:
             self._server.publish_parameter_values(as_parameters(news))
         self._notices.send(self._server, self._relay.log, newcomers=bool(fresh))
 
-    def _went(self) -> bool:
+    def _went(self) -> None:
         words = f"the daemon of robot {self._id} is gone; `acsard foxglove` waits for it"
         self._notices.say("error", "daemon", words, stays=DAEMON_GONE_ID)
-        return True
 
-    def _came_back(self) -> bool:
+    def _came_back(self) -> None:
         """Query the facts about the robot again, after a restart of its daemon.
 
-        Return False if the query fails, for example because the daemon does not answer yet.
+        If the query fails, for example because the daemon does not answer yet, a later round
+        queries again.
         """
+        # The daemon may restart during the query, which makes the reply outdated.
+        self._outdated = False
         try:
             facts = learn(self._robot)
         except AcsardError as error:
+            self._outdated, self._retry_s = True, clock.steady_s() + LEARN_RETRY_S
             self._notices.say("error", "daemon", str(error), stays=DAEMON_GONE_ID)
-            return False
+            return
         self._learn(facts)
         self._notices.over(DAEMON_GONE_ID)
         self._notices.say("info", "daemon", f"the daemon of robot {self._id} is back")
-        return True
 
     def _learn(self, facts: Facts) -> None:
         self._relay.offer(facts)

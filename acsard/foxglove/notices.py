@@ -60,9 +60,9 @@ class Notices:
             level: how serious the message is.
             name: the subject of the message on the topic `log`.
             text: the message.
-            stays: id of a message that remains visible until `over` is called with this id. With
-                "", the message is dropped if its text is repeated faster than `REPEAT_RATE`
-                permits.
+            stays: id of a message that remains visible until `over` is called with this id. The
+                message is dropped if it is visible already. With "", the message is dropped if its
+                text is repeated faster than `REPEAT_RATE` permits.
         """
         now_ns = clock.mono_ns()
         with self._lock:
@@ -92,6 +92,8 @@ class Notices:
                     server.remove_status([one.stays])
                 continue
             if one.stays:
+                if self._staying.get(one.stays) == one:
+                    continue  # the viewers show it already
                 self._staying[one.stays] = one
             server.publish_status(one.text, STATUS_LEVELS[one.level], one.stays or None)
             stamp = Time.from_ns(clock.now().wall_ns)

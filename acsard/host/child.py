@@ -231,10 +231,10 @@ class Child:
 
 
 class Parent:
-    """The child's connection to its parent process.
+    """The connection of a child process to the parent process that started it as a `Child`.
 
-    `fd` is the child's standard input. Without a parent that starts it as a `Child`, for example at
-    a terminal, the process sends no signs of life.
+    `fd` is the child's standard input. If no such parent has started the process, it sends no signs
+    of life. This is so if a person has started it at a terminal.
     """
 
     def __init__(self, fd: int) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from typing import TypeVar
 
 T = TypeVar("T")
@@ -23,31 +24,24 @@ async def in_thread(
 ) -> T:
     """Call `call` in a new thread, and return its result.
 
-    If `call` returns after the caller has stopped waiting, a thread calls `late` with the result,
-    for example to close a file that `call` has opened. An error that `call` raises is raised here
-    too.
+    If the caller stops waiting before it has the result, the thread of `call` calls `late` with the
+    result, for example to close a file that `call` has opened. An error that `call` raises is
+    raised here too.
 
     Raises `TimeoutError` if `call` has not returned after `timeout` s; None means no time limit.
     Raises `NoThreadError` if no thread can be started.
     """
     loop = asyncio.get_running_loop()
     future: asyncio.Future[T] = loop.create_future()
-    lock = threading.Lock()
-    abandoned = False
+    taken, waits_no_longer = False, threading.Event()
 
     def settle(result: T, error: BaseException | None) -> None:
         if future.done():
-            if error is None:
-                release(result)
-        elif error is not None:
+            return
+        if error is not None:
             future.set_exception(error)
         else:
             future.set_result(result)
-
-    def release(result: T) -> None:
-        if late is not None:
-            # A new thread calls `late`, because `late` may block.
-            threading.Thread(target=late, args=(result,), daemon=True).start()
 
     def work() -> None:
         result, problem = None, None
@@ -55,12 +49,14 @@ async def in_thread(
             result = call()
         except BaseException as error:  # noqa: BLE001 - carried to the caller, whatever it is
             problem = error
-        with lock:
-            if not abandoned:
-                loop.call_soon_threadsafe(settle, result, problem)  # type: ignore[arg-type]
-                return
+        with suppress(RuntimeError):  # the caller and its event loop may have ended
+            loop.call_soon_threadsafe(settle, result, problem)  # type: ignore[arg-type]
         if problem is None and late is not None:
-            late(result)  # type: ignore[arg-type]
+            # Call `late` in this thread: it could block the event loop, and another thread may fail
+            # to start.
+            waits_no_longer.wait()
+            if not taken:
+                late(result)  # type: ignore[arg-type]
 
     thread = threading.Thread(target=work, name=getattr(call, "__name__", "call"), daemon=True)
     try:
@@ -70,10 +66,8 @@ async def in_thread(
     try:
         # Before Python 3.12 wait_for swallows a cancellation that coincides with the result.
         async with asyncio.timeout(timeout):
-            return await future
-    except BaseException:
-        with lock:
-            abandoned = True
-        if future.done() and not future.cancelled() and future.exception() is None:
-            release(future.result())
-        raise
+            result = await future
+        taken = True
+        return result
+    finally:
+        waits_no_longer.set()

@@ -95,27 +95,20 @@ class Authority:
     def permits(self, address: str) -> bool:
         """Return whether this authority may sign a certificate for a host name or IP address.
 
-        If the authority's own certificate has no list of permitted names, return True. An authority
-        that acsard has made always has such a list.
+        An authority that acsard has made lists the permitted names and the permitted networks. The
+        certificate of another authority may list only one kind, and then it does not restrict the
+        other kind. It may also list excluded names and networks.
         """
         try:
             constraints = self._certificate.extensions.get_extension_for_class(x509.NameConstraints)
         except x509.ExtensionNotFound:
             return True
-        permitted = constraints.value.permitted_subtrees
-        if permitted is None:
-            return True
-        named = _general_name(address)
-        if isinstance(named, x509.IPAddress):
-            networks = (one.value for one in permitted if isinstance(one, x509.IPAddress))
-            own = ipaddress.ip_address(address)
-            return any(own in ipaddress.ip_network(str(one)) for one in networks)
-        name = address.lower()
-        return any(
-            name == one.value or name.endswith(f".{one.value}")
-            for one in permitted
-            if isinstance(one, x509.DNSName)
-        )
+        kind, limits = type(_general_name(address)), constraints.value
+        permitted = [one for one in limits.permitted_subtrees or () if isinstance(one, kind)]
+        excluded = [one for one in limits.excluded_subtrees or () if isinstance(one, kind)]
+        if any(_within(address, one) for one in excluded):
+            return False
+        return not permitted or any(_within(address, one) for one in permitted)
 
     def names_in(self, directory: Path) -> list[str]:
         """Return the host names and IP addresses in the certificate in `directory`.
@@ -220,6 +213,18 @@ def _general_name(address: str) -> x509.GeneralName:
         return x509.IPAddress(ipaddress.ip_address(address))
     except ValueError:
         return x509.DNSName(address)
+
+
+def _within(address: str, subtree: x509.GeneralName) -> bool:
+    """Return whether a name constraint matches a host name or IP address, as OpenSSL decides it.
+
+    `subtree` must be of the same kind as `address`.
+    """
+    if isinstance(subtree, x509.IPAddress):
+        return ipaddress.ip_address(address) in ipaddress.ip_network(str(subtree.value))
+    name, base = address.lower(), str(subtree.value).lower()
+    # An empty constraint matches every name. A leading dot matches only the names below the rest.
+    return not base or name == base or name.endswith(f".{base.removeprefix('.')}")
 
 
 def _pem(certificate: x509.Certificate) -> bytes:

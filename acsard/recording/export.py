@@ -428,16 +428,19 @@ def _gaps(run: RecordedRun, span: Span, about: About) -> list[Gap]:
 def measured(recording: Recording) -> bytes:
     """Return the measured data of a recording as the CSV table that `acsard calibrate` reads.
 
-    The table ends at the first gap of the recording. Raises `RecordingError` if the table has no
-    gyro samples, or if the recording cannot be replayed.
+    The table begins with the first step that can be replayed, and ends at the next gap of the
+    recording. Raises `RecordingError` if the table has no gyro samples, or if the recording cannot
+    be replayed.
     """
     run = RecordedRun(recording)
     lines, has_gyro = [MEASURED_CSV_HEADER], False
+    last: int | None = None
     with run.state_errors():
         for step in run.steps():
-            if run.gaps:
+            if last is not None and step.number != last + 1:
                 # A calibration compares whole drives, and part of this drive is missing.
                 break
+            last = step.number
             lines += measured_csv_rows(step, replay_step(run.robot, step))
             has_gyro = has_gyro or bool(step.inputs.gyro)
     if not has_gyro:

@@ -232,6 +232,11 @@ class Writing:
     """
 
     def __init__(self, path: Path, about: About, mode: int = FILE_MODE) -> None:
+        """Create a file at `path`, and write the metadata `about` to it.
+
+        `mode` is the file mode. Raises `OSError` if a file exists at `path`, or if the disk refuses
+        to write. A new file is then deleted.
+        """
         self.path, self._mode = path, mode
         self._end_builder = EndRecordBuilder(about)
         self._about = _about_records(about)
@@ -245,6 +250,8 @@ class Writing:
             self._open(about)
         except OSError:
             self.close()
+            # On a full disk, the caller may need the room that this file takes.
+            path.unlink(missing_ok=True)
             raise
 
     def _open(self, about: About) -> None:
@@ -266,10 +273,11 @@ class Writing:
         return self._file.tell()
 
     def add(self, topic: Topic, wall_ns: int, data: bytes) -> None:
-        """Add a message. `wall_ns` is the message's wall-clock time, ns since 1970.
+        """Add a message to the channel `topic`. `wall_ns` is its wall-clock time, ns since 1970.
 
-        The message is written to the file at the next `flush`, or when the message's chunk ends.
-        Use `event` for the channel `events`, so that the end record counts the event.
+        The message is written to the file at the next `flush`, or when its chunk ends. For the
+        channel `events`, call the method `event` instead: it also counts the event for the end
+        record.
         """
         self._end_builder.message(topic, wall_ns, data)
         wall_ns = max(0, wall_ns)
@@ -531,7 +539,7 @@ def rewrite(recording: Recording, path: Path, cut: str = "open") -> int:
         OSError: a file exists at `path`, or the disk refuses to write.
         RecordingError: an event cannot be decoded.
 
-    If an error occurs while the messages are copied, the new file is deleted.
+    If an error occurs, the new file is deleted.
     """
     writing = Writing(path, recording.about)
     try:

@@ -222,15 +222,25 @@ class RecordedRun(_Source):
     missing steps, the run resumes with another robot, from the next robot state in the file.
     """
 
-    def __init__(self, recording: Recording, other: Config | None = None) -> None:
+    def __init__(
+        self,
+        recording: Recording,
+        other: Config | None = None,
+        copies: EventCopies | None = None,
+    ) -> None:
         """Read the configuration and the first robot state of a recording.
 
-        `other` is the configuration of the replay. If it is None, the replay uses the recorded
-        configuration. Raises `RecordingError` if this version of acsard cannot use the recorded
-        configuration or state.
+        Args:
+            recording: the recording to replay.
+            other: the configuration of the replay; None for the recorded configuration.
+            copies: object to which `steps()` passes the two copies of each event, or None. The
+                caller must call its method `end()`.
+
+        Raises:
+            RecordingError: this version of acsard cannot use the recorded configuration or state.
         """
         super().__init__(recording)
-        self._other, self._recorded = other, config_of(recording)
+        self._other, self._recorded, self._copies = other, config_of(recording), copies
         self.config = other or self._recorded
         """Configuration with which the replay begins."""
         self.gaps: list[Gap] = []
@@ -239,7 +249,6 @@ class RecordedRun(_Source):
         """Number of the last step that `steps()` yielded; None before the first step."""
         self.skipped: Callable[[Step], None] = lambda step: None
         """Function that is called with each step that can be read, but not replayed."""
-        self.copies = EventCopies(recording)
         self._next, self._state = _first_state(recording)
         """`_next` is the number of the step that `robot` can replay next. `_state` is the recorded
         state from which `robot` was rebuilt, or None for a new robot."""
@@ -261,7 +270,7 @@ class RecordedRun(_Source):
         saved: Checkpoint | None = None
         last: Step | None = None
         gap: Gap | None = None
-        for item in _items(recording, self.copies):
+        for item in _items(recording, self._copies):
             if isinstance(item, Checkpoint):
                 saved = item
                 continue
@@ -301,7 +310,6 @@ class RecordedRun(_Source):
             if end is None or lost_ns > 0:
                 gap = gap or self._open_gap(replayed_ns)
                 gap.end_ns, gap.end_lost = max(gap.end_ns, now.mono_ns) + lost_ns, True
-        self.copies.end()
 
     def _open_gap(self, begin_ns: int) -> Gap:
         gap = Gap(begin_ns, begin_ns)
@@ -309,7 +317,7 @@ class RecordedRun(_Source):
         return gap
 
     def _resume(self, saved: Checkpoint | None, number: int) -> bool:
-        """Go on at the step `number` with the robot in the checkpoint `saved`.
+        """Restore the robot from the checkpoint `saved`, and go on with the step `number`.
 
         Return False if this is not possible, else True.
         """
@@ -355,7 +363,8 @@ def replay_file(
     Raises:
         RecordingError: the recording cannot be replayed.
     """
-    run = RecordedRun(recording, other)
+    copies = EventCopies(recording)
+    run = RecordedRun(recording, other, copies)
     with run.state_errors():
         replay = Replay(run.config, run.robot, run.memory)
         for number, step in enumerate(run.steps()):
@@ -364,8 +373,9 @@ def replay_file(
             if replay.robot is not run.robot:
                 replay.resume(run.robot, run.memory)
             replay.step(step)
+    copies.end()
     failed_step = _failed_step(recording, replay.robot, run.number)
-    return ReplayResult(replay.comparison, run.gaps, failed_step, run.copies.difference)
+    return ReplayResult(replay.comparison, run.gaps, failed_step, copies.difference)
 
 
 def _failed_step(recording: Recording, robot: Robot, last: int | None) -> str:
@@ -491,9 +501,10 @@ def _foreign(recording: Recording, reason: str) -> RecordingError:
 class EventCopies:
     """Finds the first event in a recording that differs from its copy.
 
-    A file contains each event twice: in the step of the event, and as a message of the channel
-    `events`. In the order of the file, call `batch()` for each batch of steps, and `copy()` for
-    each message of the channel `events`. Call `end()` after the last message.
+    The recording must be a single file, not a `Series`. A file contains each event twice: in the
+    step of the event, and as a message of the channel `events`. In the order of the file, call
+    `batch()` for each batch of steps, and `copy()` for each message of the channel `events`. Call
+    `end()` after the last message.
     """
 
     def __init__(self, recording: Recording) -> None:

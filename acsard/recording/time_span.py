@@ -312,7 +312,7 @@ def stretches(recording: Recording) -> list[Stretch]:
 
 
 def read_contents(recording: Recording) -> Contents | None:
-    """Return the stretches, the first step and the last step of a recording.
+    """Return the continuous parts of a recording, its first step and its last step.
 
     Return None if no step is readable.
     """

@@ -57,9 +57,11 @@ class CommandSources:
         self._newest: dict[tuple[str, str], Command] = {}
         """Maps the pair (source, sender) to the last command of this sender. The newest command
         comes last."""
+        self._robot: Robot | None = None
+        """The robot that replayed the last step; None before the first step."""
         self._counted: Counter[str] = Counter()
-        """Maps each reason for a refusal to the number of commands that the robot has refused so
-        far for this reason."""
+        """Maps each reason for a refusal to the number of commands that `_robot` has refused so far
+        for this reason."""
         self._refused: dict[str, tuple[float, str]] = {}
         """Maps the name of each refused source to a pair: the time until which the source counts as
         refused, s, and the reason in words."""
@@ -87,17 +89,22 @@ class CommandSources:
         for refusal in step.inputs.refusals:
             if refusal.source:
                 self._refuse(refusal.source, t, refusal.text)
-        if commands:
+        if commands or step.inputs.refusals or robot is not self._robot:
             self._find_refused(step, t, robot)
         return before != self._refused
 
     def _find_refused(self, step: Step, t: float, robot: Robot) -> None:
-        """Find the commands of a step that the robot refused, and mark their sources as refused."""
+        """Find the commands of a step that the robot refused, and mark their sources as refused.
+
+        If `robot` did not replay the step before, only read the robot's counters.
+        """
         # The robot's counters show the reasons, but not the sources. A source counts as refused if
         # the last command that the robot accepted from it is older than its command in this step.
         counted = Counter({name: robot.counters[f"command_{name}"] for name in REFUSED})
         new, self._counted = counted - self._counted, counted
-        if not new:
+        same, self._robot = robot is self._robot, robot
+        # A robot from a recorded state has also counted the refusals before this step.
+        if not (new and same):
             return
         words = "; ".join(REFUSED[reason] for reason in new)
         now_ns = step.inputs.now.mono_ns

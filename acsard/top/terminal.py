@@ -111,7 +111,7 @@ def roster(fleet: Roster) -> None:
     def draw() -> RenderableType:
         rows = fleet.rows()
         width, height = console.size
-        told = [Text(line, no_wrap=True) for line in table(rows, width, height - 2)]
+        told = [Text(line, no_wrap=True) for line in table(rows, width, max(1, height - 2))]
         told[0].stylize("bold cyan")
         for line in told[1:]:
             if "GONE" in line.plain or "SILENT" in line.plain:

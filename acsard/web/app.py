@@ -124,8 +124,8 @@ class Page:
     def end_all(self, why: str) -> None:
         """End every WebSocket, and stop all work for clients.
 
-        The server stops reading the camera, and discards the report of a recording, finished or
-        not. `why` is the reason that the clients receive, with at most 120 characters.
+        The server stops reading the camera. It also discards the report that it has drawn or is
+        drawing. `why` is the reason that the clients receive, with at most 120 characters.
         """
         self._reports.end()
         self._camera.close()

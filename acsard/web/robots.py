@@ -21,7 +21,7 @@ from acsard.daemon.bus.address import Address
 from acsard.daemon.bus.tls import shown_at
 from acsard.host import clock
 from acsard.host.errors import MendableError, UnreachableError
-from acsard.host.threads import in_thread
+from acsard.host.threads import NoThreadError, in_thread
 from acsard.web.last_minute import Minute, Plotted
 from acsard.web.metrics import Counts
 from acsard.web.streams import DECLARE_TIMEOUT_S, NOT_READY_ERRORS, Stream, Streams
@@ -165,7 +165,9 @@ class Robots:
                 return await in_thread(self._connect, None)
             except UnreachableError as error:
                 self.gone = str(error)
-                await asyncio.sleep(RETRY_DELAY_S)
+            except NoThreadError as error:
+                self.gone = f"{error}; the page tries again by itself"
+            await asyncio.sleep(RETRY_DELAY_S)
 
     async def _insisted(self, call: Callable[[], Awaitable[T]]) -> T:
         while True:
@@ -271,6 +273,9 @@ class Robots:
                     for source in config["commands"]["sources"]
                 },
             )
-        except (MendableError, DecodeError, msgspec.MsgspecError, KeyError, TypeError, ValueError):
+        except (
+            MendableError, NoThreadError, DecodeError, msgspec.MsgspecError, KeyError, TypeError,
+            ValueError,
+        ):  # fmt: skip
             return False
         return True

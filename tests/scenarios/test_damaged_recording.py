@@ -16,7 +16,7 @@ from acsard.recording import recorder as module
 from acsard.recording import step_writer
 from acsard.recording.directory import listed
 from acsard.recording.file import CHANNEL_NUMBERS, Recording, Writing, event_of, rewrite
-from acsard.recording.file_replay import RecordedRun, replay_file, steps
+from acsard.recording.file_replay import EventCopies, RecordedRun, replay_file, steps
 from acsard.recording.mcap_records import walk
 from acsard.recording.recorder import Recorder
 from acsard.recording.series import Series
@@ -269,7 +269,9 @@ def test_a_recovered_copy_of_a_damaged_recording_is_replayed_up_to_the_same_gap(
     begin, end = chunks(long.read_bytes())[22]
     recording = Recording(harmed(long, tmp_path / "harmed.mcap", (begin + end) // 2, 1))
     rewrite(recording, tmp_path / "copy.mcap")
-    copy, original = RecordedRun(Recording(tmp_path / "copy.mcap")), RecordedRun(recording)
+    copied, original = Recording(tmp_path / "copy.mcap"), RecordedRun(recording)
+    copy = RecordedRun(copied, copies=(copies := EventCopies(copied)))
     assert [s.number for s in copy.steps()] == [s.number for s in original.steps()]
     assert copy.gaps == original.gaps != []
-    assert copy.copies.difference == ""
+    copies.end()
+    assert copies.difference == ""

@@ -495,8 +495,8 @@ FAULTS = (
         "limits saturated",
         "a robot that turns harder at the limit of its wheels brakes harder than it may",
         LIMITS,
-        "kept, added = next((o for o in order if kinematics.fits(o[0], most)), both)",
-        "kept, added = REST, twist",
+        "return kinematics.saturate(fitted, most)",
+        "return kinematics.saturate(twist, most)",
     ),
     fault(
         "kinematics curvature",

@@ -10,14 +10,20 @@ import subprocess
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from unittest import mock
 
 import pytest
 import zenoh
+from cryptography.hazmat.primitives.asymmetric import ec
+from msgspec.structs import replace
 
+from acsard.core.config.settings import BusConfig, Config
 from acsard.core.values import NS_PER_S
 from acsard.daemon.bus.certificate_watch import FILES_CHECK_PERIOD_NS
 from acsard.daemon.bus.tls import KEY, peer_ends_ns
 from acsard.daemon.gateway.listener_process import MAX_UNANSWERED
+from acsard.daemon.gateway.tls_gateway import Gateway
+from acsard.host.errors import CertificateError, InUseError
 from acsard.machine.authority import Authority
 from tests.system.harness import (
     Bus,
@@ -185,6 +191,31 @@ def test_without_a_tls_endpoint_there_is_no_gateway_to_open(tmp_path: Path) -> N
     assert "no tls/ endpoint" in done.err
     with Daemon(tmp_path) as daemon:
         assert not children(daemon.pid, "acsard gateway")
+
+
+def gateway_with(own: Path, tls: str) -> Gateway:
+    bus = BusConfig(listen=(free_endpoint(), tls), tls=str(own))
+    return Gateway(replace(Config(), bus=bus))
+
+
+def test_a_key_that_zenoh_refuses_is_a_bad_certificate_and_not_an_address_in_use(
+    tmp_path: Path,
+) -> None:
+    authority = Authority.make(tmp_path, "test", 1)
+    # OpenSSL accepts a key of this curve, and Zenoh does not.
+    with mock.patch.object(ec, "SECP256R1", ec.SECP521R1):
+        authority.issue(tmp_path, "robot", [], 1)
+    with pytest.raises(CertificateError, match="failed to parse private key") as caught:
+        gateway_with(tmp_path, free_tls_endpoint()).open()
+    assert str(tmp_path) in str(caught.value)
+    assert "`acsard tls renew`" in str(caught.value)
+
+
+def test_an_address_in_use_is_not_a_bad_certificate(certificates: Certificates) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        tls = f"tls/127.0.0.1:{other.getsockname()[1]}"
+        with pytest.raises(InUseError, match=f"cannot listen on {tls}: .*stop that program"):
+            gateway_with(certificates.robot, tls).open()
 
 
 def listening(endpoint: str) -> zenoh.Config:

@@ -537,10 +537,11 @@ class Driving:
         self, variances: Floats | None = None, missed: Floats | None = None,
         gyro: Floats | None = None,
     ) -> Steps:  # fmt: skip
-        """Return the steps of the drive with the given errors. None means no errors of this kind.
+        """Return the steps between the feedback lines of the drive, with the given errors.
 
-        Each array has a row for every line except the first. In `Steps.rows`, `variances` fills
-        the columns 2 and 3, `missed` the columns 4 to 7, and `gyro` the column 8.
+        Each array has one row for each feedback line except the first. None means that there are no
+        such errors. In `Steps.rows`, `variances` fills the columns 2 and 3, `missed` the columns 4
+        to 7, and `gyro` the column 8.
         """
         moved, count = self._motion, len(self._motion.distance)
         errors = [

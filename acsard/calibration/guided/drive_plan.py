@@ -50,10 +50,10 @@ class GuideError(AcsardError):
 
 
 class DisturbedError(GuideError):
-    """A leg was cut short for a temporary reason, so the leg can be repeated."""
+    """A part of the guided drive was cut short for a temporary reason, and can be repeated."""
 
     def __init__(self, why: str, text: str) -> None:
-        """Store the reason `why`, and the message `text` to show if the leg is not repeated."""
+        """Store the reason `why`, and the message `text` to show if this part is not repeated."""
         super().__init__(text)
         self.why = why
 

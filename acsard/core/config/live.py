@@ -169,8 +169,9 @@ def differences(runs: Config, file: Config) -> dict[str, Difference]:
 def changed(config: Config, wishes: Mapping[str, object], at_rest: bool) -> tuple[Config, str]:
     """Return a pair: `config` with new values of settings, and a text that lists the changes.
 
-    The change is applied completely or not at all. A setting that already has the requested value
-    is skipped, even if it must not change. The text is "" if nothing changes.
+    The change is applied completely or not at all. If a setting already has the requested value, it
+    is skipped, so that it causes no error even if this setting cannot be changed. The text is "" if
+    nothing changes.
 
     Args:
         config: the configuration in force.

@@ -80,11 +80,11 @@ class GyroFollower:
         return replace(sample, anew=True) if anew else sample
 
     def _follow(self, who: str, now_ns: int) -> bool:
-        """Use the gyro of the sender `who`, and return whether it replaces another sender's gyro.
+        """Use the gyro of the sender `who`. Return True if another gyro was used before.
 
         `now_ns` is the monotonic time of arrival. Raises `DecodeError` if this gyro may not be
-        used. Either the gyro of another sender still sends, or only the gyro of the built-in
-        simulator is allowed.
+        used: because the gyro of another sender still sends, or because the configuration allows
+        only the gyro of the built-in simulator.
         """
         other = who != self._followed
         if other and (self._own or now_ns - self._heard_ns < SILENCE_TIMEOUT_NS):

@@ -58,13 +58,14 @@ class Encoders:
     """Converts each reading of the encoders to the angles turned since the previous reading."""
 
     def __init__(self, counts: int, wheel_speed: float, quiet_ns: int) -> None:
-        """Start before the first reading of the encoders.
+        """Prepare for the first reading of the encoders.
 
         Args:
             counts: encoder counts per wheel turn, 0 if unknown.
             wheel_speed: highest speed of a wheel, rad/s.
-            quiet_ns: duration of silence after which the link is stale, ns. If a reading seems to
-                arrive too early by more than this, the board has probably restarted.
+            quiet_ns: time without a line from the board after which the link is stale, ns. The
+                board has probably restarted if, by its clock, a reading arrives more than
+                `quiet_ns` too early.
         """
         self._angle = math.tau / counts if counts else 0.0
         self._fastest = wheel_speed / math.tau * counts / 1000

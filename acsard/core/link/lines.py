@@ -26,11 +26,11 @@ class LineReader:
         self._discarding = False
 
     def feed(self, data: bytes) -> list[tuple[bytes, int]]:
-        """Return the lines that `data` completes, in order.
+        """Return the lines that are complete with the bytes `data`, in order.
 
-        Each line is a pair: its bytes without the line end, and the number of bytes that follow the
-        line in `data`. From this number, the caller computes how long before the read the line was
-        complete.
+        Each item is a pair: the line without its line end, and the number of bytes in `data` behind
+        the line. The serial port needed a known time for these bytes, so the caller can compute
+        when the line was complete.
         """
         lines = []
         ends = data.split(b"\n")

@@ -532,9 +532,9 @@ class PromptedTimes:
 
     @property
     def thinks(self) -> bool:
-        """Whether the board itself varies the reply delay.
+        """Whether the board itself varies the delay of its replies.
 
-        The delay then varies more than this computer or its USB adapter can cause.
+        The criterion: the delay varies by more than this computer and its USB adapter can cause.
         """
         return self._thinking > BOARD_JITTER_FRACTION and not self._batched
 
@@ -689,11 +689,11 @@ class PromptedTimes:
         self._delay = self._base
 
     def _given_up_too_early(self, delay: float) -> bool:
-        """Give up the commands whose replies were lost.
+        """Stop waiting for lost replies. Return whether an earlier call stopped too early.
 
-        Return True if an earlier read gave up a command too early. The present reply then answers
-        the command that was given up last. The present reply must be the only reply in its read of
-        the port. `delay` is the usual delay, ns.
+        If so, the present reply answers the last command whose reply the earlier call gave up. Call
+        this only if the last read of the port contained a single reply. `delay` is the usual delay
+        of a reply, ns.
         """
         left, at, wide = self._left, self._at, 4 * self._spread
         lost, self._lost = self._lost, False

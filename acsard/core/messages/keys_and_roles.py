@@ -169,9 +169,10 @@ def _out(
     simulated: bool = False,
     urdf: bool = False,
 ) -> Topic:
-    """Return the row of a key on which the daemon publishes and which every client may read.
+    """Return a row of the table of keys for a key on which the daemon publishes.
 
-    `kind` is the type of the messages. The other arguments are fields of `Topic`.
+    Every client may read such a key. `kind` is the type of the messages. The other arguments are
+    fields of `Topic`.
     """
     return Topic(
         key, "out", kind, rate, note,

@@ -164,7 +164,7 @@ class _Source:
     def neutral(self, sender: Sender, lasts: float = 0.0) -> Wait:
         """Return the `Wait` for a sender that must send a zero command before it may drive.
 
-        `lasts` is the time for which the sender has already sent speeds instead, s.
+        `lasts` is the time for which the sender has sent speeds without such a zero command, s.
         """
         pause = self.pause_ns / NS_PER_S
         return Wait("neutral", self.name, pause, lasts=lasts, ros=sender.ros, shared=sender.shared)

@@ -82,10 +82,11 @@ class Bumpers(BoardInput):
 
     @property
     def latching(self) -> bool:
-        """Whether the bumpers latch a stop when they count as pressed.
+        """Whether a pressed bumper latches a stop, until a client calls `clear`.
 
-        If the robot may drive away from its bumpers, they latch a stop only when the board has
-        stopped reporting them.
+        If the configuration allows driving away from an obstacle (`bumper = "away"`), a real press
+        latches no stop. Bumpers that count as pressed because the board no longer reports them
+        still latch a stop.
         """
         return not self._away or self.state == "silent"
 

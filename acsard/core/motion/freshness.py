@@ -393,11 +393,12 @@ class _Clock:
         return "stale"
 
     def _forgive(self, proof: _Proof, at_ns: int) -> bool:
-        """Return whether the constant delay that `proof` found may be trusted. If so, trust it.
+        """Trust the new constant delay of a sender that `proof` has found, if it is plausible.
 
-        A decrease of the delay is always trusted. An increase is trusted if the sender has paused,
-        if the budget covers the increase, or if a visible adjustment of the clock accounts for it.
-        A visible adjustment and the budget may each account for a part of the increase.
+        Return whether the delay is trusted. A smaller delay than before is always trusted. A larger
+        one is trusted if the sender has paused. It is also trusted if the increase is explained by
+        an adjustment of the clock that the stamps show, by the sender's remaining budget for
+        adjustments that the stamps do not show (`FORGIVE_NS`), or by both together.
         """
         self._accrue(at_ns, FORGET_NS)
         hidden = proof.least - self._least

@@ -340,9 +340,10 @@ class Gaps:
         self._bridged, self._given = 0.0, (0.0, 0.0)
 
     def follow(self, twist: Twist, dt: float) -> None:
-        """Measure the acceleration with a feedback line. There must be no gap before this line.
+        """Use a feedback line from the board to measure the acceleration of the robot.
 
-        The line reports that the robot moved with `twist` in the last `dt` s.
+        The line reports that the robot moved with `twist` in the last `dt` s. There must be no
+        silence of the board before this line.
         """
         linear, angular = twist.linear, twist.angular
         self._bridged, self._given = 0.0, (0.0, 0.0)

@@ -93,7 +93,7 @@ class Kinematics:
         A difference that rounding can cause does not count.
         """
         speeds = self.wheel_speeds(twist)
-        return max(abs(speeds.front_right), abs(speeds.front_left)) <= wheel_speed * (1.0 + 1e-9)
+        return max(abs(speeds.front_right), abs(speeds.front_left)) <= wheel_speed * (1.0 + 1e-12)
 
     def room(self, kept: Twist, added: Twist, wheel_speed: float) -> float:
         """Return the largest fraction of `added`, 0 to 1, that can be added to the twist `kept`.

@@ -108,22 +108,23 @@ class Limiter:
         twist and `twist` on each axis, so it is within these limits too.
         """
         kinematics, most, now = self._kinematics, self._wheel_speed, self.twist
-        if kinematics.saturate(twist, most) is twist:
+        if kinematics.fits(twist, most):
             return twist
         # Each axis changes at its own rate. On the way to the goal, both axes together may need a
         # faster wheel than at the start or at the goal. So one axis changes as far as it may, and
         # the other one only as far as the wheels allow. An axis that slows down goes first, because
         # braking must not wait for the other axis.
-        linear_first = Twist(twist.linear, now.angular), Twist(0.0, twist.angular - now.angular)
-        angular_first = Twist(now.linear, twist.angular), Twist(twist.linear - now.linear, 0.0)
-        both = now, Twist(twist.linear - now.linear, twist.angular - now.angular)
-        order = [linear_first, angular_first, both]
+        changes = [Twist(twist.linear - now.linear), Twist(angular=twist.angular - now.angular)]
         turns_slower = abs(twist.angular) < abs(now.angular)
         if turns_slower and abs(twist.linear) >= abs(now.linear):
-            order = [angular_first, linear_first, both]
-        kept, added = next((o for o in order if kinematics.fits(o[0], most)), both)
-        share = kinematics.room(kept, added, most)
-        fitted = Twist(kept.linear + added.linear * share, kept.angular + added.angular * share)
+            changes.reverse()
+        # If the wheels do not allow the whole change of the first axis, the second one goes first.
+        first, second = (kinematics.fits(_sum(now, change), most) for change in changes)
+        if second and not first:
+            changes.reverse()
+        fitted = now
+        for change in changes:
+            fitted = _sum(fitted, change, kinematics.room(fitted, change, most))
         # Remove what rounding has added.
         return kinematics.saturate(fitted, most)
 
@@ -159,6 +160,10 @@ class Limiter:
         if abs(angular) * scale > self._angular.speed:
             scale = self._angular.speed / abs(angular)
         return Twist(linear * scale, angular * scale)
+
+
+def _sum(a: Twist, b: Twist, share: float = 1.0) -> Twist:
+    return Twist(a.linear + b.linear * share, a.angular + b.angular * share)
 
 
 def _braking(axis: _Axis, stop: bool) -> float:

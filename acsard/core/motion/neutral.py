@@ -161,9 +161,11 @@ class Sender:
     def holds(self, now_ns: int) -> bool:
         """Return whether the sender may keep control of the robot if it already has control.
 
-        It may if it is present (`present`), and if one of these conditions holds: it is armed,
-        `disarm` disarmed it at most `CANDIDATE_NS` ago, or `commands.neutral_pause` runs after its
-        zero.
+        It may if it is present (`present`), and if one of these conditions is true:
+
+        - The sender is armed.
+        - `disarm` has disarmed the sender at most `CANDIDATE_NS` ago.
+        - The sender has sent a zero command, and its `commands.neutral_pause` is not over yet.
         """
         just_set = self.disarmed_ns is not None and now_ns - self.disarmed_ns <= CANDIDATE_NS
         waits = just_set or self._zero_ns is not None

@@ -75,8 +75,8 @@ class ZenohBus:
     def take(self, queries: int) -> BusInput:
         """Return the samples and queries that have arrived since the last call, and other changes.
 
-        `queries` limits the number of returned queries. One slow query may exceed this limit, as
-        `Inbox.take` explains. The other queries wait for the next call.
+        The result contains at most `queries` queries, plus one slow query (see `Inbox.take`).
+        Further queries wait for the next call.
         """
         taken = self._inbox.take(queries)
         routers = self._links.changed()

@@ -17,7 +17,15 @@ from acsard.core.config.settings import TLS_PREFIX, Config
 from acsard.core.messages.keys_and_roles import IMU, SPEED_LIMIT, full_key, source_keys
 from acsard.core.ros.transports import command_keys
 from acsard.daemon.bus.access import access_control, gateway_access
-from acsard.daemon.bus.tls import CA, CERTIFICATE, KEY, require_usable, trouble
+from acsard.daemon.bus.tls import (
+    CA,
+    CERTIFICATE,
+    KEY,
+    RENEW_ADVICE,
+    files_in,
+    require_usable,
+    trouble,
+)
 from acsard.host.errors import CertificateError, InUseError, UnreachableError, UsageError
 from acsard.host.terminal_modes import coloured
 
@@ -63,7 +71,8 @@ def daemon_session(config: Config) -> zenoh.Session:
 def gateway_session(config: Config) -> zenoh.Session:
     """Open the session of the TLS_PREFIX gateway, which is a Zenoh router.
 
-    Raises `InUseError` if the session cannot listen, for example on an address that is in use.
+    Raises `CertificateError` if Zenoh refuses the certificate files. Raises `InUseError` if the
+    session cannot listen for another reason, for example on an address that is in use.
     """
     bus = config.bus
     settings = _base("router") | RETRY_SETTINGS | _tls(bus.tls) | _listening()
@@ -79,7 +88,17 @@ def gateway_session(config: Config) -> zenoh.Session:
         # sender of these samples.
         "timestamping/enabled": False,
     }
-    return _opened(settings, bus.outside)
+    try:
+        return _opened(settings, bus.outside)
+    except InUseError:
+        # Zenoh's error is of the same type for an address in use and for files that it refuses.
+        why = certificate_trouble(*files_in(bus.tls))
+        if not why:
+            raise
+        raise CertificateError(
+            f"the certificates in {bus.tls} cannot be used: OpenSSL accepts them, but Zenoh does "
+            f"not ({why}); to make certificates that Zenoh accepts, {RENEW_ADVICE}"
+        ) from None
 
 
 def certificate_trouble(authority: Path, certificate: Path, key: Path) -> str:

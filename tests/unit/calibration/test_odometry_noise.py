@@ -16,12 +16,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from msgspec import Struct, structs
 
-from acsard.calibration import ros_bag_log
+from acsard.calibration import odometry_noise, ros_bag_log
 from acsard.calibration.calibration_report import keys, parts, report
 from acsard.calibration.log_table import LogError, RefusedError, Table
 from acsard.calibration.odometry_noise import INITIAL_NOISE, SOURCE_COUNT, Source, Windows
@@ -429,3 +431,26 @@ def test_the_search_finds_the_noise_that_made_the_residuals() -> None:
     used = true > 0.0
     assert noise[used] == pytest.approx(true[used], rel=0.2)
     assert windows.at_least(noise)[used] == pytest.approx(noise[used], rel=0.05)
+
+
+@pytest.mark.parametrize(("count", "used"), [(79, 79), (80, 80), (81, 41), (159, 80), (160, 80)])
+def test_the_noise_is_computed_from_at_most_80_evenly_spaced_windows(
+    count: int, used: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def of_drive(*_: object) -> list[Any]:
+        effects, motion = np.zeros((SOURCE_COUNT, 1, 1)), SimpleNamespace(metres=1.0, turned=1.0)
+        motion.track = 0.5
+        return [
+            SimpleNamespace(
+                motion=motion,
+                projected=lambda _, n=number: (np.array([float(n)]), effects, np.zeros((1, 1))),
+            )
+            for number in range(count)
+        ]
+
+    monkeypatch.setattr(odometry_noise, "_of_drive", of_drive)
+    unused: Any = None
+    windows = odometry_noise._windows([unused], unused, unused, [])
+    assert windows is not None
+    assert len(windows.residual) == used
+    assert np.ptp(np.diff(windows.residual[:, 0])) == 0.0

@@ -74,6 +74,17 @@ def test_one_step_by_the_evidence_reaches_the_true_parameters() -> None:
     assert near[:3] + step[0] == pytest.approx(TRUE[:3], abs=3e-4)
 
 
+@pytest.mark.parametrize(("count", "used"), [(79, 79), (80, 80), (81, 41), (159, 80), (160, 80)])
+def test_the_search_uses_at_most_80_evenly_spaced_positions_of_a_segment(
+    count: int, used: int
+) -> None:
+    t = np.arange(float(count))
+    (kept,) = positions._furthest([positions.Segment(0, 0, t, t.astype(np.complex128))], 1)
+    assert len(kept.t) == used
+    assert np.ptp(np.diff(kept.t)) == 0.0
+    assert np.array_equal(kept.place.real, kept.t)
+
+
 def begun(seen: Drive, base: Base = BASE, sides: Floats | None = None) -> StartingPoint:
     runs = log_of(table(seen, gyro=False)).runs
     return search(segments(runs, blocks(runs, 8.0)), runs, base, sides)

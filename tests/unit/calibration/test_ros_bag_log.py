@@ -162,6 +162,14 @@ def test_only_the_sensor_that_is_named_is_used() -> None:
     assert finite(bag, "x") == len(SHORT.place)
 
 
+def test_a_named_topic_whose_joints_are_not_wheels_is_refused_and_not_replaced_by_another() -> None:
+    arm = joint_states(SHORT, "/arm/joint_states", names=("a", "b"))
+    with pytest.raises(
+        LogError, match=r"joints of /arm/joint_states .* but are a, b\. .*leave out --topic /arm/"
+    ):
+        of(joint_states(SHORT), arm, imu(SHORT), use=["/arm/joint_states"])
+
+
 def test_a_topic_with_few_messages_is_not_a_candidate() -> None:
     few = list(imu(SHORT, "/imu/raw"))[:5]
     assert "/imu/data" in of(joint_states(SHORT), imu(SHORT), iter(few)).notes[0]

@@ -49,6 +49,19 @@ def test_runs_are_distinguished_by_the_run_column() -> None:
     assert of(rows(0, run="a") + rows(0, run="b"))[0] == ["a", "b"]
 
 
+@pytest.mark.parametrize(
+    ("lines", "names"),
+    [
+        (rows(0, run="2") + rows(0), ["2", "3"]),
+        (rows(0, run="2") + 2 * rows(0, 300), ["2", "3", "4"]),
+        (2 * rows(0, 300) + rows(0, run="2"), ["1", "3", "2"]),
+        (2 * rows(0, 300, run="a") + rows(0, run="a.2"), ["a", "a.3", "a.2"]),
+    ],
+)
+def test_no_run_gets_the_name_of_another_run(lines: list[str], names: list[str]) -> None:
+    assert of(lines)[0] == names
+
+
 def test_a_run_with_too_few_rows_is_left_out_and_reported() -> None:
     names, _, notes = of(rows(0, run="a") + rows(0, 3, run="b"))
     assert names == ["a"]

@@ -107,6 +107,23 @@ def test_if_one_form_of_line_is_not_answered_the_other_form_is_used(comma: bool)
         assert board.comma is comma
 
 
+@pytest.mark.parametrize("comma", [False, True])
+def test_a_wrong_trailing_comma_is_not_reported_as_too_few_replies(comma: bool) -> None:
+    checked = Checked(Particular(comma, trailing_comma=not comma))
+    assert checked.failed == ["trailing comma"]
+    assert checked.changes == {"mcu.trailing_comma": comma}
+    assert checked["reply rate"].verdict == checked["round trip"].verdict == "PASS"
+
+
+def test_rare_reports_by_the_boards_own_clock_are_not_taken_for_answers() -> None:
+    for wait_ms in range(0, 400, 50):
+        robot = Robot("plain_only")
+        with robot.board() as board, robot.mcu.free_running(0.4):
+            board.listen(wait_ms / 1000)
+            assert dialect.form(board) is None
+            assert not board.comma
+
+
 @each(
     ("faults", "wanted", "verdict", "keys"),
     [

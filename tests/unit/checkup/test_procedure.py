@@ -418,7 +418,7 @@ def test_a_check_that_stalled_while_a_motor_turned_turns_no_motor_again(
     assert (stopped.name, stopped.verdict) == ("stall", "FAIL")
     assert stopped.figure == "stood still for 60.0 s"
     assert "suspended or overloaded" in stopped.mend
-    assert rest.text.startswith("the check ended early: stall; not tried: ")
+    assert rest.text.startswith("the check ended early: stall; not finished: ")
     assert robot.later() == [0.0] * 4
     assert (len(questions) > 1) == (turning > 1)
 
@@ -583,6 +583,8 @@ def test_a_runaway_ends_the_check_before_any_faster_command() -> None:
     assert checked.failed == ["runaway"]
     assert "more than 6 rad/s" in checked["runaway"].text
     assert "watchdog" in checked[SKIPPED_STEPS].text
+    motors = "motor b (front left), motor c (rear left), motor d (rear right)"
+    assert f"not finished: {motors}, trailing comma, " in checked[SKIPPED_STEPS].text
     told = [max(float(token[2:7]) for token in line.split(b",")[:4])
             for _, line in robot.mcu.heard if line.startswith(b"a")]  # fmt: skip
     # Motor a was commanded its 3 rad/s. Motor b got no command above the speed that already looked

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import asyncio
 import threading
 import time
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -11,6 +13,7 @@ import zenoh
 
 from acsard import client
 from acsard.client import Client, NoAnswerError
+from acsard.client.asynchronous import AsyncClient
 from acsard.client.commander import MAX_OPEN_TIMEOUT_S, MIN_SPACING_S, no_command
 from acsard.client.driving import UnheardError
 from acsard.core.config.settings import DriveConfig, JointsConfig
@@ -52,6 +55,8 @@ class Session:
         return []  # no robot answers
 
     def put(self, key: str, payload: bytes, *, encoding: str, attachment: bytes, **_: Any) -> None:
+        if self.closed:
+            raise zenoh.ZError("session closed")
         key = key.removeprefix("acsard/acsar/")
         arrival = Arrival(key, True, payload, encoding, 0, None, "", attachment=attachment)
         self.heard.append(RECEIVER.command(arrival))
@@ -180,6 +185,40 @@ def test_each_method_reports_a_closed_connection(session: Session) -> None:
     ):
         with pytest.raises(NoAnswerError, match="connection of this client is closed"):
             method()
+
+
+def without_states(robot: Client, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the client subscribe to `state`, on which nothing arrives."""
+    silence = SimpleNamespace(try_recv=lambda: None, undeclare=lambda: None)
+    monkeypatch.setattr(robot, "subscribe", lambda _: silence)
+
+
+def test_ctrl_c_ends_a_drive_whose_connection_is_closed_with_a_keyboard_interrupt(
+    session: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(_: float) -> None:
+        if not session.closed:
+            session.close()
+            raise KeyboardInterrupt
+
+    robot = client_of(session)
+    without_states(robot, monkeypatch)
+    monkeypatch.setattr(time, "sleep", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        robot.drive(0.1, seconds=1.0)
+
+
+async def test_a_cancelled_async_drive_whose_connection_is_closed_is_cancelled(
+    session: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot = client_of(session)
+    without_states(robot, monkeypatch)
+    driving = asyncio.create_task(AsyncClient(robot).drive(0.1, seconds=1.0))
+    await asyncio.sleep(0)
+    session.close()
+    driving.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await driving
 
 
 def test_two_sessions_of_one_process_are_two_senders(session: Session) -> None:

@@ -168,6 +168,16 @@ def test_the_busiest_program_is_searched_once_in_ten_seconds(
         assert kernel.searches == 1
 
 
+def test_time_from_before_the_watch_is_no_cause_of_a_late_first_period(
+    monkeypatch: pytest.MonkeyPatch, times: Path
+) -> None:
+    times.write_text(f"0 {900 * MS} 1\n")
+    with watching(monkeypatch) as (watch, _):
+        times.write_text(f"0 {930 * MS} 2\n")
+        period(watch, 30 * MS, 2)
+        assert "other programs used the processor for 0.03 s" in reported(watch).text
+
+
 @pytest.mark.slow
 def test_reports_are_a_second_apart(monkeypatch: pytest.MonkeyPatch) -> None:
     with watching(monkeypatch) as (watch, kernel):

@@ -23,6 +23,7 @@ from acsard.daemon.settings_file import SettingsFile, keeps
 from acsard.host import config_edit_process, config_file
 from acsard.host.config_edit_process import edited_apart
 from acsard.host.config_file import Edit
+from acsard.host.errors import MendableError
 from tests.system.harness import until
 
 TEXT = "[limits]\nlinear_speed = 0.5\n"
@@ -336,6 +337,35 @@ def test_a_disk_that_hangs_gets_an_answer_and_a_late_result_changes_nothing(
     hangs.set()
     until(lambda: made._results.waiting)
     assert made.results(0, []) == []
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_a_write_that_ends_after_its_overdue_answer_is_logged_unless_it_fails(
+    file: Path, made: SettingsFile, monkeypatch: pytest.MonkeyPatch, fails: bool
+) -> None:
+    hangs, events = threading.Event(), list[Event]()
+
+    def hang(edit: Edit) -> None:
+        hangs.wait()
+        if fails:
+            raise MendableError("the disk is full")
+
+    check(made)
+    monkeypatch.setattr(module, "keep", hang)
+    assert made.obeyed(OBEYED)
+    late_ns = module.REPLY_TIMEOUT_NS + 1
+    (answer,) = made.results(late_ns, events)
+    assert isinstance(answer, Answer)
+    assert "check whether the file has the new value" in answer.message
+    assert made.results(late_ns, events) == [], "each request has only one answer"
+    assert events == []
+    hangs.set()
+    until(lambda: made._results.waiting)
+    assert made.results(late_ns, events) == []
+    text = f"limits.linear_speed to {file}"
+    assert events == ([] if fails else [Event("set", text, by="anna", kind="written")])
+    assert made.results(late_ns, events) == []
+    assert len(events) == (not fails)
 
 
 @pytest.mark.slow

@@ -36,15 +36,24 @@ def shown(notices: Notices, *, newcomers: bool = False) -> list[str]:
     return list(server.shown)
 
 
-def test_a_notice_is_repeated_only_after_a_while_and_a_lasting_one_always(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_notice_is_repeated_only_after_a_while(monkeypatch: pytest.MonkeyPatch) -> None:
     notices, again_ns = Notices(lambda text: None, lambda: None), int(NS_PER_S / REPEAT_RATE.hz)
     for at_ns in (0, again_ns - 1, again_ns):
         monkeypatch.setattr(clock, "mono_ns", lambda at_ns=at_ns: at_ns)
         notices.say("warning", "drive", "too slow")
-        notices.say("error", "daemon", "gone", stays="daemon")
-    assert shown(notices) == ["too slow", "gone", "gone", "too slow", "gone"]
+    assert shown(notices) == ["too slow", "too slow"]
+
+
+def test_a_lasting_notice_is_repeated_only_with_another_text_or_after_it_was_over() -> None:
+    notices = Notices(lambda text: None, lambda: None)
+    for text in ("gone", "gone", "no reply", "gone"):
+        notices.say("error", "daemon", text, stays="daemon")
+    assert shown(notices) == ["gone", "no reply", "gone"]
+    notices.say("error", "daemon", "gone", stays="daemon")
+    assert shown(notices) == []
+    notices.over("daemon")
+    notices.say("error", "daemon", "gone", stays="daemon")
+    assert shown(notices) == ["without daemon", "gone"]
 
 
 def test_a_new_viewer_gets_the_lasting_statuses_until_they_are_over() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import threading
+from typing import Any
 
 import pytest
 
@@ -24,7 +25,9 @@ def test_a_thread_that_cannot_be_started_raises_a_timeout_error() -> None:
 
 
 @pytest.mark.parametrize("rounds", [0, 1, 2])
-def test_a_result_that_arrives_while_its_caller_is_cancelled_is_released(rounds: int) -> None:
+def test_a_result_that_arrives_while_its_caller_is_cancelled_is_released_without_a_new_thread(
+    rounds: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     released: list[int] = []
     is_released = threading.Event()
 
@@ -33,12 +36,20 @@ def test_a_result_that_arrives_while_its_caller_is_cancelled_is_released(rounds:
         is_released.set()
 
     async def caller() -> int | None:
+        loop, posted = asyncio.get_running_loop(), threading.Event()
+        post = loop.call_soon_threadsafe
+
+        def and_posted(*args: Any) -> None:
+            post(*args)
+            posted.set()
+
+        monkeypatch.setattr(loop, "call_soon_threadsafe", and_posted)
         task = asyncio.ensure_future(in_thread(call, None, release))
         await asyncio.sleep(0)
+        threading.stack_size(NO_ROOM)
         go.set()
         # The loop stands, so the result waits for its next round.
-        while any(thread.name == "call" for thread in threading.enumerate()):
-            is_released.wait(0.001)
+        assert posted.wait(5.0)
         for _ in range(rounds):
             await asyncio.sleep(0)
         task.cancel()
@@ -51,8 +62,33 @@ def test_a_result_that_arrives_while_its_caller_is_cancelled_is_released(rounds:
         go.wait()
         return 7
 
-    go = threading.Event()
-    result = asyncio.run(caller())
+    go, usual = threading.Event(), threading.stack_size()
+    try:
+        result = asyncio.run(caller())
+    finally:
+        threading.stack_size(usual)
     if result is None:
         assert is_released.wait(5.0)
     assert released == ([7] if result is None else [])
+
+
+def test_a_result_that_arrives_after_the_end_of_the_event_loop_is_released() -> None:
+    go, released = threading.Event(), threading.Event()
+    with pytest.raises(TimeoutError):
+        asyncio.run(in_thread(go.wait, 0.01, lambda _: released.set()))
+    assert not released.is_set()
+    go.set()
+    assert released.wait(5.0)
+
+
+def test_a_result_that_its_caller_has_received_is_not_released() -> None:
+    released: list[int] = []
+
+    def call() -> int:
+        return 7
+
+    assert asyncio.run(in_thread(call, None, released.append)) == 7
+    for thread in threading.enumerate():
+        if thread.name == "call":
+            thread.join(5.0)
+    assert not released

@@ -46,10 +46,10 @@ from acsard.recording.export import (
     offered_qos,
     wheel_columns,
 )
-from acsard.recording.file import Recording
+from acsard.recording.file import Recording, Topic, Writing
 from acsard.recording.replay import replay_step
 from acsard.recording.time_span import Span
-from tests.scenarios.taped import Tape, chunks, recorded_world
+from tests.scenarios.taped import BATCH, Tape, chunks, recorded_world
 from tests.scenarios.world import START
 
 SECONDS = 2.0
@@ -358,6 +358,51 @@ def tape() -> Tape:
     tape, world = recorded_world(GYRO)
     world.drive(0.5, 0.4, 1.0)
     return tape
+
+
+def test_calibration_reads_the_steps_between_a_missing_beginning_and_the_next_gap(
+    tmp_path: Path,
+) -> None:
+    tape, world = recorded_world(GYRO, every=BATCH)
+    world.drive(0.5, 0.4, 4.0)
+    tape.write(tmp_path / "whole.mcap", GYRO)
+    tape.write(tmp_path / "later.mcap", GYRO, first=BATCH)
+    whole, later = Recording(tmp_path / "whole.mcap"), Recording(tmp_path / "later.mcap")
+    messages = [*later.messages()]
+    batches = [number for number, (topic, _, _) in enumerate(messages) if topic == "steps"]
+    assert len(batches) >= 3
+    del messages[batches[1]]
+    # `whole.about` says that the recording began before its first readable step.
+    writing = Writing(tmp_path / "harmed.mcap", whole.about)
+    for topic, wall_ns, data in messages:
+        writing.add(topic, wall_ns, data)
+    writing.finish()
+    rows = [
+        row
+        for step in tape.steps()
+        for row in measured_csv_rows(step, tape.taken[step.number].outputs)
+        if BATCH <= step.number < 2 * BATCH
+    ]
+    table = measured(Recording(tmp_path / "harmed.mcap"))
+    assert table.decode().splitlines() == [MEASURED_CSV_HEADER, *rows]
+
+
+def test_an_export_does_not_compare_the_end_record_with_the_events(
+    path: Path, tmp_path: Path
+) -> None:
+    """This check reads the whole recording again, and only a replay uses its result."""
+
+    class Counted(Recording):
+        reads = 0
+
+        def messages(self) -> Iterator[tuple[Topic, int, bytes]]:
+            self.reads += 1
+            return super().messages()
+
+    recording = Counted(path)
+    export(recording, tmp_path / "new.csv", "csv")
+    # The first reading ends at the first message, which shows whether the recording has a state.
+    assert recording.reads == 2
 
 
 def test_the_table_has_a_row_for_each_feedback_line_and_each_gyro_sample(tape: Tape) -> None:

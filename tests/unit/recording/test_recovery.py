@@ -101,6 +101,24 @@ def test_a_disk_that_refuses_the_end_costs_no_chunk_and_is_reported(
     assert (part.exists(), whole.stat().st_mtime) == (False, 1e9)
 
 
+def test_a_copy_that_has_no_room_for_its_header_leaves_its_room_to_the_end_of_the_file(
+    data: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    part, whole = tmp_path / "a.part", tmp_path / "a.mcap"
+    part.write_bytes(data[: chunks(data)[-1][1]])
+    before = messages(part)
+
+    def full(handle: int) -> None:
+        if [*tmp_path.iterdir()] != [part]:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "fsync", full)
+    assert recover(part, whole, "crash", room=True) == ""
+    assert [*tmp_path.iterdir()] == [whole]
+    assert messages(whole) == before
+    assert read_end(whole) is not None
+
+
 def test_a_file_finished_in_place_has_the_cause_and_the_summary(
     data: bytes, tmp_path: Path
 ) -> None:

@@ -23,6 +23,7 @@ from acsard.recording.file_replay import DisplayReplay, replay_file
 from acsard.recording.rows import encode
 from acsard.recording.state import Checkpoint, State, StateError, adopt, freeze, thaw
 from acsard.recording.unpickling import MAX_BYTES, MAX_OPCODES
+from acsard.report import page
 from acsard.report.report_data import ReportData
 from tests.each import each
 from tests.scenarios.taped import Tape
@@ -158,6 +159,17 @@ def test_a_wrong_part_of_a_state_behind_a_gap_is_reported_with_its_place(
         replay_file(Recording(path))
     with pytest.raises(RecordingError, match=words):
         drawn(Recording(path))
+
+
+def test_a_report_of_a_robot_with_a_wrong_counter_is_refused_with_a_message(
+    taped: Tape, tmp_path: Path
+) -> None:
+    robot, memory = thaw(taped.states[100])
+    robot.counters["command_stale"] = "many"  # type: ignore[assignment]
+    spoilt = replace_state(taped, freeze(robot, memory))
+    spoilt.write(path := tmp_path / "spoilt.mcap", Config(), 100)
+    with pytest.raises(RecordingError, match="cannot read the robot state"):
+        page.drawn(Recording(path), "")
 
 
 def replace_state(tape: Tape, state: bytes) -> Tape:

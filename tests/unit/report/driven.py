@@ -9,6 +9,7 @@ from acsard.core.config.settings import Config
 from acsard.daemon.late_watch import LateWatch
 from acsard.recording.recorded_steps import Step
 from acsard.recording.replay import Replay
+from acsard.recording.state import State
 from acsard.report.report_data import ReportData
 from tests.scenarios.taped import Tape
 from tests.scenarios.world import World
@@ -35,10 +36,14 @@ def report_from(
     begin: float | None = None,
     end: float | None = None,
     ending: str = "",
+    state: State | None = None,
 ) -> ReportData:
-    """Return the report's data of these steps, and of the way in which the recording ended."""
+    """Return the report's data of these steps, and of the way in which the recording ended.
+
+    `state` is the robot's state before the first step, or None if the steps begin with the start.
+    """
     config = config or Config()
-    report, replay = ReportData(config, begin, end), Replay(config)
+    report, replay = ReportData(config, begin, end), Replay(config, *(state or ()))
     for step in steps:
         replay.step(step)
         assert replay.outputs is not None

@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 
+from acsard.core.messages.encodings import encode
+from acsard.core.messages.schema import Twist, Vector3
+from acsard.core.messages.signature import Signature
+from acsard.core.motion.arbiter_text import REFUSED
 from acsard.core.thinning import Span
+from acsard.recording.state import thaw
 from acsard.report.command_sources import OTHER_SOURCES
+from tests.scenarios.taped import recorded_world
 from tests.scenarios.world import World
-from tests.unit.report.driven import drive_of_two, report_of
+from tests.unit.report.driven import drive_of_two, report_from, report_of
 
 
 def spans(source: str) -> list[Span]:
@@ -62,6 +70,40 @@ def test_an_invalid_message_is_refused_with_its_reason() -> None:
     (refused,) = [s for s in report.sources.bands["app"].spans() if s.kind == "refused"]
     assert refused.words.startswith("cmd/app: ")
     assert 0.2 < refused.end - refused.begin < 0.5
+
+
+def put(world: World, sequence: int) -> None:
+    """Send a zero with a number. It is refused if a newer command has been accepted."""
+    signed = Signature("a/b", sequence=sequence).pack()
+    world.put("cmd/app", encode(Twist(Vector3(), Vector3()), "json"), attachment=signed)
+    world.run(0.05)
+
+
+def test_a_report_of_a_later_file_does_not_give_the_reasons_of_earlier_refusals() -> None:
+    tape, world = recorded_world()
+    world.send(0.1, 0.0, "stranger")
+    put(world, 1)
+    put(world, 2)
+    tape.cut = True
+    world.run(0.5)
+    put(world, 1)
+    ((first, state),) = tape.states.items()
+    report = report_from(tape.steps(first), state=thaw(state))
+    (refused,) = [s for s in report.sources.bands["app"].spans() if s.kind == "refused"]
+    assert refused.words == REFUSED["stale"]
+
+
+def test_the_refusal_of_a_command_has_no_reason_of_an_earlier_step_without_commands() -> None:
+    def delayed(world: World) -> None:
+        put(world, 1)
+        world.put("cmd/nav", encode(Twist(Vector3(math.nan), Vector3()), "msgpack"))
+        world.run(0.5)
+        assert world.state.counters["command_not_finite"] == 1
+        put(world, 0)
+
+    report, _ = report_of(delayed)
+    (refused,) = [s for s in report.sources.bands["app"].spans() if s.kind == "refused"]
+    assert refused.words == REFUSED["stale"]
 
 
 def test_a_source_that_never_sent_has_no_band() -> None:

@@ -1,18 +1,22 @@
-"""Tests of the reports of keyboard driving: when each is due, and where the help is."""
+"""Tests of the reports of keyboard driving, and of the table of robots on a terminal."""
 
 from __future__ import annotations
 
-from typing import cast
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 from msgspec.structs import replace
 
 from acsard.core.messages.schema import RobotState
+from acsard.top import terminal
 from acsard.top.drive_screen import HELP, Teleop
+from acsard.top.fleet_table import Roster
 from acsard.top.keyboard import Ride
 from acsard.top.terminal import NO_END, News, Page, part
 from tests.unit.top.screens import STATE
 from tests.unit.top.test_drive_screen import SEEN
+from tests.unit.top.test_fleet_table import ROW
 
 
 def told(states: list[tuple[float, RobotState]]) -> list[RobotState]:
@@ -80,3 +84,23 @@ def test_the_last_report_waits_until_the_robot_no_longer_follows_the_drive(
     other = replace(still, reason="driving: commanded by nav", source="nav")
     part(cast(Ride, Ended(still, still, other, ready)))
     assert "drive ended: the robot stands; driving: commanded by nav" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("height", [1, 2, 3, 24])
+def test_a_terminal_of_any_height_shows_the_heading_of_the_table_of_robots(
+    height: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def watch(draw: Any, console: Any, suspend: list[bool]) -> bool:
+        console.print(draw())
+        return False
+
+    monkeypatch.setenv("COLUMNS", "80")
+    monkeypatch.setenv("LINES", str(height))
+    monkeypatch.setattr(terminal, "_watch", watch)
+    monkeypatch.setattr(terminal, "_hold", lambda shows: shows([]))
+    fleet = SimpleNamespace(rows=lambda: [ROW], more="", seen="1 robot")
+    terminal.roster(cast(Roster, fleet))
+    head, *others = capsys.readouterr().out.splitlines()
+    assert head.startswith("ROBOT")
+    assert others[-1] == "q quits   1 robot"
+    assert any("robot1" in line for line in others) == (height == 24)

@@ -3,22 +3,27 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
 from collections.abc import Callable
 from typing import Any
 
+import msgspec
 import pytest
 from msgspec.structs import replace
 
 from acsard.client.follower import FIRST_STATE_TIMEOUT_S, QUERY_PERIOD_S, SILENT_S, Watch
+from acsard.core.config.settings import Config
 from acsard.core.messages.schema import Time
 from acsard.core.values import NS_PER_S
 from acsard.daemon.bus.address import Address
 from acsard.host import clock
+from acsard.host.threads import NoThreadError
 from acsard.web import robots
 from acsard.web.metrics import Counts
 from acsard.web.robots import PROCESS_PERIOD_S, About, Robots, _Asking
+from tests.each import each
 from tests.unit.client.test_follower import UNREADABLE, Robot
-from tests.unit.top.screens import STATE, sample_of
+from tests.unit.top.screens import INFO, STATE, sample_of
 
 ABOUT = About("1", False, 1.0, 4.0, 10.0, "", {"teleop": 0.25, "app": 0.25})
 
@@ -135,3 +140,35 @@ def test_a_robot_whose_last_state_is_older_than_a_suspend_is_silent_immediately(
     assert here == ""
     assert "nothing is received" in gone
     assert 65.0 <= at <= 65.0 + 2 * PROCESS_PERIOD_S
+
+
+class Known(Robot):
+    """A client whose robot also answers with its version and its configuration."""
+
+    def get(self, name: str) -> Any:
+        return INFO if name == "info" else msgspec.to_builtins(Config())
+
+
+@each("failing", [0, 1, 2, 3])
+async def test_the_page_learns_about_its_robot_although_a_thread_could_not_start_once(
+    failing: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The threads connect, subscribe to the state, and query the two keys `info` and `config`."""
+    starts = itertools.count()
+
+    async def in_thread(call: Callable[[], Any], *_: object) -> Any:
+        if next(starts) == failing:
+            raise NoThreadError("this process cannot start another thread")
+        return call()
+
+    monkeypatch.setattr(robots, "in_thread", in_thread)
+    monkeypatch.setattr(robots, "RETRY_DELAY_S", 0.0)
+    monkeypatch.setattr(robots, "ASK_SOON_S", 0.0)
+    client: Any = Known()
+    page = Robots(Address("tcp/x:1", "acsar", ""), lambda: client, ABOUT, Counts())
+    running = asyncio.create_task(page.run())
+    for _ in range(100):
+        await asyncio.sleep(0)
+    assert not running.done()
+    assert page.about.version == INFO.version
+    running.cancel()

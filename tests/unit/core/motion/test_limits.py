@@ -246,6 +246,22 @@ def test_a_small_wheel_at_its_limit_turns_the_robot_until_it_has_slowed_down() -
     assert 0.0 < after.angular < start.angular
 
 
+@pytest.mark.parametrize(
+    ("wheel_speed", "start", "goal", "dt"),
+    [(1.0, Twist(0.0225, 0.1833333), REST, 0.02), (0.5, REST, Twist(0.0135, 0.075), 0.01)],
+)
+def test_a_very_small_wheel_at_its_limit_never_stops_the_way_to_the_goal(
+    wheel_speed: float, start: Twist, goal: Twist, dt: float
+) -> None:
+    kinematics = Kinematics(DriveConfig(left_wheel_radius_multiplier=0.1))
+    found = Limiter(LimitsConfig(wheel_speed=wheel_speed), kinematics)
+    for step in range(1, 21):
+        found.follow(Twist(start.linear * step / 20, start.angular * step / 20), dt)
+    for _ in range(1000):
+        found.follow(goal, dt)
+    assert pair(found.twist) == approx(goal.linear, goal.angular)
+
+
 # acceleration and deceleration
 
 

@@ -1,0 +1,157 @@
+"""The bridge learns the facts about its robot again after each restart of the daemon."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import zenoh
+from msgspec.structs import replace
+
+from acsard.client import Client
+from acsard.core.config.settings import Config
+from acsard.core.values import NS_PER_S
+from acsard.foxglove import bridge as module
+from acsard.foxglove.bridge import Bridge
+from acsard.foxglove.robot_facts import Facts
+from acsard.host import clock
+from acsard.host.errors import ReplyError
+
+UNREADABLE = ReplyError("cannot read the robot's state; use the same version here")
+
+GONE = "the daemon of robot acsar is gone; `acsard foxglove` waits for it"
+BACK = "the daemon of robot acsar is back"
+
+
+class Server:
+    """The server's status messages: each text, or the id of one that was withdrawn."""
+
+    def __init__(self) -> None:
+        self.shown: list[str] = []
+
+    def publish_status(self, text: str, level: object, stays: str | None) -> None:
+        self.shown.append(text)
+
+    def remove_status(self, ids: list[str]) -> None:
+        self.shown += [f"without {one}" for one in ids]
+
+    def publish_parameter_values(self, values: object) -> None:
+        pass
+
+
+class World:
+    """A bridge in virtual time, whose daemon restarts when the test says so."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.now_ns, self.queries = 100 * NS_PER_S, 0
+        self.facts = Facts(Config(), None, ("app",), "")
+        self.during_query: Callable[[], object] = lambda: None
+        self.printed: list[str] = []
+        self.server = Server()
+        monkeypatch.setattr(clock, "mono_ns", lambda: self.now_ns)
+        monkeypatch.setattr(module, "learn", self._learn)
+        monkeypatch.setattr(module, "start", lambda *_, **__: self.server)
+        monkeypatch.setattr(logging.getLogger("foxglove"), "handlers", [])
+        session: Any = SimpleNamespace(liveliness=lambda: self, zid=lambda: "0123456789abcdef")
+        self.bridge = Bridge(Client(session, "acsar", "app"), ("", 0), self.printed.append)
+        self.queries = 0
+
+    def declare_subscriber(self, key: str, take: Callable[[Any], None], *, history: bool) -> None:
+        self._take = take
+
+    def _learn(self, robot: Client) -> Facts:
+        facts, self.queries = self.facts, self.queries + 1
+        self.during_query()
+        return facts
+
+    def daemon(self, kind: zenoh.SampleKind) -> None:
+        """Let the daemon start (PUT) or end (DELETE)."""
+        self._take(SimpleNamespace(kind=kind))
+
+    def restart(self) -> None:
+        """Let the daemon restart with another timeout, which tells its facts from earlier ones."""
+        self.daemon(zenoh.SampleKind.DELETE)
+        (app,) = (one for one in self.facts.config.commands.sources if one.name == "app")
+        sources = (replace(app, timeout=app.timeout + 1.0),)
+        commands = replace(self.facts.config.commands, sources=sources)
+        self.facts = replace(self.facts, config=replace(Config(), commands=commands))
+        self.daemon(zenoh.SampleKind.PUT)
+
+    def passes(self, seconds: float) -> None:
+        """Run rounds for this time, with the pauses of the main loop."""
+        end_ns = self.now_ns + seconds * NS_PER_S
+        while self.now_ns < end_ns:
+            self.now_ns += round((0.015 if self.bridge._wake.is_set() else 0.5) * NS_PER_S)
+            self.bridge._wake.clear()
+            self.bridge._round()
+
+    @property
+    def known_timeout_s(self) -> float:
+        return self.bridge._drives.timeout_s
+
+
+@pytest.fixture
+def world(monkeypatch: pytest.MonkeyPatch) -> World:
+    return World(monkeypatch)
+
+
+def fail() -> None:
+    raise UNREADABLE
+
+
+def test_a_daemon_whose_reply_cannot_be_read_is_queried_once_a_second_and_reported_once(
+    world: World,
+) -> None:
+    world.daemon(zenoh.SampleKind.DELETE)
+    world.passes(1.0)
+    world.during_query = fail
+    world.daemon(zenoh.SampleKind.PUT)
+    world.passes(10.0)
+    assert 5 <= world.queries <= 11
+    assert world.printed == world.server.shown == [GONE, str(UNREADABLE)]
+    world.during_query = lambda: None
+    world.passes(2.0)
+    assert world.printed == [GONE, str(UNREADABLE), BACK]
+    assert world.server.shown[2:] == ["without daemon", BACK]
+
+
+def test_a_daemon_that_ends_after_an_unreadable_reply_is_reported_as_gone(world: World) -> None:
+    world.during_query = fail
+    world.restart()
+    world.passes(1.0)
+    world.daemon(zenoh.SampleKind.DELETE)
+    world.passes(1.0)
+    assert world.server.shown == [str(UNREADABLE), GONE]
+
+
+def test_the_facts_are_learned_after_a_restart_that_falls_into_one_round(
+    world: World, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refresh(here: bool) -> dict[str, Any]:
+        monkeypatch.setattr(world.bridge._settings, "refresh", usual)
+        world.restart()
+        return {}
+
+    before_s, usual = world.known_timeout_s, world.bridge._settings.refresh
+    monkeypatch.setattr(world.bridge._settings, "refresh", refresh)
+    world.passes(1.0)
+    assert world.known_timeout_s == before_s + 1.0
+    assert world.server.shown == [BACK]
+
+
+def test_the_facts_are_learned_again_if_the_daemon_restarts_while_it_is_queried(
+    world: World,
+) -> None:
+    def restart_once() -> None:
+        world.during_query = lambda: None
+        world.restart()
+
+    before_s = world.known_timeout_s
+    world.during_query = restart_once
+    world.restart()
+    world.passes(1.0)
+    assert world.queries == 2
+    assert world.known_timeout_s == before_s + 2.0
