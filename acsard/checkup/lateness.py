@@ -57,7 +57,7 @@ class Lateness:
 
 
 def spoilt(found: Unsure, late_s: float) -> bool:
-    """Return whether the finding may be wrong because this computer was late.
+    """Return whether the finding may be wrong because this computer ran the check too late.
 
     `late_s` is the longest delay of this computer during the step, s. The result is True if the
     delay reaches both half of `found.margin_s` and a minimum. The minimum is `MAX_PAUSE_S` for a
@@ -70,7 +70,7 @@ def spoilt(found: Unsure, late_s: float) -> bool:
 
 
 def finding(name: str, late_s: float) -> Finding:
-    """Return the finding that the step `name` was not judged because this computer was late.
+    """Return the finding that this computer ran the step `name` too late for a judgment.
 
     `late_s` is the longest delay of this computer during the step, s.
     """
@@ -83,7 +83,7 @@ def judged(found: Finding) -> bool:
 
 
 def unjudged(findings: Iterable[Finding]) -> list[str]:
-    """Return the names of the steps that were not judged because this computer was too late.
+    """Return the names of the steps that were not judged because this computer was too slow.
 
     If several findings have the same name, only the last one counts.
     """

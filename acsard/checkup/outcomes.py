@@ -352,7 +352,7 @@ FAIL? link: silent | silent for {seconds:.1f} s
     the microcontroller fell silent when {motors} had to turn
     -> does its supply dip when a motor starts, so that it restarts? is a cable loose?
 WARN late: not judged | not judged
-    this computer was late by up to {late:.0f} ms, so the check does not judge this step
+    this computer ran the check up to {late:.0f} ms too late, so the check does not judge this step
     -> stop other programs here (`top`) and check again, or give the check real-time priority:
     `chrt -f 10 acsard mcu check ...`
 FAIL serial line: lost | lost

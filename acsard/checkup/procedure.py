@@ -285,13 +285,13 @@ class _Steps:
         for _ in range(1 + min(LATE_AGAIN, self._late_left)):
             if late_s:
                 self._late_left -= 1
-                self._operator.doing("this computer was late; this part of the check runs again")
+                self._operator.doing("this computer ran the check too late; this part runs again")
                 board.known = known
                 if board.armed:
                     board.rest()
             began_s = board.now_s
             found, ends = _ended(step)
-            # A finding that is not `Unsure` is right even if this computer was late.
+            # A finding that is not `Unsure` is right even if this computer ran the check too late.
             if board.fled or not isinstance(found, Unsure):
                 break
             # The delay of a simulated board is known only when its program runs again, so wait for

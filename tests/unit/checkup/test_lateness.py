@@ -1,4 +1,4 @@
-"""Findings are not judged when this computer was late."""
+"""Findings are not judged when this computer ran the check too late."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def test_only_outcomes_that_a_late_computer_can_cause_are_doubted(
 def test_a_step_that_is_not_judged_is_a_warning_without_keys() -> None:
     found = finding("watchdog", 0.085)
     assert (found.name, found.verdict, found.keys) == ("watchdog", "WARN", {})
-    told = "this computer was late by up to 85 ms, so the check does not judge this step"
+    told = "this computer ran the check up to 85 ms too late, so the check does not judge this step"
     assert found.text == told
     assert not judged(found)
     assert judged(find("baud rate: right", rate=9600))

@@ -833,7 +833,7 @@ def test_on_a_late_computer_no_board_is_blamed_and_no_other_setting_is_proposed(
     assert set(checked.changes) <= {"mcu.link_check", "mcu.encoder_counts"}
     for finding in checked.findings:
         if finding.figure == "not judged":
-            late = f"this computer was late by up to {1000 * late_s:.0f} ms"
+            late = f"this computer ran the check up to {1000 * late_s:.0f} ms too late"
             assert finding.text == f"{late}, so the check does not judge this step"
             assert "real-time priority" in finding.mend
     assert not checked.left_turning
