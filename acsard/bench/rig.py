@@ -283,11 +283,7 @@ class Rig:
         return self._share(began_ns, used_ns)
 
     def _neutral(self, phases: random.Random) -> None:
-        """Send zero speeds until the daemon accepts a command.
-
-        The daemon first ignores the commands of a new sender. `phases` generates the random times
-        between the commands.
-        """
+        """Send zeros until one is accepted: the daemon first ignores a new sender."""
         before = self._counted()
 
         def look() -> bool | None:

@@ -205,13 +205,7 @@ def report(log: str, calibration: Calibration, drive: DriveConfig, written: str)
 
 
 def _noise(calibration: Calibration) -> tuple[BeforeAfter, BeforeAfter]:
-    """Return a pair: the uncertainty after `REPORT_DISTANCE_M` m of the heading, deg, and of the
-    distance, m.
-
-    Each item contains two standard deviations: with the configured and with the new noise
-    settings. They are None if the noise settings stay as configured. Those of the distance are
-    also None if the log has no positions.
-    """
+    """Return the uncertainty of heading, deg, and distance, m, after `REPORT_DISTANCE_M`."""
     noise = calibration.noise
     if noise is None or not noise.better:
         return NOT_COMPARED, NOT_COMPARED
@@ -314,7 +308,6 @@ def _better(report: Report) -> list[str]:
 
 
 def _two(value: float) -> str:
-    """Format a number with about two significant digits and without an exponent."""
     return f"{value:.0f}" if value >= 10 else f"{value:.1f}" if value >= 1 else f"{value:.2f}"
 
 

@@ -276,14 +276,12 @@ class Fit(Struct, frozen=True):
         return np.asarray(chance + pull @ np.diag(1 / np.where(usual, usual, np.inf)) @ pull.T)
 
     def _changes(self, group: npt.NDArray[np.int64]) -> tuple[Floats, Floats]:
-        """Return the changes of the parameters if a group of blocks is left out, and variances.
+        """Return the changes of the parameters without each group of blocks, and variances.
 
-        The changes have a row for each group: the parameters without this group minus
-        `parameters`. The variances are those of the parameters, from a jackknife over the groups.
-        They are widened to those of Student's t, with the degrees of freedom of Satterthwaite (An
-        approximate distribution of estimates of variance components, 1946).
-
-        `group` contains the number of the group of each block.
+        The variances are those of the parameters, from a jackknife over the groups. They are
+        widened to those of Student's t, with the degrees of freedom of Satterthwaite (An
+        approximate distribution of estimates of variance components, 1946). `group` contains the
+        number of the group of each block.
         """
         change = np.array(
             [self.without(group == number) - self.parameters for number in np.unique(group)]
@@ -341,12 +339,6 @@ def fit(
 
 
 def _sum(evidence: Sequence[Evidence]) -> tuple[Floats, Floats]:
-    """Return the normal equations of all sensors, as a pair of arrays.
-
-    The first array has the left-hand side for each block, shape (blocks, PARAMETER_COUNT,
-    PARAMETER_COUNT). The second array has the right-hand side for each block, shape (blocks,
-    PARAMETER_COUNT). Both arrays are weighted sums over the sensors.
-    """
     normal, score = np.zeros_like(evidence[0].normal), np.zeros_like(evidence[0].score)
     for part in evidence:
         weight = _weight(part)
@@ -373,16 +365,7 @@ def _weight(part: Evidence) -> float:
 def _known(
     parameters: Floats, held: Sequence[Held], usual: Mapping[P, float]
 ) -> tuple[Floats, Floats]:
-    """Return the normal equations of the constraints and of the prior information, as a pair.
-
-    The first array is the left-hand side, shape (PARAMETER_COUNT, PARAMETER_COUNT). The second
-    array is the right-hand side, shape (PARAMETER_COUNT,).
-
-    Args:
-        parameters: the present parameters of the fit.
-        held: the constraints.
-        usual: the prior standard deviation of each parameter that has one.
-    """
+    """Return the normal equations of the constraints `held` and the prior deviations `usual`."""
     normal, score = np.zeros((PARAMETER_COUNT, PARAMETER_COUNT)), np.zeros(PARAMETER_COUNT)
     for index, deviation in usual.items():
         normal[index, index] = deviation**-2

@@ -226,10 +226,7 @@ def _biases(run: Run) -> Rests:
 
 
 def _mean(samples: Floats) -> tuple[float, float]:
-    """Return a pair: the mean of the gyro samples of a standstill, and the variance of this mean.
-
-    Outliers are left out.
-    """
+    """Return the mean of the gyro samples of a standstill without outliers, and its variance."""
     off = np.abs(samples - np.median(samples))
     steps = np.diff(np.unique(samples))
     step = float(steps.min()) if len(steps) else 0.0
@@ -244,11 +241,7 @@ def _mean(samples: Floats) -> tuple[float, float]:
 
 
 def _bias_std(rested: Sequence[Rests], seconds: Sequence[float]) -> float:
-    """Return the standard deviation of the mean error of the measured bias over all runs, rad/s.
-
-    The error has two causes: the gyro's noise in the standstills, and the random walk of the bias
-    between and outside of them.
-    """
+    """Return the standard deviation of the mean bias error over all runs, rad/s."""
     count = sum(len(t) for t, _, _ in rested)
     noise = sum(float(variance.sum()) for _, _, variance in rested) / max(1, count) ** 2
     walked = [np.column_stack((np.diff(v) ** 2 - n[1:] - n[:-1], np.diff(t))) for t, v, n in rested]
@@ -305,10 +298,7 @@ def offset(found: Sequence[Heading], driven: Sequence[Run]) -> float:
 
 
 def _correlation(later: Floats, earlier: Floats, reach: int) -> Floats:
-    """Return the correlation of two series for shifts from -reach to reach samples.
-
-    A positive shift means that `later` lags behind `earlier`.
-    """
+    """Return the correlation for shifts from -reach to reach. At a positive shift, `later` lags."""
     size = 1 << (len(later) + reach).bit_length()
     spectrum = np.fft.rfft(later, size) * np.conj(np.fft.rfft(earlier, size))
     whole = np.fft.irfft(spectrum, size)
@@ -398,7 +388,7 @@ def turned(rows: Rows, base: Base, parameters: Floats) -> Floats:
 
 
 def _by_growth(rows: Rows, base: Base, parameters: Floats) -> Floats:
-    """Return the derivative of the turn in each interval with respect to TRACK_GROWTH, rad2/s."""
+    """Return the derivative of each interval's turn with respect to TRACK_GROWTH, rad2/s."""
     left, right, inverse = parameters[[P.LEFT, P.RIGHT, P.INVERSE_TRACK]]
     gain = base.gain * inverse * (left + right) / 2
     return np.asarray(-gain * abs(gain) * rows.fast)

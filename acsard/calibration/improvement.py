@@ -246,10 +246,9 @@ def per_amount(sums: Floats, unit: float) -> BeforeAfter:
 
 
 def _gain(kinds: Sequence[Floats]) -> tuple[float, float]:
-    """Return a pair: `Improvement.gain` and `Improvement.chance`.
+    """Return `Improvement.gain` and `Improvement.chance`.
 
-    `kinds` has an array for each kind of error (of headings, of positions), shape (folds, 3). A row
-    contains the three numbers that `rms()` takes, for the drive of one fold.
+    Each array in `kinds` is of one kind of error, and has for each fold a row that `rms()` takes.
     """
     drives = np.any([squares[:, 2] > 0.0 for squares in kinds], axis=0)
     if not np.any(drives):
@@ -280,27 +279,13 @@ def with_chance(gain: Callable[[Mask], float], drives: Mask) -> tuple[float, flo
 def _by_group(
     before: Floats, after: Floats, group: npt.NDArray[np.int64], among: Mask, amount: float
 ) -> Floats:
-    """Return the three numbers for `per_amount`: total error before, total error after, `amount`.
-
-    Args:
-        before: error of the turn in each interval before the calibration, rad.
-        after: error of the turn in each interval after the calibration, rad.
-        group: number of the group of each interval. The total error is the sum of the absolute
-            errors of the groups. In a group, the errors of the intervals are added with their
-            signs.
-        among: mask of the intervals that count.
-        amount: the driven angle or distance.
-    """
+    """Return the numbers for `per_amount()`. The errors in a group are added with their signs."""
     sums = (np.abs(np.bincount(group[among], errors[among])).sum() for errors in (before, after))
     return np.array([*sums, amount])
 
 
 def _of_headings(held: Sequence[Fold], before: Floats, after: Floats, rows: Rows) -> Floats:
-    """Return the squared heading errors of each fold, shape (folds, 3).
-
-    A row contains the sum before the calibration, the sum after it (both in deg2), and the number
-    of samples. `before` and `after` contain the error of the turn in each interval, rad.
-    """
+    """Return for each fold the row of squared heading errors, deg2, that `rms()` takes."""
     found = np.zeros((len(held), 3))
     for number, fold in enumerate(held):
         out = fold.blocks[rows.block]
@@ -315,11 +300,7 @@ def _of_positions(
     held: Sequence[Fold], configured: Floats, base: Base,
     places: Sequence[Sequence[Segment]], steps: Sequence[WheelSteps],
 ) -> Floats:  # fmt: skip
-    """Return the squared position errors of each fold, shape (folds, 3).
-
-    A row contains the sum before the calibration, the sum after it (both in m2), and the number of
-    positions.
-    """
+    """Return for each fold the row of squared position errors, m2, that `rms()` takes."""
     found = np.zeros((len(held), 3))
     present = [path(run, base, configured) for run in steps]
     for number, (fold, out) in enumerate(zip(held, places, strict=True)):

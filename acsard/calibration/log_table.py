@@ -128,11 +128,7 @@ def spikes(values: Floats, order: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_
 
 
 def _alone(sizes: Floats, usual: float) -> npt.NDArray[np.bool_]:
-    """Return a mask of the values that are more than `SPIKE` times as large as their neighbors.
-
-    The neighbors of a value are the nearest values before and after it that are not NaN. A value
-    in the mask is also more than `SPIKE` times as large as `usual`.
-    """
+    """Return a mask of the values above `SPIKE` times `usual` and times both their neighbors."""
     held = np.flatnonzero(np.isfinite(sizes))
     seen = np.concatenate([[0.0], sizes[held], [0.0]])
     around = np.maximum(np.maximum(seen[:-2], seen[2:]), usual)
@@ -243,11 +239,7 @@ def _text(data: bytes) -> str:
 
 
 def _header(lines: Sequence[str]) -> tuple[int, list[tuple[str, str]], str]:
-    """Return three values: the number of lines above the data, the columns, and the separator.
-
-    A column is a pair of its name and its unit. The header may also be the last comment above the
-    numbers, as numpy writes it.
-    """
+    """Return the number of lines above the data, the (name, unit) pairs, and the separator."""
     comment = ""
     for at, line in enumerate(lines):
         text = line.strip()
@@ -258,6 +250,7 @@ def _header(lines: Sequence[str]) -> tuple[int, list[tuple[str, str]], str]:
             cells = _cut(text, separator)
             if not all(_is_number(cell) for cell in cells):
                 return at + 1, _names(text, separator), separator
+            # numpy writes the header as the last comment above the numbers.
             separator = _separator(comment)
             names = _names(comment, separator)
             if 1 < len(names) == len(cells) or "t" in [name for name, _ in names]:
@@ -294,10 +287,6 @@ def _is_number(cell: str) -> bool:
 
 
 def _columns(header: list[str], number: int) -> list[str]:
-    """Return the names of the columns, with "" for each unused column.
-
-    Raises `LogError` if a column that the calibration needs is missing.
-    """
     where = f"line {number} (the header)"
     twice = {name for name in header if name in COLUMNS and header.count(name) > 1}
     if twice:
@@ -356,10 +345,7 @@ def _unknown_units(header: list[tuple[str, str]], names: list[str]) -> list[str]
 
 
 class _Reader:
-    """Parser of the lines below the header.
-
-    The parser must be fast, because a log may have a million lines.
-    """
+    """Parser of the lines below the header. It must be fast: a log may have a million lines."""
 
     def __init__(self, names: list[str], separator: str, factors: list[float]) -> None:
         self._names, self._separator, self._factors = names, separator, factors
@@ -398,14 +384,12 @@ class _Reader:
         self._runs.append(self._known.setdefault(name, len(self._known)))
 
     def _cells(self, line: str) -> list[str]:
-        """Return the cells of a line that contains quotes or "#"; [] if the line is a comment.
-
-        A "#" after a number begins a comment, but not in the name of a run or in an unused column.
-        """
+        """Return the cells of a line without its comment; [] if the line is only a comment."""
         cells = _cut(line, self._separator)
         if line.lstrip().startswith("#") and not self._begins_with_its_run(cells):
             return []
         for i, cell in enumerate(cells):
+            # The name of a run, or an unused column, may contain a "#".
             if i == self._run or (i < self._last and i not in self._picks):
                 continue
             if cell.lower() not in EMPTY_CELLS and (comment := TRAILING_COMMENT.search(cell)):
@@ -443,7 +427,6 @@ class _Reader:
         self._first = self._first or why
 
     def table(self, notes: list[str]) -> Table:
-        """Return the table. Raises `LogError` if too many rows could not be read."""
         rows = len(self._runs)
         if self._bad > max(FEW, SHARE * rows) or (self._bad and not rows):
             raise LogError(

@@ -437,21 +437,12 @@ class _Window(Struct, frozen=True):
 
     residual: Floats
     start: Floats
-    """Change of each residual with each coordinate of the unknown start pose.
-
-    The shape is (residuals, unknowns).
-    """
+    """Change of each residual with each coordinate of the start pose: (residuals, unknowns)."""
     motion: _Motion
     along: Floats
-    """Change of each residual if the distance of a step is wrong by 1 m.
-
-    The shape is (residuals, steps).
-    """
+    """Change of each residual if the distance of a step is wrong by 1 m: (residuals, steps)."""
     yaw: Floats
-    """Change of each residual if the turn of a step is wrong by 1 rad.
-
-    The shape is (residuals, steps).
-    """
+    """Change of each residual if the turn of a step is wrong by 1 rad: (residuals, steps)."""
     sensor: dict[Source, Floats]
     """Maps each source of sensor noise to the covariance of the residuals if this noise is 1."""
     bias: Floats | float = 0.0
@@ -460,10 +451,8 @@ class _Window(Struct, frozen=True):
     def projected(self, known: Deviations) -> tuple[Floats, Floats, Floats]:
         """Return three arrays, from which the unknown start pose is projected out.
 
-        - The residuals.
-        - For each `Source`, the covariance of the residuals if its noise is 1.
-        - The covariance of the residuals due to the uncertainty `known` of track and wheel radii,
-          and to the uncertain bias of the gyro.
+        The arrays are the residuals, their covariance for each `Source` if its noise is 1, and
+        their covariance due to the uncertainty `known` and the uncertain bias of the gyro.
         """
         distance, turn, track = self.motion.distance, self.motion.turn, self.motion.track
         sides = np.maximum(np.abs(distance), track / 2 * np.abs(turn))
@@ -489,10 +478,6 @@ class _Window(Struct, frozen=True):
 def _windows(
     held: Sequence[Fold], seen: Reference, known: Deviations, motions: list[_Motion]
 ) -> Windows | None:
-    """Return the windows of all drives, or None if no drive has a window.
-
-    `held` contains the drives. The motion in each window is appended to `motions`.
-    """
     rows = []
     for number, fold in enumerate(held):
         for window in _of_drive(fold, seen):
@@ -541,7 +526,7 @@ def _of_drive(fold: Fold, seen: Reference) -> Iterator[_Window]:
 
 
 def _times(begin: float, end: float) -> Iterator[Floats]:
-    """Yield the times, s, of the residuals of each window. Neighboring windows overlap by half."""
+    """Yield the times of the residuals of each window. Neighboring windows overlap by half."""
     whole = min(end - begin, WINDOW_S)
     if whole > 0.0:
         count = max(1, round(2 * (end - begin) / WINDOW_S) - 1)
@@ -553,12 +538,9 @@ def _by_headings(
     t: Floats, at: Floats, heading: Heading, way: Path, track: float, headings: Headings,
     parameters: Floats,
 ) -> _Window:  # fmt: skip
-    """Return a window whose residuals are differences of headings at the times `t`, s.
+    """Return a window whose residuals are the heading of the sensor minus that of the wheels.
 
-    A residual is the heading of the sensor minus the heading of the wheels. `t` are times on the
-    wheels' clock, and `at` the same moments on the sensor's clock. `heading` is the heading that
-    the sensor measured, and `way` the path according to the wheels. `track` is the effective
-    track, m.
+    `t` are times on the wheels' clock, and `at` the same moments on the sensor's clock.
     """
     motion, since = _Motion.of(t, way, track), t - t[0]
     turned = np.interp(at, heading.t, heading.angle) - parameters[P.BIAS_ERROR] * since
@@ -576,12 +558,10 @@ def _by_headings(
 def _by_places(
     t: Floats, at: Floats, place: Complexes, way: Path, track: float, parameters: Floats
 ) -> Iterator[_Window]:
-    """Yield a window whose residuals are differences of positions at the times `t`, s.
+    """Yield a window of position residuals, unless one of the times `t` has no position.
 
-    `place` contains the measured positions (x + iy, m), and `at` their times, s. `way` is the path
-    according to the wheels. A residual is the median over the positions that are nearer to one of
-    the times `t` than to the others. If one of these times has no position, no window is yielded.
-    `track` is the effective track, m.
+    A residual is the median over the positions that are nearer to one of the times `t` than to the
+    others. `place` contains the positions (x + iy, m), and `at` their times, s.
     """
     group = np.searchsorted((t[1:] + t[:-1]) / 2, at)
     numbers = range(len(t))
@@ -608,5 +588,4 @@ def _by_places(
 
 
 def _both(places: Complexes) -> Floats:
-    """Return the x coordinates of all places x + iy, and then their y coordinates."""
     return np.concatenate((places.real, places.imag))

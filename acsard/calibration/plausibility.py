@@ -259,11 +259,6 @@ def turns_the_right_way(source: str, sides: Floats | None, begun: StartingPoint 
 
 
 def _wrong_sign(sides: Floats) -> str:
-    """Return the side whose wheel speeds have the wrong sign: "left", "right", or "" for neither.
-
-    Return "turn" if the speeds of both sides have the wrong sign. `sides` contains the factors of
-    the left and of the right side. A negative factor means a wrong sign.
-    """
     left, right = (sides > 0.0).tolist()
     if left:
         return "" if right else "right"

@@ -111,11 +111,7 @@ class Path(Struct, frozen=True):
         return here, derivatives
 
     def _sensor(self, t: Floats, parameters: Floats) -> tuple[Complexes, Complexes]:
-        """Return two arrays: the places of the position sensor, and the headings of the robot.
-
-        Each array has a value for each of the times `t`, s. A place is x + iy in m. A heading is a
-        complex number of length 1.
-        """
+        """Return the places of the sensor, x + iy, m, and the headings as unit complex numbers."""
         ahead = np.exp(1j * np.interp(t, self.t, self.heading))
         lever = complex(parameters[P.SENSOR_X], parameters[P.SENSOR_Y])
         return np.interp(t, self.t, self.place) + lever * ahead, ahead
@@ -202,11 +198,7 @@ def place(steps: WheelSteps, base: Base, parameters: Floats) -> Complexes:
 
 
 def _directions(turns: Floats) -> tuple[Floats, Complexes]:
-    """Return a pair: headings, rad, and the chord of each step.
-
-    The headings are those before the first step and after each step. A chord is a complex number,
-    computed for an arc of length 1.
-    """
+    """Return the headings around the steps, and the chord of each step for an arc of length 1."""
     heading = cumulative(turns)
     return heading, np.exp(1j * (heading[:-1] + turns / 2)) * np.sinc(turns / (2 * np.pi))
 
@@ -416,16 +408,12 @@ def _furthest(segments: Sequence[Segment], most: int) -> list[Segment]:
 
 
 def _local_minima(tried: Sequence[StartingPoint]) -> list[StartingPoint]:
-    """Return the points of `tried` whose `unexplained` is not above that of either neighbor."""
     left = [np.inf, *(point.unexplained for point in tried), np.inf]
     return [p for at, p in enumerate(tried) if p.unexplained <= min(left[at], left[at + 2])]
 
 
 def _penalty(point: StartingPoint, sides: Floats | None) -> float:
-    """Return the penalty factor of a starting point: 1, or more if its robot is unusual.
-
-    `sides` is the result of `heading.first()`, or None without a heading sensor.
-    """
+    """Return 1, or more if the robot of `point` is unusual. `sides` is from `heading.first()`."""
     signed = point.parameters[[P.LEFT, P.RIGHT]] * point.parameters[P.INVERSE_TRACK]
     turn, (least, most) = float(np.abs(signed).mean()), USUAL_TURN_RANGE
     like = np.ones(2)
@@ -446,11 +434,6 @@ def _turn(parameters: Floats) -> float:
 def _timed(
     point: StartingPoint, kept: Sequence[Segment], steps: dict[int, WheelSteps], base: Base
 ) -> StartingPoint:
-    """Return `point` with the delay of the positions that fits best among `DELAYS_S`.
-
-    `kept` contains the segments that are compared with the path, and `steps` the rolling of the
-    wheels in each run.
-    """
     parameters = point.parameters
     shape = float(np.sign(parameters[P.LEFT])), _turn(parameters)
     tried = [_tried(kept, steps, base, (*shape, late)) for late in DELAYS_S]
@@ -465,13 +448,8 @@ def _tried(
 ) -> StartingPoint:
     """Return the starting point for a shape of the path, with the wheel size that fits best.
 
-    Args:
-        kept: the segments that are compared with the path.
-        steps: the rolling of the wheels in each run.
-        base: the configured geometry.
-        shape: three numbers: the sign of the left wheels' rolling, the ratio of configured to true
-            track (negative if the robot turns opposite to its wheels), and the delay of the
-            positions, s.
+    `shape` contains the sign of the left wheels' rolling, the ratio of configured to true track
+    (negative if the robot turns opposite to its wheels), and the delay of the positions, s.
     """
     parameters = base.start()
     parameters[[P.LEFT, P.RIGHT, P.INVERSE_TRACK, P.DELAY]] = shape[0], 1.0, shape[1], shape[2]
@@ -495,11 +473,6 @@ def _tried(
 def _refined(
     point: StartingPoint, few: Sequence[Segment], steps: dict[int, WheelSteps], base: Base
 ) -> StartingPoint:
-    """Return a starting point that is refined by a fit to the segments `few`.
-
-    The parameters of `point` are kept if the refined ones fit worse, or if the refinement changes
-    the robot's turn too much (`MAX_REFINEMENT`).
-    """
     segments = [replace(segment, block=number) for number, segment in enumerate(few)]
 
     def source(parameters: Floats) -> Evidence:

@@ -138,10 +138,6 @@ def _bag(files: list[Path], config: Config, choice: Choice) -> Table:
 
 
 def _messages(file: Path, notes: list[str]) -> Iterator[RosMessage]:
-    """Yield the messages of a bag file in file order.
-
-    If the file is cut off or damaged, the generator appends a note to `notes` and ends.
-    """
     with file.open("rb") as stream:
         try:
             for schema, channel, one in _reader(stream).iter_messages(log_time_order=False):
@@ -158,10 +154,7 @@ def _messages(file: Path, notes: list[str]) -> Iterator[RosMessage]:
 
 
 def _measured(log: Path) -> bytes:
-    """Return the CSV table of a black-box recording, as `measured` computes it.
-
-    Raises `LogError` if the recording is unreadable or contains no gyro samples.
-    """
+    """Return the CSV table that `measured` makes of a black-box recording."""
     try:
         recording = Recording(log)
     except RecordingError as error:

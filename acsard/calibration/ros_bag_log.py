@@ -144,11 +144,7 @@ class _Topic:
         return pose.position.x, pose.position.y, _yaw(pose.orientation)
 
     def _joints(self, message: JointState, joints: Sequence[str]) -> Sequence[float]:
-        """Return the angles of all wheels, rad, and then their speeds, rad/s.
-
-        Angles or speeds that the message does not contain are NaN. The result is () if no joint is
-        a wheel, or if the wheels differ from those of the topic's first message.
-        """
+        """Return the angles, then the speeds; () if the wheels differ from the first message."""
         columns = wheel_joints(tuple(message.name), tuple(joints))
         self.joints.update(message.name[:8])
         self.wheels = self.wheels or tuple(columns)
@@ -174,7 +170,6 @@ class _Topic:
 
 
 def _yaw(turn: Quaternion) -> float:
-    """Return the yaw of a rotation, rad; NaN for a quaternion of zeros."""
     size = turn.x**2 + turn.y**2 + turn.z**2 + turn.w**2
     if not size:
         return math.nan
@@ -290,10 +285,6 @@ class _Log:
     # Choice of the topics
 
     def _chosen(self) -> tuple[_Topic, _Topic | None, _Topic | None]:
-        """Return the topics of the wheels, the gyro and the positions.
-
-        Raises `LogError` if a needed topic is missing, has too few messages, or is ambiguous.
-        """
         names = self._choice.topics
         known = {topic.name: topic for topic in self._topics}
         for name in names:
@@ -338,12 +329,7 @@ class _Log:
         return wheels, gyro, places
 
     def _one(self, what: str, fit: Sequence[_Topic], *, free: bool = True) -> _Topic | None:
-        """Return the topic to use among `fit`, or None if no topic can be used.
-
-        Topics that the user named take precedence. If `free` is false, only a topic that the user
-        named is used. `what` names the data in error messages, such as "the wheels". Raises
-        `LogError` if several topics remain, or if the topic has too few messages.
-        """
+        """Return the topic to use, if any. Unless `free`, use only a topic that the user named."""
         named = [topic for topic in fit if topic.name in self._choice.topics]
         for topic in named:
             if len(topic) < MIN_MESSAGES:
@@ -512,20 +498,13 @@ def speeds_of(t: Floats, angles: Floats) -> tuple[Floats, Floats]:
 
 
 def _unwrapped(angles: Floats) -> Floats:
-    """Return the angles, rad, without jumps by 2 pi.
-
-    Angles that span more than 2 pi are not wrapped, so they are returned unchanged.
-    """
+    """Remove jumps by 2 pi. Angles that span more than 2 pi are not wrapped."""
     jumps = np.abs(np.diff(angles)).max(initial=0.0) > np.pi
     within = float(np.ptp(angles)) <= 2 * np.pi + 1e-3 if len(angles) else False
     return np.unwrap(angles) if jumps and within else angles
 
 
 def _sides(wheels: dict[str, Floats]) -> tuple[Floats, Floats, Floats]:
-    """Return the times of the wheel samples, s, and the rolled angles of the two sides, rad.
-
-    The result is the triple (times, left, right). The angle of a side is the mean over its wheels.
-    """
     t = wheels["t"]
     left, right = (
         np.mean([wheels[name] for name in wheels if name in names], axis=0)
@@ -546,11 +525,7 @@ def _edges(t: Floats, sides: tuple[Floats, Floats, Floats]) -> Floats:
 
 
 def _follows(t: Floats, rates: Floats, sides: tuple[Floats, Floats, Floats]) -> float:
-    """Return the correlation between a sensor's turns and those of the wheels; NaN if unknown.
-
-    `rates` contains the sensor's turn rates at the times `t`, s. `sides` contains the times and
-    the rolled angles of the two sides, as `_sides` returns them.
-    """
+    """Return the correlation of a sensor's turns with those of the wheels; NaN if unknown."""
     order = np.argsort(t, kind="stable")
     edges = _edges(t, sides)
     if len(edges) < 4:
@@ -564,11 +539,7 @@ def _follows(t: Floats, rates: Floats, sides: tuple[Floats, Floats, Floats]) -> 
 
 
 def _computed_from(t: Floats, yaw: Floats, sides: tuple[Floats, Floats, Floats]) -> bool:
-    """Return whether the yaw follows the wheels so exactly that it was computed from them.
-
-    `yaw`, rad, was measured at the times `t`, s. `sides` contains the times and the rolled angles
-    of the two sides, as `_sides` returns them.
-    """
+    """Return whether the yaw follows the wheels so exactly that it was computed from them."""
     held = np.isfinite(yaw)
     order = np.argsort(t[held], kind="stable")
     times, angle = t[held][order], np.unwrap(yaw[held][order])

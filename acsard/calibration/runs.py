@@ -288,7 +288,6 @@ def runs(table: Table) -> Log:
 
 
 def _numbered(prefix: str, number: int, taken: Collection[str]) -> str:
-    """Return `prefix` with the first number, from `number` on, that gives a name not in `taken`."""
     while f"{prefix}{number}" in taken:
         number += 1
     return f"{prefix}{number}"
@@ -309,10 +308,7 @@ def _sides(columns: dict[str, Floats], notes: Notes) -> tuple[Floats, Floats]:
 
 
 def _apart(columns: dict[str, Floats], front: str, rear: str) -> float:
-    """Return the difference between the front and the rear wheel of a side.
-
-    The difference is a fraction of the rolled distance. Raises `LogError` if it is above `APART`.
-    """
+    """Return how much two wheels of a side differ, as a fraction of the rolled distance."""
     seen = np.isfinite(columns[front]) & np.isfinite(columns[rear])
     starts = np.arange(0, int(seen.sum()), SUMMED_ROWS)
     if not len(starts):
@@ -333,12 +329,7 @@ def _apart(columns: dict[str, Floats], front: str, rear: str) -> float:
 
 
 def _restarts(t: Floats, rows: Rows, columns: dict[str, Floats]) -> list[Rows]:
-    """Split `rows` where the times `t` jump back. Return the rows of each drive.
-
-    Only the times of rows with wheel speeds are checked. The rows stay together if there are more
-    than `MAX_RESTARTS` jumps. The rows also stay together if the parts do not overlap in time,
-    because they are then unsorted rows of one drive.
-    """
+    """Split `rows` into drives where the times of the wheel samples jump back."""
     # The times of rows without wheel speeds may jump back within a drive, because a file may list
     # all rows of one sensor after all rows of another.
     wheels = rows[np.isfinite(columns["left"][rows]) & np.isfinite(columns["right"][rows])]
@@ -347,6 +338,7 @@ def _restarts(t: Floats, rows: Rows, columns: dict[str, Floats]) -> list[Rows]:
         return [rows]
     blocks = [part for part in np.split(wheels, back) if len(part) >= MIN_ROWS]
     spans = sorted((float(np.min(t[part])), float(np.max(t[part]))) for part in blocks)
+    # Parts that do not overlap in time are unsorted rows of one drive.
     if not any(a[1] > b[0] for a, b in pairwise(spans)):
         return [rows]
     return list(np.split(rows, np.searchsorted(rows, wheels[back])))
@@ -358,7 +350,7 @@ def _wheel_times(t: Floats, rows: Rows, columns: dict[str, Floats]) -> Floats:
 
 
 def _in_seconds(name: str, t: Floats, parts: list[Rows], columns: dict[str, Floats]) -> None:
-    """Raise `LogError` if the times of run `name` are not in seconds or are too coarse."""
+    """Raise `LogError` if the times of a run are not in seconds or are too coarse."""
     for rows in parts:
         times = _wheel_times(t, rows, columns)
         if len(times) < MIN_ROWS:
@@ -379,10 +371,6 @@ def _in_seconds(name: str, t: Floats, parts: list[Rows], columns: dict[str, Floa
 
 
 def _pauses(t: Floats, rows: Rows, columns: dict[str, Floats]) -> list[Rows]:
-    """Split `rows` where the wheels have no sample for `NEW_RUN_AFTER_S`.
-
-    Return the rows of each drive.
-    """
     # Without this split, one row with a time of another day would make the drive many hours long.
     times = _wheel_times(t, rows, columns)
     ends = np.flatnonzero(np.diff(times) > NEW_RUN_AFTER_S)
@@ -417,7 +405,6 @@ def _run(name: str, streams: Streams) -> Run:
 
 
 def _remove_repeats(drives: Iterable[tuple[str, Streams]], notes: Notes) -> None:
-    """Remove, in place, the yaws and positions in `drives` that the logger repeated."""
     # A short drive may not show the repetition, so all drives are evaluated together.
     for what in ("yaw", "x y"):
         found = [(streams, *_repeats(streams, what)) for _, streams in drives]
@@ -436,11 +423,7 @@ def _remove_repeats(drives: Iterable[tuple[str, Streams]], notes: Notes) -> None
 
 
 def _repeats(streams: Streams, what: str) -> tuple[Mask, Mask]:
-    """Return two masks of the samples of the sensor `what`, in the order of time.
-
-    The first mask is true for a sample with the same values as the sample before it. The second
-    mask is true for a sample during which the wheels roll.
-    """
+    """Return masks of the samples that repeat the one before, and of those with rolling wheels."""
     t, *values = streams[what]
     if not len(t):
         return np.zeros(0, dtype=bool), np.zeros(0, dtype=bool)
@@ -452,10 +435,6 @@ def _repeats(streams: Streams, what: str) -> tuple[Mask, Mask]:
 def _stream(
     columns: dict[str, Floats], rows: Rows, names: Iterable[str], notes: Notes
 ) -> tuple[Floats, ...]:
-    """Return a sensor's times and its values in the columns `names`, sorted by time.
-
-    Rows in which a value is missing are left out. If the log lacks a column, all arrays are empty.
-    """
     held = [columns.get(name) for name in names]
     if any(values is None for values in held):
         return (np.zeros(0),) * (1 + len(held))
@@ -465,10 +444,6 @@ def _stream(
 
 
 def _ordered(stream: list[Floats], what: str, notes: Notes) -> Iterator[Floats]:
-    """Yield the columns, sorted by time (the first column).
-
-    Of several rows with the same time, only the first is kept.
-    """
     t = stream[0]
     notes.add(f"{{}} rows of {what} are out of order and were sorted", int((np.diff(t) < 0).sum()))
     order = np.argsort(t, kind="stable")
@@ -561,11 +536,7 @@ def blocks(driven: Sequence[Run], shortest_s: float) -> list[Block]:
 
 
 def _turned(run: Run, begin: float, end: float, left: Floats, right: Floats) -> bool:
-    """Return whether the wheels of a side rolled by at least `MIN_BLOCK_ROLL` in a time interval.
-
-    The interval is from `begin` to `end`, s. `left` and `right` contain the rolled angles at the
-    two times, rad. Angles that the wheels roll back and ahead are added.
-    """
+    """Return whether a side rolled by `MIN_BLOCK_ROLL`. Back and ahead do not cancel out."""
     if max(abs(left[1] - left[0]), abs(right[1] - right[0])) >= MIN_BLOCK_ROLL:
         return True
     a, b = np.searchsorted(run.t, (begin, end))

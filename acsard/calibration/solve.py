@@ -343,11 +343,7 @@ def _known(best: Candidate, odometry: OdometryConfig) -> Deviations:
 def _noise(
     best: Candidate, known: Deviations, odometry: OdometryConfig, *, present: bool
 ) -> Noise | None:
-    """Return the noise of the odometry that was measured in this log; None if it was not measured.
-
-    If `present` is true, the path of the wheels is computed with the configured geometry. Otherwise
-    it is computed with the fitted geometry.
-    """
+    """Measure the odometry noise, with the configured geometry if `present`, or else the fitted."""
     made, fitted = best.made, best.fitted
     held = folds(fitted, made.parts, drives(made.runs), best.rate)
     if present:
@@ -363,12 +359,9 @@ def _noise(
 
 
 def _candidates(made: Prepared) -> list[Candidate]:
-    """Return one or two fits to the log.
+    """Return one fit, or two if the log does not determine both the track and the radius ratio.
 
-    If the log determines both the track and the ratio of the radii, the only fit is that of all
-    parameters. Otherwise the first fit keeps the ratio as configured, and the second fit keeps the
-    track. A fit that is too inaccurate or does not converge is left out. Raises `RefusedError` if
-    no fit remains.
+    The first of two fits keeps the ratio as configured, and the second fit keeps the track.
     """
     found: list[Candidate] = []
     deviations: dict[str, float] = {}
@@ -405,10 +398,6 @@ def _candidates(made: Prepared) -> list[Candidate]:
 
 
 def _held(base: Base) -> dict[str, list[Held]]:
-    """Return the constraints that keep a quantity as configured, by the name of the quantity.
-
-    The name "" stands for a fit without constraints.
-    """
     ratio, track, growth = np.zeros((3, PARAMETER_COUNT))
     ratio[[P.LEFT, P.RIGHT]] = base.right, -base.left
     track[P.INVERSE_TRACK] = growth[P.TRACK_GROWTH] = 1.0
@@ -416,10 +405,6 @@ def _held(base: Base) -> dict[str, list[Held]]:
 
 
 def _candidate(made: Prepared, fitted: Fit) -> Candidate:
-    """Return a fit with the improvement that it brings.
-
-    Raises `RefusedError` if the robot hardly turned.
-    """
     headings, base = made.headings, made.base
     rows, by_wheels = made.rows, heading.turned(made.rows, base, fitted.parameters)
     gyro_scale = 1 + float(fitted.parameters[P.SCALE_ERROR])

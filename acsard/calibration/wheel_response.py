@@ -161,10 +161,9 @@ def response(
 
 
 def _commanded(run: Run, drive: DriveConfig) -> tuple[Floats, Floats, Floats]:
-    """Return three arrays: time steps, s, commanded wheel speeds and measured wheel speeds, rad/s.
+    """Return time steps, s, and the commanded and measured speeds (left, right), rad/s.
 
-    The speeds have the shape (samples, 2), with the left side first. The time step of a sample is
-    NaN if no command applies to the sample, or if a gap in the samples precedes it.
+    A step is NaN if no command applies to its sample, or if a gap precedes the sample.
     """
     kinematics = Kinematics(drive)
     ahead = kinematics.wheel_speeds(Twist(1.0, 0.0))
@@ -180,12 +179,7 @@ def _commanded(run: Run, drive: DriveConfig) -> tuple[Floats, Floats, Floats]:
 
 
 def _expected(steps: Floats, wanted: Floats, seen: Floats) -> Floats:
-    """Return the speeds of the wheels that each response time in `RESPONSE_TIMES_S` predicts,
-    rad/s.
-
-    The arguments are the arrays that `_commanded` returns. The shape of the result is (samples, 2,
-    times).
-    """
+    """Return the speeds that each of `RESPONSE_TIMES_S` predicts: (samples, 2, times)."""
     # The speed y of a healthy wheel follows the command u with the response time T:
     #
     #     T dy/dt = u - y
@@ -203,10 +197,7 @@ def _expected(steps: Floats, wanted: Floats, seen: Floats) -> Floats:
 def _evidence(
     parts: Sequence[tuple[Floats, Floats, Floats]], response_time: float, fault_time: float
 ) -> float:
-    """Return the longest time for which the daemon's fault detection considers a wheel faulty, s.
-
-    `parts` contains the triples that `_commanded` returns.
-    """
+    """Return the longest time for which the daemon would consider a wheel faulty, s."""
     longest, most = 0.0, fault_time / MIN_EVIDENCE_LINES
     for steps, wanted, seen in parts:
         sides = [(Expected(), Witness()) for _ in range(2)]
@@ -224,11 +215,7 @@ def _evidence(
 
 
 def _fastest(parts: Sequence[tuple[Floats, Floats, Floats]]) -> float:
-    """Return the highest steady speed of a wheel that stays below its command, rad/s.
-
-    Return infinity if no wheel has such a speed. `parts` contains the triples that `_commanded`
-    returns.
-    """
+    """Return the highest steady speed of a wheel that stays below its command, rad/s."""
     found: list[float] = []
     for steps, wanted, seen in parts:
         for told, speed in zip(wanted.T, np.abs(seen.T), strict=True):

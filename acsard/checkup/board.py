@@ -80,7 +80,7 @@ class Operator(Protocol):
 
 
 def _nothing() -> None:
-    """Do nothing. This is the default of `Board.between`."""
+    pass
 
 
 MIN_WAIT_S = 0.001
@@ -197,7 +197,6 @@ class Board:
             self.wire.close()
 
     def _farewell(self) -> None:
-        """Send zeros several times, but send nothing more once a motor runs away."""
         # If an encoder is reversed, the firmware's speed control may make the motor run away even
         # when zeros are sent. Each further line would keep the watchdog from stopping the motor.
         self.armed, self.restarts.watched, self.between = False, False, _nothing

@@ -46,10 +46,6 @@ def baud(board: Board) -> Finding:
 
 
 def _knock(board: Board, seconds: float) -> bool:
-    """Send zeros, and return whether three valid replies arrive within `seconds` s.
-
-    If they arrive, set `board.sealed` to whether all replies have a checksum.
-    """
     end_s = board.now_s + seconds
     while board.now_s < end_s:
         board.zeros()
@@ -121,10 +117,6 @@ def comma(board: Board, dead: bool) -> Finding:
 
 
 def _comma_wrong(board: Board, how: str) -> Finding:
-    """Return the finding that `mcu.trailing_comma` is wrong.
-
-    `how` is the last part of the outcome's name in `outcomes.py`.
-    """
     return outcomes.find(
         f"trailing comma: {how}",
         {"mcu.trailing_comma": board.comma},

@@ -68,10 +68,6 @@ def finding(board: Board, operator: Operator, safety: SafetyConfig) -> Finding:
 
 
 def _pressed(board: Board, operator: Operator, asked: Input, inputs: list[Input]) -> str:
-    """Let the operator press and release the input `asked`, and describe wrong reports.
-
-    Return "" if the board reported exactly this press and its release, within `PRESS_TIMEOUT_S`.
-    """
     operator.doing(f"press the {asked.name} and release it, within {PRESS_TIMEOUT_S:g} s")
     end_s, seen = board.now_s + PRESS_TIMEOUT_S, set[int]()
     while board.now_s < end_s:

@@ -100,10 +100,7 @@ def finding(board: Board) -> Finding:
 
 
 def _period_s(board: Board) -> float:
-    """Return the time from one sent line to the next, s.
-
-    It is the control period of the daemon, or longer if the wire or the board is too slow for it.
-    """
+    """Return the daemon's control period, or a longer one that the wire and board can follow."""
     longest = line_bytes(board.comma, board.sealed, board.sampled)
     period_s = 1 / min(board.rate_hz, highest_rate(board.baud_rate, longest, COMFORTABLE_USE))
     if not board.own_clock and board.gap_s > 1.5 * period_s:
@@ -136,7 +133,7 @@ def _left_out(replies: Sequence[Reply]) -> int:
 
 
 def _silence_s(board: Board, replies: Sequence[Reply]) -> float:
-    """Return the longest gap between two replies, s, or 0 if the daemon would tolerate the gap."""
+    """Return the longest gap between two replies, or 0 if the daemon would tolerate the gap."""
     longest = max(_gaps(replies), default=0.0)
     quiet_s = max(0.1, 4 / board.rate_hz, 3 * board.mcu.reply_period)
     return longest if longest > max(quiet_s, SILENCE_FACTOR * board.gap_s) else 0.0
@@ -252,10 +249,7 @@ def pulsed(board: Board, motors: Sequence[int]) -> Ways | None:
 
 
 def _whole(board: Board, since_s: float) -> bool:
-    """Return whether all reports since the monotonic time `since_s`, s, have arrived.
-
-    Use this only for a board that reports by its own clock.
-    """
+    """Return whether no report since `since_s` is missing. The board must have its own clock."""
     times = [reply.at_s for reply in motion.since(board.replies, since_s - board.gap_s)]
     return all(after - before < 1.5 * board.gap_s for before, after in pairwise(times))
 
@@ -268,10 +262,6 @@ def _grain(board: Board, motors: Sequence[int]) -> float:
 
 
 def _stand(board: Board) -> bool:
-    """Send zeros until the motors stand still.
-
-    Return True if they stop soon enough for a further pulse, else False.
-    """
     began_s = board.now_s
     while board.turning():
         if board.now_s - began_s > motion.MOTOR_TIMEOUT_S / 2:

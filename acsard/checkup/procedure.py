@@ -121,10 +121,7 @@ def run(
     unjudged: set[str] = set()
 
     def once(finding: Finding | None) -> None:
-        """Pass a finding to `tell`, unless an earlier finding has the same name.
-
-        If the earlier finding says that the step was not judged, a later judgment is passed on too.
-        """
+        """Pass on the first finding of a name, and also its first judgment if that comes later."""
         if finding is None:
             return
         judged = lateness.judged(finding)
@@ -162,35 +159,25 @@ def run(
 
 
 class _Watched:
-    """Watches during the check that the operator stays at the robot.
-
-    `look` ends the check if the operator quits. It also ends the check after a stall of this
-    program, because the operator may have left the robot during the stall. The other methods are
-    those of the operator's prompt.
-    """
+    """Ends the check if the operator quits, or after a stall, when the operator may have left."""
 
     def __init__(self, operator: Operator, board: Board, asleep_ns: Callable[[], int]) -> None:
-        """Begin to look for stalls.
-
-        `asleep_ns` returns for how long this computer has been suspended since its start, ns.
-        """
         self.doing, self.keys = operator.doing, operator.keys
         self._operator, self._board, self._asleep_ns = operator, board, asleep_ns
         self._ran_s = self._now_s()
-        """Time of the last call of `look`, or of the operator's last answer if that is later, s."""
+        """Time of the last call of `look` or of the operator's last answer, s."""
 
     def _now_s(self) -> float:
         """Return a monotonic time, s, that advances even while the computer is suspended."""
         return self._board.now_s + self._asleep_ns() / NS_PER_S
 
     def ask(self, question: str, answers: Sequence[str]) -> str | None:
-        """Ask the operator, as `Operator.ask` does. The wait for the answer is not a stall."""
         answer = self._operator.ask(question, answers)
+        # The wait for the answer is not a stall.
         self._ran_s = self._now_s()
         return answer
 
     def look(self) -> None:
-        """Raise `KeyboardInterrupt` if the operator quits, and `StoppedError` after a stall."""
         now_s = self._now_s()
         stalled_s, self._ran_s = now_s - self._ran_s, now_s
         if stalled_s > (STALL_S if self._board.armed else ZEROS_STALL_S):
@@ -204,11 +191,7 @@ class _Watched:
 
 
 class _Steps:
-    """Runs the steps of the check.
-
-    It repeats a step if the board restarts during the step, or if the finding is doubtful because
-    this computer ran the step too late.
-    """
+    """Runs the steps. It repeats a step that a restart or a delay of this computer has spoilt."""
 
     def __init__(
         self,
@@ -247,11 +230,7 @@ class _Steps:
         self._board.armed = True
 
     def _turn(self, motor: int) -> Finding:
-        """Test one motor, ask the operator which wheel the motor turned, and return the finding.
-
-        If this computer was too late in every attempt at the test, do not ask the operator. The
-        finding then says that the motor was not judged.
-        """
+        """Test one motor. Ask the operator only if this computer was in time for the test."""
         board, operator, channels = self._board, self._operator, self._channels
         operator.doing(f"{motor_name(board.mcu, motor)} turns: briefly, then forward and back")
 
@@ -267,20 +246,10 @@ class _Steps:
         return encoder_finding(board.mcu, channels[motor])
 
     def _measure(self, doing: str, step: Step) -> None:
-        """Run a step and report its finding. `doing` is the message about it for the operator.
-
-        Repeat the step if the board restarts, or if the finding is doubtful because this computer
-        ran the step too late.
-        """
         self._take(doing, partial(self._in_time, step))
 
     def _in_time(self, step: Step) -> Finding | None:
-        """Run a step, and return its finding.
-
-        Repeat the step if its finding is doubtful because this computer ran the step too late
-        (`lateness.spoilt`). If the last permitted attempt is doubtful too, return the finding that
-        the step was not judged. Raises `StoppedError` if the step ends the check.
-        """
+        """Run a step again while its finding is doubtful because this computer was too late."""
         board, known, late_s = self._board, self._board.known, 0.0
         for _ in range(1 + min(LATE_AGAIN, self._late_left)):
             if late_s:
@@ -315,11 +284,6 @@ class _Steps:
         return found
 
     def _take(self, doing: str, step: Step) -> None:
-        """Run a step and report its finding. Repeat the step if the board restarts.
-
-        `doing` is the message about the step for the operator, or "" for no message. Raises
-        `StoppedError` if the step ends the check, or if the board restarts too often.
-        """
         board, again = self._board, 0
         known = board.known
         while True:
@@ -338,10 +302,9 @@ class _Steps:
                 board.known = known
 
     def _tried(self, step: Step) -> Finding | None:
-        """Run a step and return its finding.
+        """Run a step. Raise `RestartedError` if a restart of the board spoilt the step.
 
-        If the finding is bad and the board is silent, first wait until the board answers, because a
-        restart may be the cause. Raises `RestartedError` if the board has restarted.
+        A restart may be the cause of a bad finding, so wait until a silent board answers.
         """
         try:
             finding = step()
@@ -353,21 +316,11 @@ class _Steps:
         return finding
 
     def _await_return(self, silent_s: float) -> None:
-        """If the board is silent, send zeros until it answers, for at most `BOOT_S`.
-
-        The board is silent if its last reply is older than `silent_s`, s, and older than four times
-        the mean time between replies.
-        """
         board = self._board
         if board.silent_s > max(silent_s, 4 * board.gap_s):
             board.wakes(BOOT_S)
 
     def _come_back(self) -> None:
-        """Send zeros until a restarted board answers.
-
-        Then also wait until all motors stand still, unless the check has not yet seen that they do
-        (`Board.armed`). Raises `StoppedError` if the board does not answer within `BOOT_S`.
-        """
         board = self._board
         board.forget()
         self._operator.doing(

@@ -192,8 +192,6 @@ def _outcome(restarts: Sequence[Restart]) -> str:
 
 
 def _silent(restarts: Sequence[Restart]) -> bool:
-    """Return whether `restarts` are several, each after `MIN_SILENCE_S` or more without a sent
-    line."""
     return len(restarts) > 1 and all(one.silent_s >= MIN_SILENCE_S for one in restarts)
 
 

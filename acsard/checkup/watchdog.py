@@ -149,10 +149,7 @@ def measured(board: Board, motors: Sequence[int], stop: Run) -> Between:
 
 
 def _asked(board: Board, motors: Sequence[int], stop: Run, between: Between) -> Between:
-    """Return narrower bounds than `between`, by bisection with silences of other durations.
-
-    `stop` is the behavior of the motors in an ordinary stop.
-    """
+    """Narrow the bounds `between` by bisection. `stop` is an ordinary stop of the motors."""
     least_s, most_s = between
     # Each run halves the interval between the bounds, unless this computer is late.
     for _ in range(8):
@@ -216,10 +213,7 @@ def command(motors: Sequence[int]) -> Motors:
 
 
 def _per_turn(board: Board, motors: Sequence[int]) -> float:
-    """Return the measured number of encoder counts per wheel turn.
-
-    Return 0 if it is not known, or if the board's counters could overflow in the longest silence.
-    """
+    """Return the encoder counts per wheel turn; 0 if unknown or if a counter could overflow."""
     per_turn = encoder_counts.per_turn(board.replies, motors) or 0.0
     wraps = (
         per_turn * motion.RUNAWAY_SPEED / math.tau * motion.STANDSTILL_TIMEOUT_S >= FIELD_VALUES / 2

@@ -142,11 +142,7 @@ def encoder_finding(mcu: McuConfig, channel: Channel) -> Finding:
 
 
 def _whose(mcu: McuConfig, channel: Channel) -> str:
-    """Return the suffix that the operator's answer adds to the name of an outcome.
-
-    The suffix says what the operator saw, such as ", still", or which part is at fault: ", motor"
-    or ", encoder". It is "" if the outcome does not depend on the answer.
-    """
+    """Return what the operator's answer adds to the name of an outcome, such as ", motor"."""
     wheel, sign = wheel_of(mcu, channel.motor)
     seen = channel.wheel
     match channel.kind:
@@ -271,11 +267,6 @@ def run_up(board: Board, motors: Motors) -> Motors:
 
 
 def _patience_s(board: Board, told: list[int]) -> float:
-    """Return the longest wait for steady speeds, s.
-
-    `told` contains the numbers of the motors that were commanded to turn. The wait is longer while
-    one of these motors speeds up.
-    """
     shares = motion.trend(board.replies, board.now_s, board.gap_s)
     rises = any(shares[motor] > 1 / motion.SLOWING_RATIO for motor in told)
     return motion.SLOWING_TIMEOUT_S if rises else motion.MOTOR_TIMEOUT_S
@@ -294,10 +285,7 @@ def channel(board: Board, motor: int) -> Channel:
 
 
 def _both_ways(board: Board, motor: int) -> Channel:
-    """Turn a motor forward, then backward, stop it, and return how the encoders moved.
-
-    Probe the motor first. If its own encoder does not follow, do not turn the motor further.
-    """
+    """Turn a motor forward and back, unless a probe shows that its encoder does not follow."""
     shown = probe(board, motor)
     if shown is not None:
         return Channel(motor, shown, ZERO, probed=True)
@@ -341,10 +329,7 @@ def _probe(board: Board, motor: int, speed: float) -> Motors | None:
     began_s = board.now_s
 
     def shown() -> Motors:
-        """Return each encoder's mean speed in the probe, rad/s.
-
-        The speed at which a motor still turned before the probe is subtracted.
-        """
+        """Return each encoder's mean speed in the probe, without the earlier coasting, rad/s."""
         seconds = board.now_s - began_s
         ran = motion.covered(board.replies, began_s)
         sure = [max(0.0, abs(ran[m]) - abs(coasting[m]) * seconds) for m in range(4)]
@@ -369,11 +354,7 @@ def _probe(board: Board, motor: int, speed: float) -> Motors | None:
 
 
 def _with_other_comma(board: Board, dead: Channel) -> Channel:
-    """Test motor d again with the other line ending (a comma or none), because it did not move.
-
-    If the motor moves now, return the new result and keep the new ending. Otherwise return `dead`,
-    the result with the old ending.
-    """
+    """Test motor d again with the other line ending. Keep the ending if the motor moves now."""
     configured, board.comma = board.comma, not board.comma
     channel = _both_ways(board, dead.motor)
     if channel.probed or dead.motor not in moving(channel.forth):

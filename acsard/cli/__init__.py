@@ -82,11 +82,6 @@ class _Parser(argparse.ArgumentParser):
     def parse_known_args(  # type: ignore[override]
         self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None
     ) -> tuple[argparse.Namespace, list[str]]:
-        """Parse the words of the command line.
-
-        If a word in `args` is unknown, end the program with an error that names the `--help` to
-        read.
-        """
         # `parse_known_args` of argparse does not accept positional arguments on both sides of an
         # option, such as `1` and `cal.csv` in `export 1 --csv cal.csv`. So if a word is unknown,
         # parse all words again with `parse_known_intermixed_args`.
@@ -169,11 +164,7 @@ _EXPONENT = re.compile(r"-(\d+\.?\d*|\.\d+)[eE][+-]?\d{1,3}")
 
 
 def _decimal(word: str) -> str:
-    """Return a word of the command line without an exponent: `-0.001` for `-1e-3`.
-
-    Argparse would mistake `-1e-3` for an option. Any word that is not a negative number with an
-    exponent is returned unchanged.
-    """
+    """Write a number like `-1e-3`, which argparse would mistake for an option, as `-0.001`."""
     return f"{Decimal(word):f}" if _EXPONENT.fullmatch(word) else word
 
 
@@ -198,9 +189,8 @@ def entry() -> NoReturn:
 
 
 def _fill_closed_streams() -> None:
-    """Open /dev/null in the place of each standard stream that is closed."""
-    # Otherwise the serial port could get the file descriptor of the closed stream, and printed text
-    # would go to the motors.
+    # Open /dev/null for each closed stream. Otherwise the serial port could get the file descriptor
+    # of the closed stream, and printed text would go to the motors.
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         try:
             os.fstat(number)

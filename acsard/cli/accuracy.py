@@ -53,11 +53,6 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _config(robot: Client, path: str | None) -> Config:
-    """Return the daemon's configuration.
-
-    If the daemon does not send it, print a note and load the configuration file of this machine
-    instead. `path` is the value of --config, or None.
-    """
     try:
         return msgspec.convert(robot.get("config"), Config)
     except (NoAnswerError, NotPermittedError, msgspec.ValidationError):

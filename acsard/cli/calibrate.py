@@ -153,10 +153,6 @@ def _calibrate(args: argparse.Namespace, lines: JsonPrompt | None) -> int:
 
 
 def _require_fitting(args: argparse.Namespace) -> None:
-    """Raise `UsageError` if an option does not fit the kind of drive.
-
-    The drive is a recorded drive with `--log`, and otherwise a drive that this tool guides.
-    """
     if not args.log and args.distance:
         raise UsageError(
             "--distance needs --log: without --log, acsard asks for the distances that it needs"
@@ -224,12 +220,7 @@ def _add_drive_options(parser: argparse.ArgumentParser) -> None:
 def _guided(
     args: argparse.Namespace, config: Config, where: str, lines: JsonPrompt | None
 ) -> tuple[Calibration, Config]:
-    """Guide a person through a drive of the robot, and compute the calibration from this drive.
-
-    Return a pair: the calibration, and the configuration of the robot's daemon. Raises `GuideError`
-    if the operator ends the drive. `config` is the configuration in the file `where`. `lines` is
-    the prompt for --json-lines, or None without that option.
-    """
+    """Guide a person through a drive. Return its calibration and the daemon's configuration."""
     require_one(args)
     endpoint, robot_id, tls = address_of(config, args.connect, args.id, args.tls)
     _usable(args, full_key(robot_id, "odom"))
@@ -296,11 +287,6 @@ def _usable(args: argparse.Namespace, odometry: str) -> None:
 
 
 def _differing(config: Config, mine: Config, where: str) -> str:
-    """Return an error text if two configurations have different wheel radii or separations.
-
-    `config` is the configuration of the daemon, and `mine` is the configuration in the file
-    `where`. Return "" if both values are equal.
-    """
     same = config.drive.wheel_radius, config.drive.wheel_separation
     if same == (mine.drive.wheel_radius, mine.drive.wheel_separation):
         return ""

@@ -108,10 +108,9 @@ def _words() -> Mapping[tuple[str, str], list[str]]:
 def _actions(
     parser: argparse.ArgumentParser, verb: str = ""
 ) -> Iterator[tuple[str, argparse.Action]]:
-    """Yield each option and argument of a parser as a pair: its subcommand, and the option.
+    """Yield each option with its subcommand.
 
-    `parser` is the parser of the subcommand `verb`, or of the whole program if `verb` is "". An
-    option of an action, such as `recording show`, is yielded with the subcommand `recording`.
+    An option of an action, such as `recording show`, belongs to the subcommand `recording`.
     """
     for action in parser._actions:
         yield verb, action

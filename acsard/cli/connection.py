@@ -238,9 +238,6 @@ def _ceased(robot: Client) -> str:
 
 
 def _of_link(where: Address) -> str:
-    """Return a text about the fault of the TLS_PREFIX connection, such as an expired certificate.
-
-    Return "" if the connection to `where` has no such fault, or does not use TLS_PREFIX.
-    """
+    """Return the fault of a TLS connection, such as an expired certificate, or ""."""
     secured = where.tls and where.endpoint.startswith(TLS_PREFIX)
     return trouble(where.endpoint, where.tls) if secured else ""

@@ -133,14 +133,7 @@ def _print(
     timeout: float | None,
     heard: Callable[[], None],
 ) -> int:
-    """Print one line per message in `samples`, and return the exit code.
-
-    The exit code is 0 after Ctrl-C, or when `quota` is used up. It is 1 if `samples` ends, or if no
-    message was printed for `timeout` s.
-
-    `decoder` decodes messages for the short form; None prints JSON. `of_many` says whether each
-    line must contain the id of its robot. `heard` is called for each message, printed or not.
-    """
+    """Print the messages. Return 0 after Ctrl-C or a used-up `quota`, and 1 if messages cease."""
     printed_s = time.monotonic()
     try:
         for sample in samples:
@@ -168,11 +161,6 @@ def _shortened(key: str) -> Decoder[Any]:
 
 
 def _shown(decoder: Decoder[Any] | None, encoding: str, payload: bytes, whose: str) -> str:
-    """Return a message as one line of text, in the short form or as JSON.
-
-    The line is in the short form if `decoder` can decode the message. It is JSON if `decoder` is
-    None or cannot decode it. `whose` is the robot id that the line must contain, or "".
-    """
     if decoder is not None:
         try:
             told = short(decoder.decode(encoding, payload))
@@ -191,13 +179,6 @@ def _record(
     timeout: float | None,
     heard: Callable[[], None],
 ) -> int:
-    """Print the messages on several keys as rows of one CSV log, and return the exit code.
-
-    The exit code is 0 after Ctrl-C or after `most` rows. It is 1 if no row was printed for
-    `timeout` s. For both limits, None means that there is no limit. `heard` is called for each
-    message. A message that does not fit into the log is left out. The first such message on each
-    key is reported on standard error.
-    """
     queues = [(key, robot.subscribe(key), decoder(key)) for key in keys]
     reported = set[str]()
     print(HEADER, flush=True)
@@ -234,11 +215,7 @@ def _report_left_out(full_key: str, key: str, error: Exception) -> None:
 
 
 def _expected(robot: Client, ids: tuple[str, ...]) -> Collection[str]:
-    """Return the ids of the robots from which messages are expected, and print which are present.
-
-    The result is `ids`. If `ids` contains "*", the result is the ids of the robots that are present
-    now.
-    """
+    """Return the ids of the expected robots, and print which of the robots are present."""
     # Without the printed text, the operator could not distinguish a silent robot from an absent
     # robot.
     there: list[str] = []

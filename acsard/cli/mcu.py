@@ -87,11 +87,7 @@ def main(args: argparse.Namespace) -> int:
 def _checked(
     args: argparse.Namespace, config: Config, configured: Config, where: str, prompt: Prompt
 ) -> int:
-    """Check the board, print the report, and return the exit code.
-
-    `config` contains the values of the options. The board is checked with it. `configured` is the
-    configuration in the file `where`, for which the report suggests changes.
-    """
+    """Check the board with `config`. Suggest changes to `configured`, the file's own values."""
     port, simulated = config.mcu.port, config.mcu.simulated
     findings: list[Finding] = []
 
@@ -136,12 +132,7 @@ def _checked(
 
 
 def _prompt(args: argparse.Namespace, port: str) -> TerminalPrompt | NoPrompt | JsonPrompt:
-    """Return the prompt that asks the person near the robot, or one that asks no questions.
-
-    `port` is the path of the serial device, or the name of the built-in simulator. Raises
-    `UsageError` if no port is configured, or if wheels at this port could turn without a person's
-    consent.
-    """
+    """Return a prompt. Refuse a port at which wheels could turn without a person's consent."""
     if port == SIMULATOR and args.port != SIMULATOR:
         raise UsageError(
             "no port is configured, so there is no board to check (mcu.port is the simulator, "
@@ -172,10 +163,6 @@ def _prompt(args: argparse.Namespace, port: str) -> TerminalPrompt | NoPrompt | 
 
 
 def _wire(config: Config) -> Wire:
-    """Return the connection to the configured board, which may be the built-in simulator.
-
-    The simulator runs in virtual time, so that the check does not wait in real time.
-    """
     if config.mcu.port == SIMULATOR:
         return VirtualWire(FakeMcu(config))
     return BlockingPort(config.mcu.port)

@@ -297,8 +297,7 @@ def main_show(args: argparse.Namespace) -> int:
 def _is_being_recorded(recording: Recording) -> bool:
     """Return whether a daemon is still writing to this recording.
 
-    Call this only after all steps of the recording have been read, because its ending is not known
-    before.
+    Read all steps of the recording first, because its ending is not known before.
     """
     if recording.ending != UNFINISHED:
         return False
@@ -309,10 +308,7 @@ def _is_being_recorded(recording: Recording) -> bool:
 
 
 def _show(recording: Recording, part: Span, as_json: bool) -> bool:
-    """Print the events of a recording that happened in the time span `part`.
-
-    Return whether the recording has steps in this span. `as_json` selects JSON instead of text.
-    """
+    """Print the events in the time span `part`. Return whether it contains steps."""
     story = TimelineWriter(_config_of(recording))
     found, over = False, False
     for step in steps(recording):
@@ -334,7 +330,6 @@ def _show(recording: Recording, part: Span, as_json: bool) -> bool:
 
 
 def _config_of(recording: Recording) -> Config | None:
-    """Return the recorded configuration, or None if this version of acsard cannot read it."""
     try:
         return config_of(recording)
     except RecordingError:
@@ -456,10 +451,6 @@ def _refuse_times(args: argparse.Namespace, subcommand: str) -> None:
 
 
 def _require_suffix(new: str | None, kind: Kind | Literal["html"]) -> None:
-    """Raise `UsageError` if the typed file name `new` has a suffix that does not fit the format.
-
-    `kind` is the format of the output. `new` is None if the operator did not type a name.
-    """
     suffix = Path(new or "").suffix.lower()
     if mend := _MISNAMED.get((kind, suffix)):
         form = "a directory" if kind == "rosbag2" else f"{kind.upper()}, not {suffix}"
@@ -478,10 +469,6 @@ def _files_to_write(args: argparse.Namespace) -> list[tuple[Recording, Span]]:
 
 
 def _parts(args: argparse.Namespace) -> list[tuple[Recording, Span]]:
-    """Return the recordings that the arguments select, each with the span of time to read.
-
-    The options --from and --to limit this span of time.
-    """
     times = [when for when in (args.begin, args.end) if when is not None]
     by_clock = bool(times) and not any(isinstance(when, Offset) for when in times)
     if args.file == "all" or (args.file is None and by_clock):
@@ -495,11 +482,7 @@ def _parts(args: argparse.Namespace) -> list[tuple[Recording, Span]]:
 
 
 def _range(args: argparse.Namespace) -> tuple[float, float]:
-    """Return a pair: the time of --from and the time of --to, s since 1970.
-
-    Without the option --from the first time is minus infinity, and without --to the second time is
-    plus infinity. Raises `UsageError` if an option counts seconds from the start of a recording.
-    """
+    """Return the times of --from and --to, s since 1970; infinite without the option."""
     if any(isinstance(when, Offset) for when in (args.begin, args.end)):
         raise UsageError(
             "--from and --to in seconds count from the beginning of one recording, but "
@@ -514,10 +497,6 @@ def _range(args: argparse.Namespace) -> tuple[float, float]:
 
 
 def _search(args: argparse.Namespace) -> list[tuple[Recording, Span]]:
-    """Return the recordings with steps between --from and --to, each with the span of time to read.
-
-    Also print the names of these recordings, and the times in which nothing was recorded.
-    """
     first, last = _range(args)
     where, files = _files(args)
     try:
@@ -583,11 +562,7 @@ def _when(text: str) -> When:
 
 @contextmanager
 def _progress(recording: Recording) -> Iterator[Callable[[int], None]]:
-    """Show how far a recording has been read, if standard error is a terminal.
-
-    Yield a function that the caller must call to report the progress. Its argument is the recorded
-    wall-clock time, ns, up to which the recording has been read.
-    """
+    """Yield a function that shows on a terminal up to which time has been read."""
     if not sys.stderr.isatty():
         yield lambda wall_ns: None
         return
@@ -606,7 +581,6 @@ def _progress(recording: Recording) -> Iterator[Callable[[int], None]]:
 
 @contextmanager
 def _written(new: Path) -> Iterator[None]:
-    """Convert an `OSError` in the `with` block to an `ExitError` that names the file `new`."""
     try:
         yield
     except OSError as error:
@@ -615,11 +589,7 @@ def _written(new: Path) -> Iterator[None]:
 
 
 def _percent(recording: Recording) -> Callable[[int], None]:
-    """Return a function that prints the progress of reading a recording, in percent.
-
-    The numbers go to standard error, where the server of the web page reads them. The argument of
-    the function is the recorded wall-clock time, ns, up to which the recording has been read.
-    """
+    """Return a function that prints percentages, which the server of the web page reads."""
     last, began = read_end(recording.path), recording.about.wall_ns / 1e9
     end = last.last_ns / 1e9 if last else recording.path.stat().st_mtime
     told = 0

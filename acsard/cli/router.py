@@ -43,10 +43,9 @@ def main(args: argparse.Namespace) -> int:
 
 
 async def _kept(file: str, log: Log) -> int:
-    """Run a router process with Zenoh's configuration file `file`, and restart it when it ends.
+    """Keep a router process running, and return 0 after a signal.
 
-    Return 0 after a signal. If the router cannot use its configuration or its certificates, return
-    the exit code of the router process.
+    If the router cannot use its configuration or its certificates, return its exit code.
     """
     keeper = asyncio.ensure_future(keep_running(["router", file], log.event, ROUTER))
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):

@@ -132,17 +132,12 @@ def _require_for_many(args: argparse.Namespace, settings: dict[str, Plain]) -> N
 
 
 def _lasting(message: str) -> str:
-    """Return the daemon's answer, with an added text on how long the new settings stay in force."""
     until = _until(message)
     return f"{message}; {until}" if until else message
 
 
 def _until(message: str) -> str:
-    """Return a text that says how long the changed settings stay in force.
-
-    `message` is the daemon's answer, such as "KEY = NEW (was OLD), KEY = NEW (was OLD)". Return ""
-    if the daemon has not changed a setting.
-    """
+    """Return how long the changes in a text like "KEY = NEW (was OLD)" stay in force, or ""."""
     changes = {key: (new, old) for key, new, old in _CHANGE.findall(message)}
     if not changes:
         return ""
@@ -162,11 +157,7 @@ def _until(message: str) -> str:
 
 
 def _limits(pairs: Mapping[str, Sequence[str]], at: int) -> LimitsConfig:
-    """Return the limits with the new or the old values of the changed keys.
-
-    `pairs` maps each changed key to a pair: the new value and the old value. `at` is 0 to use the
-    new values, and 1 to use the old values. All other limits have their default values.
-    """
+    """Return default limits with the new values of `pairs` if `at` is 0, or the old ones if 1."""
     return LimitsConfig(
         **{key.removeprefix(LIMITS_PREFIX): float(pair[at]) for key, pair in pairs.items()}
     )
@@ -186,11 +177,6 @@ def _set_all(
 
 
 def _file(path: str | None, settings: dict[str, Plain]) -> Path:
-    """Return the path of the configuration file that --write changes.
-
-    `path` is the value of --config, or None. Raises `UsageError` if --write cannot write
-    `settings`.
-    """
     if not settings:
         raise UsageError("--write needs a setting: acsard set limits.linear_speed 0.8 --write")
     if any(key.startswith("commands.sources.") for key in settings):

@@ -81,11 +81,6 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _make_link(link: Path, device: str) -> None:
-    """Make a symbolic link with the path `link` to the path `device`.
-
-    Replace an existing symbolic link. Raises `UsageError` if the link cannot be made, for example
-    because there is another kind of file at this path.
-    """
     try:
         if link.is_symlink():
             if link.exists():
@@ -99,7 +94,6 @@ def _make_link(link: Path, device: str) -> None:
 
 
 def _remove_link(link: Path, device: str) -> None:
-    """Remove the symbolic link `link`, unless it no longer leads to `device`."""
     # Another program may have replaced the link in the meantime.
     if link.is_symlink() and os.readlink(link) == device:
         link.unlink()

@@ -229,11 +229,7 @@ def _certified(names: list[str]) -> str:
 
 
 def _admit_service(directory: Path) -> None:
-    """Write a systemd drop-in that lets the TLS_DIRECTORY gateway use the certificates in
-    `directory`.
-
-    Do nothing if the service is not installed, or if the user of this program is not root.
-    """
+    """Let the TLS gateway of an installed service use the certificates in `directory`."""
     step = service.admitting(directory)
     if step is None:
         return

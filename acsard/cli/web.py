@@ -148,10 +148,6 @@ def _listen(args: argparse.Namespace, config: Config) -> tuple[Listen, ...]:
 
 
 def _invite(args: argparse.Namespace, config: Config, where: str) -> int:
-    """Make a token, and print the link that contains the token, and its QR code.
-
-    `where` is the path of the configuration file, for an error text.
-    """
     import segno
 
     from acsard.web.listen import invitations, require_certificate

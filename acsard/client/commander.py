@@ -206,10 +206,6 @@ class Commander:
         return self._zero(now_ns)
 
     def _zero(self, at_ns: int) -> Wish:
-        """Return a zero whose stamp is the monotonic time `at_ns`, converted to the sender's clock.
-
-        The zero has no stamp if the sender sends no stamps.
-        """
         # With a stamp from another clock, the daemon would assume that the sender's clock has
         # jumped.
         stamp_ns = self._last.stamp_ns

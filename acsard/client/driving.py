@@ -130,14 +130,11 @@ def _opening(checks: _Drive) -> Iterator[float]:
 
 
 def _stopping(checks: _Drive) -> Iterator[float]:
-    """Send zero commands until the robot stands still.
+    """Send zeros until the robot stands still, and yield the time to wait after each, s.
 
-    This is a generator. After each command, it yields the time, s, for which the caller must wait
-    before it resumes the generator. The generator also ends if the robot has not become slower for
-    `SLOWS_S` s. Then something else moves the robot, or the board sends no feedback.
-
-    Raises `NotDrivenError` if the daemon will keep refusing the commands, and `NoAnswerError` if
-    the daemon is silent.
+    End too if the robot has not become slower for `SLOWS_S` s: then something else moves the robot,
+    or the board sends no feedback. Raises `NotDrivenError` if the daemon will keep refusing the
+    commands, and `NoAnswerError` if the daemon is silent.
     """
     begun = since = clock.steady_s()
     watch, slowest = checks.watch, math.inf
@@ -174,19 +171,16 @@ class _Drive:
 
     @property
     def hopeless(self) -> bool:
-        """Whether the daemon will keep refusing the commands. Waiting cannot help then."""
         state = self.watch.state
         return state is not None and hopeless(state, self._robot.source)
 
     def send(self, linear: float, angular: float) -> None:
-        """Send one command. Raises `NoAnswerError` if the connection was closed."""
         try:
             self._robot.send(linear, angular)
         except zenoh.ZError:
             raise NoAnswerError(CONNECTION_CLOSED) from None
 
     def require_no_pause(self) -> None:
-        """Raise `NotDrivenError` if the previous call was more than `GRACE_S` s ago."""
         # The process may have been stopped, its computer may have been suspended, or the bus may
         # not have accepted the command. The received states cannot reveal such a pause, because old
         # states that waited in the queue seem to arrive now.
@@ -200,10 +194,6 @@ class _Drive:
             )
 
     def look(self) -> None:
-        """Process the states that have arrived, and update `objection`.
-
-        Raises `NoAnswerError` if the daemon counts as silent, or if the connection was closed.
-        """
         now, watch = clock.steady_s(), self.watch
         try:
             news = watch.look(now)
@@ -224,11 +214,9 @@ class _Drive:
             )
 
     def require(self, grace: float) -> None:
-        """Raise `NotDrivenError` if the robot does not follow, after processing the new states.
+        """Raise `NotDrivenError` if the robot has not followed for `grace` s, or never will.
 
-        The error is raised if the robot has not followed the commands for `grace` s, or if the
-        state shows that the daemon will keep refusing the commands. If the daemon receives no
-        commands, the error is the subclass `UnheardError`.
+        If the daemon receives no commands, the error is the subclass `UnheardError`.
         """
         self.look()
         if not self.objection:

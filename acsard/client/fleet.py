@@ -54,10 +54,6 @@ class _Known:
         self.begin()
 
     def begin(self) -> None:
-        """Start to follow the robot, or start again when it reappears.
-
-        The queries of its keys `state` and `info` are then due immediately.
-        """
         self.since = self.info_due = clock.steady_s()
         self.follower = Follower(self.since, FLEET_QUERY_PERIOD_S)
         self.follower.due = self.since
@@ -175,7 +171,6 @@ class Fleet:
             return self._known.get(name)
 
     def _forget_one(self) -> None:
-        """Drop the robot that has been absent longest. Never drop a robot that `ids` names."""
         gone = [(one.since, name) for name, one in self._known.items() if not one.here]
         for _, name in sorted(one for one in gone if one[1] not in self._ids)[:1]:
             del self._known[name]

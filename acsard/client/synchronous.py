@@ -102,11 +102,10 @@ def close(session: zenoh.Session) -> None:
 
 
 class _Puts:
-    """Keeps a minimum pause between the commands on one connection.
+    """Keeps a minimum pause between the commands of all clients on one connection.
 
-    All clients of a connection share one instance. The daemon accepts at most 1000 commands a
-    second per connection and key. Without the pause, it would drop a zero that is sent directly
-    after a command of any of these clients.
+    The daemon accepts at most 1000 commands a second per connection and key. It would drop a zero
+    that is sent directly after another command.
     """
 
     def __init__(self) -> None:
@@ -118,10 +117,7 @@ class _Puts:
 
     @contextmanager
     def turn(self) -> Iterator[None]:
-        """Wait until the next command may be sent. The caller sends it in the `with` block.
-
-        No other thread sends a command during the block.
-        """
+        """Wait until the next command may be sent. The caller sends it in the `with` block."""
         # Each thread reserves a time and waits for it without the lock. Otherwise a thread that
         # sends without end would take the lock again and again before the others.
         with self._lock:
@@ -423,7 +419,6 @@ class Client:
             self._puts.moving.pop(self, None)
 
     def _ask(self, name: str, payload: bytes | None = None) -> tuple[str, bytes]:
-        """Return the first reply to a query of the key `name`: a pair of encoding and payload."""
         # Ignore later replies, because any client on the bus may send any number of replies.
         end_s = time.monotonic() + REPLY_TIMEOUT_S
         while True:
@@ -466,7 +461,6 @@ class Client:
         return UsageError(f"{name!r} is not a key; `acsard topics` lists them")
 
     def _unanswered(self, name: str) -> MendableError:
-        """Return the error for a query of the key `name` without a reply. Its text says why."""
         key, no_answer = name.partition("?")[0], f"no answer on the Zenoh key {self.key(name)}"
         if unknown(key):
             return NoAnswerError(f"{no_answer}: {key} is not in the topic table ({key_hint(key)})")

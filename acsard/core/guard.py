@@ -189,13 +189,7 @@ class Guard:
 
 
 def _ramp_ns(config: Config, *, stop: bool) -> int:
-    """Return the time that the robot needs to brake from its highest speed to rest, ns.
-
-    If `stop` is true, the stop decelerations apply. The result is the longer of two braking times:
-    that of the linear and that of the angular speed. The highest speed is the limit in `[limits]`,
-    or the speed that the robot has with all wheels at `limits.wheel_speed`, whichever is lower. The
-    jerk limits do not affect braking.
-    """
+    """Return the time to brake from the highest speed, ns. Jerk limits do not affect braking."""
     limits, drive = config.limits, config.drive
     sides = drive.left_wheel_radius_multiplier + drive.right_wheel_radius_multiplier
     rim = limits.wheel_speed * drive.wheel_radius * sides / 2
@@ -214,8 +208,7 @@ def _ramp_ns(config: Config, *, stop: bool) -> int:
 def _wheels(columns: bytes) -> Wheels | None:
     """Return the speeds of the motors a to d, in 0.01 rad/s, or None if a column is malformed.
 
-    `columns` are the first 31 bytes of a line: its wheel speeds, without the sequence number and
-    the checksum, which differ from line to line.
+    `columns` are the first 31 bytes of a line, without sequence number and checksum.
     """
     match = _COLUMNS.match(columns)
     if match is None:

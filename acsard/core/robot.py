@@ -355,11 +355,7 @@ class Robot:
         self._odometry.checks.wheels.forget()
 
     def _watch_inputs(self, now: Instant, events: list[Event]) -> None:
-        """React to the board's reports of its emergency stop, bumpers, motor drivers and battery.
-
-        A press of the emergency stop or of a bumper stops the robot even if it began and ended
-        between two steps.
-        """
+        """A press stops the robot even if it began and ended between two steps."""
         estop, bumpers, statuses = self._estop, self._bumpers, self.session.statuses
         events += estop.look(statuses, now.mono_ns)
         if estop.pressed_now:
@@ -402,9 +398,8 @@ class Robot:
     def _awaited_report(self) -> tuple[str, str]:
         """Return the cause of a latch that cannot be cleared yet, and what a person must do.
 
-        An input of the board may have caused this latch in an earlier run of the daemon. The latch
-        cannot be cleared until the board has reported the input again. Both texts are "" if there
-        is no such latch.
+        An input of the board may have caused it in an earlier run. The latch stays until the board
+        has reported this input again.
         """
         reported = {
             "estop": self._estop.use == "off" or bool(self._estop.state),
@@ -418,11 +413,10 @@ class Robot:
         return "", ""
 
     def _keep_away(self, now_ns: int) -> None:
-        """Reduce the chosen command to motion that leads away from the pressed bumpers.
+        """Reduce the command to motion that leads away from the pressed bumpers.
 
-        If no part of the command leads away, the command is dropped, and each sender must send a
-        zero before it drives again. Otherwise, the robot would drive against the obstacle as soon
-        as the bumper is released.
+        If none is left, require a zero of each sender. Otherwise the robot would drive against the
+        obstacle as soon as the bumper is released.
         """
         twist = self._choice.twist
         if twist is None:
@@ -436,11 +430,6 @@ class Robot:
             self._choice = replace(self._choice, twist=away)
 
     def _board(self, now_ns: int) -> dict[str, str]:
-        """Return the last value of each field of the board's status lines, as text by field name.
-
-        The entry `age_s` is the age of the last status line, s. The result is empty before the
-        first status line.
-        """
         status_ns = self.session.status_ns
         if status_ns is None:
             return {}
@@ -450,9 +439,7 @@ class Robot:
     def _plausible(self, line: Feedback, now: Instant, events: list[Event]) -> list[Feedback]:
         """Return the feedback lines that the odometry may use now, the oldest first.
 
-        A line with impossible speeds is rejected. A line after a long gap may need a confirmation
-        of its speeds. It is then kept until a later line confirms it, and is returned together
-        with this later line. If later lines contradict it, it is dropped.
+        A line after a long gap may wait for a later line that confirms its speeds.
         """
         why = self._sanity.impossible(line)
         if self._sanity.warning is not None:
@@ -638,11 +625,6 @@ class Robot:
     # Report.
 
     def _with_bumper(self, reason: str) -> str:
-        """Return `reason` with the directions in which the pressed bumpers let the robot drive.
-
-        `reason` is the reason of the mode, in words. It stays as it is in modes other than driving
-        and ready.
-        """
         match self._life.mode:
             case Mode.DRIVING:
                 return f"{reason}; {self._bumpers.note()}"
@@ -670,11 +652,7 @@ class Robot:
 
 
 def _input(why: str) -> str:
-    """Return the input of the board that caused a latch, as a key of `INPUT_NAMES`.
-
-    `why` is the cause of the latch, in words. The result is "" if an input of the board is not the
-    cause.
-    """
+    """Return the key of `INPUT_NAMES` for the cause `why` of a latch, or ""."""
     if why in (PRESSED_REASON, SILENT_REASON):
         return "estop"
     if why == DRIVER_FAULT_REASON:

@@ -83,11 +83,7 @@ class Curve:
 
 
 def _merged(one: _Bin, other: _Bin) -> _Bin:
-    """Merge two neighboring bins, `one` and the later `other`.
-
-    A gap between these bins would be too short to see, so it is dropped. A gap after `other` is
-    kept.
-    """
+    """A gap between these bins would be too short to see, so it is dropped."""
     low = other.low if other.low.value < one.low.value else one.low
     high = other.high if other.high.value > one.high.value else one.high
     return _Bin(one.number, low, high, other.breaks)

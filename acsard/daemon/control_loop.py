@@ -289,11 +289,7 @@ class ControlLoop:
         return outputs
 
     def _decided(self, inputs: Inputs) -> tuple[Outputs, bool]:
-        """Run the robot's step, send its line, and record the step.
-
-        Return the outputs, and whether the port wrote the line. If an exception occurs, the
-        recorder still stores the inputs of the step.
-        """
+        """Run the robot's step. The returned bool is true if the port wrote the line."""
         try:
             outputs = self.outputs = self.robot.step(inputs)
             self._step_answers = outputs.answers
@@ -314,11 +310,11 @@ class ControlLoop:
         return outputs, went is not None
 
     def _to_keep(self, latches: Latches) -> Latches:
-        """Return the latches that the latch file must store for the next start of the daemon.
+        """Return the latches that the next start of the daemon needs.
 
-        If a `set` request has lowered a limit, the limit stays lowered after a restart, unless it
-        is a deceleration. A limit from a message on the key `speed_limit` is not stored, because
-        the program that would lift it may have ended by then.
+        A limit that a `set` request lowered stays lowered, unless it is a deceleration. A limit
+        from the key `speed_limit` does not, because the program that would lift it may have ended
+        by then.
         """
         now, file = self._speed.settings.limits, self._settings_file
         if file is not None:
@@ -414,7 +410,6 @@ class ControlLoop:
         return tuple(commands), tuple(refusals), tuple(requests)
 
     def _note(self, got: BusInput) -> None:
-        """Count and report lost samples and messages, a blocked bus, and new router connections."""
         if got.overrun:
             self.robot.counters["bus_overrun"] += got.overrun
         if got.dropped:
@@ -426,11 +421,10 @@ class ControlLoop:
             self._others.append(BUS_STUCK)
 
     def _served(self, query: Query, now: Instant, refusals: list[Refusal]) -> Request | None:
-        """Answer a query, or return the request that the robot must answer.
+        """Answer a query and return None, or return the request that the robot must answer.
 
-        Return None if the query was answered, or if it is a `set` request with the field `keep`,
-        which waits for the settings file. If the query cannot be decoded, refuse it and add the
-        reason to `refusals`.
+        Also return None for a `set` request with the field `keep`, which waits for the settings
+        file.
         """
         try:
             served = self._queries.serve(query, self._current, self.outputs)
@@ -450,10 +444,6 @@ class ControlLoop:
         return None
 
     def _keep(self, request: Request, now: Instant) -> None:
-        """Pass a `set` request with the field `keep` to the settings file.
-
-        If the daemon has no settings file, refuse the request.
-        """
         if self._settings_file is None:
             text = (
                 "nothing is set: this daemon has no configuration file in which to keep settings; "
@@ -464,10 +454,9 @@ class ControlLoop:
             self._settings_file.keep(request, now.mono_ns)
 
     def _keepable(self, now: Instant) -> tuple[Request, ...]:
-        """Return the `set` requests with the field `keep` whose settings the robot must use now.
+        """Return the `set` requests whose settings the robot must use now.
 
-        Also queue an answer for each earlier request of this kind whose settings were written to
-        the file, or that was refused or took too long.
+        Also queue the answers to the earlier requests that have ended.
         """
         if self._settings_file is None:
             return ()
@@ -480,11 +469,7 @@ class ControlLoop:
         return tuple(requests)
 
     def _send(self, outputs: Outputs, now: Instant, tick: bool) -> bytes | None:
-        """Let the guard check the line in `outputs`, and offer the line to the port.
-
-        `now` is the time of the step. `tick` is true for the line of a period, and false for a line
-        between two periods. Return the line if the port wrote it, else None.
-        """
+        """Return the line if the port wrote it. `tick` is false for a line between two periods."""
         line, self._trip = self._guard.check(outputs)
         self._superseded, self._late_ns = False, 0
         if line is None:
@@ -525,10 +510,9 @@ class ControlLoop:
             self._log(event)
 
     def _answer(self, now: Instant, *, last: bool = False) -> None:
-        """Send each queued answer that need not wait any longer.
+        """Send the queued answers.
 
-        An answer waits until the newest latches are stored, but at most `MAX_ANSWER_DELAY_NS`. If
-        `last` is true, no answer waits. `now` is the time of the step.
+        Unless `last` is true, they wait until the latches are stored.
         """
         held, before_ns = self._handover.held, now.mono_ns - MAX_ANSWER_DELAY_NS
         trouble = "" if held else self._handover.trouble or NOT_STORED
@@ -562,7 +546,6 @@ class ControlLoop:
 
 
 def _stops(got: BusInput) -> list[str]:
-    """Return the name of the client for each stop in `got`."""
     puts = [one for one in got.arrivals if one.key == "stop" and one.put]
     calls = [query for query in got.queries if query.topic == "srv/stop"]
     names = [caller_name(put.via, put.attachment, put.sender) for put in puts]

@@ -220,10 +220,6 @@ async def run(
 def _recorder(
     config: Config, log: Callable[[Event], None], wall_ns: int, stack: AsyncExitStack
 ) -> Recorder | None:
-    """Return the recorder of the black box, or None if `[record] directory` is empty.
-
-    `wall_ns` is the time at which the daemon started, ns since 1970. `stack` closes the recorder.
-    """
     if not config.record.directory:
         return None
     recorder = Recorder(config, log, wall_ns)
@@ -232,13 +228,10 @@ def _recorder(
 
 
 def _keeper(config: Config, stack: AsyncExitStack) -> LatchFile | None:
-    """Return the latch file. Return None for the built-in simulator, whose latches are not stored.
-
-    `stack` closes the latch file later than the serial port. A slow disk then cannot delay the last
-    STOP line to the board.
-    """
     if config.mcu.simulated:
         return None
+    # The stack closes the latch file later than the serial port. A slow disk then cannot delay the
+    # last STOP line to the board.
     keeper = LatchFile(config, os.environ)
     stack.callback(keeper.close)
     return keeper
@@ -251,7 +244,6 @@ def _port(config: Config, path: str, wake: Wakeup, tell: Callable[[Event], None]
 
 @asynccontextmanager
 async def _beside(helpers: Iterable[Coroutine[Any, Any, object]]) -> AsyncIterator[None]:
-    """Run the coroutines as tasks during the `async with` block, and cancel them at its end."""
     async with asyncio.TaskGroup() as group:
         tasks = [group.create_task(helper) for helper in helpers]
         yield
@@ -260,12 +252,9 @@ async def _beside(helpers: Iterable[Coroutine[Any, Any, object]]) -> AsyncIterat
 
 
 def _certificates(config: Config, ours: bool) -> dict[str, int]:
-    """Return the expiry time of each certificate that the daemon uses, ns since 1970.
+    """Return the expiry times from `ends_of`. Raises `MendableError` if a file cannot be used.
 
-    In the returned dict, the key "" stands for the daemon's own certificate, and `tls.AUTHORITY`
-    for the certificate of its authority. Return {} if the daemon uses no certificate. Raises a
-    `MendableError` if the certificate files cannot be used. `ours` says whether this daemon itself
-    starts the TLS_PREFIX gateway.
+    `ours` is true if this daemon itself starts the TLS gateway.
     """
     bus = config.bus
     if not (any(e.startswith(TLS_PREFIX) for e in bus.connect) or (ours and bus.outside)):
@@ -281,7 +270,6 @@ async def _control(
     wake: Wakeup,
     manager: Systemd,
 ) -> None:
-    """Run a control step for each event in the list of `wakeup.py`, until the shutdown is over."""
     # Let each of the other tasks run once first. This first round is slow, and must end before the
     # first period.
     await asyncio.sleep(0)
@@ -304,10 +292,7 @@ async def _control(
 
 @asynccontextmanager
 async def _patience(config: Config, log: Log, manager: Systemd) -> AsyncIterator[None]:
-    """Log that the daemon waits for its router, and tell systemd so, during the `async with` block.
-
-    In peer mode the daemon does not wait for a router, so nothing is reported.
-    """
+    """Log that the daemon waits for its router, and tell systemd so. Do nothing in peer mode."""
     if config.bus.mode == "peer":
         yield
         return

@@ -201,10 +201,9 @@ class LatchFile:
             return latches
 
     def _read(self, now: Instant) -> Latches:
-        """Lock the file, and return its latches. Return no latches if the file does not exist.
+        """Lock the file, and return its latches. If the file cannot be read, return a stop.
 
-        If the file cannot be read, return a stop that was set at `now`. Raises `InUseError` if
-        another daemon has locked the file.
+        Raises `InUseError` if another daemon has locked the file.
         """
         path = self._path
         if path is None:
@@ -224,7 +223,6 @@ class LatchFile:
             return stopped(Latches(), unreadable(self.where, _reason(error)), now)
 
     def _take_lock(self, path: Path) -> None:
-        """Lock the file against other daemons; raise `InUseError` if another one has locked it."""
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             lock = os.open(path.with_suffix(".lock"), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
@@ -299,12 +297,9 @@ class LatchFile:
 
     @property
     def _hangs(self) -> bool:
-        """True if the disk hangs: a sync or a needed write has lasted longer than `HANG_TIMEOUT_S`.
-
-        A write is needed if the file does not contain the newest latches.
-        """
         if self._failed:
             return False
+        # A write does not matter if the file already contains the newest latches.
         busy_ns = None if self._held is self._handed else self._busy_ns
         begun_ns = [one for one in (busy_ns, self._syncing_ns) if one is not None]
         return any(clock.mono_ns() - one > HANG_TIMEOUT_S * NS_PER_S for one in begun_ns)
@@ -343,10 +338,9 @@ class LatchFile:
             self._box.wait(None if latches is None else RETRY_PAUSE_S)
 
     def _try(self, latches: Latches, now: Instant) -> str:
-        """Write these latches, and return "" on success.
+        """Write these latches; return "" or the reason of the failure.
 
-        If the write fails, report the reason as an event and return it. `now` is the time at which
-        the daemon started.
+        `now` is the time at which the daemon started.
         """
         self._busy_ns = clock.mono_ns()
         with self._disk:
@@ -359,9 +353,9 @@ class LatchFile:
         return trouble
 
     def _read_late(self, now: Instant) -> None:
-        """Read the file that `start()` could not read in time, and store its latches in `_missed`.
+        """Read the file that `start()` could not read in time.
 
-        Without this call, the next write would overwrite these latches.
+        Otherwise, the next write would overwrite its latches.
         """
         self._blind = False
         if self._found is None:
@@ -373,7 +367,6 @@ class LatchFile:
         self._missed = replace_fields(self._found, stop=None)
 
     def _replace(self, latches: Latches) -> str:
-        """Write these latches to the file without a sync. Return the reason of a failure, or ""."""
         if self._path is None or self._barred:
             return self._barred
         try:
@@ -416,7 +409,6 @@ class LatchFile:
             self._renamed.wait(RETRY_PAUSE_S if failed else None)
 
     def _sync(self) -> str:
-        """Sync the file that `_replace` has written; return the reason of a failure, or ""."""
         assert self._path is not None
         try:
             sync(self._path)
@@ -426,11 +418,10 @@ class LatchFile:
         return ""
 
     def _with_missed(self, latches: Latches) -> Latches:
-        """Return `latches` together with the missed latches (`_missed`).
+        """Add the missed latches. A newer fault or "inactive" drops the missed one for good.
 
-        If `latches` contains a fault, the missed fault is dropped for good. The same holds for
-        "inactive". A missed stop is never added, because the robot already has a stop: `start()`
-        could not read the file.
+        A missed stop is never added, because `start()` has set a stop when it could not read the
+        file.
         """
         missed = self._missed
         if latches.fault is not None:
@@ -459,10 +450,6 @@ class LatchFile:
 
 
 def _content(path: Path) -> bytes:
-    """Return the content of a regular file.
-
-    Raises `OSError` if it is not a regular file or has more than `MAX_BYTES` bytes.
-    """
     # Without O_NONBLOCK, opening a named pipe at this path would block the start.
     handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     with os.fdopen(handle, "rb") as file:

@@ -189,10 +189,6 @@ class LateWatch:
         self._readings.append((clock.mono_ns(), reading))
 
     def _before(self, now_ns: int) -> Reading | None:
-        """Return the newest reading that was complete at the monotonic time `now_ns`, ns.
-
-        Return None if all readings are newer.
-        """
         older = [reading for read_ns, reading in self._readings if read_ns <= now_ns]
         return older[-1] if older else None
 
@@ -211,11 +207,6 @@ class LateWatch:
         self._news.put(event_of(late, clause, news=news))
 
     def _busiest_of(self, kernel: Kernel) -> Program | None:
-        """Return the process that uses the most processor time, or None if no process uses much.
-
-        If the last search is not older than `MIN_SEARCH_INTERVAL_NS`, return the result of that
-        search again.
-        """
         now_ns = clock.mono_ns()
         if self._searched_ns is None or now_ns - self._searched_ns >= MIN_SEARCH_INTERVAL_NS:
             self._busiest, self._searched_ns = kernel.busiest(SEARCH_S), now_ns

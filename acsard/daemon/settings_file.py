@@ -70,10 +70,7 @@ class _Checked(Struct, frozen=True):
 
 
 class _Pending(Struct):
-    """A `set` request with the field `keep` that waits for its reply or for the change of the file.
-
-    If the change takes too long, the client gets its reply before the file is changed.
-    """
+    """A `set` request with the field `keep` that waits for its reply or the change of the file."""
 
     request: Request
     due_ns: int
@@ -167,10 +164,7 @@ class SettingsFile:
             self._box.put(request)
 
     def _look(self) -> None:
-        """Wake the thread. Do nothing if requests wait for the thread, because it is awake then.
-
-        In a full queue, the item "look" would displace a request.
-        """
+        # If requests wait, the thread is awake. In a full queue, "look" would displace a request.
         if not self._box.waiting:
             self._box.put("look")
 
@@ -351,7 +345,7 @@ class SettingsFile:
 
 
 def _overdue(pending: _Pending) -> Answer:
-    """Return the answer to a request that took too long, or that exceeded the limit `MAX_JOBS`."""
+    """Answer a request that took too long, or that exceeded the limit `MAX_JOBS`."""
     why = (
         f"the disk did not answer within {REPLY_TIMEOUT_NS / NS_PER_S:g} s, or too many changes "
         f"came at "

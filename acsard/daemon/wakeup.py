@@ -25,8 +25,6 @@ from acsard.host.timerfd import TimerFd
 
 
 class _Timer:
-    """A kernel timer, as a context manager. The event loop watches it inside the context."""
-
     def __init__(self, wake: Callable[[], None]) -> None:
         self._wake = wake
         self._timer = TimerFd()

@@ -123,10 +123,7 @@ class Bridge:
         self._server.stop()
 
     def _viewer(self, client: int) -> Client:
-        """Return a bus client for the viewer with the id `client`.
-
-        To the daemon, each viewer is a different sender.
-        """
+        """Return a bus client for one viewer. To the daemon, each viewer is a different sender."""
         name = self._robot.sender.rpartition("/")[0]
         return self._robot.like(self._id, f"{name}/{client}")
 
@@ -161,11 +158,6 @@ class Bridge:
         self._notices.say("error", "daemon", words, stays=DAEMON_GONE_ID)
 
     def _came_back(self) -> None:
-        """Query the facts about the robot again, after a restart of its daemon.
-
-        If the query fails, for example because the daemon does not answer yet, a later round
-        queries again.
-        """
         # The daemon may restart during the query, which makes the reply outdated.
         self._outdated = False
         try:
@@ -204,7 +196,7 @@ class Bridge:
     def _object(self, driving: dict[int, Client]) -> None:
         """Tell all viewers why the robot does not follow the commands of a viewer.
 
-        `driving` maps the id of each viewer that requests a speed to the bus client of this viewer.
+        `driving` maps the id of each viewer that requests a speed to its bus client.
         """
         now_ns = clock.steady_ns()
         for client in driving.keys() - self._objections.keys():

@@ -204,10 +204,7 @@ class _Heard:
         self._box.put((arrival, now.wall_ns))
 
     def take(self) -> list[tuple[Arrival, int]]:
-        """Return the commands that arrived since the last call, as pairs (command, arrival time).
-
-        The arrival time is in ns since 1970.
-        """
+        """Return the new commands as pairs (command, arrival time in ns since 1970)."""
         return self._box.take()
 
     def undeclare(self) -> None:

@@ -146,8 +146,8 @@ class Settings:
     def _change(self, wishes: dict[str, Any]) -> dict[str, Any]:
         """Change all settings in `wishes`, or none. Return settings with their present values.
 
-        The result contains all settings that have changed. It contains those in `wishes` even if
-        the change has failed, because viewers may already show the new values.
+        The result contains `wishes` even after a failure, because viewers may already show the new
+        values.
         """
         news = dict[str, Any]()
         try:

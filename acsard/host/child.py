@@ -199,11 +199,7 @@ class Child:
             return process.wait()
 
     def _falls_silent(self, ours: socket.socket) -> bool:
-        """Wait until the child falls silent or ends, and return True if it fell silent.
-
-        Also return, with False, after `release` was called. `ours` is the parent's end of the
-        socket to the child.
-        """
+        """Return False if the child ends, or after `release` was called."""
         silence, before_ns, alive = Silence(START_TIMEOUT_NS), clock.mono_ns(), False
         while True:
             beat = ours.recv(4096) if select.select([ours], [], [], HEARTBEAT_S)[0] else None

@@ -152,10 +152,7 @@ def keep(edit: Edit) -> None:
 
 
 def _require_writable(place: Path) -> None:
-    """Raise `ValueError` if the daemon may not replace the file at `place`.
-
-    `place` is a path without symbolic links.
-    """
+    """`place` is a path without symbolic links."""
     if not place.is_file():
         raise ValueError("it is not a regular file")
     # Check the mode bits too, because root may write every file. Without these checks the daemon
@@ -187,7 +184,6 @@ def is_tracked(place: Path) -> bool:
 
 
 def _is_reference(file: Path) -> bool:
-    """Return whether `file` is the `acsard.toml` at the top of a git clone of acsard."""
     place = file.resolve()
     top = place.parent
     in_clone = (top / ".git").exists() and (top / "acsard" / "__init__.py").is_file()
@@ -241,10 +237,6 @@ def require_changeable(
 def _changed(
     file: Path, keys: Keys | Callable[[Config], Keys], new: bool
 ) -> tuple[Path, str, Keys]:
-    """Return the file's path without symbolic links, its new text, and the keys with new values.
-
-    The arguments are those of `change`.
-    """
     place = file.resolve(strict=not new)
     # `read_text` would lose CRLF line ends.
     text = "" if new and not place.exists() else place.read_bytes().decode()

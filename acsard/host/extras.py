@@ -60,7 +60,6 @@ def wanted_by(installed: Distribution, extra: Extra) -> list[str]:
 
 
 def _installer() -> list[str]:
-    """Return the words of the command that installs packages into the venv of this process."""
     sudo = [] if os.access(sys.prefix, os.W_OK) else ["sudo"]
     if find_spec("pip"):
         return [*sudo, sys.executable, "-m", "pip", "install"]

@@ -126,8 +126,8 @@ def iowait(text: str, tick_ns: int) -> int:
 
 
 def _processors(text: str) -> list[list[str]]:
-    """Return the words of each line about one processor in `/proc/stat`."""
     rows = [line.split() for line in text.splitlines() if line.startswith("cpu")]
+    # The row "cpu" is the sum of all processors.
     return [row for row in rows if row[0] != "cpu"]
 
 

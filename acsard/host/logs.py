@@ -220,10 +220,6 @@ _LEVELS = {"info": logging.INFO, "warning": logging.WARNING, "error": logging.ER
 
 
 def _in_order(logger: object, method: str, line: MutableMapping[str, Any]) -> dict[str, Any]:
-    """Return the fields of a log entry with time, level, event and text as the first fields.
-
-    structlog calls this function as a processor. `line` contains the fields of the entry.
-    """
     first = ("timestamp", "level", "event", "text")
     return {key: line[key] for key in first if key in line} | dict(line)
 
@@ -231,10 +227,7 @@ def _in_order(logger: object, method: str, line: MutableMapping[str, Any]) -> di
 def _printable(
     logger: object, method: str, line: MutableMapping[str, Any]
 ) -> MutableMapping[str, Any]:
-    """Make the values of a log entry safe to print.
-
-    Cut long values, and replace characters that would move the cursor or begin a new line.
-    """
+    """Replace characters that would move the cursor or begin a new line."""
     for key, value in line.items():
         if isinstance(value, str) and not (value.isprintable() and len(value) <= MAX_VALUE_LENGTH):
             line[key] = printable(value[:MAX_VALUE_LENGTH])

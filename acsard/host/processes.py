@@ -27,11 +27,7 @@ class Holder(Struct, frozen=True):
 
 
 class _Open(Struct, frozen=True):
-    """A device that a process has open.
-
-    `process` is the directory of the process in /proc, and `fd` is the file descriptor of the
-    device.
-    """
+    """A device that a process has open. `process` is the directory of the process in /proc."""
 
     process: Path
     fd: str
@@ -128,10 +124,6 @@ def _processes() -> Iterator[Path]:
 
 
 def _open_devices(part: str) -> Iterator[_Open]:
-    """Yield each device that a process has open, if the path of the device contains `part`.
-
-    A file counts as a device if its path contains "/dev/".
-    """
     for process in _processes():
         try:
             numbers = os.listdir(process / "fd")
@@ -171,10 +163,7 @@ def _holder(process: Path) -> Holder:
 
 
 def _name(process: Path) -> str:
-    """Return the program name of a process, whose directory in /proc is `process`.
-
-    The name of a process that runs `python -m acsard` is "acsard" too.
-    """
+    """`process` is the directory in /proc. "acsard" is also the name of `python -m acsard`."""
     words = (process / "cmdline").read_bytes().split(b"\0")
     if any(Path(os.fsdecode(word)).name == "acsard" for word in words[:4]):
         return "acsard"

@@ -92,10 +92,7 @@ def _schedule() -> bool:
 
 
 def _stay_awake() -> bool:
-    """Keep the processor out of deep sleep until this process ends. Return False if refused.
-
-    From deep sleep, a processor wakes late and with cold caches.
-    """
+    """From deep sleep, a processor wakes late and with cold caches. Return False if refused."""
     try:
         wish = os.open(WAKE_UP_LATENCY, os.O_WRONLY | os.O_CLOEXEC)
     except FileNotFoundError:

@@ -216,10 +216,7 @@ def _general_name(address: str) -> x509.GeneralName:
 
 
 def _within(address: str, subtree: x509.GeneralName) -> bool:
-    """Return whether a name constraint matches a host name or IP address, as OpenSSL decides it.
-
-    `subtree` must be of the same kind as `address`.
-    """
+    """Decide like OpenSSL whether the name constraint `subtree`, of the same kind, matches."""
     if isinstance(subtree, x509.IPAddress):
         return ipaddress.ip_address(address) in ipaddress.ip_network(str(subtree.value))
     name, base = address.lower(), str(subtree.value).lower()
@@ -240,8 +237,5 @@ def _key_pem(key: ec.EllipticCurvePrivateKey) -> bytes:
 
 
 def _write(path: Path, data: bytes, mode: int) -> None:
-    """Write a file that this user owns, with the permission bits `mode`.
-
-    The file never has more permissions than these, not even while it is being written.
-    """
+    """Write a file that never has more permissions than `mode`, not even during the write."""
     replace(path, data, mode=mode, owner=(os.geteuid(), os.getegid()))

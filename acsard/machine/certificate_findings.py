@@ -95,7 +95,6 @@ def renewal(tls: str, whose: str) -> str:
 
 
 def _mend_of_absent(directory: Path) -> str:
-    """Return advice for a directory in which a certificate file is missing or not readable."""
     if (directory / CA_KEY).exists():
         return f"run `{_command('renew', directory)}`, or run this check again with sudo"
     if not directory.is_dir() or not any(directory.iterdir()):
@@ -110,10 +109,6 @@ def _mend_of_absent(directory: Path) -> str:
 
 
 def _command(action: str, directory: Path) -> str:
-    """Return the shell command that runs `acsard tls ACTION` for this directory.
-
-    The command begins with sudo if this user may not write into the directory.
-    """
     there = next(one for one in (directory, *directory.absolute().parents) if one.exists())
     program = "acsard"
     if not os.access(there, os.W_OK):
@@ -125,7 +120,7 @@ def _command(action: str, directory: Path) -> str:
 
 def router_certificates(config: Config) -> Iterator[Finding]:
     """Yield a finding about the certificate of each configured router that answers over
-    TLS_PREFIX."""
+    TLS."""
     tls = config.bus.tls
     routers = [endpoint for endpoint in config.bus.connect if endpoint.startswith(TLS_PREFIX)]
     for whose, ends_ns in ends_of(routers, tls).items():

@@ -139,7 +139,6 @@ def renew(directory: Path, addresses: Sequence[str], days: int) -> list[str]:
 
 
 def _names_of(name: str) -> list[str]:
-    """Return the host names and addresses for a certificate with the common name `name`."""
     # If a certificate contains no host name, OpenSSL treats its common name, such as `anna.meyer`,
     # as a host name. If the authority may not sign for this host name, OpenSSL refuses the
     # certificate.
@@ -162,7 +161,6 @@ def _require_permitted(authority: Authority, addresses: Sequence[str]) -> None:
 
 
 def _robot_names(more: Sequence[str]) -> list[str]:
-    """Return the host names and addresses of this machine, followed by those in `more`."""
     host = socket.gethostname()
     names = [host, f"{host}.local", "localhost", "127.0.0.1", *own_addresses(), *more]
     return list(dict.fromkeys(names))
@@ -199,11 +197,6 @@ def _maker() -> type[Authority]:
 
 
 def _load(directory: Path) -> Authority:
-    """Load the authority from `directory`.
-
-    Raises `MendableError` if the authority cannot be loaded, or if this user may not write files
-    into `directory`.
-    """
     maker = _maker()
     _writable(directory)
     try:
@@ -239,7 +232,6 @@ def _password() -> str:
 
 
 def _writable(directory: Path) -> None:
-    """Raise `MendableError` if this user cannot create the directory or write files into it."""
     there = next(place for place in (directory, *directory.absolute().parents) if place.exists())
     if not there.is_dir():
         raise MendableError(f"{there} is not a directory; name a directory with --directory")

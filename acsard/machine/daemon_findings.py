@@ -140,11 +140,7 @@ def asked(config: Config, address: Address) -> Running:
 
 
 def _configuration(robot: Client, info: Info, file: Config) -> Config:
-    """Query the daemon's configuration and return it.
-
-    If the daemon does not send it, return the configuration `file` of the local file, with the
-    values from the daemon's `info`.
-    """
+    """Return the daemon's configuration, or the nearest one that `info` and the local file give."""
     try:
         return from_builtins(robot.get("config"))
     except (AcsardError, msgspec.ValidationError):  # not permitted, or a daemon of another version

@@ -173,11 +173,6 @@ def serial_port(config: Config) -> Iterator[Finding]:
 
 
 def _hardware(name: str) -> Iterator[Finding]:
-    """Yield warnings about the USB hardware of a serial port.
-
-    There is a warning if the USB id is not in `BOARDS`, and a warning if the USB chip delays bytes.
-    `name` is the name of the serial device in /dev.
-    """
     usb = [port for port in serial_devices() if port.device == f"/dev/{name}"]
     if usb and usb[0].usb_id and not usb[0].board:
         known = ", ".join(sorted(BOARDS))

@@ -105,10 +105,7 @@ def _hidden(path: Path, hidden: Sequence[str]) -> bool:
 
 
 def _closed(path: Path) -> Path | None:
-    """Return the outermost part of `path` that the service's user has no permission to enter.
-
-    Return None if the user may enter all directories of the path.
-    """
+    """Return the outermost part of `path` that the service's user has no permission to enter."""
     for place in (*reversed(path.parents), path):
         try:
             mode = place.stat().st_mode
@@ -360,7 +357,7 @@ def lan_drop_in(unit: str) -> File:
 
 
 def admitting(directory: Path) -> Write | Keep | None:
-    """Return the step that lets the service's TLS_DIRECTORY gateway use the certificates in
+    """Return the step that lets the service's TLS gateway use the certificates in
     `directory`.
 
     The step writes a drop-in file for the gateway's unit. Without this file, the gateway may use
@@ -557,9 +554,9 @@ def source() -> Path:
 
 
 def _reference() -> Path:
-    """Return the path of the reference configuration `acsard.toml`.
+    """Return the path of `acsard.toml`.
 
-    In an installed package, this file is inside `deploy/`. In a git clone, it is beside `deploy/`.
+    An installed package has it in `deploy/`, a git clone beside it.
     """
     inside = source() / "acsard.toml"
     return inside if inside.is_file() else source().parent / "acsard.toml"

@@ -67,7 +67,6 @@ def synced(stream: BinaryIO) -> None:
 
 
 def _put(part: Path, new: Path) -> None:
-    """Rename `part` to `new`, and remove the file or directory that was at `new`."""
     # No system call replaces a directory that contains files. Therefore an existing directory `new`
     # first gets another name. It is removed after `part` has been renamed.
     if not new.is_dir():
@@ -132,10 +131,7 @@ def _recording(path: Path) -> Recording | None:
 
 
 def _remove(path: Path) -> None:
-    """Remove a file, or the directory of a ROS bag with its files.
-
-    Raises `OSError` if the directory has a subdirectory, because a ROS bag never has one.
-    """
+    """Remove a file or a ROS bag. A bag has no subdirectory, so a subdirectory raises `OSError`."""
     if path.is_dir() and not path.is_symlink():
         for file in path.iterdir():
             file.unlink()

@@ -141,10 +141,6 @@ def mark_cut(part: Path, kind: Kind, cut: Literal["late", "disk"]) -> None:
 
 
 def _marked(part: Path) -> tuple[Kind, str] | None:
-    """Return the pair (retention class, cause) from the name of the marker of a `.part` file.
-
-    The cause is a key of `CUT_TEXTS`. Return None if the file has no marker.
-    """
     for marker in part.parent.glob(f".{part.name}.*{MARKER_SUFFIX}"):
         words = marker.name.removeprefix(f".{part.name}.").removesuffix(MARKER_SUFFIX)
         first, _, cut = words.partition(".")
@@ -264,7 +260,7 @@ class Ring:
                 self._retain_before(part, found.st_mtime_ns)
 
     def _retain_before(self, part: Path, cut_ns: int) -> None:
-        """Retain the older files that ended within a minute of the crash at `cut_ns`."""
+        """Retain the older files that ended within a minute of the crash."""
         for path in listed(self._directory):
             # Another process may have just removed the file.
             with suppress(FileNotFoundError):
@@ -355,7 +351,6 @@ class Ring:
             self.trim(now)
 
     def _shift_times(self, jumped_ns: int) -> None:
-        """Add a jump of the wall clock to the modification times of this run's finished files."""
         for path in listed(self._directory):
             if _number(path) in self._run.numbers:
                 # Another process may have just removed the file.

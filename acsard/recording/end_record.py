@@ -132,9 +132,9 @@ def end_in(data: bytes) -> EndRecord | None:
 
 
 def _last(tail: bytes) -> dict[str, str] | None:
-    """Return the metadata of the end record in `tail`, the last bytes of a file.
+    """Return the metadata of the end record, or None if the file is not finished.
 
-    Return None if the file is not finished.
+    `tail` contains the last bytes of the file.
     """
     footer_at = len(tail) - len(MAGIC) - 20 - RECORD_HEAD.size
     if footer_at < 0 or not (tail.startswith(_FOOTER, footer_at) and tail.endswith(MAGIC)):

@@ -217,31 +217,29 @@ class ExportResult(Struct, frozen=True):
 
 
 class _Writer:
-    """Base class of the writers. A writer writes steps to a stream in one file format."""
+    """Base class of the writers, one for each file format."""
 
     count = 0
     """Number of messages or rows that were written so far."""
 
     def step(self, step: Step, outputs: Outputs) -> None:
-        """Write a step of the exported part, with its replayed outputs."""
         raise NotImplementedError
 
     def skip(self, step: Step, inside: bool) -> None:
         """Process a step whose outputs are not exported.
 
-        If `inside` is false, the step is before the exported part. If it is true, the step is in
-        the exported part, but could not be replayed. Its log lines are then written nevertheless.
+        If `inside` is true, the step is in the exported part but was not replayed, and its log
+        lines are still written.
         """
 
     def end(self, ending: str = "") -> None:
         """Write the log lines that follow the last exported step.
 
-        `ending` says how the recording was cut off. It is "" if the daemon ended normally, or if
-        the exported part ends before the recording.
+        `ending` says how the recording was cut off, if the exported part reaches that place.
         """
 
     def finish(self) -> None:
-        """Write the end of the file."""
+        pass
 
 
 class _MessageWriter(_Writer):
@@ -388,12 +386,11 @@ def export(
 def _write_steps(
     run: RecordedRun, writer: _Writer, recording: Recording, span: Span, progress: Progress
 ) -> None:
-    """Replay all steps of a recording, and write the steps in `span`."""
     # The steps before `span` are replayed too, because each step changes the robot.
     began_ns, over = recording.about.mono_ns, False
 
     def is_inside(step: Step) -> bool:
-        """Return whether a step is in `span`. At the first step after `span`, end the output."""
+        """Also end the output at the first step after `span`."""
         nonlocal over
         seconds = (step.inputs.now.mono_ns - began_ns) / NS_PER_S
         if seconds > span.end and not over:

@@ -165,7 +165,7 @@ class EndRecordBuilder:
         """Return the end record of a recording with the messages that were added so far.
 
         Args:
-            cut: the cause that cut off the recording, a key of `CUTS`; "" for an ordinary end.
+            cut: the cause that cut off the recording, a key of `CUT_TEXTS`; "" for an ordinary end.
             why: an explanation of this cause in words, or "".
         """
         text = summary(self._incidents, self._starts)
@@ -313,7 +313,6 @@ class Writing:
             raise FileNotFoundError(errno.ENOENT, f"{self.path.name} has been removed")
 
     def _put(self, data: bytes) -> None:
-        """Write compressed bytes of the growing chunk, after the chunk's header."""
         if self._chunk_at is None:
             self._chunk_at = self._file.tell()
             self._file.write(GROWING_HEAD)
@@ -341,7 +340,7 @@ class Writing:
         """Write the end record and the MCAP summary section, and close the file.
 
         Args:
-            cut: the cause that cut off the recording, a key of `CUTS`; "" for an ordinary end.
+            cut: the cause that cut off the recording, a key of `CUT_TEXTS`; "" for an ordinary end.
             why: an explanation of this cause in words, or "".
         """
         self.end_chunk()
@@ -368,7 +367,6 @@ class Writing:
 
 
 def _about_records(about: About) -> list[McapRecord]:
-    """Return the metadata record and the attachment `acsard.toml` with the fields of `about`."""
     meta = {key: str(value) for key, value in msgspec.to_builtins(about).items()}
     text, at_ns = meta.pop("config").encode(), about.wall_ns
     return [
@@ -378,7 +376,7 @@ def _about_records(about: About) -> list[McapRecord]:
 
 
 def _checksum(metadata: Mapping[str, str]) -> int:
-    """Return a CRC-32 of the metadata. MCAP has no checksum for metadata records."""
+    """Return a CRC-32, because MCAP has no checksum for metadata records."""
     return zlib.crc32(msgspec.json.encode(metadata, order="sorted"))
 
 
@@ -388,7 +386,6 @@ def _is_intact(metadata: Mapping[str, str]) -> bool:
 
 
 def _definitions() -> Iterator[McapRecord]:
-    """Yield the records that define the schema and the channels."""
     schema = msgspec.json.encode(msgspec.json.schema(TimelineEntry))
     yield Schema(EVENTS_SCHEMA, schema, "jsonschema", "acsard.TimelineEntry")
     for topic, number in CHANNEL_NUMBERS.items():
@@ -418,8 +415,8 @@ class Recording:
         """Number of damaged places that were skipped, mostly MCAP chunks. The incomplete end of a
         file that was cut off does not count."""
         self.cut = ""
-        """Cause that cut off the recording, a key of `CUTS`; "" if the daemon ended normally or if
-        the file is not finished."""
+        """Cause that cut off the recording, a key of `CUT_TEXTS`; "" if the daemon ended normally
+        or if the file is not finished."""
         self.why = ""
         """If `cut` is "bug", text that names the failed step and the exception; otherwise ""."""
         self.unfinished: bytes | None = None
@@ -533,7 +530,7 @@ def rewrite(recording: Recording, path: Path, cut: str = "open") -> int:
     """Copy all readable messages to a new, finished file at `path`, and return their number.
 
     If the recording is not finished, the end record of the new file names the cause `cut`, a key of
-    `CUTS`. Otherwise the new end record has the cause of the recording's own end record.
+    `CUT_TEXTS`. Otherwise the new end record has the cause of the recording's own end record.
 
     Raises:
         OSError: a file exists at `path`, or the disk refuses to write.

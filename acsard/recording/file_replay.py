@@ -116,11 +116,6 @@ def steps(recording: Recording) -> Iterator[Step]:
 def _items(
     recording: Recording, copies: EventCopies | None = None
 ) -> Iterator[list[Step] | Checkpoint]:
-    """Yield the readable batches of steps and the checkpoints, in the order of the file.
-
-    If `copies` is not None, each batch of steps and each message of the channel `events` is first
-    passed to `copies`. Each damaged message is added to `Recording.damaged`.
-    """
     for topic, _, data in recording.messages():
         if topic == "events" and copies is not None:
             copies.copy(data)
@@ -144,7 +139,7 @@ is this factor times the size of the file, plus `MAX_BYTES`."""
 
 
 class _Source:
-    """Base class of the replays of a recording. It decodes the robot states in the recording."""
+    """Base class of the replays of a recording."""
 
     def __init__(self, recording: Recording) -> None:
         self._recording = recording
@@ -164,15 +159,14 @@ class _Source:
     def state_errors(self) -> Iterator[None]:
         """Convert the errors of a robot with an incomplete recorded state to `RecordingError`.
 
-        A forged state may lack any part, so every use of the robot must be in a `with` block of
-        this context manager. Errors of a robot that was not rebuilt from a recorded state are not
-        converted, because they are defects in the code.
+        A forged state may lack any part, so every use of the robot must be in such a `with` block.
         """
         try:
             yield
         except RecordingError:
             raise
         except INCOMPLETE_STATE_ERRORS as error:
+            # Without a recorded state, the error is a defect in the code.
             if self._state is None:
                 raise
             reason = (
@@ -187,17 +181,9 @@ class _Source:
         number: int,
         tried: Callable[[Config], Config] | None = None,
     ) -> State | None:
-        """Decode the robot state with which the replay can go on at the step `number`.
+        """Return the state with which the replay can go on at step `number`, or None.
 
-        Return None if this is not possible. Either `saved` is None or was not saved just before
-        this step, or this version of acsard cannot use the state, or the limit on the total size of
-        the decoded states is exceeded.
-
-        Args:
-            saved: the last checkpoint before the step `number`.
-            number: the number of the next step.
-            tried: function that takes the configuration of the decoded robot, and returns the
-                configuration that replaces it. If it is None, the robot keeps its configuration.
+        `tried` gives the configuration that replaces that of the decoded robot.
         """
         if saved is None or saved.number != number:
             return None
@@ -317,10 +303,6 @@ class RecordedRun(_Source):
         return gap
 
     def _resume(self, saved: Checkpoint | None, number: int) -> bool:
-        """Restore the robot from the checkpoint `saved`, and go on with the step `number`.
-
-        Return False if this is not possible, else True.
-        """
         other = self._other
         tried = None if other is None else partial(_with_changes, other, self._recorded)
         state = self._resumed(saved, number, tried)
@@ -332,14 +314,9 @@ class RecordedRun(_Source):
 
 
 def _with_changes(other: Config, recorded: Config, present: Config) -> Config:
-    """Return `other` with the settings that clients changed while the recorded robot ran.
+    """Return `other` with the settings that clients changed during the recording, if permitted.
 
-    If the changed values are not permitted together with `other`, return `other` itself.
-
-    Args:
-        other: the configuration of the replay.
-        recorded: the configuration at the beginning of the recording.
-        present: the configuration of the recorded robot after the changes.
+    `recorded` is the configuration before these changes, and `present` the one after them.
     """
     # A robot with the configuration `other` would have refused changes that are not permitted.
     before = dict(flat(effective(recorded)))
@@ -379,15 +356,9 @@ def replay_file(
 
 
 def _failed_step(recording: Recording, robot: Robot, last: int | None) -> str:
-    """Replay the step in which the recorded daemon failed.
+    """Replay the step in which the recorded daemon failed; return `ReplayResult.failed_step`.
 
-    Return the text for `ReplayResult.failed_step`. The step is replayed only if its number is
-    `last` + 1.
-
-    Args:
-        recording: the recording, after `messages()` has yielded the last message.
-        robot: the robot after the last replayed step.
-        last: the number of the last replayed step; None if no step was replayed.
+    Call this after `recording.messages()` has yielded the last message.
     """
     if recording.unfinished is None:
         return ""
@@ -473,12 +444,7 @@ class DisplayReplay(_Source):
 
 
 def _first_state(recording: Recording) -> tuple[int, State | None]:
-    """Return the robot state with which a recording begins.
-
-    The result is a pair: the number of the step that follows the state, and the state. It is
-    (0, None) if the recording has no state before its first steps. Raises `RecordingError` if the
-    state is damaged, or if this version of acsard cannot use it.
-    """
+    """Return (number of the next step, state) for the state with which a recording begins."""
     for topic, _, data in recording.messages():
         if topic == "state":
             try:
@@ -564,18 +530,14 @@ class EventCopies:
             )
 
     def _compare(self, last: bool, follows: bool = True) -> None:
-        """Compare the events of the most recent batch with their copies.
+        """Report the first event of the newest batch that differs from its copy.
 
-        Nothing is compared if steps or copies may be missing because of damage.
-
-        Args:
-            last: true if this is the last batch. If the file was cut off, copies may then be
-                missing.
-            follows: true if no step is missing between this batch and the next batch.
+        `last` is true for the last batch. `follows` is true if no step is missing after the batch.
         """
         recording = self._recording
         if recording.damaged > self._damaged or not follows:
             return
+        # Copies may be missing at the end of a file that was cut off.
         missing = last and bool(recording.cut or not recording.ended)
         for event, copy in zip_longest(self._events, self._copies):
             if event != copy:

@@ -254,13 +254,9 @@ def read_chunk(data: bytes, begin: int) -> ReadChunk | None:
 
 
 def _blocks(data: bytes, at: int) -> Iterator[tuple[int, bytes, bool]]:
-    """Yield the triple (end offset, unpacked data, is last) for each zstd block of a frame.
+    """Yield (end offset in the file, data, is last) for each block of the zstd frame at `at`.
 
-    The end offset counts from the beginning of the file, bytes. `is last` is true for the last
-    block of the frame.
-
-    `data` is the content of the file. `at` is the offset at which the zstd frame begins. Raises
-    `ZstdError` for a damaged block.
+    Raises `ZstdError` for a damaged block.
     """
     begin = at + zstandard.frame_header_size(data[at : at + _LONGEST_FRAME_HEAD])
     unpacker = zstandard.ZstdDecompressor(max_window_size=1 << ZSTD_PARAMETERS.window_log)
@@ -280,11 +276,9 @@ def _blocks(data: bytes, at: int) -> Iterator[tuple[int, bytes, bool]]:
 
 
 def _messages(data: bytearray) -> tuple[list[Message], int, int]:
-    """Decode the complete messages at the beginning of `data`.
+    """Return the complete messages, their size, and the number of bytes that the next one needs.
 
-    Returns a triple: the messages, the total size of these messages, and the number of bytes that
-    are needed to continue with the next message. This number exceeds `MAX_MESSAGE_BYTES` if the
-    next message is damaged.
+    This number exceeds `MAX_MESSAGE_BYTES` if the next message is damaged.
     """
     messages: list[Message] = []
     at = 0
@@ -396,11 +390,10 @@ def walk(data: bytes) -> Iterator[Found]:
 
 
 def _read(stream: io.BytesIO, at: int, opcode: int, claimed: int, size: int) -> Found | None:
-    """Decode the record at the offset `at`.
+    """Decode the record at the offset `at`, or return None if it is damaged or cut off.
 
-    Return None if the opcode is not a key of `READ_RECORDS`, or if the record is damaged or cut
-    off. `claimed` is the offset at which the record ends according to its length field. `size` is
-    the size of the file, bytes.
+    `claimed` is the offset of its end according to its length field. `size` is the size of the
+    file.
     """
     read = READ_RECORDS.get(opcode)
     if read is None:
@@ -417,10 +410,7 @@ def _read(stream: io.BytesIO, at: int, opcode: int, claimed: int, size: int) -> 
 
 
 def _is_intact(stream: io.BytesIO, at: int, end: int) -> bool:
-    """Return whether an attachment has a correct checksum, or has no checksum (0).
-
-    `at` and `end` are the offsets in the file at which the attachment begins and ends.
-    """
+    """Check the checksum of an attachment. A checksum of 0 means that it has none."""
     stream.seek(at)
     record = stream.read(end - at)
     crc = int.from_bytes(record[-4:], "little")
@@ -445,26 +435,16 @@ class _Chunks:
 
     @property
     def spent(self) -> bool:
-        """True if the work for incomplete chunks exceeds its limit, so that `later()` stops."""
         return self._effort < 0
 
     def read(self, begin: int) -> ReadChunk | None:
-        """Read the chunk whose header begins at the offset `begin`, as far as it is readable.
-
-        Return None if no chunk begins at this offset. If the chunk is incomplete or empty, the work
-        of reading it counts towards the limit.
-        """
         chunk = read_chunk(self._data, begin)
         if chunk is not None and not (chunk.complete and chunk.messages):
             self._effort -= chunk.effort
         return chunk
 
     def later(self, begin: int) -> int | None:
-        """Return the offset of the first complete chunk that begins at the offset `begin` or later.
-
-        Return None if the rest of the file contains no complete chunk, or if the work exceeds its
-        limit. `begin` must not be smaller than in the previous call.
-        """
+        """Return the offset of the next complete chunk. `begin` must not decrease between calls."""
         if self._found is not None and self._found >= begin:
             return self._found
         self._found = None

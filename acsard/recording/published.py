@@ -118,7 +118,6 @@ class Publisher:
         return lambda: self.robot.snapshot(now.mono_ns)
 
     def _latched(self, now: Instant) -> Iterator[Published]:
-        """Yield `tf_static` once, and again after a setting has changed it."""
         if self._static_due and "tf_static" in self._wanted:
             self._static_due = False
             static = self._report.tf_static()

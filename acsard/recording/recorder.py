@@ -150,10 +150,7 @@ class Recorder:
             queue.append(Start(self._number, freeze(robot, guard.memory), robot.config))
 
     def _watch_disk(self, now_ns: int) -> None:
-        """Report when the disk begins to hang, and when it is fast enough again.
-
-        `now_ns` is the monotonic time of the present step, ns.
-        """
+        """Report when the disk begins to hang, and when it is fast enough again."""
         before, self._syncs = self._syncs, self._writer.syncs
         passed = self._syncs - before
         if passed:

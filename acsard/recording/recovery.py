@@ -44,7 +44,7 @@ def recover(part: Path, whole: Path, cut: str, room: bool) -> str:
     Args:
         part: path of the file that was cut off.
         whole: path of the finished file.
-        cut: the cause that cut off the file, a key of `CUTS`.
+        cut: the cause that cut off the file, a key of `CUT_TEXTS`.
         room: true if the disk has room for a copy.
 
     Returns:
@@ -95,16 +95,12 @@ def _has_configuration(part: Path) -> bool:
 
 
 def _has_chunks(part: Path) -> bool:
-    """Return whether the file has the header of a chunk. Its content may be unreadable."""
+    """Return whether the file has the header of a chunk, even if its content is unreadable."""
     return any(True for _ in chunk_places(part.read_bytes(), 0))
 
 
 def _copy(recording: Recording, part: Path, whole: Path, cut: str) -> bool:
-    """Copy the readable data of `recording` to `whole`, and then delete its file `part`.
-
-    `cut` is the cause that cut off the recording, a key of `CUTS`. Return False without a copy if
-    the disk is full, else True.
-    """
+    """Copy the readable data. Return False, and keep the file `part`, if the disk is full."""
     written = part.with_name(f".{part.name}.new")
     written.unlink(missing_ok=True)
     try:
@@ -119,13 +115,9 @@ def _copy(recording: Recording, part: Path, whole: Path, cut: str) -> bool:
 
 
 def _finish_in_place(recording: Recording, part: Path, cut: str) -> bool:
-    """Write the missing end of the file `part`, and the true headers of its unfinished chunks.
+    """Overwrite incomplete data with the end of the file, and write true headers of the chunks.
 
-    The end is written directly after the last readable data, and overwrites incomplete data. `cut`
-    is the cause that cut off the recording, a key of `CUTS`.
-
-    Return True on success. Return False, and leave the file unchanged, if the disk has no room for
-    the end.
+    Return False, and leave the file unchanged, if the disk has no room for the end.
     """
     # Readable data is not removed to make room, because on some disks this does not help.
     builder = EndRecordBuilder(recording.about)
@@ -155,15 +147,9 @@ def _finish_in_place(recording: Recording, part: Path, cut: str) -> bool:
 
 
 def _writes(before: bytes, last: EndRecord) -> tuple[list[tuple[int, bytes]], int]:
-    """Return a pair: the writes that finish a file, and the size of the finished file in bytes.
+    """Return the writes (offset, data) that finish a file, and the size of the finished file.
 
-    Each write is a pair (offset, data). The first write is the end of the file. The other writes
-    are the true headers of chunks. If an interrupted recovery has already written the end of the
-    file, there are only headers.
-
-    Args:
-        before: the present content of the file.
-        last: the end record of the finished file.
+    If an earlier recovery has already written the end of the file, there are only chunk headers.
     """
     # The end comes first, because the disk may have no room for it.
     heads: list[tuple[int, bytes]] = []
@@ -195,10 +181,7 @@ def _writes(before: bytes, last: EndRecord) -> tuple[list[tuple[int, bytes]], in
 
 
 def _put(stream: FileIO, at: int, data: bytes) -> None:
-    """Write `data` at the offset `at` of the file, and sync the file to the disk.
-
-    If the disk refuses to write, a part of `data` may have been written.
-    """
+    """Write and sync `data`. If the disk refuses it, a part of `data` may have been written."""
     stream.seek(at)
     while data:
         data = data[stream.write(data) :]
@@ -206,11 +189,7 @@ def _put(stream: FileIO, at: int, data: bytes) -> None:
 
 
 def _end(last: EndRecord, index: Index, at: int) -> bytes:
-    """Return the last bytes of an MCAP file: the end record `last`, the summary and the footer.
-
-    The caller writes these bytes at the offset `at` of the file. `index` contains the data of the
-    summary.
-    """
+    """Return the end of an MCAP file, which the caller writes at the offset `at`."""
     # The summary section does not repeat the schema and the channels, because the disk may be
     # nearly full. It has the statistics, because some readers treat a file without statistics as
     # empty.

@@ -162,11 +162,7 @@ def to_delete(
 
 
 def _protected(ended: Sequence[Ended]) -> set[str]:
-    """Return the names of the protected recordings.
-
-    These are the newest `MAX_KEPT_FILES` recordings of the class `kept`, and all `near` recordings
-    that are in a group with one of these (see `_groups`).
-    """
+    """Return the names of the newest `kept` recordings, and of the `near` ones in their groups."""
     kept = {file.name for file in [file for file in ended if file.kind == "kept"][-MAX_KEPT_FILES:]}
     return {
         file.name
@@ -178,10 +174,6 @@ def _protected(ended: Sequence[Ended]) -> set[str]:
 
 
 def _groups(ended: Sequence[Ended]) -> Iterator[list[Ended]]:
-    """Yield the groups of successive recordings that are not `plain`.
-
-    The file numbers in a group are consecutive.
-    """
     group: list[Ended] = []
     for file in ended:
         if file.kind == "plain":

@@ -201,11 +201,7 @@ def encode(first: int, taken: Sequence[Taken]) -> bytes:
 
 
 def _times(taken: Sequence[Taken], mono_ns: int, offset_ns: int) -> Iterator[list[int]]:
-    """Yield the times of each row as a list, in ns.
-
-    The list contains `Row.now` and `Row.offset`, and then `Read.age` and `Read.offset` of each
-    read.
-    """
+    """Yield for each row `Row.now`, `Row.offset`, and then age and offset of each read, ns."""
     tick_ns = mono_ns
     for inputs, _, _ in taken:
         now = inputs.now
@@ -327,11 +323,7 @@ def _sent(row: Row) -> bytes | None:
 
 
 def _instant(batch: Batch, mono_ns: int, offset: int) -> Instant:
-    """Return an instant: the monotonic time `mono_ns`, and the wall-clock time at that time.
-
-    `offset` is a `Row.offset` or a `Read.offset` of the batch. Raises `ValueError` if a time is out
-    of range.
-    """
+    """Return an instant; `offset` is a `Row.offset` or a `Read.offset` of the batch."""
     ahead_ns = batch.offset_ns + offset * batch.unit
     if abs(mono_ns) >= 2 * MAX_TIME_NS or abs(ahead_ns) >= MAX_OFFSET_NS:
         raise ValueError("a time is out of range")
@@ -339,10 +331,7 @@ def _instant(batch: Batch, mono_ns: int, offset: int) -> Instant:
 
 
 def _require_finite(rare: Rare) -> None:
-    """Raise `ValueError` if a number in a request or in a gyro sample is NaN or infinite.
-
-    The numbers in commands are not checked here, because the robot checks them.
-    """
+    """Check requests and gyro samples only, because the robot checks the numbers in commands."""
     for request in rare.requests:
         pose = request.pose
         if pose is not None and not all(map(math.isfinite, (pose.x, pose.y, pose.yaw))):

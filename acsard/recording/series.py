@@ -154,10 +154,6 @@ def search(files: Sequence[Path], first: float, last: float) -> Search:
 
 
 def _gaps(pieces: Sequence[_Piece], first: float, last: float) -> list[tuple[float, float]]:
-    """Return the gaps: the parts of the range from `first` to `last` that no piece covers.
-
-    A gap is a pair (beginning, end), s since 1970. Gaps of at most `MIN_GAP_S` are left out.
-    """
     inside = sorted(piece for piece in pieces if piece.begin <= last and first <= piece.end)
     ends = [first]
     for piece in inside:
@@ -168,11 +164,7 @@ def _gaps(pieces: Sequence[_Piece], first: float, last: float) -> list[tuple[flo
 
 
 def _groups(files: Sequence[Path], chosen: dict[int, Contents]) -> list[list[int]]:
-    """Group the chosen files into series, and return the indices in `files` of each series.
-
-    `chosen` maps the index of each chosen file to the contents of this file. A series also includes
-    the earlier files that `_earlier()` finds for its first chosen file.
-    """
+    """Return the indices in `files` of each series. `chosen` maps some indices to contents."""
     groups: list[list[int]] = []
     for number, contents in sorted(chosen.items()):
         if groups and number - 1 in chosen and _continues(chosen[number - 1], contents):
@@ -185,8 +177,7 @@ def _groups(files: Sequence[Path], chosen: dict[int, Contents]) -> list[list[int
 def _earlier(files: Sequence[Path], number: int, contents: Contents) -> list[int]:
     """Return the indices of the files with the earlier part of a drive, the oldest file first.
 
-    It is the drive during which the file with the index `number` begins. The list is empty if this
-    file does not begin during a drive. `contents` are the contents of this file.
+    It is the drive during which the file with the index `number` begins.
     """
     found: list[int] = []
     while number > 0 and contents.first.recorded.status[0] == "driving":
@@ -203,30 +194,19 @@ def _earlier(files: Sequence[Path], number: int, contents: Contents) -> list[int
 
 
 def _continues(before: Contents, contents: Contents) -> bool:
-    """Return whether a file with `contents` continues a file with `before`.
-
-    It does if both are from the same run of the daemon, and no step is missing between them.
-    """
     follows = contents.first.number == before.last.number + 1
     mono_ns = contents.first.inputs.now.mono_ns - before.last.inputs.now.mono_ns
     return follows and 0 <= mono_ns < TIME_TOLERANCE_S * NS_PER_S
 
 
 def _covered(path: Path) -> _Piece:
-    """Return the range of time that a file covers, from its end record.
-
-    If the file has no end record, read the whole file. Raises `RecordingError` if that fails.
-    """
     end = read_end(path) or Recording(_present(path)).compute_end_record()
     earliest_ns = end.wall_ns if end.earliest_ns is None else end.earliest_ns
     return _Piece(min(earliest_ns, end.wall_ns) / NS_PER_S, end.last_ns / NS_PER_S, path)
 
 
 def _present(path: Path) -> Path:
-    """Return the present path of a recording, which the daemon may have renamed since `path`.
-
-    If no file is found, return `path`.
-    """
+    """Return the present path of a recording, which the daemon may have renamed."""
     if path.exists() or not path.parent.is_dir():
         return path
     stem = path.name.partition(".")[0]
@@ -234,7 +214,6 @@ def _present(path: Path) -> Path:
 
 
 def _nearest(pieces: Sequence[_Piece], first: float, last: float) -> str:
-    """Return the text of `NothingRecordedError`, with the nearest recordings."""
     before = max([p for p in pieces if p.end < first], key=lambda p: p.end, default=None)
     after = min([p for p in pieces if p.begin > last], key=lambda p: p.begin, default=None)
     text = f"nothing was recorded {in_words(first, last)}"

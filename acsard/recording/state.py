@@ -184,11 +184,7 @@ class _Walk:
         so that no other object gets the same `id()`."""
 
     def into(self, now: Any, begun: Any, other: Any) -> None:
-        """Change the attributes of the object `now` as `adopt()` describes.
-
-        `now`, `begun` and `other` are corresponding objects in `robot`, `begun` and `other` of
-        `adopt()`.
-        """
+        """Change the attributes of the object `now` as `adopt()` describes."""
         if id(now) in self._visited:
             return
         self._visited[id(now)] = now
@@ -204,11 +200,7 @@ class _Walk:
                 setattr(now, name, merged)
 
     def merged(self, now: Any, begun: Any, other: Any) -> Any:
-        """Return the new value of an attribute, given its values in the three robots of `adopt()`.
-
-        The result is `other`, or `now`, or a copy of `now` with changed parts. Parts of `now` may
-        be changed in place.
-        """
+        """Return the new value of an attribute. Parts of `now` may be changed in place."""
         if type(now) is not type(other):
             return other if _same(now, begun) else now
         match now:
@@ -236,7 +228,6 @@ def _same(now: Any, begun: Any) -> bool:
 
 
 def _names(item: object) -> list[str]:
-    """Return the names of the object's own attributes, in `__dict__` and `__slots__`."""
     slots = [name for kind in type(item).__mro__ for name in getattr(kind, "__slots__", ())]
     names = [*getattr(item, "__dict__", ()), *slots]
     return [name for name in names if hasattr(item, name)]

@@ -171,7 +171,6 @@ class StepWriter:
                 mark_cut(writing.path, self._incidents.kind, cut)
 
     def _open_ring(self) -> Ring:
-        """Open the directory of recordings, and report the old files that could not be finished."""
         ring = Ring(self._config.record, self._run, self._refused)
         self._refused, self._cut_ns = False, ring.cut_ns or self._cut_ns
         for text in ring.messages:
@@ -179,11 +178,7 @@ class StepWriter:
         return ring
 
     def _write_group(self, ring: Ring, start: Start | None, steps: list[Taken]) -> None:
-        """Write steps to the current file, or to a new file.
-
-        If `start` is not None, it is the robot's state before the first of the steps. A new file
-        begins with this state. In the current file, the state becomes a checkpoint.
-        """
+        """Write steps. `start` begins a new file, or becomes a checkpoint in the current one."""
         if start is not None and self._writing is not None and self._goes_on(ring, start):
             self._add_checkpoint(self._writing, start, self._last)
         elif start is not None:
@@ -201,11 +196,6 @@ class StepWriter:
             self._add(ring, self._writing, steps[at : at + MAX_BATCH_STEPS])
 
     def _goes_on(self, ring: Ring, start: Start) -> bool:
-        """Return whether the steps after `start` may follow in the current file.
-
-        If not, either steps are missing before `start`, or the current file has reached its largest
-        duration or size.
-        """
         return start.number == self._number and not self._is_long_enough(ring)
 
     def _is_long_enough(self, ring: Ring) -> bool:
@@ -218,9 +208,8 @@ class StepWriter:
         self._state_ns = now.mono_ns
 
     def _add(self, ring: Ring, writing: Writing, batch: list[Taken]) -> None:
-        """Write steps as one message, or as several messages if one would exceed the limit of the
-        reader, `MAX_DATA_BYTES`."""
         data = encode(self._number, batch)
+        # The reader refuses a larger message.
         if len(data) > MAX_DATA_BYTES and len(batch) > 1:
             half = len(batch) // 2
             self._add(ring, writing, batch[:half])
@@ -258,22 +247,19 @@ class StepWriter:
         self._add_checkpoint(self._writing, start, now)
 
     def _look_back(self, ring: Ring, now: Instant) -> None:
-        """Register the files of the previous run that ended less than a minute ago.
+        """Let an incident at the beginning of this run protect the last files of the previous run.
 
-        An incident at the beginning of this run then protects these files. An incident at the end
-        of the previous run protects the first file of this run.
+        An incident at the end of the previous run protects the first file of this run.
         """
         for path, kind, ended_ns in ring.just_ended(now):
             self._incidents.earlier(path, kind, ended_ns)
         self._looked_back = True
 
     def _retain(self, ring: Ring, now: Instant) -> None:
-        """Retain the current file, and the files that ended less than a minute ago."""
         for path in self._incidents.happened(now.mono_ns):
             ring.retain(path)
 
     def _write_bug(self, ring: Ring, bug: Bug) -> None:
-        """Record the inputs of the step that failed. The failure counts as an incident."""
         if bug.at is not None and self._writing is None and self._start is not None:
             self._begin(ring, self._start, bug.at)
         if self._writing is None:
@@ -325,7 +311,6 @@ class StepWriter:
         self._incidents.end(path, self._last.mono_ns)
 
     def _fail(self, error: OSError) -> None:
-        """Close the file and the directory after an error of the disk, and begin the pause."""
         text = f"{self.where}: {error.strerror or error}"
         if not self.trouble:
             self._lost_before = self.lost

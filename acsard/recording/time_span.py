@@ -121,17 +121,9 @@ def _time_of_day(words: str, text: str) -> TimeOfDay:
 
 
 def _date(words: str, text: str, now_s: float) -> tuple[int, int, int]:
-    """Return the triple (year, month, day) for a date that a person typed.
+    """Return the triple (year, month, day).
 
-    On the first day of a month, the result for "yesterday" has the day 0. This means the last day
-    of the previous month.
-
-    Args:
-        words: the date: "today", "yesterday" or a date like "2026-11-21".
-        text: the whole text that the person typed, for the error message.
-        now_s: the present time, s since 1970.
-
-    Raises `TimeError` if `words` are not a date.
+    On the first day of a month, "yesterday" has the day 0: the last day of the previous month.
     """
     if words in _DAYS_AGO:
         today = time.localtime(now_s)
@@ -148,11 +140,7 @@ def _date(words: str, text: str, now_s: float) -> tuple[int, int, int]:
 
 
 def _moment(date: tuple[int, int, int], when: TimeOfDay = MIDNIGHT, days: int = 0) -> float:
-    """Return a local time as s since 1970: the time of day `when`, `days` days after `date`.
-
-    `date` is a triple (year, month, day). The day may be out of range. For example, the day 0 is
-    the last day of the previous month.
-    """
+    """Return a local time as s since 1970. The day 0 is the last day of the previous month."""
     year, month, day = date
     whole = (year, month, day + days, when.hours, when.minutes, 0, 0, 0, -1)
     return time.mktime(whole) + when.seconds
@@ -285,10 +273,6 @@ def part_between(found: list[Stretch], first: float, last: float) -> Span | None
 
 
 def _on(near: float, day: int, when: TimeOfDay) -> float:
-    """Return the time at which a clock shows `when`, `day` days after the date of `near`.
-
-    `near` and the result are times in s since 1970.
-    """
     date = time.localtime(near)
     return _moment((date.tm_year, date.tm_mon, date.tm_mday), when, day)
 
@@ -351,7 +335,6 @@ def _from(recording: Recording, now: Instant) -> Stretch:
 
 
 def _steps(data: bytes) -> list[Step]:
-    """Return the steps of a message, or an empty list if the message is empty or damaged."""
     try:
         return list(decode(data)) if data else []
     except BatchError:

@@ -279,7 +279,6 @@ class WaitingSenders:
         yield TimelineEntry(now.wall_ns / 1e9, "waits", text, by=_named(*key))
 
     def _has_room(self, now: Instant) -> bool:
-        """Return whether another sender can be watched. If needed, first forget silent senders."""
         if len(self._waiting) >= MAX_WAITING:
             oldest_ns = now.mono_ns - MIN_SILENCE_NS
             kept = {key: one for key, one in self._waiting.items() if one.last_ns >= oldest_ns}
@@ -291,10 +290,9 @@ class WaitingSenders:
         return self._commander.startswith(f"{source} (") and ", " not in self._commander
 
     def _why(self, waiting: str, followed: str) -> str:
-        """Return why the robot follows the source `followed` and not the source `waiting`.
+        """Return "" if a priority is not known, or if `waiting` has the higher one.
 
-        The result is "" if a priority is not known, or if `waiting` has the higher priority. In the
-        latter case `waiting` does not wait, but the robot refuses its commands.
+        In the latter case `waiting` does not wait, but the robot refuses its commands.
         """
         one, other = self._priorities.get(waiting), self._priorities.get(followed)
         if one is None or other is None or one > other:
@@ -348,7 +346,6 @@ class TimelineWriter:
         yield from entries
 
     def _continues(self) -> Iterator[TimelineEntry]:
-        """Yield the entry `continues`, with the robot's state at the beginning of the recording."""
         first, self._continued = self._continued, None
         if first is None:
             return
@@ -391,7 +388,6 @@ class TimelineWriter:
         self._shutting_down = step.inputs.shutting_down
 
     def _clock(self, now: Instant) -> Iterator[TimelineEntry]:
-        """Yield an entry `clock` if the wall clock was adjusted since the last step."""
         last = self._now
         if last is None:
             return

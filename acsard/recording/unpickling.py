@@ -131,10 +131,7 @@ class _Entry:
         more."""
 
     def holds(self, parts: Sequence[_Entry]) -> None:
-        """Update the depth and the size of this value for `parts`, which the caller will add to it.
-
-        Raises `ValueError` if a limit is exceeded, or if this value may not grow any more.
-        """
+        """Update the depth and the size for `parts`, which the caller will add to this value."""
         if self.closed:
             raise ValueError(
                 "a part of the robot state contains itself, or grows after it was used: the file "
@@ -173,17 +170,12 @@ class _Machine:
         """Number of values that were copied so far."""
 
     def result(self) -> object:
-        """Return the only value on the stack; raise `ValueError` if there is not exactly one."""
         if len(self._stack) != 1 or self._marks:
             raise ValueError("the robot state is damaged: its data ends too early")
         return self._stack[0].value
 
     def do(self, name: str, argument: Any) -> None:
-        """Execute the opcode `name`.
-
-        Raises `ValueError` if the opcode is forbidden. If the operands are damaged, it may also
-        raise the other exceptions that `unpickle` converts.
-        """
+        """Execute an opcode. Damaged operands may raise any exception that `unpickle` converts."""
         if name in ARGUMENTS:
             if type(argument) is int and argument.bit_length() > MAX_INT_BITS:
                 raise ValueError(
@@ -228,17 +220,12 @@ class _Machine:
         return taken
 
     def _marked(self) -> list[_Entry]:
-        """Remove the last mark. Pop and return all values above this mark."""
         mark = self._marks.pop()
         taken = self._stack[mark:]
         del self._stack[mark:]
         return taken
 
     def _copies(self, entry: _Entry) -> None:
-        """Add the size of `entry` to the number of copied values.
-
-        Raises `ValueError` if this number exceeds `MAX_COPIED_PARTS`.
-        """
         self._copied += entry.size
         if self._copied > MAX_COPIED_PARTS:
             raise ValueError(
@@ -309,7 +296,6 @@ class _Machine:
         self._push(self._find(module, name))
 
     def construct(self) -> None:
-        """Pop a class and a tuple of arguments, and push a new object of the class."""
         kind, given = self._top(2)
         if not isinstance(kind.value, type) or not isinstance(given.value, tuple):
             raise TypeError("an instruction calls an object that is not a class")
@@ -320,10 +306,6 @@ class _Machine:
         self._stack.append(entry)
 
     def make_bare(self) -> None:
-        """Pop a class, and push an object of this class that has no attributes yet.
-
-        The constructor is not called.
-        """
         kind, given = self._top(2)
         if not isinstance(kind.value, type) or given.value != ():
             raise TypeError(
@@ -335,10 +317,7 @@ class _Machine:
         self._push(object.__new__(kind.value))
 
     def set_attributes(self) -> None:
-        """Pop a dict, and set its items as attributes of the object that is then on top.
-
-        Only `make_bare` can have made this object.
-        """
+        """Pop a dict, and set its items as attributes of an object that `make_bare` has made."""
         (state,) = self._top(1)
         whole, named = self._stack[-1], state.value
         if not _is_part(type(whole.value)) or not isinstance(named, dict):
@@ -380,10 +359,7 @@ OPCODES: dict[str, Callable[[_Machine], None]] = {
 
 
 def _keys(entries: Sequence[_Entry]) -> None:
-    """Raise `ValueError` unless every entry is allowed as a dict key or set element.
-
-    The other values cannot be hashed, are slow to hash, or may be forged to have equal hashes.
-    """
+    """Reject keys that cannot be hashed, are slow to hash, or may be forged for equal hashes."""
     for entry in entries:
         value = entry.value
         parts = value if type(value) is tuple and len(value) <= MAX_KEY_PARTS else (value,)
@@ -400,19 +376,15 @@ def _keys(entries: Sequence[_Entry]) -> None:
 
 
 def _is_part(kind: Any) -> bool:
-    """Return whether objects of the class `kind` can be rebuilt from their attributes alone.
-
-    Return False if `kind` is a builtin, or defines `__new__`, `__reduce_ex__` or `__setstate__`.
-    """
+    """Return whether objects of the class `kind` can be rebuilt from their attributes alone."""
     plain = kind.__new__ is object.__new__ and kind.__reduce_ex__ is object.__reduce_ex__
     return plain and kind.__module__ != "builtins" and not hasattr(kind, "__setstate__")
 
 
 def _made(kind: type, given: tuple[Any, ...]) -> object:
-    """Return an object of the class `kind`, constructed from the arguments `given`.
+    """Construct an object, or raise `ValueError` if the class is not allowed here.
 
-    Raises `ValueError` if the class is not allowed here. Wrong arguments also raise `TypeError` or
-    a msgspec error.
+    Wrong arguments also raise `TypeError` or a msgspec error.
     """
     match given:
         case (dict(),) if kind is Counter:

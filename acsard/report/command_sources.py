@@ -94,10 +94,6 @@ class CommandSources:
         return before != self._refused
 
     def _find_refused(self, step: Step, t: float, robot: Robot) -> None:
-        """Find the commands of a step that the robot refused, and mark their sources as refused.
-
-        If `robot` did not replay the step before, only read the robot's counters.
-        """
         # The robot's counters show the reasons, but not the sources. A source counts as refused if
         # the last command that the robot accepted from it is older than its command in this step.
         counted = Counter({name: robot.counters[f"command_{name}"] for name in REFUSED})
@@ -139,10 +135,7 @@ class CommandSources:
             self.bands[name].add(t, state, words)
 
     def _states(self, step: Step, t: float, robot: Robot) -> Iterator[tuple[str, str, str]]:
-        """Yield a triple for each source: its name, its state, and the reason in words.
-
-        The state of a silent source is "".
-        """
+        """Yield the name, state and reason of each source. A silent source has the state ""."""
         mode, reason, _, driver = step.recorded.status
         for source in robot.snapshot(step.inputs.now.mono_ns).sources:
             refusal, wait = self._refusal(source.name, t), source.waits_for
@@ -160,9 +153,5 @@ class CommandSources:
         yield OTHER_SOURCES, "refused" if refusal else "", refusal
 
     def _refusal(self, name: str, t: float) -> str:
-        """Return why the source `name` counts as refused at the time `t`, s.
-
-        Return "" if it does not count as refused.
-        """
         until, words = self._refused.get(name, (-math.inf, ""))
         return words if t < until else ""

@@ -156,7 +156,7 @@ class BandStyle(NamedTuple):
     """Name of the command source if `kind` is "drives"; "" for a style that applies to all rows."""
     colour: str
     pattern: str = ""
-    """Fill pattern, as in `PATTERNS`."""
+    """Fill pattern, as in `FILL_PATTERNS`."""
 
     @property
     def meaning(self) -> str:
@@ -181,7 +181,6 @@ def _styles(rows: list[Row]) -> Iterator[BandStyle]:
 
 
 def _keys(styles: list[BandStyle]) -> list[Key]:
-    """Return the entries of the legend. Styles with equal color and pattern share an entry."""
     meanings: dict[tuple[str, str], list[str]] = {}
     for style in styles:
         meanings.setdefault((style.colour, style.pattern), []).append(style.meaning)
@@ -245,10 +244,6 @@ def path_figure(data: ReportData) -> Figure:
 
 
 def _events(name: str, marks: Marks, dot: dict[str, Any]) -> Trace | None:
-    """Draw the events with the name `name` at the robot's positions.
-
-    Return None if no such event has a position.
-    """
     named = [mark for mark in marks.all() if mark.name == name]
     placed = [(mark, mark.place) for mark in named if mark.place is not None]
     if not placed:
@@ -265,14 +260,13 @@ def _places(name: str, places: list[Place], mode: str, **look: object) -> Trace:
 
 
 def _with_gaps(places: list[Place]) -> list[Place]:
-    """Return the places with a gap before each jump of the path (`Place.new`)."""
     gap = Place(0.0, math.nan, math.nan, 0.0)
     found = [item for place in places for item in ((gap, place) if place.new else (place,))]
     return found[1:] if found and found[0] is gap else found
 
 
 def _spread(places: list[Place]) -> list[Place]:
-    """Return about `HEADING_ARROWS` places of the path, at about equal distances along the path."""
+    """Return about `HEADING_ARROWS` places, at about equal distances along the path."""
     distances = [0.0]
     for before, after in pairwise(places):
         metres = 0.0 if after.new else math.hypot(after.x - before.x, after.y - before.y)
@@ -429,10 +423,6 @@ class TimeFigures:
         return Figure("sources", title, caption, _keys(styles), height, traces, axes)
 
     def _bars(self, style: BandStyle, spans: list[tuple[int, Span]]) -> Trace:
-        """Draw the spans of time that have one style as bands.
-
-        Each element of `spans` is a pair: the number of a row, and a span in this row.
-        """
         kind, colour = style.kind, style.colour
         # The border line keeps even a very short band visible.
         marker: dict[str, Any] = {"color": colour, "line": {"color": colour, "width": 1}}
@@ -499,10 +489,7 @@ class TimeFigures:
         return layout() | {"xaxis": axis, "margin": {"l": 44, "r": 12, "t": 8, "b": 44}}
 
     def _stack(self, name: str, title: str, caption: str, parts: list[Part], px: int) -> Figure:
-        """Return a picture of diagrams below each other, with one time axis and one legend.
-
-        `px` is the height of each diagram, px.
-        """
+        """Return diagrams below each other with one time axis. Each is `px` high."""
         traces, notes = list[Trace](), list[dict[str, Any]]()
         axes = self._timed()
         axes["margin"] |= {"t": GAP_PX}
@@ -535,7 +522,6 @@ class TimeFigures:
         )
 
     def _clips(self, line: Line, clips: Sequence[Clip], axis: str) -> Trace:
-        """Draw a triangle at the beginning of each excursion of a curve."""
         symbols = ["triangle-up" if clip.value > clip.edge else "triangle-down" for clip in clips]
         return scatter(
             f"{line.name} outside",
@@ -549,11 +535,6 @@ class TimeFigures:
 
 
 def _hover(name: str, values: Sequence[float]) -> dict[str, Any]:
-    """Return plotly's settings for the text that appears when the user points at a curve.
-
-    The text contains the name of the curve, the value and the time. The value comes from `values`,
-    or from the curve if `values` is empty.
-    """
     shown = "customdata" if values else "y"
     text = f"{name} %{{{shown}:.3~f}}<br>%{{x|%H:%M:%S.%L}}<extra></extra>"
     return {"hovertemplate": text} | ({"customdata": numbers(values)} if values else {})

@@ -263,11 +263,7 @@ class SerialCounts:
         self._sent += sent
 
     def _end(self, received: tuple[int, int]) -> None:
-        """Add the counts of the present second to the curves.
-
-        `received` is the pair of the numbers of accepted and of dropped lines since the daemon's
-        start.
-        """
+        """Add the counts of the present second. `received` counts since the daemon's start."""
         t = float(self._second or 0) + 0.5
         good, dropped = (now - then for now, then in zip(received, self._before, strict=True))
         outstanding = self._outstanding or 0
@@ -285,10 +281,7 @@ class SerialCounts:
 
 
 def _received(counters: Mapping[str, int]) -> tuple[int, int]:
-    """Return the pair: number of accepted lines, number of dropped lines.
-
-    Implausible lines count as dropped.
-    """
+    """Return the numbers of accepted and dropped lines. Implausible lines count as dropped."""
     bad = sum(count for name, count in counters.items() if name.startswith("line_"))
     return counters.get("lines", 0) - counters.get("line_implausible", 0), bad
 
@@ -422,11 +415,7 @@ class ReportData:
     # Distance and speeds.
 
     def _drive(self, step: Step, t: float, inside: bool) -> None:
-        """Process the poses of a step at the time `t` of the report, s.
-
-        `inside` is true if the step is in the range of the report. The poses then become a part of
-        the path, and the step counts for the time and the distance of the driving source.
-        """
+        """Process the poses of a step. `inside` is true if the report covers this step."""
         mode, _, _, source = step.recorded.status
         driven = self._driven(source) if mode == "driving" and inside else None
         if driven is not None and t > self.seconds:
@@ -471,14 +460,10 @@ class ReportData:
             )
 
     def _add_sent(self, curve: Curve, step: Step, t: float, speed: float) -> None:
-        """Add a speed to a curve if the daemon sent a line in the step.
-
-        If the daemon sent no line for longer than `WATCHDOG_S`, add a gap to the curve instead. The
-        watchdog of the microcontroller stops the robot after this time.
-        """
         if step.recorded.sent is not None:
             curve.add(t, speed)
         elif t - self._sent > WATCHDOG_S:
+            # The watchdog of the microcontroller stops the robot, so the curve has a gap.
             curve.add(t, None)
 
     # Serial port, control loop and modes.
@@ -495,11 +480,6 @@ class ReportData:
             self.lateness.at_once()
 
     def _sample(self, step: Step, t: float, robot: Robot, refused: bool) -> None:
-        """Sample the mode, the link and the sources if a sample is due.
-
-        A sample is due every `SAMPLE_PERIOD_S`, after a change of the status, and if `refused` is
-        true. `refused` says whether a command was refused in this step.
-        """
         mode, reason, link, _ = status = step.recorded.status
         if status == self._status and t - self._sampled < SAMPLE_PERIOD_S and not refused:
             return

@@ -150,10 +150,6 @@ def reasons(data: ReportData) -> list[tuple[str, str, str, float]]:
 
 
 def _first_of_each(marks: list[Mark], clock: Clock) -> str:
-    """Return one text that lists the different texts of the marks, at most `MAX_NAMES` of them.
-
-    Each listed text comes after the time of the first mark that has this text.
-    """
     first: dict[str, Mark] = {}
     for mark in marks:
         first.setdefault(mark.text, mark)
@@ -162,10 +158,6 @@ def _first_of_each(marks: list[Mark], clock: Clock) -> str:
 
 
 def _late(marks: Iterable[Mark], clock: Clock) -> str:
-    """Return a text that lists the causes of missed control periods, each with its first time.
-
-    Return "" if no event names a cause.
-    """
     late = [
         replace(mark, text=cause)
         for mark in marks

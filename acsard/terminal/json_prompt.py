@@ -234,11 +234,6 @@ class JsonPrompt:
         return wanted == "write"
 
     def _choose(self, words: str, answers: Sequence[str], **more: bool) -> str:
-        """Ask a question until the answer is one of `answers`, and return this answer.
-
-        `words` is the text of the question. `more` contains further fields of `Question`.
-        """
-
         def chosen(value: str | float | None) -> str:
             if value not in answers:
                 raise ValueError(f"answer with one of: {', '.join(answers)}")
@@ -250,10 +245,9 @@ class JsonPrompt:
         print(msgspec.json.encode(message).decode(), flush=True)
 
     def _ask(self, read: Callable[[str | float | None], T], **about: object) -> T:
-        """Ask a question until `read` accepts the answer, and return the result of `read`.
+        """Ask until `read` accepts the answer.
 
-        `read` gets the answer. It raises `ValueError` with a description of valid answers to reject
-        it. `about` contains the fields of the `Question`.
+        To reject it, `read` raises `ValueError` with a description of valid answers.
         """
         self._moves, wrong = False, ""
         while True:
@@ -280,11 +274,6 @@ class JsonPrompt:
     # Input
 
     def _listen(self) -> None:
-        """Read standard input until the end of the `with` block.
-
-        If `_heard_out` returns a reason to interrupt the subcommand, or if the input cannot be
-        read, send SIGINT to the main thread and print the reason.
-        """
         try:
             self._end(self._heard_out())
         except BaseException as error:
@@ -292,11 +281,7 @@ class JsonPrompt:
             raise
 
     def _heard_out(self) -> str:
-        """Read standard input, and return the reason why the subcommand must be interrupted.
-
-        The reason is the end of the input, a line that is too long, or no line for
-        `MAX_INPUT_SILENCE_S` while something may move. Return "" after the end of the `with` block.
-        """
+        """Return why the subcommand must be interrupted, or "" at the end of the `with` block."""
         held, heard_s = b"", time.monotonic()
         while not self._left:
             if self._readable(POLL_S):

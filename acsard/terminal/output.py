@@ -84,7 +84,6 @@ def plain(*parts: RenderableType, width: int = UNLIMITED_WIDTH) -> str:
 
 
 def _console(file: TextIO, width: int | None = None) -> Console:
-    """Return a console that prints a text as it is, without markup, emoji or highlighting."""
     return Console(
         file=file,
         width=width,

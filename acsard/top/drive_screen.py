@@ -155,10 +155,6 @@ def measured(state: RobotState) -> list[Text]:
 
 
 def _words(told: Sequence[str], width: int, figures: Sequence[Text] = ()) -> list[str]:
-    """Return lines with the sentences `told`, followed by lines with the values `figures`.
-
-    A line has at most `width` characters. All lines except the first are indented.
-    """
     width = max(20, width)
     lines = wrap("; ".join(told), width, subsequent_indent="  ", break_on_hyphens=False)
     return [*lines, *(f"  {line}" for line in flow(figures, width - 2))]

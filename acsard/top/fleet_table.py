@@ -25,7 +25,7 @@ NAME, WHY = 12, 32
 ROBOT shrinks to its minimum before WHY becomes shorter than its minimum."""
 
 BATTERY_COLUMN = COLUMN_HEADS.index("BATTERY")
-"""Index of the column BATTERY_COLUMN.
+"""Index of the column BATTERY.
 
 The table has this column only if any robot reports a battery.
 """
@@ -111,10 +111,6 @@ def told(row: Row) -> tuple[str, ...]:
 
 
 def _why(state: RobotState) -> str:
-    """Return the text of the column WHY: warnings in brief, reason of the mode, and details.
-
-    If the mode is in `URGENT`, the reason of the mode comes first.
-    """
     why = reason(state)
     found, parts = [one for one in warnings(state) if one.brief not in why], [why]
     if found:
@@ -136,10 +132,7 @@ def _absence(row: Row) -> str:
 
 
 def _order(row: Row) -> tuple[int, str]:
-    """Return the sort key of a row: a number that is lower for urgent robots, and the robot's id.
-
-    The mode of a robot that is gone or silent does not count.
-    """
+    """Sort urgent robots first. The mode of a robot that is gone or silent does not count."""
     what = _absence(row) or ("" if row.state is None else row.state.mode)
     if what in URGENT:
         return URGENT.index(what), row.robot_id

@@ -62,10 +62,7 @@ def screen(seen: ScreenData, width: int, height: int | None = None) -> Group:
 
 
 def _unmeasured(state: RobotState) -> RobotState:
-    """Return the state without its speeds.
-
-    Use this while the link to the board is not up, because the speeds are then outdated.
-    """
+    """Drop the speeds, which are outdated while the link to the board is not up."""
     return replace(state, linear=math.nan, angular=math.nan, wheels=[])
 
 
@@ -80,7 +77,6 @@ def _header(seen: ScreenData, width: int) -> Text:
 
 
 def _mode(seen: ScreenData, width: int) -> list[Text]:
-    """Return lines with the robot's mode as a colored label, and with the reason of the mode."""
     # On a wide screen, always return two lines. Otherwise, the lines below would move when the
     # reason becomes long.
     state = seen.state
@@ -96,10 +92,6 @@ def _mode(seen: ScreenData, width: int) -> list[Text]:
 
 
 def _warnings(state: RobotState, width: int) -> list[Text]:
-    """Return lines with the robot's warnings, or [] if the robot gives no warning.
-
-    A single warning is shown with its details. Several warnings are shown by name only.
-    """
     found = warnings(state)
     words = clean(f"{WARNING}: {found[0]}" if len(found) == 1 else brief(found))
     wide = width >= narrow_screen.MIN_WIDE_COLUMNS
@@ -110,10 +102,6 @@ def _warnings(state: RobotState, width: int) -> list[Text]:
 
 
 def _split(words: str, room: int) -> tuple[str, str]:
-    """Return the pair (first `room` characters, rest) of a text, split between words if possible.
-
-    If the text has at most `room` characters, the rest is "".
-    """
     if len(words) <= room:
         return words, ""
     at = words.rfind(" ", 0, room + 1)
@@ -121,7 +109,6 @@ def _split(words: str, room: int) -> tuple[str, str]:
 
 
 def _no_news(seen: ScreenData, width: int) -> list[Text]:
-    """Return a red bar across the screen, which warns that the data below the bar is old."""
     since = lasting(int(min(seen.age, 1e9)))
     words = f"NOTHING RECEIVED FOR {since}: does the daemon run?"
     if seen.undecodable:

@@ -146,11 +146,10 @@ def _screen(console: Console) -> Live:
 
 
 def _hold(shows: Callable[[list[bool]], bool]) -> None:
-    """Show a screen with the function `shows`, until a signal arrives or `shows` returns False.
+    """Call `shows` until a signal arrives or `shows` returns False.
 
-    The argument of `shows` is an empty list. When the user presses Ctrl-Z, an element is added to
-    the list. Then `shows` must close the screen and return True. This function suspends the
-    program, and calls `shows` again when the user resumes the program with `fg`.
+    Ctrl-Z adds an element to the list that `shows` gets. Then `shows` must close the screen and
+    return True.
     """
     _be_lenient()
     suspend: list[bool] = []
@@ -162,10 +161,7 @@ def _hold(shows: Callable[[list[bool]], bool]) -> None:
 
 
 def _steer(ride: Ride, console: Console, suspend: list[bool]) -> bool:
-    """Do the work of `drive` on a screen until the user presses Ctrl-Z or the input ends.
-
-    Return True for Ctrl-Z, which makes `suspend` non-empty, and False for the end of the input.
-    """
+    """Return True if the user pressed Ctrl-Z, and False at the end of the input."""
     with keys() as read, _screen(console) as shown:
         due = 0.0
         while not suspend:
@@ -182,7 +178,6 @@ def _steer(ride: Ride, console: Console, suspend: list[bool]) -> bool:
 
 
 def _be_lenient() -> None:
-    """Make standard output replace characters that its encoding does not contain."""
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")
 

@@ -162,10 +162,7 @@ class Acceptor:
             _Connection(self, pool, accepted, peer, secure, make).enter()
 
     def _no_file(self, opened: socket.socket, secure: ssl.SSLContext | None, make: Factory) -> None:
-        """Close an old connection, because the process has no free file descriptor.
-
-        The listening socket `opened` accepts connections again after `NO_FILES_PAUSE_S`.
-        """
+        """Close an old connection, because the process has no free file descriptor."""
         loop = asyncio.get_running_loop()
         loop.remove_reader(opened)
         loop.call_later(NO_FILES_PAUSE_S, self._resume, opened, secure, make)
@@ -210,10 +207,6 @@ class Acceptor:
             self._next()
 
     def _next(self) -> None:
-        """Start one waiting TLS handshake if the limits allow it.
-
-        If any handshake was waiting, schedule the next call of this method.
-        """
         loop, self._again = asyncio.get_running_loop(), None
         if not self._waiting:
             return
@@ -235,12 +228,7 @@ class Acceptor:
         self._again = loop.call_later(0.005, self._next)
 
     def _has_room(self, now: float) -> bool:
-        """Return whether a TLS handshake may start at the time `now`, s on the event loop's clock.
-
-        If `HANDSHAKES_AT_ONCE` handshakes are running, abort one to make room: the oldest handshake
-        of the network with the most handshakes. If that handshake is younger than
-        `MIN_ABORT_AGE_S`, abort nothing and return False.
-        """
+        """Return whether a TLS handshake may start. If too many are running, abort one first."""
         if len(self._starting) < HANDSHAKES_AT_ONCE:
             return True
         # Only the network with the most handshakes loses one. So a slow client in another network
@@ -281,11 +269,6 @@ class _Connection(asyncio.Protocol):
         self._inner: Reader | None = None
 
     def enter(self) -> None:
-        """Add this connection to its pool, and wait for the client's first byte.
-
-        If the pool refuses this connection, cut it. If the pool displaces an older connection to
-        make room, cut the older connection.
-        """
         gone = self.pool.enter(self.network, self)
         if gone is self:
             self._acceptor.crowded(self)
@@ -315,7 +298,6 @@ class _Connection(asyncio.Protocol):
             self._acceptor.wait(self)
 
     def start(self) -> None:
-        """Start the TLS handshake. For plain HTTP, pass the connection to aiohttp immediately."""
         self._task = self._loop.create_task(self._open())
 
     async def _open(self) -> None:
@@ -355,11 +337,7 @@ class _Connection(asyncio.Protocol):
                 self._socket.shutdown(socket.SHUT_RDWR)
 
     def spoke(self, body: StreamReader) -> None:
-        """Record that the head of a request (request line and headers) has arrived.
-
-        This ends the time limit `REQUEST_TIMEOUT_S`, and resets the size of the head to 0 bytes.
-        `body` is the stream from which the body of this request is read.
-        """
+        """Record that the head of a request has arrived, which ends the time limit of the head."""
         self._head, self._body = 0, body
         self._cancel_timer()
 

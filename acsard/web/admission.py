@@ -199,7 +199,7 @@ class Admission:
             return problem(error.status, STATUS_TEXTS.get(error.status, error.reason))
 
     async def _pace_stranger(self, request: web.Request) -> None:
-        """Wait for `REFUSAL_DELAY_S` if the client's network exceeds the limit `STRANGER_RATE`.
+        """Delay a request if the client's network exceeds `STRANGER_RATE`.
 
         Call this for each request without a valid token.
         """
@@ -209,9 +209,8 @@ class Admission:
     async def _admit(self, request: web.Request, row: Route | None) -> bool:
         """Check a request; return True if it must be delayed because it exceeds a rate limit.
 
-        Also store the client's identity in the request, unless the path is open to every client.
-        `row` is the route of the path, or None for an unknown path. Raises `RefusedError` if the
-        client may not use the path, or exceeds its rate limit while `row.waits` is false.
+        Raises `RefusedError` if the client may not use the path, or exceeds its rate limit while
+        `row.waits` is false. `row` is None for an unknown path.
         """
         said = asked_of(request)
         here = place(said, self._names | {own_address(request)}) == "here"
@@ -260,7 +259,6 @@ class Admission:
         return by_listed_page(asked_of(request), self._origins)
 
     def _preflight(self, request: web.Request) -> web.Response:
-        """Return the answer to a CORS preflight, which lets a page in `web.origins` use the API."""
         place(asked_of(request), self._names | {own_address(request)})
         return web.Response(
             status=204,

@@ -262,10 +262,7 @@ class Files:
 
 
 def _read(paths: Sequence[Path], kind: str, stamp: tuple[tuple[int, int], ...]) -> File:
-    """Read the file `paths[0]`, and include the text of the other files as `INLINED` says.
-
-    `kind` is the content type of the first file, and `stamp` is the value of `File.stamp`.
-    """
+    """Read the first file, and include the text of the others as `INLINED` says."""
     whole, *parts = paths
     body, policy = whole.read_bytes(), ""
     for part in parts:

@@ -369,8 +369,6 @@ def _allowed(key: str) -> dict[str, Any]:
 
 
 async def _body_of(request: web.Request) -> bytes:
-    """Return the whole body; raise `HTTPRequestTimeout` if it does not arrive within
-    `BODY_TIMEOUT_S`."""
     try:
         async with asyncio.timeout(BODY_TIMEOUT_S):
             return await request.read()

@@ -155,11 +155,6 @@ class Calls:
     async def _stop(
         self, robot: str, client: Client, who: Who, request: Callable[[], ServiceReply]
     ) -> ServiceReply:
-        """Stop another robot by calling `request`, and return the robot's reply.
-
-        If `MAX_REMOTE_STOPS` calls are waiting for a reply already, only send the stop, and return
-        a failure that says so.
-        """
         # A robot that does not exist never replies, so the number of waiting calls is limited.
         with self._elsewhere.held() as free:
             if free:
@@ -286,7 +281,6 @@ def require(who: Who, verb: str) -> None:
 
 
 def _require_stop(verb: str, robot: str) -> None:
-    """Raise `RefusedError` unless `robot` is a valid robot id and `verb` is `stop`."""
     try:
         require_id(robot)
     except UsageError as error:
@@ -300,10 +294,7 @@ def _require_stop(verb: str, robot: str) -> None:
 
 
 def _named(client: Client, robot: str, who: Who) -> Client:
-    """Return a bus client for the robot with the id `robot`.
-
-    The robot logs the service calls of this bus client under the name of the page's client `who`.
-    """
+    """Return a bus client for a robot, which logs the calls under the name of the client `who`."""
     other = client.like(robot)
     other.name = f"{who.name}@page"
     return other

@@ -83,10 +83,7 @@ class Choices(Struct, frozen=True):
 
 
 class _Said(Struct, frozen=True):
-    """The fields that this server reads in an output line of the child.
-
-    The server passes on the whole line to the browser.
-    """
+    """The fields that this server reads in an output line of the child."""
 
     question: int = 0
     leg: bool = False
@@ -317,14 +314,12 @@ class _Errand:
         self._last = b""
 
     def about(self, viewer: object) -> Guided:
-        """Return the message that tells `viewer` that this check or calibration is running."""
         return Guided(Running(self.name, self.by, viewer is self.viewer))
 
     async def run(self, given: Sequence[str]) -> tuple[int, str]:
-        """Run the child until it ends, and return the pair (exit code, last error output).
+        """Return (exit code, error output). The code is 128 plus the signal that ended the child.
 
-        `given` contains the arguments of `acsard`. If a signal ended the child, the exit code is
-        128 plus the number of the signal. Raises `OSError` if the child cannot be started.
+        Raises `OSError` if the child cannot be started.
         """
         if self.left:
             return int(Exit.FAILURE), ""
@@ -337,10 +332,6 @@ class _Errand:
         return code if code >= 0 else 128 - code, self._words()
 
     def answer(self, reply: Reply) -> bool:
-        """Send the user's answer to the child, and return True.
-
-        Return False if the child does not wait for the answer to this question.
-        """
         if not self._question or reply.reply != self._question:
             return False
         self._question, self._rides = 0, self._leg
@@ -348,10 +339,7 @@ class _Errand:
         return True
 
     def key(self) -> None:
-        """Tell the child that the user pressed a key, which ends one drive of a calibration.
-
-        Do nothing if no drive is running, or if a key has already been pressed during the drive.
-        """
+        """Tell the child that the user pressed a key, which ends one drive of a calibration."""
         if self._rides:
             self._rides = False
             self._write({"key": True})
@@ -362,11 +350,7 @@ class _Errand:
             self._write({})
 
     def leave(self) -> None:
-        """Interrupt the child as Ctrl-C does. Kill the child if it does not exit in
-        `END_TIMEOUT_S`.
-
-        Further calls do nothing.
-        """
+        """Interrupt the child as Ctrl-C does. Kill the child if it does not exit in time."""
         if self.left:
             return
         self.left = True

@@ -260,11 +260,7 @@ class Seats:
             places.leave(name)
 
     def _places(self, address: str, token: str) -> list[tuple[Places, str, str]]:
-        """Return the limits that apply to a WebSocket, as a list of triples.
-
-        Each triple consists of the limit, the name under which the limit counts the WebSocket, and
-        the text of a refusal.
-        """
+        """Return triples: a limit, the name under which it counts the WebSocket, and a refusal."""
         if not token:
             here = f"{MAX_LOCAL_SOCKETS} pages are open on the robot itself: close some"
             return [(self._here, address, here)]

@@ -59,7 +59,7 @@ def _raw(schema: Described) -> Any:
 
 
 def _value(key: str, kind: str) -> type[Struct]:
-    """Return the type of the WebSocket messages that contain the values of the bus key `key`.
+    """Return the type of the WebSocket messages with the values of the bus key `key`.
 
     `kind` is the name of the schema of these values.
     """
@@ -170,7 +170,6 @@ def _needed(kind: type | str) -> bool:
 
 
 def _messages() -> Described:
-    """Return the schemas of the bus messages, by name."""
     # The types in `$defs` become schemas of their own, because most programs that read the document
     # cannot resolve `$defs`.
     found: Described = {}
@@ -183,10 +182,9 @@ def _messages() -> Described:
 
 
 def _flat(node: Any, before: str) -> Any:
-    """Return a copy of a JSON Schema in which references to `$defs` are references to components.
+    """Replace references to `$defs` by references to components.
 
-    `node` is the JSON Schema or a part of it. The name of a component is `before` followed by the
-    name in `$defs`.
+    Their names begin with `before`.
     """
     if isinstance(node, list):
         return [_flat(one, before) for one in node]
@@ -198,9 +196,9 @@ def _flat(node: Any, before: str) -> Any:
 
 
 def _components(kinds: Iterable[Any]) -> tuple[Described, Refs]:
-    """Return a pair: the schemas by name, and the reference to the schema of each type in `kinds`.
+    """Return the schemas by name, and the reference to the schema of each type in `kinds`.
 
-    The schemas describe the types in `kinds`, and the types that are nested in these types.
+    The schemas also describe the types that are nested in these types.
     """
     # Pass all types to msgspec in one call: it then gives different names to two types that have
     # the same name.
@@ -215,10 +213,6 @@ def _components(kinds: Iterable[Any]) -> tuple[Described, Refs]:
 
 
 def _of_the_socket(refs: Refs) -> Described:
-    """Return the schemas `ToRobot`, `FromRobot` and `Guided`, which describe WebSocket messages.
-
-    `refs` maps each message type to a reference to the schema of this type.
-    """
     guided = msgspec.defstruct(
         GUIDED_PREFIX,
         [("guide", _raw({"oneOf": [refs[kind] for kind in GUIDE_MESSAGES]}))],

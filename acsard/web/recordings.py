@@ -190,10 +190,6 @@ def _row(path: Path) -> Recording:
 
 
 def _begun(path: Path) -> float | None:
-    """Return the start time in a recording's file name, s since 1970.
-
-    Return None if the name contains no time.
-    """
     try:
         told = time.strptime(path.name.partition("-")[2].partition(".")[0], NAME_TIME_FORMAT)
     except ValueError:
@@ -374,10 +370,7 @@ async def _body(child: Process) -> bytes:
 
 
 async def _listened(child: Process, one: _Drawing) -> str:
-    """Read the child's error output until its end, and return the error text in it.
-
-    A line of digits is the progress in percent. Store it in `one` instead of returning it.
-    """
+    """Return the child's error text. A line of digits is the progress in percent."""
     assert child.stderr is not None
     said = ""
     while part := await child.stderr.read(1 << 12):

@@ -77,10 +77,6 @@ class _Asking:
         self._asked: asyncio.Task[None] | None = None
 
     def ask(self, name: str, take: Callable[[zenoh.Sample], object]) -> None:
-        """Query the key `name`, and call `take` with each reply.
-
-        Do nothing if an earlier query is still running.
-        """
         if self._asked is None or self._asked.done():
             self._asked = asyncio.create_task(self._ask(name, take))
 
@@ -216,10 +212,7 @@ class Robots:
             self._minute.add(now_ns, state, self._wished(now_ns))
 
     def _wished(self, now_ns: int) -> Twist | None:
-        """Return the newest twist that the daemon has published on the key `cmd_vel_out`.
-
-        Return None if this twist is older than 2 s, or if no viewer is subscribed to the key.
-        """
+        """Return the daemon's newest output twist, or None if no viewer is subscribed to it."""
         stream = self.streams.followed(self.id, "cmd_vel_out")
         raw = None if stream is None else stream.raw()
         # A twist that is older than 2 s does not belong to the row that is plotted now.
@@ -255,7 +248,6 @@ class Robots:
                 pass
 
     async def _ask(self) -> bool:
-        """Query the values of `about` from the daemon; return True if all of them have arrived."""
         client = self.client
         assert client is not None
         try:

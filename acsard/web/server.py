@@ -115,10 +115,6 @@ async def serve(wanted: Wanted, announce: Callable[[Sequence[Listen]], None], lo
 
 
 async def _until(leaving: asyncio.Event, parts: Parts, page: Page, wanted: Wanted) -> None:
-    """Run the background tasks until `leaving` is set, or until one of the tasks ends.
-
-    If an error ended a task, raise this error.
-    """
     work: list[asyncio.Future[Any]] = [
         asyncio.create_task(leaving.wait()),
         asyncio.create_task(parts.robots.run()),
@@ -150,10 +146,7 @@ async def _tell(counts: Counts, log: Log) -> None:
 
 
 async def _held(leaving: asyncio.Event) -> None:
-    """Send signs of life to the parent process until cancelled.
-
-    Set `leaving` when the parent closes the standard input of this process.
-    """
+    """Send signs of life to the parent, which ends this process by closing its standard input."""
     parent, loop = Parent(sys.stdin.fileno()), asyncio.get_running_loop()
 
     def look() -> None:
@@ -193,10 +186,9 @@ def _about(wanted: Wanted) -> About:
 
 
 def _certified(wanted: Wanted) -> tuple[ssl.SSLContext | None, set[str]]:
-    """Return a pair: the TLS context, and the names and addresses of this machine for the network.
+    """Return the TLS context, and the names and addresses of this machine for the network.
 
-    If the server listens at no HTTPS address, return None and an empty set. Raises `MendableError`
-    if the certificate is not usable.
+    Raises `MendableError` if the certificate is not usable.
     """
     if not any(one.secure for one in wanted.listen):
         return None, set()
@@ -212,10 +204,6 @@ def _load(context: ssl.SSLContext, directory: str) -> None:
 
 
 def _names(directory: str) -> set[str]:
-    """Return this machine's names, and the names and addresses in its certificate, in lower case.
-
-    Loopback names and addresses are left out. `directory` contains the certificate.
-    """
     names = {socket.gethostname().lower(), own_name(), *map(str.lower, names_in(directory))}
     return {one for one in names if one != "localhost" and not is_loopback(one)}
 
@@ -223,11 +211,6 @@ def _names(directory: str) -> set[str]:
 async def _renew(
     context: ssl.SSLContext, names: set[str], files: CertificateFiles, directory: str, log: Log
 ) -> None:
-    """Load the certificate into `context` whenever its files change, until cancelled.
-
-    Also add the host names in the new certificate to `names`. Open connections keep the old
-    certificate.
-    """
     while True:
         await asyncio.sleep(TIDY_S)
         if not files.renewed():

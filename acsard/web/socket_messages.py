@@ -59,7 +59,6 @@ class _Frame(Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def kind(self) -> str:
-        """Kind of this message: the name of its first field."""
         return self.__struct_fields__[0]
 
 

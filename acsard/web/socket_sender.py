@@ -152,10 +152,7 @@ class Outgoing:
             await self._send(self._out.popleft())
 
     async def _send_due(self, one: Following, now: float) -> float:
-        """Send the newest value of a key if it is due and has not been sent yet.
-
-        Return the time at which the next value is due, s on the event loop's clock.
-        """
+        """Return the time at which the next value is due, s on the event loop's clock."""
         stream = one.stream
         if stream is None:
             return now + one.period  # `Keys._join` wakes the task when the stream exists
@@ -281,7 +278,6 @@ class Keys:
         self._out.wake()
 
     async def _found(self, one: Following) -> Stream | None:
-        """Return the stream of a key. If the bus is not ready, wait a moment and return None."""
         client = self._robots.client
         if client is None:
             await asyncio.sleep(0.2)

@@ -160,10 +160,9 @@ class Vault:
 
     @contextmanager
     def _changing(self) -> Iterator[list[Token]]:
-        """Lock the token file during the `with` block, and yield the list of all robots' tokens.
+        """Lock the token file, and yield the list of all robots' tokens. The block may change it.
 
-        The block may change the list. At the end of the block, write the list to the file, unless
-        the block has raised an exception.
+        At the end, write the list to the file, unless the block has raised an exception.
         """
         directory = self.path.parent
         try:

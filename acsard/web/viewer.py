@@ -236,10 +236,6 @@ class Viewer:
             self.end("too many messages")
 
     def _ping(self, message: aiohttp.WSMessage) -> None:
-        """Answer a ping of the WebSocket protocol, and ignore a pong.
-
-        If pings, pongs and other messages exceed the rate limit too often, cut the connection.
-        """
         if not self._bucket.take(clock.mono_ns()):
             self._overruns += 1
             if self._overruns >= MAX_OVERRUNS:
@@ -321,9 +317,9 @@ class Viewer:
             self._start(self._answer(frame))
 
     def _refuse(self, frame: Frame, text: str) -> None:
-        """Refuse a message because it exceeds a rate limit. `text` is the reason in words.
+        """Refuse a message.
 
-        The client waits for an answer to a call, so send the reason as that answer.
+        The client waits for an answer to a call, so send `text` as that answer.
         """
         if isinstance(frame, Call):
             self._counts.refuse("too_fast", self.who.origin)
@@ -379,11 +375,7 @@ class Viewer:
         self._out.say(socket_messages.Hello(greeting))
 
     def _look_around(self, now: float) -> float:
-        """Tell the client if the daemon has become unreachable, or if the facts in `About` changed.
-
-        Also send the list of robots if it is due. Return the time at which the caller must call
-        this method again. This time and `now` are in s on the event loop's clock.
-        """
+        """Report changes; return when to call this again, s on the event loop's clock."""
         if self._robots.gone != self._gone:
             self._gone = self._robots.gone
             if self._gone:

@@ -210,7 +210,6 @@ def budget(received: Received, config: Config, metres: float = BUDGET_DISTANCE_M
 
 
 def _standing(received: Received, config: Config, model: _Model) -> Budget:
-    """Return the budget of a robot that stands still, with the errors that the settings state."""
     lines, odometry, known = received.lines, config.odometry, model.declares_parameters
     shares = (
         model.share("slip", "settings", STRAIGHT, SPIN, _only(odometry, *NOISE)),
@@ -233,10 +232,7 @@ def _standing(received: Received, config: Config, model: _Model) -> Budget:
 
 
 def _causes(received: Received, model: _Model, driving: Driving, counts: int) -> Iterator[Share]:
-    """Yield the errors of each cause.
-
-    `counts` is the number of encoder counts per wheel turn, or 0 if it is unknown.
-    """
+    """Yield the errors of each cause. `counts` is encoder counts per wheel turn; 0 if unknown."""
     odometry, plain = model.odometry, driving.plain()
 
     def share(
@@ -272,16 +268,10 @@ def _causes(received: Received, model: _Model, driving: Driving, counts: int) ->
 
 
 class _Model:
-    """The error model of the odometry, used for one cause at a time."""
-
     def __init__(self, config: Config, metres: float) -> None:
         self.odometry, self.kinematics = config.odometry, Kinematics(config.drive)
         self.rolls = self.turns = True
-        """Whether the drive is long enough to extrapolate its errors.
-
-        `rolls` is true if the robot drove far enough for position errors. `turns` is true if the
-        robot turned enough for heading errors.
-        """
+        """Whether the drive is long enough to extrapolate the position and the heading error."""
         self._metres = metres
 
     @property
@@ -292,16 +282,12 @@ class _Model:
         self, cause: Cause, basis: Basis, ahead: Steps, left: Steps, only: OdometryConfig,
         counts: int = 0, scale: float = 0.0,
     ) -> Share:  # fmt: skip
-        """Return the errors that one cause makes.
+        """Return the errors that one cause makes. They are None if `basis` is "unknown".
 
-        Args:
-            cause: the cause of the errors.
-            basis: how the size of the errors is known. If it is "unknown", the errors are None.
-            ahead: the steps to repeat for the position error.
-            left: the steps to repeat for the heading error, with all turns to the left.
-            only: the settings of `[odometry]`, with the errors of all other causes set to 0.
-            counts: encoder counts per wheel turn; 0 if the encoders are not the cause.
-            scale: relative standard deviation of the gyro's scale; 0 if the gyro is not the cause.
+        The position error comes from repeating the steps `ahead`. The heading error comes from
+        repeating the steps `left`, in which all turns are to the left. `only` sets the errors of
+        all other causes to 0. `counts` (encoder counts per wheel turn) and `scale` (relative
+        standard deviation of the gyro's scale) are 0 if they are not the cause.
         """
         if basis == "unknown":
             return Share(cause, None, None, basis)
@@ -318,11 +304,7 @@ class _Model:
         self, steps: Steps, only: OdometryConfig, counts: int, scale: float, metres: float,
         angle: float,
     ) -> PoseCovariance:  # fmt: skip
-        """Return the covariance of the pose at the end of a drive that repeats `steps`.
-
-        The drive ends after `metres` m or after turns of `angle` rad, whichever comes first.
-        `only`, `counts` and `scale` are those of `share()`.
-        """
+        """Repeat `steps` until `metres` m are driven, or until the turns add up to `angle` rad."""
         pose, path = PoseUncertainty(ErrorModel(only, self.kinematics), counts), Path()
         rolled = turned = 0.0
         for distance, turn, along, yaw, *missed, by_gyro in cycle(steps.rows.tolist()):
@@ -340,7 +322,6 @@ class _Model:
 
 
 def _only(odometry: OdometryConfig, *kept: str) -> OdometryConfig:
-    """Return the settings with all error settings set to 0, except the settings in `kept`."""
     zeros = {name: 0.0 for name in (*NOISE, *PARAMETERS) if name not in kept}
     return replace(odometry, pose_covariance_diagonal=(0.0,) * 6, **zeros)
 

@@ -84,10 +84,7 @@ def line_times(t: Floats, sent: Floats) -> LineTimes:
 
 
 def _even(t: Floats) -> LineTimes:
-    """Estimate the delays of feedback lines from a board that sends them at a fixed period.
-
-    `t` contains the stamps of the feedback lines, s.
-    """
+    """Estimate the delays for a board that sends its feedback lines at a fixed period."""
     steps = np.diff(t)
     usual, mean = float(np.median(steps)), float(np.mean(steps))
     alike = np.abs(steps - usual) < ALIKE_TIMES * usual
@@ -104,14 +101,10 @@ def _even(t: Floats) -> LineTimes:
 
 
 def _asked(t: Floats, sent: Floats) -> LineTimes | None:
-    """Estimate the delays of feedback lines from a board that answers each line of the daemon.
+    """Estimate the delays for a board that answers each line of the daemon.
 
-    Return None if the daemon sent too few lines, or if its lines do not cover the whole time of
-    the feedback lines.
-
-    Args:
-        t: the stamp of each feedback line, s.
-        sent: the time at which the daemon sent each of its lines to the board, s.
+    Return None if `sent`, the times of the daemon's lines, does not cover the whole time of the
+    replies.
     """
     if len(sent) < 3 or sent[0] > t[0] or len(sent) < len(t) / 2:
         return None
@@ -127,10 +120,9 @@ def _asked(t: Floats, sent: Floats) -> LineTimes | None:
 
 
 def _missing(at: Floats) -> Counts:
-    """Return, for each feedback line, the number of lines that were lost just before it.
+    """Return the number of lines that were lost just before each feedback line.
 
-    `at` contains the time of each line divided by the period of the lines. These times may count
-    from any moment.
+    `at` contains the time of each line, in periods of the lines, from any origin.
     """
     count = len(at)
     ahead = at - np.arange(count)
@@ -259,14 +251,8 @@ def motion(lines: list[Line], sent: Floats, kinematics: Kinematics, whole: bool)
 def _noise(t: Floats, speeds: Floats, turns: Floats, variances: Floats) -> Floats | None:
     """Return the variance, rad2, that the gyro's noise adds to the heading between two lines.
 
-    The result is 0 for lines at which the wheels stand still. Return None if the noise cannot be
-    separated from the gyro's scale error.
-
-    Args:
-        t: the time of each feedback line, s.
-        speeds: the speeds of the four wheels in each feedback line.
-        turns: the turn from each feedback line to the next, rad.
-        variances: the variance of the heading at each feedback line, rad2.
+    Return None if the noise cannot be separated from the gyro's scale error. `variances` contains
+    the variance of the heading at each line, rad2.
     """
     # The gyro's scale error also adds to the variance of the heading: S^2 A^2, where S is the
     # relative standard deviation of the scale, and A is the turn since the pose was last set. A
@@ -289,7 +275,6 @@ def _noise(t: Floats, speeds: Floats, turns: Floats, variances: Floats) -> Float
 
 
 def _late(t: Floats, twists: list[Twist], found: LineTimes) -> Floats:
-    """Return the errors of the motion due to wrong stamps: rows of (m, rad)."""
     # A wrong stamp changes the interval dt before a line, and thus the distance, which is speed
     # times dt. It changes the next interval by the opposite amount. Summation by parts gives each
     # line one error: the delay of the line times (speed in this line - speed in the next line).
@@ -307,13 +292,9 @@ def _gaps(
 ) -> tuple[Floats, Floats, int, float]:
     """Return the four values `filled`, `unfilled`, `missing` and `unseen` of `Motion`.
 
-    Args:
-        t: the time of each feedback line, s.
-        twists: the motion at each feedback line, computed from the wheel speeds in the line.
-        rolled: the motion from each feedback line to the next, computed from the wheel positions.
-        found: the result of `line_times`, which says where feedback lines were lost.
-        whole: whether this program received every feedback line that the daemon received. If it is
-            false, lost lines count only in gaps that the odometry did not fill.
+    `twists` comes from the wheel speeds, and `rolled` from the wheel positions. If `whole` is
+    false, this program itself may have lost lines. Lost lines then count only in gaps that the
+    odometry did not fill.
     """
     filled, unfilled = np.zeros((len(rolled), 2)), np.zeros((len(rolled), 4))
     lost, unseen = 0, 0.0
@@ -407,10 +388,7 @@ def rounding(speeds: Floats, period: float) -> Rounding:
 
 
 def _runs(values: Floats) -> Floats:
-    """Return the variance of a wheel's rounding error in each line, divided by q^2 / 12.
-
-    q is the quantization step. `values` contains the wheel's speed in each feedback line.
-    """
+    """Return the variance of each line's rounding error, divided by (quantization step)^2 / 12."""
     # Of n equal speeds in a row, the last one has the variance n^2, and the others have 0. If the
     # wheel passed through this speed while it became faster or slower, the last one has the
     # variance 1.
@@ -429,7 +407,6 @@ def _runs(values: Floats) -> Floats:
 
 
 def _quantum(speeds: Floats) -> float:
-    """Return the quantization step of which all speeds are multiples, rad/s; 0 if no step fits."""
     # Count each value once, because its repetitions do not add evidence.
     seen = np.unique(np.abs(speeds[speeds != 0.0]))
     return quantization_step(seen) if len(seen) >= MIN_VALUES else 0.0
@@ -525,11 +502,7 @@ class Driving:
         return self._steps(missed=self._of_wheels(np.column_stack([right, left, left, right])))
 
     def _of_wheels(self, off: Floats) -> Floats:
-        """Return the motion that the pose missed because rolled angles are wrong.
-
-        `off` contains the errors of the angles, rad, with a column for each wheel. The result has
-        rows of (m, rad, 0, 0).
-        """
+        """Return the missed motion, rows of (m, rad, 0, 0), for wrong rolled angles, rad."""
         moved = off @ self._weights.T
         return np.hstack([moved, np.zeros_like(moved)])
 
@@ -537,12 +510,6 @@ class Driving:
         self, variances: Floats | None = None, missed: Floats | None = None,
         gyro: Floats | None = None,
     ) -> Steps:  # fmt: skip
-        """Return the steps between the feedback lines of the drive, with the given errors.
-
-        Each array has one row for each feedback line except the first. None means that there are no
-        such errors. In `Steps.rows`, `variances` fills the columns 2 and 3, `missed` the columns 4
-        to 7, and `gyro` the column 8.
-        """
         moved, count = self._motion, len(self._motion.distance)
         errors = [
             np.zeros((count, width)) if given is None else given.reshape(count, width)

@@ -58,25 +58,16 @@ def quantization_step(speeds: Floats) -> float:
 
 
 def _strays(speeds: Floats, step: float, doubt: float) -> int:
-    """Return the number of speeds that are not multiples of `step`, except for rounding.
-
-    `doubt` is the largest relative error of `step`.
-    """
+    """Return how many speeds are not multiples of `step`. `doubt` is its largest relative error."""
     off = np.abs(speeds - step * np.round(speeds / step))
     return int(np.count_nonzero(off > ROUNDING + doubt * speeds))
 
 
 def _fitted(speeds: Floats, rough: float, spare: int, tries: int) -> float:
-    """Return the quantization step near `rough`, rad/s, fitted by least squares.
+    """Return the quantization step near `rough`, rad/s, by least squares; 0 if none fits.
 
-    Return 0 if the step is smaller than `MIN_STEP`, does not fit the speeds, or may fit only by
-    chance.
-
-    Args:
-        speeds: the wheel speeds, rad/s.
-        rough: the candidate for the step, rad/s.
-        spare: the number of speeds that need not be multiples of the step.
-        tries: the number of candidates tried so far, each of which could fit by chance.
+    `spare` speeds need not be multiples of the step. `tries` is the number of candidates tried so
+    far, each of which could fit by chance.
     """
     whole = np.round(speeds / rough)
     near = np.abs(speeds - whole * rough) <= 2 * ROUNDING

@@ -219,9 +219,8 @@ class LegDriver:
             )
 
     def _tolerate_briefly(self, why: str, now: float, *, disturbed: bool) -> None:
-        """Halt the leg if the robot has deviated from the commands for `DEVIATION_TIMEOUT_S`.
+        """Halt the leg after `DEVIATION_TIMEOUT_S` of deviation. `why` is "" without a deviation.
 
-        `why` is the reason of the present deviation, or "" if the robot does not deviate now.
         `disturbed` is true if the leg can be repeated.
         """
         # A short deviation is harmless. If this computer is busy for a moment, it sends commands
@@ -234,7 +233,6 @@ class LegDriver:
             self._halt(why, disturbed=disturbed)
 
     def _objection(self, state: RobotState) -> str:
-        """Return the reason why the robot does not follow this leg's commands; "" if it does."""
         if why := objection(state, self._source, self._sender):
             return why
         # A source with a long timeout still drives the robot after its commands stop arriving.
@@ -244,7 +242,6 @@ class LegDriver:
         return ""
 
     def _deviation(self, state: RobotState, now: float) -> str:
-        """Return a sentence about how the wheels deviate from the command; "" if they do not."""
         if now - self._changed < RESPONSE_TIMEOUT_S:
             return ""
         if not state.wheels:

@@ -293,8 +293,5 @@ class RobotOnBus:
         self._watch.look(clock.steady_s())
 
     def _full(self, key: str) -> str:
-        """Return the full Zenoh key for `key`.
-
-        If `key` is a key of acsard, such as "imu", the id of this robot is put in front of it.
-        """
+        """Put the id of this robot in front of a key of acsard, such as "imu"."""
         return self._client.key(key) if by_key(key) is not None else key

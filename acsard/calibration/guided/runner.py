@@ -104,10 +104,6 @@ def guide(
             answers[leg, ask.name] = UNITS[ask.unit] * prompt.number(ask)
 
     def repeat(disturbed: DisturbedError) -> int:
-        """Return the index of the leg with which the drive continues.
-
-        Raise `disturbed` after too many repeats.
-        """
         leg = legs[number]
         repeats[leg.name] = repeats.get(leg.name, 0) + 1
         if repeats[leg.name] > most:

@@ -191,11 +191,7 @@ def fit_readings(readings: Sequence[Reading], base: Base) -> TapeFit:
 
 
 def _starting_parameters(readings: Sequence[Reading], base: Base) -> Floats:
-    """Return parameters from which the fit can start.
-
-    The parameters are accurate enough to find the number of whole turns in each `angle` reading.
-    Raises `RefusedError` if a measured turn is far from the turn of the wheels.
-    """
+    """Return parameters that are good enough to count the whole turns in `angle` readings."""
     start = base.start()
     for reading in readings:
         if reading.quantity == "turned" and reading.deviation < MAX_STARTING_STD * abs(
@@ -216,7 +212,6 @@ def _starting_parameters(readings: Sequence[Reading], base: Base) -> Floats:
 def _compared(
     readings: Sequence[Reading], base: Base, parameters: Floats
 ) -> Iterator[tuple[Predicted, float, float]]:
-    """Yield, for each reading, its prediction, its residual and its weight."""
     for reading in readings:
         prediction = predicted(reading.steps, reading.quantity, base, parameters)
         weight = 1 / (reading.deviation**2 + prediction.variance)
@@ -224,22 +219,10 @@ def _compared(
 
 
 def _solved(readings: Sequence[Reading], base: Base, start: Floats) -> tuple[Floats, Floats]:
-    """Fit the parameters to the readings by weighted least squares, and return a pair.
+    """Return the parameters that fit the readings, and the matrix of the normal equations.
 
-    The first item is the array of the fitted parameters, shape (PARAMETER_COUNT,). The second item
-    is the matrix on the left-hand side of the normal equations of the last step, shape
-    (PARAMETER_COUNT, PARAMETER_COUNT). It is J^T W J plus the prior information about the track
-    growth and the mean radius. J contains the derivatives of the predicted readings with respect to
-    the parameters, and W contains the weights of the readings.
-
-    Args:
-        readings: the measurements by tape.
-        base: the configured geometry.
-        start: the parameters from which the fit starts.
-
-    Raises:
-        RefusedError: the readings do not determine the parameters, or the fit does not converge
-            because the readings contradict each other.
+    The matrix is that of the last step: J^T W J plus the prior information. Raises `RefusedError`
+    if the readings do not determine the parameters, or if they contradict each other.
     """
     parameters, configured = start.copy(), base.start()
     for _ in range(MAX_STEPS):
@@ -273,17 +256,6 @@ def _solved(readings: Sequence[Reading], base: Base, start: Floats) -> tuple[Flo
 def _held_out_residual(
     number: int, readings: Sequence[Reading], base: Base, start: Floats
 ) -> float:
-    """Return the residual of one reading with the parameters that fit all other readings.
-
-    The residual is the measured value of the reading minus the value that the fit to the other
-    readings predicts. The result is NaN if this fit fails.
-
-    Args:
-        number: the index in `readings` of the reading whose residual is returned.
-        readings: all measurements by tape.
-        base: the configured geometry.
-        start: the parameters from which the fit starts.
-    """
     try:
         parameters, _ = _solved([*readings[:number], *readings[number + 1 :]], base, start)
     except RefusedError:
@@ -432,11 +404,7 @@ def calibrated(
 
 
 def _improvement(readings: Sequence[Reading], base: Base, fit: TapeFit, rate: Rates) -> Improvement:
-    """Return the odometry errors with the configured and with the new parameters.
-
-    Each reading shows one error. The new parameters are fitted to all other readings. If that fit
-    fails, the parameters that fit all readings are used.
-    """
+    """Compare the parameters by each reading's residual in a fit to all other readings."""
     sums = {name: np.zeros(3) for name in ("turn", "straight", "place")}
     present = fit.parameters.copy()
     present[: P.DELAY] = base.start()[: P.DELAY]

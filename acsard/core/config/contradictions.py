@@ -153,11 +153,6 @@ def _wire_problems(config: Config) -> list[str]:
 
 
 def _shorter_lines(mcu: McuConfig, rate: float) -> str:
-    """Return advice such as "; or mcu.encoder_counts = 0, which shortens the lines to 41 B".
-
-    The advice is the end of an error message. It is "" if no setting makes the serial lines short
-    enough for the control rate `rate`, Hz.
-    """
     fixes = ((True, "mcu.encoder_counts = 0"), (False, 'mcu.link_check = "off"'))
     for check, fix in fixes:
         count = line_bytes(mcu.trailing_comma, check)
@@ -167,11 +162,7 @@ def _shorter_lines(mcu: McuConfig, rate: float) -> str:
 
 
 def _count_problems(config: Config) -> list[str]:
-    """Return an error line if forward motion of a wheel could look like backward motion.
-
-    To prevent this, `mcu.encoder_counts` must be low enough: while a wheel turns at full speed,
-    its count must not change by half of its range within `MIN_WRAP_PERIODS` control periods.
-    """
+    """Report counts so large that forward motion could look like backward motion."""
     counts, fastest = config.mcu.encoder_counts, config.feedback.wheel_speed / math.tau
     lasts = MIN_WRAP_PERIODS / config.rate_hz
     if fastest * counts * lasts <= FIELD_VALUES / 2:
@@ -240,12 +231,6 @@ def _gyro_problems(config: Config) -> list[str]:
 
 
 def _battery_problems(config: Config) -> list[str]:
-    """Return an error line for each mistake in the battery thresholds.
-
-    A more severe level must have a lower threshold. A level ends when the voltage or the charge
-    rises above the threshold plus the hysteresis, so a board must be able to report a value above
-    this sum.
-    """
     battery, found = config.battery, []
     rows = [(f"battery.{level}_below", below) for level, below in battery.bounds.items()]
     for (name, below), (worse, lower) in pairwise(rows):
@@ -266,11 +251,9 @@ def _battery_problems(config: Config) -> list[str]:
 def _repeated(
     noun: str, names: dict[str, str], part: Callable[[str], str] = lambda name: name
 ) -> list[str]:
-    """Return an error line for each value in `names` that repeats an earlier value.
+    """Return an error line for each value that repeats an earlier value.
 
-    `noun` is the kind of value for the error text, such as "motor". `names` maps dotted keys, such
-    as `mcu.wheels.front_left`, to their values. Two values count as the same if `part` returns the
-    same text for both values.
+    `names` maps dotted keys to values. Values are the same if `part` returns the same text.
     """
     first: dict[str, str] = {}
     found = []
@@ -307,10 +290,6 @@ def _bumper_problems(config: Config) -> list[str]:
 
 
 def _reachability_problems(config: Config) -> list[str]:
-    """Return an error line for each setting of `[bus]` with which clients cannot connect.
-
-    Some of these settings lock out all clients, and others only the clients that use TLS.
-    """
     bus, found = config.bus, []
     if bus.mode == "client" and not bus.connect:
         found.append(
@@ -363,10 +342,7 @@ def _listen_twice_problems(config: Config) -> list[str]:
 
 
 def _page_problems(config: Config) -> list[str]:
-    """Return an error line for each entry of `web.address` that prevents the start of the page.
-
-    `acsard/web/listen.py` applies the same rules when the page starts.
-    """
+    """`acsard/web/listen.py` applies the same rules when the page starts."""
     addresses, found = config.web.address, []
     for address in addresses:
         where = f"web.address = {show(address)}"
@@ -408,19 +384,12 @@ def _ros_problems(config: Config) -> list[str]:
 
 
 def _endpoints(bus: BusConfig) -> dict[str, tuple[str, ...]]:
-    """Return the endpoints that the daemon uses, by the keys "listen" and "connect" of `[bus]`.
-
-    The result has no "listen" if `bus.mode` is "client", because a client listens at no endpoint.
-    """
+    # A client listens at no endpoint.
     listen = {"listen": bus.listen} if bus.mode == "peer" else {}
     return listen | {"connect": bus.connect}
 
 
 def _host(endpoint: str) -> str | None:
-    """Return the host in an endpoint such as "tcp/127.0.0.1:7448".
-
-    Return None if the endpoint is not valid.
-    """
     scheme, _, address = endpoint.partition("/")
     if set(endpoint) & set("#?;= \t"):
         # These characters add options for Zenoh to an endpoint. Such options could switch off the

@@ -234,10 +234,6 @@ def _put(tables: dict[str, Any], path: list[str], value: object) -> None:
 
 
 def _must_stand(key: str, before: object, after: object) -> str:
-    """Return an error line if this change is allowed only while the robot stands still, else "".
-
-    `key` is the dotted key of the setting. `before` and `after` are its values.
-    """
     row = live(key)
     if row is None or row.when == "always":
         return ""

@@ -88,8 +88,5 @@ def _applied(config: Config, wishes: Mapping[str, object]) -> tuple[Config, list
 
 
 def _rank(name: str, value: float) -> float:
-    """Return a number to compare two values of the limit `name`; a larger one allows more motion.
-
-    The result is infinity for a jerk limit of 0, which means "no limit". Otherwise it is `value`.
-    """
+    # A jerk limit of 0 means "no limit".
     return math.inf if name.endswith("_jerk") and value == 0.0 else value

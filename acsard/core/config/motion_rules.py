@@ -95,10 +95,6 @@ def _jerk_problems(config: Config, name: str) -> list[str]:
 
 
 def _feedback_problems(config: Config, asked: float) -> list[str]:
-    """Return an error line if a sound wheel could be faster than `feedback.wheel_speed`.
-
-    `asked` is the highest wheel speed that a command can request within the limits, rad/s.
-    """
     most = config.feedback.wheel_speed
     needed = min(_rounded_up(OVERSPEED_FACTOR * asked), MAX_WHEEL_SPEED)
     if most >= needed:
@@ -111,7 +107,6 @@ def _feedback_problems(config: Config, asked: float) -> list[str]:
 
 
 def _reply_problems(config: Config) -> list[str]:
-    """Return an error line if, with `mcu.reply_period`, one lost line looks like a wheel fault."""
     period, fault_s = config.mcu.reply_period, config.feedback.fault_time
     most = longest_reply(fault_s)
     if period <= most:
@@ -135,10 +130,7 @@ def longest_reply(fault_s: float) -> float:
 
 
 def _rounded_up(value: float) -> float:
-    """Return a value rounded up to three decimals.
-
-    The value is the least allowed value in an error message, so it must not be rounded down.
-    """
+    """The value is the least allowed one in a message, so do not round it down."""
     return math.ceil(round(value * 1000, 6)) / 1000
 
 

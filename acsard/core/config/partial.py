@@ -44,8 +44,7 @@ def mistakes(rules: Iterable[Rule], config: Config) -> list[str]:
 class _View:
     """A view of one table of the configuration. Reading an invalid key raises `InvalidKeyError`.
 
-    `path` is the dotted name of the table plus a dot, or "" for the whole document. `invalid`
-    contains the dotted keys that are not valid.
+    `path` is the dotted name of the table plus a dot, or "" for the whole document.
     """
 
     def __init__(self, table: object, path: str, invalid: Set[str]) -> None:

@@ -329,7 +329,7 @@ class RatesConfig(Struct, frozen=True):
 
 
 TLS_PREFIX = "tls/"
-"""Prefix of endpoints with mutual TLS_PREFIX: the server and the client each present a
+"""Prefix of endpoints with mutual TLS: the server and the client each present a
 certificate."""
 
 
@@ -345,7 +345,7 @@ class BusConfig(Struct, frozen=True):
 
     @property
     def plain(self) -> tuple[str, ...]:
-        """The endpoints in `listen` without TLS_PREFIX, at which the daemon listens.
+        """The endpoints in `listen` without TLS, at which the daemon listens.
 
         The tuple is empty if `mode` is "client".
         """
@@ -353,7 +353,7 @@ class BusConfig(Struct, frozen=True):
 
     @property
     def outside(self) -> tuple[str, ...]:
-        """The endpoints in `listen` with TLS_PREFIX, at which the TLS_PREFIX gateway listens.
+        """The endpoints in `listen` with TLS, at which the TLS gateway listens.
 
         The tuple is empty if `mode` is "client".
         """

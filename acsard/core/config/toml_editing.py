@@ -61,9 +61,9 @@ def _changed(text: str, keys: Mapping[str, object]) -> str:
 
 
 def _adjusted(array: object, value: object) -> bool:
-    """Change the TOML list `array` to `value` and keep its comments. Return True if that works.
+    """Change the TOML list `array` to `value` and keep its comments.
 
-    Otherwise return False. The list may then be partly changed, so the caller must replace it.
+    If this returns False, the list may be partly changed, so the caller must replace it.
     """
     from tomlkit.items import Array
 
@@ -82,8 +82,7 @@ def _adjusted(array: object, value: object) -> bool:
 def _dotted(text: str, keys: Mapping[str, object]) -> tuple[str, dict[str, object]]:
     """Insert each new key whose table is written as dotted keys, such as `mcu.port = ...`.
 
-    `keys` maps dotted keys to the new values. Return a pair: the new text, and the entries of
-    `keys` that the caller must still put into the text.
+    Return the new text, and the entries that the caller must still put into the text.
     """
     import tomlkit
 

@@ -150,10 +150,6 @@ def expected(kind: inspect.Type) -> str:
 
 
 def _entries(least: int | None, most: int | None) -> str:
-    """Return words for the allowed length of a list, such as " of 1 to 4 entries".
-
-    The words begin with a space. The result is "" if any length is allowed.
-    """
     if most is None:
         return "" if least is None else f" of {least} or more entries"
     return f" of at most {most} entries" if least is None else f" of {least} to {most} entries"

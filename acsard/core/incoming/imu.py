@@ -82,9 +82,7 @@ class GyroFollower:
     def _follow(self, who: str, now_ns: int) -> bool:
         """Use the gyro of the sender `who`. Return True if another gyro was used before.
 
-        `now_ns` is the monotonic time of arrival. Raises `DecodeError` if this gyro may not be
-        used: because the gyro of another sender still sends, or because the configuration allows
-        only the gyro of the built-in simulator.
+        Raises `DecodeError` while another gyro sends, or if only the simulated gyro is allowed.
         """
         other = who != self._followed
         if other and (self._own or now_ns - self._heard_ns < SILENCE_TIMEOUT_NS):

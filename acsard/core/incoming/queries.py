@@ -180,11 +180,6 @@ class Queries:
         return Reply(answer.id, key, payload, encoding_name(form, name), attachment=attachment)
 
     def _ros(self, query: Query, wall_ns: int) -> list[Reply] | Request:
-        """Serve a query over a ROS transport, as `serve` does.
-
-        The query calls a std_srvs/Trigger service or a ROS parameter service. `wall_ns` is the time
-        of the reply by the wall clock, ns since 1970.
-        """
         asked = unpack(query.attachment) if query.via == "rmw" else None
         by = caller_name(query.via, query.attachment)
         verb = VERBS.get(query.topic)
@@ -246,7 +241,7 @@ class Queries:
         return [] if value is None else [(topic, type(value).__name__, value)]
 
     def _matches(self, query: Query, key: str) -> bool:
-        """Return whether a query asks for `key`, a key without the prefix `acsard/<id>/`."""
+        """`key` is a key without the prefix `acsard/<id>/`."""
         if "*" not in query.asked:
             return query.asked == key
         if len(query.asked) > MAX_WILDCARD_LENGTH:
@@ -273,10 +268,7 @@ def includes(expression: str, key: str) -> bool:
 
 
 def _fits(pattern: str, chunk: str) -> bool:
-    """Return whether `pattern`, a chunk of a key expression, matches `chunk`, a chunk of a key.
-
-    In the pattern, `$*` matches any characters.
-    """
+    """Match a chunk of a key with a chunk of a key expression, in which `$*` is any text."""
     if pattern == "*":
         return True
     first, *middle = pattern.split("$*")
@@ -321,21 +313,11 @@ def most_bytes(topic: str) -> int:
 
 
 def _echo(asked: Attachment | None, wall_ns: int) -> bytes:
-    """Return the attachment by which rmw_zenoh matches a reply with its request.
-
-    `asked` is the attachment of the request. If it is None, the result is b"". `wall_ns` is the
-    time of the reply by the wall clock, ns since 1970.
-    """
+    """Return the attachment by which rmw_zenoh matches a reply with its request."""
     return b"" if asked is None else Attachment(asked.sequence, wall_ns, asked.gid).pack()
 
 
 def _format(query: Query) -> Format:
-    """Return the encoding of the reply to a query.
-
-    If the query has the parameter `fmt`, the result is the encoding that `fmt` names. Otherwise
-    it is the encoding of the payload if the query calls a service with a payload, else JSON.
-    Raises `DecodeError` if `fmt` names no encoding.
-    """
     for form in FORMATS:
         if query.fmt == form:
             return form

@@ -166,7 +166,7 @@ class SpeedLimiter:
         return tuple(found), refused
 
     def _limited(self, request: Request) -> Request:
-        """Return a client's `set` request, with the requested highest speed lowered to the limit.
+        """Lower the highest speed in a client's `set` request to the limit.
 
         Raises `ConfigError` if the requested settings would be invalid when the limit ends.
         """
@@ -181,11 +181,6 @@ class SpeedLimiter:
         return replace(request, settings=request.settings | {LOWERED_SETTING: self._limit.speed})
 
     def _own(self, now_ns: int) -> tuple[Request, ...]:
-        """Put the newest limit in force, and return the `set` request that sends it to the robot.
-
-        The result is () if no new limit waits, if the last change is too recent, or if the robot
-        already has the right value. `now_ns` is monotonic.
-        """
         if self._waiting is None or now_ns - self._changed_ns < MIN_INTERVAL_NS:
             return ()
         new, self._waiting = self._waiting, None

@@ -126,10 +126,7 @@ class Codec:
 # A robot at rest repeats the same line, so the last lines are cached.
 @lru_cache(16)
 def _words(line: bytes) -> tuple[tuple[bytes, float], ...] | None:
-    """Return the four values of a plain line, such as `(b"ap", 12.5)`, or None if it is malformed.
-
-    The second item of each value is a speed, rad/s.
-    """
+    """Return four pairs such as `(b"ap", 12.5)`, the speed in rad/s; None if malformed."""
     match = _LINE.fullmatch(line)
     if match is None:
         return None

@@ -141,11 +141,7 @@ class EchoDetector:
         return found
 
     def _continued(self, run: _Run | None, wheels: _Wheels) -> _Run:
-        """Return `run` with one more line at its end, or a new run with only this line.
-
-        `wheels` are the speeds in the line, rad/s. A new run begins if `run` is None, or if the
-        reports since the last line of `run` show that the line is not an echo.
-        """
+        """Return `run` with one more line, or a new run if this line cannot be an echo."""
         others = MAX_OTHER_REPORTS + 1 if run is None else self._reports - run.report - 1
         if run is None or others > MAX_OTHER_REPORTS:
             return _Run(self._reports, wheels)
@@ -163,10 +159,6 @@ class EchoDetector:
 
 
 def _between(wheels: _Wheels, one: _Wheels, other: _Wheels) -> bool:
-    """Return whether each wheel's speed in `wheels` lies between its speeds in `one` and `other`.
-
-    A speed that equals one of these two speeds counts as between them.
-    """
     rows = zip(wheels, one, other, strict=True)
     return all(min(a, b) <= speed <= max(a, b) for speed, a, b in rows)
 

@@ -105,10 +105,8 @@ class Encoders:
         return Turned((a * angle, b * angle, c * angle, d * angle), mcu_ms / 1000)
 
     def _most(self, ms: float) -> float:
-        """Return the largest number of counts that a wheel can make in `ms` milliseconds."""
         return self._fastest * (ms + ROUNDING_MS) + SLACK_COUNTS
 
 
 def _signed(difference: int) -> int:
-    """Return the number nearest to 0 that equals `difference` modulo 65536."""
     return (difference + FIELD_VALUES // 2) % FIELD_VALUES - FIELD_VALUES // 2

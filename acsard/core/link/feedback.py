@@ -326,10 +326,7 @@ class Timeline:
         )
 
     def _placed(self, asked_ns: int | None, came_ns: int) -> Placed:
-        """Return the time of the next line by the best available clock.
-
-        `came_ns` is the monotonic time at which the whole line had arrived, ns.
-        """
+        """Return the time of the next line by the best available clock."""
         speaks, answered = self._style.speaks, None
         if asked_ns is not None or not speaks:
             answered = self._prompts.place(asked_ns)
@@ -352,10 +349,7 @@ class Timeline:
         return Placed("reads", int(self._end_ns - self._share_ns * self._rest))
 
     def _since_last(self, placed: Placed) -> tuple[float, float]:
-        """Return the time since the last good line, and its part in which lines were lost.
-
-        Both times are in s. The second time is 0 if no line was lost.
-        """
+        """Return the time since the last good line, s, and its part with lost lines."""
         last = self._last_placed
         back = placed.due_ns < last.due_ns
         self._last_placed = replace(placed, due_ns=last.due_ns) if back else placed
@@ -387,10 +381,7 @@ class Timeline:
         self._later += DIFFERENCE_GAIN * (later_ns - self._later)
 
     def _late_ns(self, clock: str) -> float:
-        """Return how much later `clock` usually is than `FreeRunningTimes` for the same line, ns.
-
-        `clock` is one of the values of `Placed.clock`.
-        """
+        """Return how much later `clock` usually is than `FreeRunningTimes` for a line, ns."""
         if clock == "reads":
             return self._slots.late_ns
         return self._later if clock == "prompts" else 0.0
@@ -400,12 +391,7 @@ class Timeline:
         return self._slots.usual or self._period_ns
 
     def _sampled(self, came_ns: int, placed: Placed, length: int) -> Instant:
-        """Return the sample time of a line: the time at which the board began to send the line.
-
-        `came_ns` is the monotonic time at which the whole line had arrived, ns. `placed` is the
-        time of the line by the chosen clock. `length` is the number of bytes of the line with its
-        line end.
-        """
+        """Return the time at which the board began to send the line."""
         mono_ns = min(came_ns, placed.due_ns) - wire_ns(length, self._baud_rate)
         last, read = self._last, self._at
         wall_ns = read.wall_ns - read.mono_ns + mono_ns

@@ -234,10 +234,9 @@ class FreeRunningTimes:
     def _missing(self, ahead: float, since: float, lines: int, drained: bool) -> int:
         """Return the number of missing lines that this read proves.
 
-        Return -1 if the read shows that the clock is wrong, or that an earlier read counted a slot
-        too many as missing. `ahead` is the lateness x of the read's last line, and `since` is the
-        time since the last read, both in slots. `lines` is the number of lines in the read.
-        `drained` is true if the read took all data from the kernel.
+        Return -1 if the clock is wrong, or an earlier read counted a slot too many as missing.
+        `ahead` is the lateness x of the last line, and `since` the time since the last read, both
+        in slots. `drained` is true if the read took all data from the kernel.
         """
         lag = self._lag if self._lag < 0.5 else 0.5
         if ahead < -0.5 + 0.6 * lag:
@@ -285,7 +284,7 @@ class FreeRunningTimes:
         """Yield candidate clocks, the likelier ones first.
 
         A candidate is a triple: the slot of each read's last line, the largest allowed lateness in
-        slots, and the period in ns. `gaps` are the times between the reads, ns.
+        slots, and the period in ns.
         """
         # The configured periods come before the measured period, because for jittery lines they are
         # more reliable than half a second of data.
@@ -311,21 +310,15 @@ class FreeRunningTimes:
             yield own, LATE_BATCHED, slope
 
     def _begin(self, at_ns: int) -> None:
-        """Start a new window at the monotonic time `at_ns`.
-
-        `_lossy` counts the reads of the window that follow missing lines.
-        """
         self._window_ns: int = at_ns
         self._least = math.inf
         self._count: int = 0
         self._passed: int = 0
+        # Number of reads that follow missing lines.
         self._lossy: int = 0
 
     def _follow(self, at_ns: int) -> None:
-        """Correct the clock by equations (2) and (3) of the class, or give up a wrong clock.
-
-        `at_ns` is the monotonic time at which the window of reads ended, ns.
-        """
+        """Correct the clock by equations (2) and (3) of the class, or give up a wrong clock."""
         least, slots = self._least, self._passed
         lossy, self._share = self._share, self._lossy / self._count
         if (
@@ -346,11 +339,6 @@ class FreeRunningTimes:
         self._begin(at_ns)
 
     def _nominal(self) -> float:
-        """Return the nominal period of the firmware, s.
-
-        The result is the first of these that applies: a configured period that is close to the
-        measured period, a whole number of ms that is close to it, or the measured period itself.
-        """
         seconds = self.usual / NS_PER_S
         for known in self._known:
             if abs(seconds / known - 1) < MAX_CLOCK_ERROR:
@@ -362,8 +350,7 @@ class FreeRunningTimes:
 def _slots(reads: list[Read], period: float = math.inf) -> list[int]:
     """Return the slot of the last line of each read. The first read has slot 0.
 
-    Each line has its own slot. If `period`, ns, is finite, missing lines have slots too: the time
-    between two reads shows their number.
+    With a finite `period`, ns, missing lines have slots too.
     """
     slots = [0]
     for (before, _), (at, lines) in pairwise(reads):
@@ -382,9 +369,9 @@ def _slope(reads: list[Read], slots: list[int]) -> float:
 
 
 def _latest(reads: list[Read], slots: list[int], period: float) -> tuple[float, list[float]]:
-    """Return a pair: the time of slot 0, ns, and the resulting lateness of each read, in slots.
+    """Return the time of slot 0, ns, and the lateness of each read, in slots.
 
-    The time of slot 0 is the latest one for which no read comes before its slot. `period` is in ns.
+    The time is the latest one for which no read comes before its slot.
     """
     offsets = [at - slot * period for (at, _), slot in zip(reads, slots, strict=True)]
     first = min(offsets)
@@ -619,10 +606,7 @@ class PromptedTimes:
             self._passed = self._left.popleft()
 
     def _begin(self) -> None:
-        """Assign the first reply to the newest command that this reply can answer.
-
-        The delay of this reply becomes the usual delay.
-        """
+        """Assign the first reply to the newest command that this reply can answer."""
         left = self._left
         while len(left) > 1 and left[1] + self._soonest <= self._at:
             self._passed = left.popleft()
@@ -634,10 +618,7 @@ class PromptedTimes:
         self._delay = self._least = self._soon = float(delay_ns)
 
     def _shorten(self, line: int) -> None:
-        """Correct the usual delay if it was measured on a first reply that a stall had delayed.
-
-        `line` is the time at which the command that the second reply answers was written, ns.
-        """
+        """Correct the usual delay if it was measured on a reply that a stall had delayed."""
         # After a stall, the delay of the second reply is much shorter than the usual delay. Without
         # the correction, the usual delay would fall by only 5 % of the difference per reply. Until
         # then the delay would seem to vary much, which would hide lost replies.
@@ -650,8 +631,7 @@ class PromptedTimes:
     def _weigh(self, lines: int, since: int, cut: bool) -> None:
         """Give up the commands whose replies were lost on a batched link.
 
-        `lines` is the number of whole replies in the batch. `since` is the time since the previous
-        read, ns. `cut` is true if the read also contains the first part of one more reply.
+        `cut` is true if the read also contains the first part of one more reply.
         """
         # The last reply of a batch shows a loss: it comes too late for the command that it would
         # answer if no reply were lost. If it comes too soon for its command, commands that were
@@ -691,9 +671,8 @@ class PromptedTimes:
     def _given_up_too_early(self, delay: float) -> bool:
         """Stop waiting for lost replies. Return whether an earlier call stopped too early.
 
-        If so, the present reply answers the last command whose reply the earlier call gave up. Call
-        this only if the last read of the port contained a single reply. `delay` is the usual delay
-        of a reply, ns.
+        If so, the present reply answers the last command that the earlier call gave up. Call this
+        only if the last read of the port contained a single reply.
         """
         left, at, wide = self._left, self._at, 4 * self._spread
         lost, self._lost = self._lost, False
@@ -727,25 +706,11 @@ class PromptedTimes:
         return at - left[0] - delay <= -max((left[0] - self._passed) / 2, wide)
 
     def _shift(self, line: int) -> int:
-        """Return an estimate of the extra time that the board took for the present reply, ns.
+        """Return an estimate of the extra time that the board took for this reply, ns.
 
-        The result is negative if the board answered sooner than usual. It is computed from the
-        difference between the delay of this reply and the usual delay. The result is smaller than
-        this difference, because USB and the scheduler cause a part of the difference. The present
-        reply must be the only reply in its read of the port. The result is 0 in these cases:
-
-        - An adapter batches the replies, or the usual delay is not known yet.
-        - The difference is more than four times the usual deviation, so that a host stall has
-          probably delayed the reply.
-        - The delay usually varies so little that USB and the scheduler explain the variation.
-        - The delay usually varies so much that an adapter must cause the variation.
-
-        The method also updates the usual delay, the least delay and the mean deviation. It does not
-        update them in the first case, or if the difference in the second case exceeds even the
-        usual delay.
-
-        Args:
-            line: the time at which the daemon wrote the command that this reply answers, ns.
+        USB and the scheduler cause a part of the difference from the usual delay. The result is 0
+        if they explain the usual deviation, or if the deviation is so large that an adapter must
+        cause it. The present reply must be the only reply in its read of the port.
         """
         delay, spread = self._delay, self._spread
         if delay is None or self._batched:

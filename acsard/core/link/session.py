@@ -173,7 +173,7 @@ class McuSession:
             if 0.0 < self.lateness.step_s < WATCHDOG_S and self._answers and not feedback:
                 # The board may have had nothing to answer, because this computer sent nothing. If
                 # its watchdog has not stopped the motors yet, a stop without a ramp would only
-                # shake the robot. `Robot` makes such a stop anyway after `UNHEARD_S`.
+                # shake the robot. `Robot` makes such a stop anyway after `WRITE_PAUSE_S`.
                 self._link.wait(now.mono_ns)
             self._judge(now.mono_ns)
         if self._rejected:
@@ -246,7 +246,6 @@ class McuSession:
     def _settle(self, went: bool, port_open: bool, late_ns: int) -> None:
         """Record whether the port wrote the line that `line()` returned last.
 
-        `went` is true if the port wrote this line. `port_open` is true if the port is open.
         `late_ns` is the time from the making to the writing of the line, ns.
         """
         made = self._made
@@ -280,10 +279,7 @@ class McuSession:
         self.negotiation.begin(fresh=True)
 
     def _restart(self, how: str) -> None:
-        """Start a new session, because the MCU has restarted and its motors stand still.
-
-        `how` completes the sentence "the microcontroller ..." in the log.
-        """
+        """Start a new session, because the MCU has restarted and its motors stand still."""
         if self.link == "up":
             self.events.append(Event("mcu_restarted", f"the microcontroller {how}", "warning"))
         self._link.sign("restarted")
@@ -325,16 +321,12 @@ class McuSession:
             self.events.append(Event(NAMES[self.link], self.words(), "warning"))
 
     def _reject(self, reason: str, line: bytes = b"", more: int = 1) -> None:
-        """Count `more` lines rejected for `reason`.
-
-        `line` is the last of these lines; b"" means that its bytes are unknown.
-        """
+        """`line` is the last of these lines; b"" means that its bytes are unknown."""
         self.rejects[reason] += more
         before, _ = self._rejected.get(reason, (0, b""))
         self._rejected[reason] = (before + more, line)
 
     def _announce_rejects(self) -> None:
-        """Add one event to `events` for each reason for which this update has rejected lines."""
         # After noise on the cable, an event for each rejected line would take too much time.
         for reason, (count, line) in self._rejected.items():
             text = f"{line[:60]!r}" if line else ""
@@ -444,12 +436,7 @@ class McuSession:
         size: tuple[int, int],
         asked_ns: int | None,
     ) -> Feedback:
-        """Return the feedback of a good line.
-
-        `read_at` is the time of the read of the port. `size` is the pair of `following` and
-        `length`, the arguments of `Timeline.place`. `asked_ns` is the monotonic time at which the
-        answered command was written, ns; None if unknown.
-        """
+        """`size` is the pair of `following` and `length`, the arguments of `Timeline.place`."""
         self.good_lines += 1
         before_ns, self._heard_ns = self._heard_ns, read_at.mono_ns
         if before_ns is not None and read_at.mono_ns - before_ns >= LONG_GAP_NS:

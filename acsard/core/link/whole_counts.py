@@ -201,21 +201,14 @@ class WholeCounts:
         )
 
     def _fits(self, number: int, fastest: float, want: float) -> bool:
-        """Return whether a wheel makes about `number` counts in the time `want`, s.
-
-        `fastest` is the speed of the wheel, rad/s. `MAX_COUNT_ERROR` is the largest accepted
-        difference.
-        """
         return abs(number - want * fastest / self.angle) <= MAX_COUNT_ERROR
 
     def _number(self, speeds: Motors, fastest: float, want: float) -> tuple[int, bool | None]:
-        """Return a pair: the number n of counts of the fastest wheel, and whether n is proved.
+        """Return the number n of counts of the fastest wheel, or 0, and whether n is proved.
 
-        n is 0 if the line does not show n. The second value is True if the speeds prove that they
-        are whole counts, False if they prove the opposite, and None if they prove neither. `speeds`
-        are those of all wheels, and `fastest` is the largest absolute speed, rad/s. `want` is the
-        expected time between the two samples, s: the host's estimate plus the addition from the
-        previous line.
+        The second value is True if the speeds prove that they are whole counts, False if they prove
+        the opposite, and None otherwise. `want` is the host's estimate of the time between the two
+        samples plus the addition from the previous line, s.
         """
         count = fastest / self.angle
         exact = want * count  # counts if the host's time were right

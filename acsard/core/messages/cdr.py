@@ -106,11 +106,7 @@ class _Source:
         return layout.unpack_from(self.data, start)
 
     def count(self, least: int) -> int:
-        """Read and return the number of items in a sequence.
-
-        `least` is the smallest size of an item, bytes. Raises `CdrError` if the rest of the
-        payload is too short for that many items.
-        """
+        """`least` is the smallest size of an item, bytes."""
         (count,) = self.take("I")
         if count * least > len(self.data) - self.at:
             raise CdrError(
@@ -142,8 +138,7 @@ def _whole(code: str, value: Any) -> Any:
 def _layout(order: str, codes: str, start: int) -> struct.Struct:
     """Return the layout of neighboring numbers, each aligned to its size.
 
-    `order` is the byte order, "<" or ">". `codes` contains the format character of each number in
-    Python's `struct`. `start` is the position of the first number modulo 8, after the CDR header.
+    `start` is the position of the first number modulo 8, after the CDR header.
     """
     text, at = order, start
     for code in codes:
@@ -154,23 +149,16 @@ def _layout(order: str, codes: str, start: int) -> struct.Struct:
 
 
 def _packs(codes: str) -> tuple[Callable[..., bytes], ...]:
-    """Return eight functions that pack neighboring numbers, one for each start position modulo 8.
-
-    `codes` contains the format character of each number in Python's `struct`. The position is
-    counted from the end of the CDR header.
-    """
+    """Return a function for each start position modulo 8, counted from the end of the header."""
     return tuple(_layout("<", codes, start).pack for start in range(8))
 
 
 _put_count = _packs("I")
 
 
+# A robot sends few different strings, so a small cache saves most work.
 @lru_cache(256)
 def _text_bytes(text: str) -> bytes:
-    """Return a string in CDR: its length in bytes, its UTF-8 text and a zero byte.
-
-    The results are cached, because a robot sends few different strings.
-    """
     raw = text.encode() + b"\0"
     return struct.pack("<I", len(raw)) + raw
 
@@ -224,10 +212,9 @@ class _Text:
 
 
 class _List:
-    """Codec of one list in a message: a CDR sequence, or a CDR array if `fixed` is true.
+    """Codec of one list: an array of `most` items if `fixed` is true, otherwise a sequence.
 
-    An array has exactly `most` items. A sequence has up to `most` items, or any number if `most`
-    is None.
+    A sequence has up to `most` items, or any number if `most` is None.
     """
 
     def __init__(self, get: Get, kind: inspect.Type, most: int | None, fixed: bool) -> None:
@@ -292,10 +279,7 @@ _Part = _Numbers | _Text | _List
 
 @cache
 def _compiled(cls: Any) -> tuple[tuple[_Part, ...], Build]:
-    """Return a pair for the struct type `cls`: the codecs of its parts in order, and a builder.
-
-    The builder is a function that makes a struct from the decoded values.
-    """
+    """Return the codecs of the parts of `cls`, and a function that builds it from values."""
     info = struct_info(cls)
     parts: list[_Part] = []
     run: list[tuple[str, inspect.Type]] = []

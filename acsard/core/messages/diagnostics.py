@@ -179,11 +179,6 @@ def _commands(outputs: Outputs, snapshot: Snapshot, speed_limit: str) -> Row:
 
 
 def _wheels(doubt: WheelsStatus, counters: dict[str, int]) -> Row:
-    """Return the row about wheels that are faulty, slip or turn slower than commanded.
-
-    `doubt` is the result of the wheel checks. From `counters`, the row shows the numbers of wheel
-    faults and of uncommanded motions.
-    """
     left, right = doubt.differ
     values = {
         "left_out": ", ".join(doubt.left_out),
@@ -199,10 +194,6 @@ def _wheels(doubt: WheelsStatus, counters: dict[str, int]) -> Row:
 
 
 def _board(config: Config, snapshot: Snapshot) -> list[Row]:
-    """Return a list with the row about the emergency stop, the bumpers and the motor drivers.
-
-    The list is empty if the board has sent no status line and the configuration requires no input.
-    """
     safety, bumpers = config.safety, snapshot.bumpers
     required, needed = safety.estop == "required", safety.bumpers and safety.bumper != "off"
     if not (snapshot.board or required or needed):
@@ -226,10 +217,6 @@ def _board(config: Config, snapshot: Snapshot) -> list[Row]:
 
 
 def _battery(config: Config, snapshot: Snapshot) -> list[Row]:
-    """Return a list with the row about the battery.
-
-    The list is empty if the board reports no battery and the configuration sets no threshold.
-    """
     status, bounds = snapshot.battery, config.battery.bounds
     if status is None:
         return [Row("battery", WARN, battery.MISSING_REASON, {})] if bounds else []

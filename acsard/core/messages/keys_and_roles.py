@@ -169,11 +169,6 @@ def _out(
     simulated: bool = False,
     urdf: bool = False,
 ) -> Topic:
-    """Return a row of the table of keys for a key on which the daemon publishes.
-
-    Every client may read such a key. `kind` is the type of the messages. The other arguments are
-    fields of `Topic`.
-    """
     return Topic(
         key, "out", kind, rate, note,
         subscribe="viewer", query="viewer", latched=latched, simulated=simulated, urdf=urdf,

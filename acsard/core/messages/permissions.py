@@ -47,10 +47,6 @@ def keys_for(role: Role, use: Use, rows: Iterable[Topic]) -> list[str]:
 
 
 def _exact(row: Topic, use: Use) -> Iterator[tuple[str, Role]]:
-    """Yield each key that `row` describes, with the lowest role that has the permission `use`.
-
-    The function yields nothing if no client has this permission.
-    """
     least = {"publish": row.publish, "subscribe": row.subscribe, "query": row.query}[use]
     if least == "<role>":
         yield from ((row.key.replace("<role>", role), role) for role in ROLES)

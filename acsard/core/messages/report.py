@@ -226,11 +226,7 @@ class Report:
         return String(self.description) if self.description else None
 
     def _odom(self, estimate: Estimate, live: bool = True) -> Odometry:
-        """Return the message `odom` for an estimate.
-
-        `live` is False if the board no longer sends feedback. The message then has a twist of zero
-        with the covariance `UNKNOWN_COVARIANCE`.
-        """
+        """`live` is False if the board no longer sends feedback."""
         frames, pose = self._config.odometry, estimate.pose
         of_pose = self._covariances.of_pose(estimate.covariance)
         of_twist = (
@@ -308,11 +304,7 @@ class Report:
         return round((first(self.certificate_ends)[1] - now.wall_ns) / DAY_NS, 2)
 
     def _battery(self, outputs: Outputs, snapshot: Snapshot) -> Battery | None:
-        """Return the message `battery`, or None if the board has never reported a battery.
-
-        The stamp is the time of the board's last report. If the board has stopped these reports,
-        the stamp is the time of the step.
-        """
+        """The stamp is the time of the board's last report, or now if the reports have stopped."""
         battery, now = snapshot.battery, outputs.now
         if battery is None:
             return None
@@ -331,10 +323,6 @@ class Report:
         )
 
     def _certificate(self, now: Instant) -> tuple[int, str]:
-        """Return the diagnostic level and the text of `expiry` for the TLS certificates.
-
-        Without TLS, the result is (0, "").
-        """
         if not self._config.bus.tls:
             return 0, ""
         return expiry(self.certificate_ends, now.wall_ns)

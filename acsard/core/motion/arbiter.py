@@ -72,7 +72,6 @@ class _Source:
         self.use(settings, pause)
 
     def use(self, settings: Source, pause: float) -> None:
-        """Apply new settings to the source and its senders. `pause` is `neutral_pause`, s."""
         self.pause_ns = int(pause * NS_PER_S)
         self.timeout_ns = int(settings.timeout * NS_PER_S)
         self.proof = Wait("proof", settings.name, min(self.timeout_ns, MAX_PROOF_NS) / NS_PER_S)
@@ -82,12 +81,7 @@ class _Source:
             sender.use(self.timeout_ns, self.pause_ns)
 
     def add(self, name: str, now_ns: int) -> Sender | None:
-        """Add a sender and return it, or return None if there are too many senders.
-
-        If the source is full, the new sender replaces another sender. Return None if all
-        `MAX_SENDERS` senders may keep control of the robot (`Sender.holds`). `name` is the public
-        name of the new sender.
-        """
+        """Return None if all `MAX_SENDERS` senders may keep control of the robot."""
         if len(self.senders) >= MAX_SENDERS:
             least = min(self.senders, key=lambda other: self._account(other, now_ns))
             if self._account(least, now_ns)[0]:
@@ -103,22 +97,19 @@ class _Source:
         return holds, holds or sender.armed(now_ns), sender.noticed_ns
 
     def cancel_zeros(self, at_ns: int) -> None:
-        """Record that a sender with a shared identity may have sent a speed.
+        """Process a message that may be a speed of any sender with a shared identity.
 
-        Any sender with a shared identity may be this sender. Therefore a zero command of such a
-        sender does not arm it any more, unless its `commands.neutral_pause` was already over.
-        `at_ns` is the monotonic time at which the message that may be a speed arrived.
+        Their zeros do not arm them any more, unless `commands.neutral_pause` was already over.
         """
         for sender in self.senders.values():
             sender.cancel_zero(at_ns)
 
     def doubt(self, command: Command, was_set: bool) -> None:
-        """Undo the effect of a sender's zero commands, because the sender's clock is in doubt.
+        """Undo the effect of a sender's zeros on this source, because `command` raised a doubt.
 
-        Only the effect on this source is undone. `command` raised the doubt; it may have been sent
-        to another source. If `was_set` is true, the sender's clock was set, and the sender must
-        send a zero command again. If `was_set` is false, the clock is unproven. A zero command then
-        arms the sender only if it was accepted before the doubt or arrives later.
+        If `was_set`, the clock of the sender was set, and the sender must send a zero again.
+        Otherwise the clock is unproven. A zero then arms the sender only if it was accepted before
+        the doubt or arrives later.
         """
         sender = self.senders.get(command.sender)
         # Behind a bridge, several programs with clocks of their own share one identity. Therefore a
@@ -132,12 +123,7 @@ class _Source:
             sender.unlearn()
 
     def present(self, now_ns: int) -> list[Sender]:
-        """Return the senders that take part in the choice, the preferred sender first.
-
-        These are the senders for which `Sender.present` is true. Armed senders come before unarmed
-        senders. In each of these two groups, live senders come before senders that are not live.
-        Otherwise the sender that began to send earlier comes first.
-        """
+        """Return the present senders: armed ones first, then live ones, then the earliest."""
         present = []
         for sender in self.senders.values():
             if sender.present(now_ns):
@@ -150,10 +136,7 @@ class _Source:
         )
 
     def latest_ns(self) -> int | None:
-        """Return the monotonic time at which the last accepted command of this source arrived, ns.
-
-        Return None if no command was accepted since the last `require_neutral`.
-        """
+        """Return None if no command was accepted since the last `require_neutral`."""
         times = [s.arrived_ns for s in self.senders.values() if s.arrived_ns is not None]
         return max(times, default=None)
 
@@ -162,26 +145,19 @@ class _Source:
             sender.require_neutral()
 
     def neutral(self, sender: Sender, lasts: float = 0.0) -> Wait:
-        """Return the `Wait` for a sender that must send a zero command before it may drive.
-
-        `lasts` is the time for which the sender has sent speeds without such a zero command, s.
-        """
+        """`lasts` is the time for which the sender has sent speeds without a zero before, s."""
         pause = self.pause_ns / NS_PER_S
         return Wait("neutral", self.name, pause, lasts=lasts, ros=sender.ros, shared=sender.shared)
 
     def doubted(self, now_ns: int) -> Wait | None:
-        """Return why recent commands of this source were not accepted because of their stamps.
-
-        If several senders sent such commands, the result is for the sender of the newest message.
-        Return None if no sender sent such a command.
-        """
+        """Return why commands were not accepted because of their stamps, or None."""
         doubtful = [sender for sender in self.senders.values() if sender.doubtful(now_ns)]
         if not doubtful:
             return None
         return self.why(max(doubtful, key=lambda sender: sender.noticed_ns), now_ns)
 
     def why(self, sender: Sender, now_ns: int) -> Wait:
-        """Return why the robot does not follow `sender`. Call this only if `sender` is not live."""
+        """Call this only if `sender` is not live."""
         if not sender.doubtful(now_ns):
             return self.stalled
         if sender.doubt == "stale":
@@ -189,11 +165,7 @@ class _Source:
         return self.proof if sender.armed(now_ns) else self.neutral(sender)
 
     def obstacle(self, sender: Sender, now_ns: int, lasting: bool = True) -> Wait:
-        """Return why `sender` cannot drive the robot, although it takes part in the choice.
-
-        If the sender must first send a zero command, and `lasting` is true, the result also has the
-        time for which the sender has sent speeds instead.
-        """
+        """If `lasting`, the result says for how long an unarmed sender has sent speeds."""
         if not sender.live(now_ns):
             return self.why(sender, now_ns)
         since_ns = sender.speeds_ns if lasting else None
@@ -334,11 +306,7 @@ class Arbiter:
         return Choice(source.name, sender.twist, wait, sender.arrived_ns, sender.name)
 
     def _kept(self, holder: _Source, now_ns: int) -> str:
-        """Return the name of a source whose speeds have no effect, because `holder` sends zeros.
-
-        If another sender of `holder` itself sends the speeds, the result is "another sender of
-        NAME". Return "" if no other sender sends speeds.
-        """
+        """Return the source whose speeds have no effect, because `holder` sends zeros; or ""."""
         for source in self._ranking:
             senders = (each for each in source.present(now_ns) if each is not self._followed)
             if any(sender.twist != REST for sender in senders):
@@ -376,7 +344,6 @@ class Arbiter:
 
 
 def _lasts(ns: int) -> float:
-    """Return the duration `ns` in s, rounded down to a value of `REPORTED_DURATIONS_S` or to 0."""
     if ns < REPORTED_DURATIONS_S[0] * NS_PER_S:
         return 0.0  # Nearly every step ends here.
     return max(seconds for seconds in REPORTED_DURATIONS_S if ns >= seconds * NS_PER_S)

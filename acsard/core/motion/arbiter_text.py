@@ -128,10 +128,7 @@ class CommandEvents:
         return events + self._kept_waiting(mode, choice)
 
     def _kept_waiting(self, mode: Mode, choice: Choice) -> list[Event]:
-        """Return a list with one event if a source's speeds have had no effect for a while.
-
-        While this goes on, later calls return an empty list.
-        """
+        """Report once that the speeds of a source have had no effect for a while."""
         wait, kept = choice.wait, ""
         if mode not in (Mode.READY, Mode.DRIVING) or wait.what not in ("neutral", "zeros"):
             self._kept = ""

@@ -196,10 +196,7 @@ class Battery:
             self._mean_ns = at_ns
 
     def _level(self, now_ns: int) -> BatteryLevel | None:
-        """Update the battery level from the running mean and return it; None if it is undecided.
-
-        It is undecided until the reports cover `SETTLE_S`.
-        """
+        """Return None while the level is undecided: until the reports cover `SETTLE_S`."""
         measure, values = self._config.measure, self._values
         if measure not in values:
             self._mean = None

@@ -85,12 +85,10 @@ class EventThrottle:
         return tuple([self._held.pop(name).line() for name in told])
 
     def _may(self, name: EventName, news: bool, now_ns: int) -> bool:
-        """Return whether a line of this name may be written now. If so, count it as written.
+        """Return whether a line may be written now. If so, count it as written.
 
-        The schedule has one line of each name per second. If `news` is true (the line does more
-        than repeat earlier events), up to `BURST` lines may be written ahead of the schedule. The
-        lines of a stop may too, even if the robot is already stopped, because the time of each stop
-        matters.
+        Each name has one line per second. Up to `BURST` lines may come earlier if `news` is true.
+        The same holds for the lines of a stop, because the time of each stop matters.
         """
         free_ns, at_once = self._free_ns.get(name, now_ns), news or name == "stop"
         if free_ns > now_ns + (BURST - 1 if at_once else 0) * NS_PER_S:
@@ -124,10 +122,6 @@ def _count(counts: Counter[str], what: str, times: int) -> None:
 
 
 def _numbered(counts: Counter[str]) -> str:
-    """Return the kinds with their numbers of events, like `12 x stale, 1 x not_finite`.
-
-    If there is only one event, return its kind without a number.
-    """
     if counts.total() == 1:
         return next(iter(counts))
     return ", ".join(f"{times} x {what}" for what, times in counts.most_common())

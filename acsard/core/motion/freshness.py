@@ -145,12 +145,7 @@ class _Proof:
         """Monotonic start, ns, and minimum delay, ns, of each of the latest halves."""
 
     def add(self, delay: int, at_ns: int, timeout_ns: int) -> Literal["proven", "open", "failed"]:
-        """Add a command to the test, and return whether the delays are proven constant.
-
-        "open" means that the test goes on. "failed" means that a new test must begin with this
-        command. A command whose delay exceeds the lowest delay by more than `timeout_ns` cannot
-        complete the test.
-        """
+        """Return "failed" if a new test must begin with this command."""
         if not -MAX_JITTER_NS <= delay - self._first <= WAVER_NS:
             return "failed"
         proven = False
@@ -241,10 +236,6 @@ class _Clock:
         return self._accepted is not None
 
     def judge(self, command: Command, stamp_ns: int, timeout_ns: int) -> Verdict:
-        """Return the verdict on the next command of this clock, and update the minimum delay.
-
-        `stamp_ns` is the stamp of the command, and `timeout_ns` the timeout of its source, ns.
-        """
         at_ns, delay = command.arrived_ns, command.arrived_ns - stamp_ns
         silence, departed = at_ns - self.at_ns, stamp_ns - self._stamp_ns
         number = -1 if command.sequence is None else command.sequence
@@ -271,29 +262,19 @@ class _Clock:
         return verdict
 
     def _superseded(self, mark: tuple[int, int]) -> bool:
-        """Return whether this command, or a newer command of the same clock, was already accepted.
+        """`mark` is the stamp of this command, ns, and its sequence number, or -1 if it has none.
 
         A repetition of an accepted command is recognized only if the command is numbered.
-
-        Args:
-            mark: a pair that describes this command: its stamp, ns, and its sequence number. The
-                sequence number is -1 if the command is not numbered.
         """
         last = self._accepted
         return last is not None and (mark < last or (mark == last and mark[1] >= 0))
 
     def _repeats(self, stamp_ns: int, number: int, silence: int) -> bool:
-        """Return whether the network repeated this command, or delivered a later command before it.
+        """Return whether the network repeated this command, or delivered it after a later one.
 
-        The caller ignores such a command. A low sequence number may also mean that the sender has
-        restarted and counts from the beginning. The method assumes a restart, and returns False, if
-        the sender has paused, or if the stamp is later than the stamps of the previous command and
-        of the last accepted command.
-
-        Args:
-            stamp_ns: the stamp of this command, ns.
-            number: the sequence number of this command, or -1 if the command is not numbered.
-            silence: the time since the previous command arrived, ns.
+        A low number may also mean that the sender has restarted. This is assumed if the sender has
+        paused, or if the stamp is later than those of the previous and of the last accepted
+        command.
         """
         if not 0 <= number <= self._number or silence > self.gap_ns:
             return False
@@ -301,15 +282,7 @@ class _Clock:
         return stamp_ns <= self._stamp_ns or (accepted is not None and stamp_ns <= accepted[0])
 
     def _later_than_lowest(self, delay: int, silence: int) -> int:
-        """Return the difference between a delay and the lowest delay of this steady clock, ns.
-
-        The result is 0 if `delay` is the new lowest delay. The lowest delay rises by the drift that
-        is possible in the time `silence`.
-
-        Args:
-            delay: the delay of the present command, ns.
-            silence: the time since the previous command arrived, ns.
-        """
+        """Return by how much `delay` exceeds the lowest delay of this steady clock, ns."""
         floor = delay if self._floor is None else self._floor + silence // SECONDS_PER_DRIFT
         self._floor = min(floor, delay)
         return delay - self._floor
@@ -318,17 +291,10 @@ class _Clock:
         """Record a pause of the sender, or an adjustment of its clock.
 
         A stamp that goes back or stands still shows an adjustment. The next command must confirm
-        the adjustment: the stamp of that command must also go back or stand still, or must not be
-        later than the stamp before the adjustment.
+        it: the stamp of that command must do the same, or not be later than before the adjustment.
 
-        If the sequence numbers show that commands were lost, the network may have caused the
-        silence, so no pause is recorded. The size of an adjustment is then the time by which the
-        stamp is earlier than the stamp of the last accepted command.
-
-        Args:
-            stamp_ns: the stamp of the present command, ns.
-            silence: the time since the previous command arrived, ns.
-            number: the sequence number of the present command, or -1 if it is not numbered.
+        If commands were lost, the network may have caused the silence, so no pause is recorded. The
+        adjustment is then measured from the stamp of the last accepted command.
         """
         lost = number - self._number - 1 if number >= 0 and self._number >= 0 else 0
         if lost < 0:  # the sender has restarted its numbers
@@ -393,12 +359,10 @@ class _Clock:
         return "stale"
 
     def _forgive(self, proof: _Proof, at_ns: int) -> bool:
-        """Trust the new constant delay of a sender that `proof` has found, if it is plausible.
+        """Trust the new constant delay that `proof` has found, if it is plausible.
 
-        Return whether the delay is trusted. A smaller delay than before is always trusted. A larger
-        one is trusted if the sender has paused. It is also trusted if the increase is explained by
-        an adjustment of the clock that the stamps show, by the sender's remaining budget for
-        adjustments that the stamps do not show (`FORGIVE_NS`), or by both together.
+        A larger delay is plausible after a pause of the sender. It is also plausible if visible
+        adjustments of the clock, the budget for invisible ones (`FORGIVE_NS`), or both explain it.
         """
         self._accrue(at_ns, FORGET_NS)
         hidden = proof.least - self._least
@@ -412,7 +376,6 @@ class _Clock:
         return True
 
     def _accrue(self, at_ns: int, most_ns: int) -> None:
-        """Refill the budget for the time since the last call, but to at most `most_ns`."""
         grown = (at_ns - self._budget_at_ns) // FORGIVE_RATE
         self._budget, self._budget_at_ns = min(self._budget + grown, most_ns), at_ns
 
@@ -467,10 +430,7 @@ class Freshness:
         return verdict
 
     def _in_order(self, command: Command, gap_ns: int) -> Verdict:
-        """Return the verdict on a command without a stamp, according to its sequence number.
-
-        After a silence of more than `gap_ns` ns, the numbers of a sender may restart.
-        """
+        """Judge a command without a stamp. After `gap_ns` of silence, its numbers may restart."""
         number, at_ns = command.sequence, command.arrived_ns
         if number is None:
             return "fresh"
@@ -484,7 +444,6 @@ class Freshness:
         return "fresh"
 
     def _forget(self, now_ns: int) -> None:
-        """Forget clocks that were silent for long, and one more if `MAX_CLOCKS` is exceeded."""
         # The number of clocks is limited, because a recording begins with all clocks, and the
         # control loop writes all of them in one step.
         limits = (
@@ -504,6 +463,5 @@ class Freshness:
 
 
 def _oldest(held: dict[str, _Clock]) -> _Clock:
-    """Return the clock that has been silent longest."""
     # Each command moves its clock to the end of the dictionary.
     return next(iter(held.values()))

@@ -192,11 +192,7 @@ def _some(*pieces: Motors) -> tuple[Motors, ...]:
 
 
 def _until_rest(before: Motors, driven: float, after: Motors, bridged: float) -> Motors:
-    """Return the wheel angles, rad, in a gap in which the motors were commanded to rest.
-
-    `before` and `after` are the wheel speeds before and after the gap, rad/s. `driven` is the time
-    from the start of the gap to the command, s, and `bridged` is the duration of the gap, s.
-    """
+    """Return the wheel angles, rad, in a gap with a command to rest after `driven` s."""
     # A board that computes its speeds since its last reply reports the means over the gap. These
     # means are large enough for the motion until the command to rest. A smaller speed is the speed
     # at the end of the gap.
@@ -297,15 +293,7 @@ class Confirmation:
 
 
 def _alone(a: Motors, b: Motors, steps: Motors) -> float:
-    """Return the largest speed change of one wheel that the other wheel of its side did not make.
-
-    A change by one known quantization step does not count. The result is in rad/s.
-
-    Args:
-        a: the wheel speeds after the change, rad/s.
-        b: the wheel speeds before the change, rad/s.
-        steps: the quantization step of each wheel's speed, rad/s; infinite if it is unknown.
-    """
+    """Return the largest speed change that the other wheel of its side did not make, rad/s."""
     changes, largest = tuple(map(sub, a, b)), 0.0
     # The wheels i and 3 - i in `WHEELS` order are those of one side.
     for own, other, step in zip(changes, reversed(changes), steps, strict=True):

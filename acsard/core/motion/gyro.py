@@ -120,7 +120,6 @@ class Gyro:
         self._begin()
 
     def _begin(self) -> None:
-        """Start over with a gyro whose bias, delay and direction are unknown."""
         self._bias, self._match, self._trial = Bias(), Match(), Trial()
         self._heard: deque[tuple[int, GyroSample]] = deque(maxlen=256)
         """Samples that `turn` has not used yet, each with its monotonic time, ns (`_time_of`)."""
@@ -238,10 +237,7 @@ class Gyro:
     # Samples.
 
     def _time_of(self, sample: GyroSample) -> int:
-        """Return the monotonic time at which `sample` would have arrived without jitter, ns.
-
-        The stamps of the samples show the jitter. Without stamps, the jitter counts as 0.
-        """
+        """Return the monotonic time at which `sample` would have arrived without jitter, ns."""
         last, self._last = self._last, sample
         if last is None or sample.stamp_ns is None or last.stamp_ns is None:
             return sample.at_ns
@@ -252,11 +248,7 @@ class Gyro:
         return sample.at_ns - max(0, int(late))
 
     def _take(self, until_ns: int, resting: bool) -> None:
-        """Process the samples until the monotonic time `until_ns`.
-
-        If `resting` is true, the robot is at rest, and the bias is learned from the samples.
-        Otherwise, the turn according to the samples is added to `_angle`.
-        """
+        """Process the samples until `until_ns`: learn the bias at rest, else add their turn."""
         bias, heard = self._bias, self._heard
         until_ns += self._delay_ns
         while heard and heard[0][0] <= until_ns:
@@ -278,11 +270,9 @@ class Gyro:
     # Comparison with the wheels.
 
     def _try(self, wheels: float, angle: float, variance: float, dt: float, resting: bool) -> bool:
-        """Test a gyro that is not proven yet, and return whether the wheels must provide this turn.
+        """Test a gyro that is not proven yet. Return whether the wheels must provide this turn.
 
-        `wheels` and `angle` are the turns in the last `dt` s according to the wheels and to the
-        gyro, rad, and `variance` is the variance of `angle`, rad2. If `resting` is true, the wheels
-        rest and the gyro provides the turn, because a person may turn the robot.
+        While the wheels rest, the gyro provides it, because a person may turn the robot.
         """
         trial, known = self._trial, self._bias.known
         if not trial.open or resting:
@@ -309,10 +299,7 @@ class Gyro:
         self._slipped_s = self._slipped_s + dt if self._slip_s > 0.0 else 0.0
 
     def _shift(self) -> None:
-        """Correct the assumed delay of the gyro.
-
-        Call this only while the robot is at rest. Otherwise the heading would jump.
-        """
+        """Call this only while the robot is at rest. Otherwise the heading would jump."""
         delay = self._match.delay()
         if delay is not None and abs(delay) >= MIN_DELAY_CORRECTION_S:
             earliest, latest = DELAY_RANGE_NS

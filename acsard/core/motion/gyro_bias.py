@@ -86,10 +86,6 @@ class Bias:
         return True
 
     def _doubt(self, rate: float, variance: float, dt: float, noise: float) -> bool:
-        """Process a sample that contradicts the bias; return True if the bias changes.
-
-        `noise` is the variance of the samples so far, rad2/s2. For the other arguments, see `rest`.
-        """
         other = self._other = self._other or Bias()
         if not other.rest(rate, variance, dt) or other._rested_s < NEW_BIAS_TIME_S:
             return False

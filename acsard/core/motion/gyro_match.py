@@ -201,12 +201,9 @@ class Match:
             sums[2] -= old[2]
 
     def _learn(self) -> None:
-        """Learn from the block that was completed `BEHIND` blocks ago.
-
-        The blocks before and after it show whether the gyro's rate changes, too.
-        """
         block = self._blocks[BEFORE]
         wheels, gyro, change = block.wheels / block.time, block.gyro / block.time, block.change
+        # The blocks before and after this block show whether the gyro's rate changes, too.
         rates = [one.gyro / one.time for one in self._blocks]
         if max(rates) - min(rates) < MIN_RATE_CHANGE * BLOCK_S:
             change = 0.0

@@ -97,7 +97,6 @@ class Trial:
         self._wheels = self._gyro = self._seconds = self._fast = self._fast_gyro = 0.0
 
     def _says_nothing(self) -> bool:
-        """Return whether the gyro reads about zero although the wheels report a fast turn."""
         fast, gyro = self._fast, self._fast_gyro
         if abs(self._stretch) >= MIN_TURN_RATE * self._stretch_s:
             fast, gyro = fast + self._stretch, gyro + self._stretch_gyro
@@ -113,7 +112,7 @@ class Trial:
 
 
 def _named(ratio: float) -> Verdict:
-    """Return the fault of a gyro. `ratio` is the gyro's turn divided by the wheels' turn."""
+    """`ratio` is the gyro's turn divided by the wheels' turn."""
     least, most = TURN_RATIO_RANGE
     if DEGREES_RATIO_RANGE[0] <= abs(ratio) <= DEGREES_RATIO_RANGE[1]:
         return "in degrees"

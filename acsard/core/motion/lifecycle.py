@@ -322,11 +322,6 @@ class Lifecycle:
         )
 
     def _require_seen_stop(self, asked_ns: int) -> None:
-        """Raise `RefusedError` if the sender of a call `clear` may not know the latched stop.
-
-        Do nothing if no stop is latched. `asked_ns` is the monotonic time at which the call
-        arrived.
-        """
         stop = self.latches.stop
         if stop is None:
             return
@@ -339,14 +334,9 @@ class Lifecycle:
         self._require_seen(stop, self._stopped_ns, asked_ns, "srv/clear")
 
     def _require_seen(self, latch: Latch, set_ns: int, asked_ns: int, call: str) -> None:
-        """Raise `RefusedError` if `latch` is so new that the sender of the request may not know it.
+        """Raise `RefusedError` if the sender of the request may not know `latch` yet.
 
-        Args:
-            latch: the latch that the request would release.
-            set_ns: the monotonic time at which the latch was set; `LONG_AGO_NS` if an earlier run
-                set it.
-            asked_ns: the monotonic time at which the request arrived.
-            call: the service that the text of the error names.
+        `set_ns` is `LONG_AGO_NS` if an earlier run set the latch.
         """
         began_ns = LONG_AGO_NS if self._began_ns is None else self._began_ns
         since = asked_ns - max(set_ns, began_ns)
@@ -399,12 +389,10 @@ def _not_in_force(number: int, still: str, call: str) -> str:
 
 
 def _still(latch: Latch) -> str:
-    """Return all causes of a latch as words that complete "the robot is still ..."."""
     return " and ".join([_stopped(cause) for cause in latch.causes])
 
 
 def _stopped(latch: Latch) -> str:
-    """Return the newest cause of a latch as words that complete "the robot was ..."."""
     return latch.why if _asked_for(latch) else f"stopped ({latch.why})"
 
 

@@ -104,8 +104,7 @@ class Limiter:
     def _fitted(self, twist: Twist) -> Twist:
         """Return the next twist, changed so that no wheel exceeds its speed limit.
 
-        `twist` is the next twist within the limits of both axes. The result is between the present
-        twist and `twist` on each axis, so it is within these limits too.
+        On each axis, the result is between the present twist and `twist`.
         """
         kinematics, most, now = self._kinematics, self._wheel_speed, self.twist
         if kinematics.fits(twist, most):
@@ -151,7 +150,6 @@ class Limiter:
         return REST
 
     def _within_speed(self, wished: Twist) -> Twist:
-        """Return `wished`, scaled down to the speed limits. An axis with the limit 0 becomes 0."""
         linear = wished.linear if self._linear.speed else 0.0
         angular = wished.angular if self._angular.speed else 0.0
         scale = 1.0
@@ -173,10 +171,9 @@ def _braking(axis: _Axis, stop: bool) -> float:
 def _approach(
     speed: float, goal: float, slope: float, dt: float, axis: _Axis
 ) -> tuple[float, float]:
-    """Move the speed of one axis towards `goal` for `dt` s, within the limits of `axis`.
+    """Return the speed of one axis after `dt` s on the way to `goal`, and its acceleration.
 
-    Return a pair: the new speed, and the acceleration. `slope` is the acceleration in the previous
-    step. The units are m/s and m/s2 for the linear axis, and rad/s and rad/s2 for the angular axis.
+    `slope` is the acceleration in the previous step.
     """
     if dt <= 0.0:
         return speed, slope

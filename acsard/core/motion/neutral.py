@@ -258,11 +258,7 @@ class Sender:
                 self._ended = None
 
     def _tell_apart(self, zero: bool, now_ns: int, present: bool) -> None:
-        """Record since when the sender has sent only zeros, or only speeds.
-
-        `zero` is true if the command that arrives at `now_ns` is a zero. `present` is false if this
-        command ends a silence of the sender.
-        """
+        """`present` is false if this command ends a silence of the sender."""
         since_ns = self.zeros_ns if zero else self.speeds_ns
         if since_ns is None or not present:
             since_ns = now_ns
@@ -298,7 +294,6 @@ class Sender:
 
 
 def _later(mark: int | None, last: int | None) -> bool:
-    """Return whether `mark` is higher than `last`. Return False if one of the two is None."""
     return mark is not None and last is not None and mark > last
 
 

@@ -238,10 +238,7 @@ class Odometry:
         )
 
     def _settled(self, rolled: Rolled, at_rest: bool) -> tuple[Motors, ...]:
-        """Return the wheel angles by which to advance the pose, rad, one item for each arc.
-
-        Small motions at rest are not returned yet. They are kept in `_held`.
-        """
+        """Return the wheel angles of each arc, but keep small motions at rest in `_held`."""
         turned = rolled.turned
         if self._held != AT_REST:
             turned = plus(self._held, turned)
@@ -281,9 +278,7 @@ class Odometry:
     ) -> list[tuple[float, float]]:
         """Return the arcs that the robot drove, as pairs of distance (m) and turn (rad).
 
-        `pieces` contains the wheel angles, rad. If a gyro provides the turn, the result is one arc
-        for all pieces. Otherwise it is one arc for each piece, with an effective track of `share`
-        times the configured track.
+        `share` is the effective track divided by the configured track.
         """
         believed, kinematics = self.checks.wheels.believed, self._kinematics
         arcs = []
@@ -301,11 +296,7 @@ class Odometry:
         speeds: WheelSpeeds,
         slips: bool,
     ) -> float:
-        """Advance the pose by the angles of the wheels, and return the turn of the pose, rad.
-
-        `pieces` contains the angles, rad, one item for each arc. `turn` is the turn according to a
-        gyro; None if the wheels must provide the turn. `slips` is true if the wheels slip.
-        """
+        """Advance the pose, and return its turn, rad. `turn` is the turn according to a gyro."""
         path, turned = self._path, 0.0
         pose, variance = path.pose, None if turn is None else turn.variance
         for piece in pieces:
@@ -322,8 +313,7 @@ class Odometry:
     def _go_on(self, rolled: Rolled, feedback: Feedback, before: Twist, twist: Twist) -> None:
         """Add the uncertainty of a filled gap; without a gap, measure the robot's acceleration.
 
-        `before` and `twist` are the twists of the previous line and of this line. A gap that was
-        not filled restarts the measurement.
+        A gap that was not filled restarts the measurement.
         """
         bridged, doubtful = rolled.bridged, rolled.doubtful
         if bridged > 0.0:
@@ -349,11 +339,7 @@ class Odometry:
         return variances
 
     def _stand(self, seconds: float, before: Twist, after: Twist) -> None:
-        """Add the uncertainty of `seconds` s of unknown motion, but do not move the pose.
-
-        `before` and `after` are the twists before and after this time. If both are zero, the time
-        does not count as a gap in which the robot moved.
-        """
+        """Add the uncertainty of `seconds` s of unknown motion, but do not move the pose."""
         if before != REST or after != REST:
             self.gaps += 1
             self.unseen += seconds

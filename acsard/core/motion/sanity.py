@@ -129,30 +129,19 @@ class Sanity:
         return ""
 
     def _most(self, since: float, longest: float) -> float:
-        """Return the largest possible change of a wheel's speed within `since` s, rad/s.
-
-        `longest` is the longest time that one of the recent lines covers, s (see `_longest`).
-        """
         # Each speed is a mean over the time that its line covers. Therefore the change may have
         # lasted from the middle of one such time to the middle of the next.
         mean = (since + longest) / 2
         return self._settings.wheel_acceleration * (mean if mean > since else since) + SPEED_MARGIN
 
     def _agrees(self, line: Feedback, longest: float) -> bool:
-        """Return whether a feedback line agrees with one of the impossible lines in `_rejected`.
-
-        `longest` is the longest time that one of the recent lines covers, s (see `_longest`).
-        """
         return any(
             not self._jump(line, speeds, self._most(self._since - since, longest))
             for speeds, since in self._rejected
         )
 
     def _count(self, why: str) -> None:
-        """Count a feedback line, and set `warning` if too many lines of the window are impossible.
-
-        `why` is the reason why the line is impossible; "" for a possible line.
-        """
+        """`why` is the reason why a line is impossible; "" for a possible line."""
         self._lines += 1
         self.warning = None
         if why:
@@ -171,7 +160,6 @@ class Sanity:
         )
 
     def _too_fast(self, line: Feedback) -> str:
-        """Return why a wheel speed in this line is too high; "" if no speed is too high."""
         wheels, fastest = line.speeds.as_tuple(), self._settings.wheel_speed
         turned = _proven(line)
         for name, now, step, angle in zip(
@@ -190,10 +178,6 @@ class Sanity:
         return ""
 
     def _jump(self, line: Feedback, before: WheelSpeeds, most: float) -> str:
-        """Return why a wheel speed in this line differs too much from `before`; "" if none does.
-
-        The allowed difference is `most`, rad/s, plus the quantization of the speeds.
-        """
         least = line.count / MIN_INTERVAL_S if _proven(line) is not None else 0.0
         rows = zip(WHEELS, line.speeds.as_tuple(), before.as_tuple(), line.steps, strict=True)
         for name, now, then, step in rows:

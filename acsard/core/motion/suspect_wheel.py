@@ -65,8 +65,7 @@ FAULT_TEXTS: dict[WheelFault, str] = {
 class _Ballot:
     """Sums of angles over feedback lines, rad, to decide which of two wheels is wrong.
 
-    The sums are the angles that the suspect wheel and the other wheel rolled, and the lowest and
-    the highest angle that a healthy wheel can have rolled according to a reference.
+    `low` and `high` limit the angle of a healthy wheel according to a reference.
     """
 
     def __init__(self) -> None:
@@ -80,7 +79,6 @@ class _Ballot:
 
     @property
     def apart(self) -> float:
-        """Difference between the two wheels, rad."""
         return abs(self._own - self._other)
 
     @property
@@ -90,7 +88,6 @@ class _Ballot:
 
     @property
     def share(self) -> float:
-        """Difference between the two wheels, divided by the angle of the faster wheel."""
         return self.apart / (max(abs(self._own), abs(self._other)) or 1.0)
 
     def _off(self, turned: float) -> float:
@@ -134,7 +131,6 @@ class Suspect:
         return sign is not None
 
     def _sign(self, own: float, other: float, same: bool, count: float) -> WheelFault | None:
-        """Return the sign of a fault that this line shows, or None (arguments: see `looks`)."""
         if self.sign == "stuck" and same:
             return "stuck"
         if reverses(own, other, count) or (self.sign == "reversed" and own * other == 0.0):
@@ -192,10 +188,7 @@ class Suspect:
         return self.sign == "stuck" and not self._known and self._seconds >= STUCK_TIME_S
 
     def _plain(self, ballot: _Ballot) -> bool:
-        """Return whether the two wheels differ by more than slip of the other wheel can cause.
-
-        Only the sign "stuck" needs this test. For the other signs, the result is True.
-        """
+        """Return False if slip of the other wheel can explain the sign "stuck"."""
         return self.sign != "stuck" or ballot.share >= MIN_STUCK_FRACTION
 
 

@@ -93,11 +93,7 @@ class PoseUncertainty:
         self._stand_within(self._count)
 
     def _stand_within(self, angle: float) -> None:
-        """Set the `angle` of one encoder count, rad, and compute two effects of this angle.
-
-        The first effect is the dead band of the heading. The second effect is an uncertainty of the
-        pose, because the position of each wheel between two counts is unknown.
-        """
+        """Set the angle of a count, rad. The wheel positions between two counts are unknown."""
         self._count, count, track = angle, self._model.radius * angle, self._model.track
         self._play = count / track
         self._phase = (count**2 / 24 / 2, count**2 / 24 * 2 / track**2, 0.0)
@@ -201,7 +197,6 @@ class PoseUncertainty:
         self._publish()
 
     def _widen(self) -> int:
-        """Add a column of zeros to J for a further source of error, and return its index."""
         self._effects = (*self._effects, NO_EFFECT)
         self._columns = [*self._columns, ORIGIN]
         self._columns_before = [*self._columns_before, ORIGIN]
@@ -209,15 +204,11 @@ class PoseUncertainty:
         return len(self._columns) - 1
 
     def _forget_where(self, distance: float, turn: float) -> None:
-        """Make the whole pose unknown if the robot moves by `distance` m or turns by `turn` rad.
-
-        Call this only if the position or the heading is already unknown.
-        """
+        """Call this only if the position or the heading is already unknown."""
         if distance or turn:
             self.covariance = UNKNOWN_POSE
 
     def _beyond_play(self, turn: float) -> float:
-        """Return the part of `turn` that leaves the heading's dead band of one count, rad."""
         # On a straight drive, the encoder counts of both sides arrive at different times, so the
         # heading turns back and forth by one count. The sum of |dyaw| over all feedback lines would
         # count this as turning, and make the variance of yaw 2 to 4 times too large. The heading
@@ -234,11 +225,9 @@ class PoseUncertainty:
     def _bend(
         self, distance: float, turn: float, dx: float, dy: float, scale: float | None
     ) -> None:
-        """Update the matrix J of the parameters' effects after a step: J <- F J + G_p.
+        """Update the matrix J of the parameters' effects after an arc: J <- F J + G_p.
 
-        The step is an arc of `distance` m through `turn` rad, with the displacement `dx`, `dy` m in
-        odom. If a gyro measured the turn, `scale` is the relative standard deviation of the gyro's
-        scale. Otherwise it is None.
+        `scale` is the relative standard deviation of the gyro's scale, or None without a gyro.
         """
         c, s, more = self._cos, self._sin, 0.0
         columns: list[Vector] = []
@@ -296,7 +285,7 @@ class PoseUncertainty:
 
 
 def _capped(p: PoseCovariance) -> PoseCovariance:
-    """Return `p` with each variance limited to `MAX_VARIANCE`. Correlations do not change."""
+    """Limit the variances to `MAX_VARIANCE`. The correlations do not change."""
     x, y, yaw = (
         min(1.0, math.sqrt(MAX_VARIANCE / max(v, MAX_VARIANCE))) for v in (p.xx, p.yy, p.yawyaw)
     )

@@ -95,12 +95,10 @@ class _Side:
 
     @property
     def left_out(self) -> str:
-        """The name of the wheel that the pose ignores; "" if the pose uses both wheels."""
         return "" if self.out is None else WHEELS[self.wheels[self.out]]
 
     @property
     def text(self) -> str:
-        """A text about the ignored wheel or about slip on this side; "" if both wheels are fine."""
         if self.out is not None:
             return (
                 f"{self.left_out} wheel is left out of the pose: it {FAULT_TEXTS[self._fault]}; "
@@ -113,10 +111,6 @@ class _Side:
 
     @property
     def slow(self) -> list[str]:
-        """A text for each wheel that turns too slowly: its name and its speed in percent.
-
-        100 % is the expected speed. An ignored wheel is not included.
-        """
         return [
             f"{WHEELS[self.wheels[i]]} {witness.ratio:.0%}"
             for i, witness in enumerate(self.witnesses)
@@ -124,17 +118,12 @@ class _Side:
         ]
 
     def forget(self) -> None:
-        """Drop the evidence of faults. An ignored wheel stays ignored."""
         self._out_s = 0.0
         for part in (self.expected, *self.witnesses):
             part.forget()
 
     def watch(self, seen: Motors, dt: float, most: float, count: float, still: bool) -> bool:
-        """Compare both wheels with their command, and return whether one of them may be faulty.
-
-        `seen` contains the speeds of all wheels, rad/s. The other arguments are as in
-        `Witness.look`.
-        """
+        """Return whether a wheel may be faulty. The arguments are as in `Witness.look`."""
         i, j = self.wheels
         front, rear = self.witnesses
         bad = front.look(seen[i], self.expected, dt, most, count, still)
@@ -143,10 +132,6 @@ class _Side:
         return bad or self._out_s > 0.0
 
     def fault(self, seen: Motors, limit: float) -> str:
-        """Return a text about a wheel fault that has lasted longer than `limit` s, otherwise "".
-
-        `seen` contains the speeds of all wheels, rad/s.
-        """
         for i, witness in enumerate(self.witnesses):
             evidence = dict(witness.evidence)
             if i == self.out:
@@ -180,15 +165,10 @@ class _Side:
             self.out, self._out_s, self.residual.learns = None, 0.0, True
 
     def stands_still(self, turned: Motors, same: Same, dt: float, count: float) -> bool:
-        """Test both wheels for a stuck encoder, and return whether this line proves one stuck.
+        """Return whether this line proves an encoder stuck; the pose then ignores its wheel.
 
-        The pose then ignores the wheel with this encoder.
-
-        Args:
-            turned: the angles that all wheels rolled in the line, rad.
-            same: whether each wheel repeats the speed of the previous line.
-            dt: the time that the line covers, s.
-            count: the angle of an encoder count, rad.
+        `same` is whether each wheel repeats its previous speed. `count` is the angle of an encoder
+        count, rad.
         """
         if self.out is not None:
             return False
@@ -210,17 +190,10 @@ class _Side:
         count: float,
         by_gyro: float | None,
     ) -> bool:
-        """Process a feedback line in which the two wheels of this side contradict each other.
+        """Process a line in which the two wheels contradict each other.
 
-        Return whether this line has proved a wheel faulty, so that the pose now ignores this wheel.
-
-        Args:
-            turned: the angles that all wheels rolled in the line, rad.
-            same: whether the front and the rear wheel of this side repeat their speeds.
-            dt: the time that the line covers, s.
-            count: the angle of an encoder count, rad.
-            by_gyro: the angle that this side rolled according to a gyro, rad; None without a
-                trusted gyro.
+        Return whether the line proves a wheel faulty, so that the pose now ignores it. `by_gyro` is
+        the angle that this side rolled according to a gyro, rad.
         """
         self._agreed_s, fault = 0.0, None if self.out is None else self._fault
         if self.out is not None and self.expected.clear:
@@ -253,10 +226,7 @@ class _Side:
         return False
 
     def was_faulty(self, before: WheelSpeeds, now: WheelSpeeds) -> bool:
-        """Return whether the ignored wheel may already have been wrong in an earlier line.
-
-        `before` contains the wheel speeds in that line, and `now` those in the last line.
-        """
+        """Return whether the ignored wheel may have been wrong already at the speeds `before`."""
         if self.out is None:
             return False
         own, other = self.wheels[self.out], self.wheels[1 - self.out]
@@ -391,10 +361,6 @@ class WheelFaults:
         return right.fault(speeds, limit) or left.fault(speeds, limit)
 
     def _notice(self, speeds: Motors, dt: float, still: bool) -> None:
-        """Set `pushed` if wheels that were at rest turn without a command.
-
-        Set it at most once per `REPEATED_S`.
-        """
         fastest = 0.0
         if still:
             fastest = max([
@@ -466,7 +432,6 @@ class WheelFaults:
         return self._found is not None
 
     def _standing(self, turned: Motors, same: Same, dt: float) -> _Side | None:
-        """Return the side on which this feedback line proves an encoder stuck, or None."""
         left = self._left.stands_still(turned, same, dt, self._count)
         right = self._right.stands_still(turned, same, dt, self._count)
         return self._right if right else self._left if left else None
@@ -489,11 +454,7 @@ class WheelFaults:
         return self._found is not None and self._found.was_faulty(before, self._last)
 
     def _seek(self, speeds: WheelSpeeds, dt: float) -> None:
-        """Learn the angle of an encoder count: the smallest wheel angle that occurs repeatedly.
-
-        `speeds` contains the wheel speeds in a feedback line that covers `dt` s. See `RECUR` and
-        `SOUGHT`.
-        """
+        """Learn the angle of a count: the smallest angle that recurs (`RECUR`, `SOUGHT`)."""
         self._period += PERIOD_GAIN * (dt - self._period)
         self._looked += 1
         if self._looked > SOUGHT:
@@ -506,10 +467,9 @@ class WheelFaults:
                 self._seeking = self._count > FINEST
 
     def _by_gyro(self, i: int, turned: Motors, turn: float) -> float:
-        """Return the angle that a side rolled, computed from the gyro and from the other side, rad.
+        """Return the angle of the left (0) or right (1) side by the gyro and the other side, rad.
 
-        `i` is 0 for the left side and 1 for the right side. The wheels of the other side must agree
-        with each other. `turn` is the turn according to the gyro, rad.
+        The wheels of the other side must agree with each other.
         """
         front_right, front_left, rear_left, rear_right = turned
         return self._kinematics.opposite(

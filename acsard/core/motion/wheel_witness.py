@@ -157,10 +157,7 @@ class Witness:
         self.driven = self.driven and not self._rests(seen, dt, count)
 
     def _rests(self, seen: float, dt: float, count: float) -> bool:
-        """Return whether the wheel is certainly not faster than `MIN_FAULT_SPEED`.
-
-        The arguments are as in `look`.
-        """
+        """Return whether the wheel is certainly not faster than `MIN_FAULT_SPEED`."""
         # An encoder with few counts often reports 0 although the wheel turns. Therefore the
         # reported speed must stay low for the time of one count at the speed `MIN_FAULT_SPEED`.
         self._rested_s = 0.0 if abs(seen) > MIN_FAULT_SPEED else self._rested_s + dt

@@ -145,7 +145,6 @@ def _fields(name: str) -> str:
 
 
 def _short(kind: str) -> str:
-    """Return the form of a type name in message definitions: `pkg/Type` for `pkg/msg/Type`."""
     return re.sub("/msg/", "/", kind)
 
 

@@ -120,8 +120,8 @@ SOURCES = {
 """Maps each ROS topic that commands the robot to the name of its command source."""
 
 URDF_TOPIC = RosName(DESCRIPTION, DESCRIPTION, "out", "std_msgs/msg/String", Qos(1, transient=True))
-"""The topic of the robot's URDF_TOPIC. It is not in `PUBLISHED`, because the topics in `PUBLISHED`
-are recorded and the URDF_TOPIC is not."""
+"""The topic of the robot's URDF. It is not in `PUBLISHED`, because the topics in `PUBLISHED`
+are recorded and the URDF is not."""
 
 SPEED_LIMIT_TOPIC = RosName(SPEED_LIMIT, SPEED_LIMIT, "in", "nav2_msgs/msg/SpeedLimit")
 """Subscription to the speed limits of Nav2's speed filter."""
@@ -246,11 +246,7 @@ def _node(ros: RosConfig, zid: str) -> Node:
 
 
 def _bridge(ros: RosConfig, zid: str, names: tuple[RosName, ...]) -> Iterator[Endpoint]:
-    """Yield one endpoint of the transport "bridge" for each ROS name.
-
-    The endpoint of a topic with two types is not announced, because a DDS reader has only one
-    type.
-    """
+    """Announce no topic with two types, because a DDS reader has only one type."""
     for row in names:
         twins = [other for other in names if other.name == row.name]
         if row is not twins[0]:

@@ -292,11 +292,9 @@ class FakeMcu(Faults):
         self._schedule(self._out_free_ns, "sent", data)
 
     def _handed_over(self, now_ns: int, what: str, data: bytes) -> bytes:
-        """Return the bytes that the USB adapter passes to the host at the time `now_ns`.
+        """Return the bytes that the USB adapter passes to the host; b"" during a stall.
 
-        `what` is "batch" if the timer of the adapter has expired. It is "sent" if the bytes `data`
-        of the board have arrived at the adapter. During a stall, return b"" and schedule the same
-        call for the end of the stall.
+        `what` is "batch" if its timer has expired, or "sent" if `data` has arrived from the board.
         """
         until_ns = self._stalled_until(now_ns)
         if until_ns > now_ns:
@@ -321,10 +319,6 @@ class FakeMcu(Faults):
         return self._seen
 
     def _speeds(self, now_ns: int) -> list[float]:
-        """Return the mean speeds of the motors a to d since the last computation, rad/s.
-
-        If the last computation is less than `MIN_WINDOW_NS` old, return its speeds again.
-        """
         since, before = self._window
         gains = self.gains
         if self.stuck is not None:
@@ -374,7 +368,6 @@ class FakeMcu(Faults):
             self._send(now_ns, self._damaged(protocol.status(fields, self._checks)))
 
     def _tell_battery(self, now_ns: int) -> None:
-        """Drain the battery for the time since the last call, and report it in a status line."""
         seconds, self._drained_ns = (now_ns - self._drained_ns) / NS_PER_S, now_ns
         turning = sum(map(abs, self.vehicle.set_points))
         if not turning:
@@ -501,10 +494,7 @@ class FakeMcu(Faults):
 
 
 def _wiring(wheels: WheelMap) -> list[tuple[int, int]]:
-    """Return a pair for each of the motors a to d: the index of its wheel in `WHEELS`, and a sign.
-
-    The sign is -1 if the motor is reversed, else 1.
-    """
+    """Return the index in `WHEELS` and the sign for each of the motors a to d."""
     motors = (wheels.front_right, wheels.front_left, wheels.rear_left, wheels.rear_right)
     place = {motor[1]: (index, -1 if motor[0] == "-" else 1) for index, motor in enumerate(motors)}
     return [place[letter] for letter in "abcd"]

@@ -76,10 +76,7 @@ class Faults:
             self._turn(before)
 
     def _turn(self, values: dict[str, object]) -> None:
-        """Set the switches in `values`.
-
-        Before that, simulate the vehicle up to now with the old switches.
-        """
+        # The old switches were in force until now.
         self._catch_up()
         for name, value in values.items():
             setattr(self, name, value)
@@ -88,10 +85,7 @@ class Faults:
         """Simulate the vehicle up to now. `FakeMcu` implements this."""
 
     def _hit(self, what: str, every: int) -> bool:
-        """Count an event of the kind `what`. Return True for every n-th event, where n is `every`.
-
-        The kinds are "reply", "command" and "bit". If `every` is 0, always return False.
-        """
+        """Count an event. Return True for every n-th event, where n is `every`."""
         self._passed[what] += 1
         return every > 0 and self._passed[what] % every == 0
 
@@ -259,7 +253,6 @@ class Faults:
         return self._with(stall_every_ns=int(every_s * NS_PER_S), stall_ns=int(length_s * NS_PER_S))
 
     def _stalled_until(self, now_ns: int) -> int:
-        """Return the end of the present stall, ns. Outside a stall, return `now_ns`."""
         if not self.stall_every_ns:
             return now_ns
         began_ns = now_ns // self.stall_every_ns * self.stall_every_ns

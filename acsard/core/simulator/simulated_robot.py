@@ -74,10 +74,6 @@ class WatchedMcu(FakeMcu):
         self._see(Sight(now_ns, self.vehicle.pose, rate))
 
     def _turned(self, at_ns: int) -> float:
-        """Return the angle by which the robot had turned at the time `at_ns`, rad.
-
-        If `at_ns` is outside the history, return the angle at the nearer end of the history.
-        """
         before_ns, before = self._history[0]
         if at_ns <= before_ns:
             return before

@@ -163,8 +163,7 @@ class _Keys:
     def of(self, role: Role, use: Use) -> list[str]:
         """Return the keys for which `role` is the lowest role with the permission `use`.
 
-        The result contains native keys and ROS keys, without wildcards. It does not contain the
-        command keys that end with a certificate's name, which `commands_by` returns.
+        Command keys that end with a certificate's name are in `commands_by` only.
         """
         rows = self._incoming if use == "publish" else self._readable
         keys = [full_key(self._robot, key) for key in keys_for(role, use, rows)]
@@ -173,24 +172,21 @@ class _Keys:
     def commands_by(self, certificate: str) -> list[str]:
         """Return the command keys of all sources for one certificate.
 
-        Args:
-            certificate: the common name of the certificate. For "*", the result is key expressions
-                that match the command keys of all certificates. A router needs these key
-                expressions, because it forwards the commands of every client.
+        For "*", return key expressions that match every certificate: a router forwards the commands
+        of every client.
         """
         return [full_key(self._robot, key) for key in source_keys(self._sources, certificate)]
 
     def _least(self, endpoint: Endpoint) -> Role | None:
         """Return the lowest role that may use a ROS endpoint.
 
-        Return None for the commands of a source that is not configured. A ROS key cannot contain a
-        certificate's name, so each role that may command may use the ROS command keys of all
-        configured sources. Raises `LookupError` if the endpoint's native key is not in the table of
-        keys.
+        Return None for the commands of a source that is not configured.
         """
         native = endpoint.native
         if native.startswith(PARAMETERS_PREFIX):
             return least_role("config")
+        # A ROS key cannot contain a certificate's name, so each role that may command may use the
+        # ROS command keys of all configured sources.
         if native.startswith(tuple(f"{kind}/" for kind in COMMANDS)):
             return COMMAND_ROLE if native.rpartition("/")[2] in self._sources else None
         if row_of(native) is None:
@@ -230,9 +226,8 @@ def gateway_access(config: Config) -> dict[str, object]:
 def _access(config: Config, local: tuple[str, ...], *, gateway: bool) -> dict[str, object]:
     """Return the value of Zenoh's setting `access_control` for one session.
 
-    `local` contains the names of the rules for links without a certificate. `gateway` is true for
-    the session of the TLS gateway, and false for the daemon's. Only the gateway limits each
-    certificate to the command keys of this certificate.
+    `local` contains the names of the rules for links without a certificate. Only the session of the
+    TLS gateway limits each certificate to its own command keys.
     """
     keys = _Keys(config)
     rules = _rules(keys)

@@ -15,7 +15,7 @@ from acsard.host.errors import UsageError
 
 
 class Address(NamedTuple):
-    """The address of a robot for a client: its endpoint, its id, and the client's TLS_PREFIX
+    """The address of a robot for a client: its endpoint, its id, and the client's TLS
     directory."""
 
     endpoint: str

@@ -144,10 +144,9 @@ class ZenohBus:
         return session
 
     def _conflict(self, tokens: set[str]) -> str:
-        """Return an error message if another daemon has this robot's id or ROS names, else "".
+        """Return an error message, or "".
 
-        `tokens` contains the liveliness tokens of this robot that other sessions have declared
-        (`_others`).
+        `tokens` are the tokens of this robot from other sessions.
         """
         if self._alive in tokens:
             return (
@@ -186,14 +185,11 @@ class ZenohBus:
             self._declare_json(session, topic)
 
     def _declare_json(self, session: zenoh.Session, topic: Topic) -> None:
-        """Declare the JSON key of a topic, for clients without msgpack.
-
-        The publisher on this key is never latched, because a latched publisher must encode every
-        message even without subscribers. A late subscriber can query the key for the newest message
-        instead.
-        """
+        """Declare the JSON key of a topic, for clients without msgpack."""
         below = json_key(topic.key)
         key, encoding = full_key(self._id, below), encoding_name("json", topic.type)
+        # The publisher is not latched: a latched publisher encodes every message even without
+        # subscribers. A late subscriber can query the key for the newest message instead.
         self._outlets.declare(session, topic.key, key, "json", encoding)
         on_query = direct(partial(self._inbox.on_query, below))
         self._kept.append(session.declare_queryable(key, on_query))

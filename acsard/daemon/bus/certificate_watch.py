@@ -28,7 +28,7 @@ Signature = tuple[tuple[int, int, int], ...]
 
 
 class CertificateFiles:
-    """The three TLS_PREFIX files of a process that listens: authority, certificate and key.
+    """The three TLS files of a process that listens: authority, certificate and key.
 
     `renewed` detects that they were replaced.
     """
@@ -105,7 +105,7 @@ async def watch_certificates(bus: BusConfig, known: MutableMapping[str, int]) ->
     cancelled.
 
     If a certificate cannot be read, its value stays unchanged. If `bus.outside` names endpoints,
-    the value of the robot's own certificate is not updated, because the TLS_PREFIX gateway reports
+    the value of the robot's own certificate is not updated, because the TLS gateway reports
     it.
 
     Args:
@@ -127,7 +127,7 @@ async def watch_certificates(bus: BusConfig, known: MutableMapping[str, int]) ->
         except NoThreadError:
             pass  # the next round tries again
         if bus.outside:
-            # The TLS_PREFIX gateway reports the certificate that it uses.
+            # The TLS gateway reports the certificate that it uses.
             found.pop("", None)
         known.update(found)
         look += 1

@@ -277,11 +277,6 @@ class Inbox:
             self._buffer(key).put(arrival)
 
     def _buffer(self, key: str) -> Mailbox[Arrival]:
-        """Return the buffer for the samples of a key.
-
-        All certificates of one source share a buffer. All keys of unknown sources share another
-        one.
-        """
         buffer = self._arrivals.get(key)
         if buffer is None:
             buffer = self._arrivals.get(
@@ -363,10 +358,7 @@ class Inbox:
 
 
 def _bytes(payload: zenoh.ZBytes | None, most: int) -> bytes:
-    """Return the first `most` + 1 bytes of the payload.
-
-    If the result is longer than `most`, the payload is too long.
-    """
+    """Return at most `most` + 1 bytes: the extra byte shows that the payload is too long."""
     return b"" if payload is None else payload.to_bytes()[: most + 1]
 
 

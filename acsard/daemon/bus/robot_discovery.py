@@ -1,7 +1,7 @@
 """Finds, follows or stops the robots that an `--id` names, and explains why a robot is silent.
 
-Over TLS_PREFIX the access rules allow only exact keys, because a few wildcards can take all the
-processor time of a router. So a client over TLS_PREFIX must name each robot.
+Over TLS the access rules allow only exact keys, because a few wildcards can take all the
+processor time of a router. So a client over TLS must name each robot.
 """
 
 from __future__ import annotations
@@ -153,7 +153,7 @@ class Presence(Struct, frozen=True):
     """True if the requested robot is present."""
     others: tuple[str, ...] = ()
     """The ids of the other visible robots if the requested robot is absent, else (). Over
-    TLS_PREFIX, a client sees other robots only if `access.wildcards` is set."""
+    TLS, a client sees other robots only if `access.wildcards` is set."""
 
 
 def explain_silence(key: str, robot_id: str, endpoint: str, presence: Presence) -> str:

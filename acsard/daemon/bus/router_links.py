@@ -104,7 +104,7 @@ def unreached(mode: str, endpoints: tuple[str, ...], ends: set[str]) -> tuple[st
 def _leads_there(endpoint: str, ends: set[str]) -> bool:
     """Return whether a link leads to the endpoint. May block in a name lookup.
 
-    `ends` contains the address at the far end of each link, such as "tcp/192.168.0.2:7447".
+    `ends` contains far ends of links, such as "tcp/192.168.0.2:7447".
     """
     bare = endpoint.partition("?")[0].partition("#")[0]
     protocol, _, address = bare.partition("/")

@@ -1,7 +1,7 @@
-"""Checks and reads the certificate files, and explains why a TLS_PREFIX endpoint cannot be reached.
+"""Checks and reads the certificate files, and explains why a TLS endpoint cannot be reached.
 
 Zenoh reports the same error for every cause. `trouble` therefore repeats the connection step by
-step with Python's own TLS_PREFIX, and returns a message for each cause. This module needs a library
+step with Python's own TLS, and returns a message for each cause. This module needs a library
 from the optional extra `tls` only to read the expiry times of certificates.
 """
 
@@ -21,12 +21,12 @@ from acsard.core.values import NS_PER_S
 from acsard.host.errors import CertificateError, NotPermittedError
 
 CA, CERTIFICATE, KEY = "ca.pem", "certificate.pem", "key.pem"
-"""File names in a TLS_PREFIX directory: the certificate of the authority, the certificate of the
+"""File names in a TLS directory: the certificate of the authority, the certificate of the
 directory's owner, and the owner's private key."""
 
 
 def require_usable(directory: str) -> None:
-    """Check that the files of a TLS_PREFIX directory can be read and belong together.
+    """Check that the files of a TLS directory can be read and belong together.
 
     Raises `CertificateError` for a missing or unusable file, and `NotPermittedError` for a file
     that this user may not read. The error's message says how to fix the problem.
@@ -60,7 +60,7 @@ def require_usable(directory: str) -> None:
 
 
 def files_in(directory: str) -> tuple[Path, Path, Path]:
-    """Return the paths of the three files in a TLS_PREFIX directory: authority, certificate and
+    """Return the paths of the three files in a TLS directory: authority, certificate and
     key."""
     return Path(directory, CA), Path(directory, CERTIFICATE), Path(directory, KEY)
 
@@ -91,7 +91,7 @@ def shown_at(endpoint: str, directory: str) -> str:
     """Return the common name of the certificate that this client shows to an endpoint.
 
     Return "" if the endpoint needs no certificate, or if the certificate cannot be read.
-    `directory` is the TLS_PREFIX directory of the client, or "".
+    `directory` is the TLS directory of the client, or "".
     """
     return common_name(directory) if directory and endpoint.startswith(TLS_PREFIX) else ""
 
@@ -103,10 +103,7 @@ def names_in(directory: str) -> list[str]:
 
 
 def _plain(name: str) -> str:
-    """Return an IP address in its short form. Return any other name unchanged.
-
-    `ssl` writes an IPv6 address with all its zeros.
-    """
+    """Shorten an IPv6 address, because `ssl` writes it with all its zeros."""
     try:
         return str(ipaddress.ip_address(name))
     except ValueError:
@@ -114,11 +111,9 @@ def _plain(name: str) -> str:
 
 
 def _decoded(directory: str) -> dict[str, Any]:
-    """Return the decoded certificate in `directory`, or {} if it cannot be read.
-
-    The standard library decodes only the certificate of a connected peer. So this function connects
-    a TLS_PREFIX client and a TLS_PREFIX server in memory, both of which use this certificate.
-    """
+    """Return the decoded certificate in `directory`, or {} if it cannot be read."""
+    # The standard library decodes only the certificate of a connected peer. So connect a client and
+    # a server in memory, both of which use this certificate.
     server_context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     server_context.verify_mode = ssl.CERT_REQUIRED
     # Accept an expired certificate, because its name is needed to say how to replace it.
@@ -146,7 +141,7 @@ AUTHORITY = "the authority"
 
 
 def ends(directory: str) -> dict[str, int]:
-    """Return the expiry times of the certificates in a TLS_PREFIX directory, ns since 1970.
+    """Return the expiry times of the certificates in a TLS directory, ns since 1970.
 
     In the returned dict, the key "" stands for `certificate.pem`, and `AUTHORITY` for `ca.pem`.
     Return {} if a file cannot be read, or if the library `cryptography` is missing.
@@ -167,7 +162,7 @@ def ends(directory: str) -> dict[str, int]:
 
 
 def peer_ends_ns(endpoint: str, directory: str) -> int | None:
-    """Return the expiry time of the certificate that a TLS_PREFIX endpoint uses, ns since 1970.
+    """Return the expiry time of the certificate that a TLS endpoint uses, ns since 1970.
 
     The certificate is not verified, so the function also works if the certificate has expired.
     Return None if no program answers at the endpoint, or if the library `cryptography` is missing.
@@ -175,7 +170,7 @@ def peer_ends_ns(endpoint: str, directory: str) -> int | None:
 
     Args:
         endpoint: the endpoint, such as "tls/robot.local:7449".
-        directory: the TLS_PREFIX directory of this machine, whose certificate the program may
+        directory: the TLS directory of this machine, whose certificate the program may
             require.
     """
     try:
@@ -194,10 +189,6 @@ def peer_ends_ns(endpoint: str, directory: str) -> int | None:
 
 
 def _trusting(directory: str) -> ssl.SSLContext:
-    """Return a TLS_PREFIX client context that accepts any certificate of the server.
-
-    The client shows the certificate in `directory` to the server.
-    """
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
     _load(context, directory)
@@ -209,7 +200,7 @@ def _load(context: ssl.SSLContext, directory: str) -> None:
 
 
 def _ends_ns(certificate: Any) -> int:
-    """Return the expiry time of a certificate (an object of `cryptography`), ns since 1970."""
+    """Return the expiry time of a certificate, which is an object of `cryptography`."""
     return int(certificate.not_valid_after_utc.timestamp()) * NS_PER_S
 
 
@@ -226,10 +217,10 @@ def _place(endpoint: str) -> tuple[str, str]:
 
 HANDSHAKE_TIMEOUT_S = 2.0
 """Longest wait for the server to accept the TCP connection, s. It is also the longest wait for each
-answer of the server in the TLS_PREFIX handshake."""
+answer of the server in the TLS handshake."""
 
 REFUSAL_WAIT_S = 0.5
-"""Time for which this client waits after the TLS_PREFIX handshake, s. If the server rejects the
+"""Time for which this client waits after the TLS handshake, s. If the server rejects the
 client's certificate, it reports that within this time. If the server accepts it, the server sends
 nothing."""
 
@@ -252,10 +243,10 @@ RENEW_ADVICE = (
 
 
 def trouble(endpoint: str, directory: str) -> str:
-    """Return the reason why this machine cannot connect to a TLS_PREFIX endpoint, and how to fix
+    """Return the reason why this machine cannot connect to a TLS endpoint, and how to fix
     that.
 
-    Return "" if the connection succeeds. `directory` is the TLS_PREFIX directory of the client.
+    Return "" if the connection succeeds. `directory` is the TLS directory of the client.
     Blocks for a few seconds at most.
     """
     host, port = _place(endpoint)
@@ -309,10 +300,6 @@ def _tls_trouble(plain: socket.socket, host: str, directory: str) -> str:
 
 
 def _server_rejected(error: ssl.SSLCertVerificationError, host: str, directory: str) -> str:
-    """Return the message for a server whose certificate this client does not accept.
-
-    `directory` is the TLS_PREFIX directory of the client, with the certificate of its authority.
-    """
     now = time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime())
     reason = error.verify_message
     match error.verify_code:
@@ -352,11 +339,7 @@ def _server_rejected(error: ssl.SSLCertVerificationError, host: str, directory: 
 
 
 def _client_rejected(reason: str, host: str, directory: str) -> str:
-    """Return the message for a server that does not accept the client's certificate.
-
-    `reason` is OpenSSL's name of the TLS_PREFIX alert that the server sent. `directory` is the
-    TLS_PREFIX directory of the client.
-    """
+    """Return an error message; `reason` is OpenSSL's name of the alert that the server sent."""
     certificate = f"{directory}/{CERTIFICATE}"
     if "CERTIFICATE_EXPIRED" in reason:
         return (

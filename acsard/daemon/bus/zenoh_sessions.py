@@ -1,4 +1,4 @@
-"""Opens the Zenoh sessions of the daemon, of the TLS_PREFIX gateway and of the client tools.
+"""Opens the Zenoh sessions of the daemon, of the TLS gateway and of the client tools.
 
 This module contains all settings of these sessions, each with its reason.
 """
@@ -32,12 +32,12 @@ from acsard.host.terminal_modes import coloured
 COMMAND_RATE_HZ = 1000.0
 """Largest number of commands per second that a session accepts on each key. The limit is high
 enough for a zero command 1 ms after another command. It is low enough that a flood of commands does
-not make the daemon miss a control period. The TLS_PREFIX gateway also applies this limit to stops.
+not make the daemon miss a control period. The TLS gateway also applies this limit to stops.
 If it drops a stop, it has passed another stop less than a millisecond before, so the robot stops
 anyway."""
 
 MAX_SESSIONS = 256
-"""Largest number of connections of the daemon's session, and of the TLS_PREFIX gateway's
+"""Largest number of connections of the daemon's session, and of the TLS gateway's
 session."""
 
 MAX_MESSAGE_BYTES = 65536
@@ -69,7 +69,7 @@ def daemon_session(config: Config) -> zenoh.Session:
 
 
 def gateway_session(config: Config) -> zenoh.Session:
-    """Open the session of the TLS_PREFIX gateway, which is a Zenoh router.
+    """Open the session of the TLS gateway, which is a Zenoh router.
 
     Raises `CertificateError` if Zenoh refuses the certificate files. Raises `InUseError` if the
     session cannot listen for another reason, for example on an address that is in use.
@@ -148,10 +148,7 @@ RETRY_SETTINGS = {"connect/timeout_ms": -1, "connect/exit_on_failure": False}
 
 
 def _listening() -> dict[str, object]:
-    """Return settings that protect a listening session against faulty clients.
-
-    Such clients send nothing, send too much, or do not read.
-    """
+    """Protect a listening session from clients that send nothing, send too much, or do not read."""
     return {
         "transport/link/rx/max_message_size": MAX_MESSAGE_BYTES,
         "transport/unicast/accept_timeout": 1000,
@@ -190,7 +187,7 @@ def client_session(endpoint: str, tls: str = "") -> zenoh.Session:
 
     Args:
         endpoint: the endpoint, such as "tcp/127.0.0.1:7448".
-        tls: the directory with the client's certificate. Only a TLS_PREFIX endpoint, such as
+        tls: the directory with the client's certificate. Only a TLS endpoint, such as
             "tls/robot.local:7449", needs it.
 
     Raises:
@@ -250,10 +247,6 @@ def _base(mode: str) -> dict[str, object]:
 
 
 def _tls(directory: str) -> dict[str, object]:
-    """Return Zenoh's TLS_PREFIX settings for the certificate files in `directory`.
-
-    With these settings, a link closes when the certificate at either end of the link expires.
-    """
     certificate, key = f"{directory}/{CERTIFICATE}", f"{directory}/{KEY}"
     return {
         "transport/link/tls": {
@@ -269,14 +262,9 @@ def _tls(directory: str) -> dict[str, object]:
 
 
 def _command_limits(config: Config) -> dict[str, object]:
-    """Return the Zenoh setting that limits the rate of the messages that clients put on input keys.
+    """Limit the rate of messages on input keys. Zenoh counts each connection separately.
 
-    Clients put three kinds of messages on these keys: velocity commands, gyro samples, and messages
-    that lower the robot's highest speed (`SPEED_LIMIT`). The limit covers native and ROS keys.
-
-    Zenoh counts the messages of each connection separately. On each command key of a configured
-    source, all certificates share one limit. All sources that are not configured share one limit
-    too.
+    All certificates of a source share one limit. So do all sources that are not configured.
     """
     names = [*(source.name for source in config.commands.sources), "*"]
     below = [*source_keys(names), *source_keys(names, "*"), IMU, SPEED_LIMIT]

@@ -5,8 +5,8 @@ certificate can still make a router hang with requests that the rules allow. Thi
 that it hangs, and restarts within 2 s (`listener_process.py`).
 
 The template `deploy/zenoh/router.json5` is for one robot. `router_file` repeats the template's
-lines between the marks ROBOT and END for each robot. It repeats the lines between EXAMPLE_OPERATOR
-and END EXAMPLE_OPERATOR for each certificate that may command.
+lines between the marks ROBOT and END for each robot. It repeats the lines between PERSON
+and END PERSON for each certificate that may command.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _BLOCK = re.compile(r"^ *// ROBOT\n(.*?)^ *// END\n", re.M | re.S)
 _NAME = re.compile(rf"\b{EXAMPLE_ROBOT}\b")
 
 EXAMPLE_OPERATOR: Role = "operator"
-"""Example name in the template's lines between EXAMPLE_OPERATOR and END EXAMPLE_OPERATOR. It is
+"""Example name in the template's lines between PERSON and END PERSON. It is
 replaced by the common name of each certificate that may command."""
 
 _PERSONS = re.compile(r"^ *// PERSON\n(.*?)^ *// END PERSON\n", re.M | re.S)
@@ -190,7 +190,7 @@ class Router(Listener):
             ) from error
 
     def _opens_elsewhere(self) -> bool:
-        """Return whether Zenoh opens a session with free loopback ports in place of the addresses.
+        """Return whether Zenoh opens a session with free loopback ports.
 
         If so, only the addresses in the file are wrong. Zenoh's own error does not show this.
         """
@@ -206,10 +206,6 @@ class Router(Listener):
         return True
 
     def _certificate_files(self) -> CertificateFiles | None:
-        """Return the certificate files that the router's file names, or None.
-
-        The result is None unless the router's file names all three of them.
-        """
         tls = json.loads(self._config.get_json("transport/link/tls")) or {}
         named = [Path(tls[name]) for name in CERTIFICATE_FILES if tls.get(name)]
         return CertificateFiles(*named) if len(named) == len(CERTIFICATE_FILES) else None

@@ -261,10 +261,7 @@ class ListenerProcess:
         return Exit.OK
 
     def _renewed(self) -> bool:
-        """Return whether the process must restart to use a new certificate.
-
-        If there is a new certificate that cannot be used, log the reason and return False.
-        """
+        """Return whether the process must restart to use a new certificate."""
         files = self._listener.files
         if files is None or not files.renewed():
             return False
@@ -281,8 +278,7 @@ class ListenerProcess:
         self._leaving = True
 
     def _wait(self) -> bool:
-        """Send signs of life, wait for `CHECK_PERIOD_S`, and return whether the process must
-        end."""
+        """Wait for `CHECK_PERIOD_S`, and return whether the process must end."""
         self._manager.alive()
         parent = self._parent
         if parent is None:
@@ -318,7 +314,6 @@ class ListenerProcess:
 
 
 def _confine() -> None:
-    """Limit the memory and lower the priority of this process, as far as the system permits it."""
     with contextlib.suppress(OSError, ValueError):
         resource.setrlimit(resource.RLIMIT_DATA, (MAX_MEMORY_BYTES, MAX_MEMORY_BYTES))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))

@@ -33,10 +33,6 @@ class _Device(serial.Serial):  # type: ignore[misc]
     """A port whose `read` makes one system call and never waits."""
 
     def read(self, size: int = 1) -> bytes:
-        """Return up to `size` bytes without waiting; b"" if no bytes have arrived.
-
-        Raises `SerialException` if the port is lost.
-        """
         if self.fd is None:
             raise serial.PortNotOpenError
         try:

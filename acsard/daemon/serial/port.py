@@ -233,10 +233,7 @@ class SerialPort:
         self._wake()
 
     def _leave(self, error: BaseException | None) -> None:
-        """Close the port and discard unsent bytes.
-
-        `error` is the reason if the port was lost, or None at the end of the daemon.
-        """
+        """Close the port and discard unsent bytes. `error` is None at the end of the daemon."""
         if not self.is_open:
             return
         self.is_open = False

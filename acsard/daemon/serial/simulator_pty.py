@@ -113,10 +113,7 @@ class SimPty:
         termios.tcsetattr(self._end.slave, termios.TCSANOW, attributes)
 
     def _speed(self) -> int:
-        """Return the baud rate that the host has set on the pty.
-
-        If acsard does not support that rate, return the board's baud rate.
-        """
+        """Return the baud rate that the host has set on the pty, if acsard supports it."""
         return _RATES.get(termios.tcgetattr(self._end.slave)[5], self.mcu.baud_rate)
 
     def _advance(self) -> None:
