@@ -89,8 +89,7 @@ def _too_large(path: str) -> ExitError:
     return _error(
         path,
         f"it has more than {MAX_BYTES} bytes, or more than {MAX_JSON_BYTES} as JSON, which is too "
-        f"long "
-        "for a message on the bus; shorten the URDF, or let robot_state_publisher publish it",
+        "long for a message on the bus; shorten the URDF, or let robot_state_publisher publish it",
     )
 
 

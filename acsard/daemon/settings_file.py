@@ -348,8 +348,7 @@ def _overdue(pending: _Pending) -> Answer:
     """Answer a request that took too long, or that exceeded the limit `MAX_JOBS`."""
     why = (
         f"the disk did not answer within {REPLY_TIMEOUT_NS / NS_PER_S:g} s, or too many changes "
-        f"came at "
-        "once"
+        "came at once"
     )
     answer = pending.answer
     text = f"nothing is set: {why}"

@@ -63,8 +63,7 @@ def edited_apart(text: str, keys: Mapping[str, object]) -> str:
     except subprocess.TimeoutExpired:
         text = (
             f"the robot's computer was too busy to make the change within {EDIT_TIMEOUT_S:g} s: "
-            f"type the "
-            "command again"
+            "type the command again"
         )
         raise MendableError(text) from None
     try:

@@ -337,8 +337,7 @@ class TimeFigures:
         if furthest:
             caption += (
                 " A triangle marks a commanded speed that is too large for the picture; the "
-                "largest of these is "
-                f"{' and '.join(furthest)}."
+                f"largest of these is {' and '.join(furthest)}."
             )
         return self._stack("speeds", "Speed", caption, parts, 210)
 

@@ -240,8 +240,7 @@ class Admission:
         if fast and not (row and row.waits):
             text = (
                 f"more than {REQUEST_RATE.hz:g} requests a second with one token: use the "
-                f"WebSocket "
-                "/ws, which sends each change"
+                "WebSocket /ws, which sends each change"
             )
             raise RefusedError("too_fast", text)
         if row is not None and row.least is not None:

@@ -56,13 +56,11 @@ MAX_CHILD_MEMORY = 256 << 20
 
 TOO_LONG = (
     f"the drawing takes longer than {DRAW_TIMEOUT_S / 60:.0f} min here: fetch the recording, and "
-    f"draw its "
-    "report on a faster machine with acsard recording report"
+    "draw its report on a faster machine with acsard recording report"
 )
 TOO_MUCH = (
     f"the drawing takes over {MAX_CHILD_MEMORY >> 20} MB of memory: draw the report on another "
-    f"machine, with "
-    "acsard recording report"
+    "machine, with acsard recording report"
 )
 TOO_BIG = (
     f"the report has over {MAX_REPORT_BYTES >> 20} MB: draw a part of the recording, with "

@@ -301,9 +301,8 @@ FAULTS = (
         "a newer command counts only when half of the timeout is over",
         NEUTRAL,
         "        self.twist, self._doubted_ns = command.twist, None\n",
-        "        if present and now_ns - (self.arrived_ns or 0) < self._timeout_ns // 2:\n"
-        "            return\n"
-        "        self.twist, self._doubted_ns = command.twist, None\n",
+        "        if present and now_ns - (self.arrived_ns or 0) < self._timeout_ns // 2:\n        "
+        "    return\n        self.twist, self._doubted_ns = command.twist, None\n",
     ),
     fault(
         "neutral stall",
@@ -922,10 +921,9 @@ FAULTS = (
         "away pushes",
         "a sender that pushes against the obstacle drives on at the release of the bumper",
         ROBOT,
-        "            self._arbiter.require_neutral(now_ns)\n"
-        "            # `require_neutral` has discarded all commands, so the new choice has no "
-        "twist.\n"
-        "            self._choice = self._arbiter.choose(now_ns)\n",
+        "            self._arbiter.require_neutral(now_ns)\n            # `require_neutral` has "
+        "discarded all commands, so the new choice has no twist.\n            self._choice = "
+        "self._arbiter.choose(now_ns)\n",
         "            self._choice = Choice()\n",
     ),
     fault(

@@ -74,8 +74,7 @@ def _at_the_edge(setup: Setup) -> str:
     return (
         f"Place the robot so that its middle is {setup.from_edge:.2f} m from the edge behind it, "
         f"on a free floor of {FLOOR_M:g} m x {FLOOR_M:g} m, and {FLOOR_M / 2:g} m from the edges "
-        f"to its "
-        "left and right."
+        "to its left and right."
     )
 
 
@@ -151,13 +150,12 @@ def _tape(setup: Setup, track: float) -> tuple[Leg, ...]:
         Leg(
             "ahead",
             f"On a free floor of {FLOOR_M:g} m x {FLOOR_M:g} m, find or draw a straight line "
-            f"across its "
-            "middle (a joint of tiles, a board, chalk). Place the robot to the right of the line, "
-            f"about 300 mm away, its middle {setup.from_edge:.2f} m from the edge behind it, "
-            "facing along the line. Its front left and its rear left wheel must have the same "
-            "distance from the line, to the millimetre. Mark on the floor where one wheel stands. "
-            "Do not move the robot by hand until the calibration is done. The robot drives "
-            f"{setup.length:.2f} m straight ahead.",
+            "across its middle (a joint of tiles, a board, chalk). Place the robot to the right "
+            f"of the line, about 300 mm away, its middle {setup.from_edge:.2f} m from the edge "
+            "behind it, facing along the line. Its front left and its rear left wheel must have "
+            "the same distance from the line, to the millimetre. Mark on the floor where one "
+            "wheel stands. Do not move the robot by hand until the calibration is done. The robot "
+            f"drives {setup.length:.2f} m straight ahead.",
             (SETTLE, setup.ahead(setup.length), SETTLE),
             (FROM_MARK, *TO_LINE),
             (DISTANCE, Slant("angle", *LINE_ANSWERS)),
@@ -217,8 +215,7 @@ def _wall(setup: Setup, track: float) -> tuple[Leg, ...]:
         return Leg(
             f"half round to the {to}",
             f"{PLACE_ROBOT_BACK}. The robot drives away from the wall, turns half a circle to the "
-            f"{to}, and "
-            "drives back.",
+            f"{to}, and drives back.",
             (STOP, out, STOP, half, STOP, home, STOP),
             _corners("front"),
             (Slant("angle", *FRONT, plus=side * math.pi),),
@@ -259,8 +256,7 @@ def _wall(setup: Setup, track: float) -> tuple[Leg, ...]:
         Leg(
             "round at the wall",
             f"{PLACE_ROBOT_BACK}. The robot drives away from the wall, turns {count} full circles "
-            f"to the "
-            "right, and drives back.",
+            "to the right, and drives back.",
             (
                 STOP, setup.ahead(OUTWARD_M), STOP, around,
                 STOP, setup.ahead(GAP_M - OUTWARD_M), STOP,
@@ -305,10 +301,9 @@ def _umbmark(setup: Setup, track: float) -> tuple[Leg, ...]:
         return Leg(
             f"square to the {to}",
             f"Place the robot so that its middle is {(FLOOR_M - edge) / 2:.2f} m from the edge of "
-            f"the "
-            f"floor behind it, and the same distance from the edge on its {other}. Make two marks "
-            "on the floor: one exactly beside the middle of the robot's left side, one exactly "
-            f"beside the middle of its right side. The robot drives a square with sides of "
+            f"the floor behind it, and the same distance from the edge on its {other}. Make two "
+            "marks on the floor: one exactly beside the middle of the robot's left side, one "
+            "exactly beside the middle of its right side. The robot drives a square with sides of "
             f"{edge:.2f} m and all turns to the {to}, and ends about where it started.",
             (STOP, *(setup.ahead(edge), STOP, corner, STOP) * 4),
             ends,

@@ -168,14 +168,12 @@ def _count_problems(config: Config) -> list[str]:
     if fastest * counts * lasts <= FIELD_VALUES / 2:
         return []
     return [
-        f"mcu.encoder_counts = {counts}: at feedback.wheel_speed = "
-        f"{config.feedback.wheel_speed:g} rad/s a wheel's counter could wrap round within "
+        f"mcu.encoder_counts = {counts}: at feedback.wheel_speed = {config.feedback.wheel_speed:g} "
+        "rad/s a wheel's counter could wrap round within "
         f"{FIELD_VALUES / 2 / fastest / counts * 1000:.0f} ms, which is less than "
-        f"{MIN_WRAP_PERIODS} "
-        f"control periods ({lasts * 1000:.0f} ms); write "
-        f"mcu.encoder_counts = {int(FIELD_VALUES / 2 / fastest / lasts)} or less and make the "
-        f"firmware "
-        "count fewer edges; or lower feedback.wheel_speed; or write mcu.encoder_counts = 0"
+        f"{MIN_WRAP_PERIODS} control periods ({lasts * 1000:.0f} ms); write mcu.encoder_counts = "
+        f"{int(FIELD_VALUES / 2 / fastest / lasts)} or less and make the firmware count fewer "
+        "edges; or lower feedback.wheel_speed; or write mcu.encoder_counts = 0"
     ]
 
 
@@ -188,8 +186,7 @@ def _rate_problems(config: Config) -> list[str]:
     }
     return [
         f"rates.{name} = {hz:g} Hz: the rate must be 0 (every sample) or at least {MIN_RATE_HZ:g} "
-        f"Hz; "
-        f"write rates.{name} = {MIN_RATE_HZ:g} or more"
+        f"Hz; write rates.{name} = {MIN_RATE_HZ:g} or more"
         for name, hz in each.items()
         if 0.0 < hz < MIN_RATE_HZ
     ]

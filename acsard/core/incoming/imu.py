@@ -89,8 +89,7 @@ class GyroFollower:
             raise DecodeError(
                 "second_sender",
                 f"{who[:MAX_NAME_LENGTH]} also sends gyro samples: end it, or end the sender in "
-                f"use, "
-                f"{self._followed}",
+                f"use, {self._followed}",
             )
         before, self._followed, self._heard_ns = self._followed, who, now_ns
         return other and before != ""

@@ -140,8 +140,7 @@ class Lateness:
         if link == "stale" and self.late_s:
             return (
                 f"{HOST_STALL} {self.late_s:.2f} s, so it received nothing from the "
-                f"microcontroller: "
-                f"{BUSY_ADVICE}"
+                f"microcontroller: {BUSY_ADVICE}"
             )
         if link == "stale" and self._simulated:
             return f"{SIMULATOR_FAULT}: {BUSY_ADVICE}"

@@ -102,8 +102,7 @@ class _Side:
         if self.out is not None:
             return (
                 f"{self.left_out} wheel is left out of the pose: it {FAULT_TEXTS[self._fault]}; "
-                f"check "
-                "its encoder"
+                "check its encoder"
             )
         if self.slip_s > 0.0:
             return f"{self.name} wheels slip: front and rear turn differently"
@@ -141,8 +140,7 @@ class _Side:
                     wheel, told = self.wheels[i], self.expected.commanded
                     return (
                         f"{WHEELS[wheel]} wheel {WITNESS_TEXTS[kind]} (commanded {told:.1f}, "
-                        f"measured "
-                        f"{seen[wheel]:.1f} rad/s)"
+                        f"measured {seen[wheel]:.1f} rad/s)"
                     )
         return ""
 

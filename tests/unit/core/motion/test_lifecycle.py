@@ -296,17 +296,16 @@ def test_every_cause_survives_restarts() -> None:
         life = Lifecycle(active=True, latches=life.latches.after_restart())
         assert life.why == (
             f"{PRESSED_REASON} (latched at {AT}:02 UTC, before the restart); also was stopped by "
-            f"ann at "
-            f"{AT}:01 UTC, before the restart; call srv/clear"
+            f"ann at {AT}:01 UTC, before the restart; call srv/clear"
         )
     press(life, 5.0, SILENT_REASON)
     life = Lifecycle(active=True, latches=life.latches.after_restart())
     press(life, 6.0)
     life.hold("", "", ns(7.0))
     assert life.why == (
-        f"{PRESSED_REASON} (latched at {AT}:06 UTC); also {SILENT_REASON} (latched at {AT}:05 "
-        f"UTC, before the "
-        f"restart); also was stopped by ann at {AT}:01 UTC, before the restart; call srv/clear"
+        f"{PRESSED_REASON} (latched at {AT}:06 UTC); also {SILENT_REASON} (latched at {AT}:05 UTC, "
+        f"before the restart); also was stopped by ann at {AT}:01 UTC, before the restart; call "
+        "srv/clear"
     )
 
 
@@ -601,8 +600,7 @@ def test_a_press_after_a_release_is_a_new_latch() -> None:
     assert str(caught.value) == (
         f"this call names latch {seen}, but srv/clear would release another latch; the robot is "
         f"still stopped ({PRESSED_REASON}): look at the robot, then call srv/clear again with the "
-        f"present "
-        "`latch` in `state`"
+        "present `latch` in `state`"
     )
 
 
