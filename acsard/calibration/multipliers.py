@@ -21,7 +21,7 @@ SEPARATION, LEFT_RADIUS, RIGHT_RADIUS = range(3)
 """Indices into `Multipliers.values` and `Multipliers.covariance`."""
 
 
-NO_CHANGE = 1e-4
+TOLERANCE = 1e-4
 """Difference between two multipliers that is too small to matter."""
 
 
@@ -75,7 +75,7 @@ class Multipliers(Struct, frozen=True):
         nothing.
         """
         off = self.values - (base.track, base.left, base.right)
-        return math.sqrt(off @ np.linalg.solve(self.covariance + NO_CHANGE**2 * np.eye(3), off))
+        return math.sqrt(off @ np.linalg.solve(self.covariance + TOLERANCE**2 * np.eye(3), off))
 
     def own(self) -> Deviations:
         """Return the relative standard deviations of track, ratio of the radii and mean radius.

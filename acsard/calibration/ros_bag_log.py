@@ -23,7 +23,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from acsard.calibration.log_table import FOUR, TWO, Floats, LogError, Table, bounded, spikes
-from acsard.calibration.runs import MIN_RESTART_S, cumulative, gaps, on_arrival_clock
+from acsard.calibration.runs import MIN_BACKWARD_STEP_S, cumulative, gaps, on_arrival_clock
 from acsard.core.formatting import many, printable
 from acsard.core.messages.encodings import DecodeError, decode_cdr
 from acsard.core.messages.schema import Imu, JointState, Odometry, PoseStamped, Quaternion
@@ -384,7 +384,7 @@ class _Log:
         made = [topic.seconds(topic.made, since_ns) for topic in used]
         for topic, stamps in zip(used, made, strict=True):
             back = float(np.diff(stamps).min(initial=0.0))
-            if topic.stamped and back < -MIN_RESTART_S:
+            if topic.stamped and back < -MIN_BACKWARD_STEP_S:
                 raise LogError(
                     f"the stamps of {topic} go back by {-back:.0f} s in the middle of the bag, "
                     "because a simulation or a played bag restarted: record each drive in its own "

@@ -26,7 +26,7 @@ Complexes = npt.NDArray[np.complex128]
 Mask = npt.NDArray[np.bool_]
 Rows = npt.NDArray[np.int64]
 
-MIN_RESTART_S = 1.0
+MIN_BACKWARD_STEP_S = 1.0
 """Smallest backward step of the times in a log that may be a restart of the recording, s."""
 
 MAX_RESTARTS = 100
@@ -333,7 +333,7 @@ def _restarts(t: Floats, rows: Rows, columns: dict[str, Floats]) -> list[Rows]:
     # The times of rows without wheel speeds may jump back within a drive, because a file may list
     # all rows of one sensor after all rows of another.
     wheels = rows[np.isfinite(columns["left"][rows]) & np.isfinite(columns["right"][rows])]
-    back = np.flatnonzero(np.diff(t[wheels]) < -MIN_RESTART_S) + 1
+    back = np.flatnonzero(np.diff(t[wheels]) < -MIN_BACKWARD_STEP_S) + 1
     if not 0 < len(back) <= MAX_RESTARTS:
         return [rows]
     blocks = [part for part in np.split(wheels, back) if len(part) >= MIN_ROWS]

@@ -71,7 +71,7 @@ def signed(value: float | None, decimals: int, width: int) -> str:
     """Format a number with its sign, right-aligned in `width` characters.
 
     `decimals` is the number of decimals. None and NaN become "-". A number that is too long for
-    `width` is written with an exponent.
+    `width` is written with one digit and an exponent.
     """
     if value is None or math.isnan(value):
         return "-".rjust(width)

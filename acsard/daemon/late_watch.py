@@ -75,7 +75,9 @@ class Late(Struct, frozen=True):
     late_ns: int
     """Time from the due time of the first missed period to `now_ns`, ns."""
     before: bytes
-    """Content of `THREAD_TIMES_FILE` in the period before the late period; b"" if it is unknown."""
+    """Content of `THREAD_TIMES_FILE` in the period before the late period; b"" if it is unknown.
+
+    If the first period is late, it is the content when the `LateWatch` was made."""
     after: bytes
     """Content of `THREAD_TIMES_FILE` in the late period; b"" if it is unknown."""
 

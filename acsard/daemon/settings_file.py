@@ -76,6 +76,8 @@ class _Pending(Struct):
     due_ns: int
     """Monotonic time after which the client is told that the request has failed, ns. This limit
     does not apply while the robot decides about the request."""
+    too_many: bool
+    """True if the request exceeds the limit `MAX_JOBS`."""
     edit: Edit | None = None
     """The prepared change of the file. It is None until the thread has checked the request."""
     answer: Answer | None = None
@@ -157,9 +159,8 @@ class SettingsFile:
         full = len(self._pending) >= MAX_JOBS
         # A request beyond the limit is overdue from the start, so that `results` refuses it in this
         # step.
-        self._pending[request.id] = _Pending(
-            request, now_ns - 1 if full else now_ns + REPLY_TIMEOUT_NS
-        )
+        due_ns = now_ns - 1 if full else now_ns + REPLY_TIMEOUT_NS
+        self._pending[request.id] = _Pending(request, due_ns, full)
         if not full:
             self._box.put(request)
 
@@ -192,8 +193,8 @@ class SettingsFile:
     def results(self, now_ns: int, events: list[Event]) -> list[Request | Answer]:
         """Return the requests whose settings the robot must use now, and the answers for clients.
 
-        Append an event to `events` for each request whose settings were written to the file.
-        `now_ns` is the present monotonic time, ns.
+        Append an event to `events` for each request whose settings were written to the file, and
+        for each one that failed after its answer. `now_ns` is the present monotonic time, ns.
         """
         if not self._pending:
             return []
@@ -212,11 +213,13 @@ class SettingsFile:
             if not pending.overdue:
                 found.append(one)
             del self._pending[number]
+            keys, by = ", ".join(pending.request.settings), pending.request.by
+            # The log puts the kind in front of the text: `written: KEY to FILE`.
             if one.success:
-                keys = ", ".join(pending.request.settings)
-                # The log puts the kind in front of the text: `written: KEY to FILE`.
-                text = f"{keys} to {self._file}"
-                events.append(Event("set", text, by=pending.request.by, kind="written"))
+                events.append(Event("set", f"{keys} to {self._file}", by=by, kind="written"))
+            elif pending.overdue:
+                text = f"{keys} to {self._file}: {one.message}"
+                events.append(Event("set", text, "warning", by=by, kind="not written"))
         # Skip a request that the robot is deciding about. The robot may use its settings, so the
         # answer must not say that nothing is set.
         overdue = [
@@ -346,12 +349,13 @@ class SettingsFile:
 
 def _overdue(pending: _Pending) -> Answer:
     """Answer a request that took too long, or that exceeded the limit `MAX_JOBS`."""
-    why = (
-        f"the disk did not answer within {REPLY_TIMEOUT_NS / NS_PER_S:g} s, or too many changes "
-        "came at once"
-    )
     answer = pending.answer
-    text = f"nothing is set: {why}"
-    if answer is not None:
-        text = f"{answer.message}, but {why}: check whether the file has the new value"
+    if pending.too_many:
+        why = f"more than {MAX_JOBS} changes of the file wait for the disk"
+        text = f"nothing is set: {why}; try again in some seconds"
+    else:
+        why = f"the disk did not answer within {REPLY_TIMEOUT_NS / NS_PER_S:g} s"
+        text = f"nothing is set: {why}; check the disk (`dmesg`), then try again"
+        if answer is not None:
+            text = f"{answer.message}, but {why}: check whether the file has the new value"
     return Answer(pending.request.id, False, text)

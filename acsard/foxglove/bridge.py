@@ -66,6 +66,15 @@ class Bridge:
         robot.name += ", a viewer"
         self._wake, self._ended = Event(), Event()
         self._notices = Notices(tell, self._wake.set)
+        self._here = self._was_here = True
+        self._outdated = False
+        """Whether the daemon has ended since the last query of the facts about the robot. It is not
+        enough to compare `_here` with `_was_here`: if the daemon restarts during one round, both
+        are true."""
+        # Subscribe before the query. Otherwise a restart of the daemon between the two would leave
+        # outdated facts.
+        key = robot.key("alive")
+        self._token = robot.session.liveliness().declare_subscriber(key, self._alive, history=True)
         facts = learn(robot)
         ros = facts.config.ros
         self._shown = Shown(self._wake.set)
@@ -86,15 +95,8 @@ class Bridge:
         self._objections: dict[int, Objections] = {}
         self._watch: Watch | None = None
         """Receives the robot's `state` while a viewer drives; None while no viewer drives."""
-        self._here = self._was_here = True
-        self._outdated = False
-        """Whether the daemon has ended since the last query of the facts about the robot. It is not
-        enough to compare `_here` with `_was_here`: if the daemon restarts during one round, both
-        are true."""
         self._retry_s = 0.0
         """Earliest time of the next query of the facts about the robot, s."""
-        key = robot.key("alive")
-        self._token = robot.session.liveliness().declare_subscriber(key, self._alive, history=True)
 
     def run(self) -> None:
         """Run the main loop until `end` is called.

@@ -36,7 +36,7 @@ MIN_REASON_NS = NS_PER_S
 Without this limit, two sources that alternate in every step would fill the timeline.
 """
 
-MIN_POSE_INTERVAL_NS = NS_PER_S
+MAX_POSE_WAIT_NS = NS_PER_S
 """Longest delay of the entry `continues`, ns. The entry is delayed until the first pose, because it
 contains this pose. Without a link to the board there is no pose."""
 
@@ -341,7 +341,7 @@ class TimelineWriter:
         entries, first = list(self._entries(step)), self._continued
         if first is not None:
             waited_ns = step.inputs.now.mono_ns - first.inputs.now.mono_ns
-            if entries or step.recorded.poses or waited_ns > MIN_POSE_INTERVAL_NS:
+            if entries or step.recorded.poses or waited_ns > MAX_POSE_WAIT_NS:
                 yield from self._continues()
         yield from entries
 

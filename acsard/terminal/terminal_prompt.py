@@ -11,9 +11,9 @@ import select
 import sys
 import termios
 import textwrap
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
-from typing import Self
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext, suppress
+from typing import Self, TypeVar
 
 from rich.table import Table
 from rich.text import Text
@@ -21,6 +21,8 @@ from rich.text import Text
 from acsard.checkup.findings import Finding
 from acsard.terminal.output import MAX_TEXT_WIDTH, show, table
 from acsard.terminal.prompt import Ask, NobodyError
+
+T = TypeVar("T")
 
 BAR_WIDTH = 30
 
@@ -127,14 +129,12 @@ class TerminalPrompt(Screen):
         """
         self._clear()
         choice = f" [{'/'.join((*answers, QUIT_KEY))}]" if len(answers) > 1 else ""
-        at_terminal = sys.stdin.isatty()
-        with _lines() if at_terminal else nullcontext():
+        with _lines() if sys.stdin.isatty() else nullcontext():
             # A line that was typed before the question appeared must not answer it.
-            if at_terminal:
-                termios.tcflush(sys.stdin, termios.TCIFLUSH)
+            _forget_input()
             while True:
                 self._print(f"\n{question}{choice} ")
-                line = sys.stdin.readline()
+                line = _end_if_closed(lambda: sys.stdin.readline())
                 word = line.strip().lower()
                 if not line or word == QUIT_KEY:
                     raise KeyboardInterrupt
@@ -145,8 +145,7 @@ class TerminalPrompt(Screen):
     def start(self, text: str, by_key: bool = False) -> None:
         self.say(text)
         # Keys that were pressed before the text appeared must not start anything.
-        if sys.stdin.isatty():
-            termios.tcflush(sys.stdin, termios.TCIFLUSH)
+        _forget_input()
         self.say("Enter starts this drive, then any key stops it; q quits.")
         while True:
             pressed = _read()
@@ -157,7 +156,7 @@ class TerminalPrompt(Screen):
 
     def number(self, ask: Ask) -> float:
         with _lines():
-            termios.tcflush(sys.stdin, termios.TCIFLUSH)
+            _forget_input()
             while True:
                 self._print(f"\n{_wrapped(ask.words)}\n{ask.unit}: ")
                 line = _read().strip()
@@ -187,24 +186,40 @@ def row(finding: Finding) -> Table:
 
 
 def _read() -> str:
-    read = os.read(sys.stdin.fileno(), 256)
-    # No data means that the terminal has been closed.
+    read = _end_if_closed(lambda: os.read(sys.stdin.fileno(), 256))
     if not read:
         raise KeyboardInterrupt
     return read.decode(errors="replace")
 
 
+def _end_if_closed(call: Callable[[], T]) -> T:
+    """Return the result of `call`. If the terminal has been closed, raise `KeyboardInterrupt`."""
+    try:
+        return call()
+    except (OSError, termios.error):
+        raise KeyboardInterrupt from None
+
+
+def _forget_input() -> None:
+    if sys.stdin.isatty():
+        _end_if_closed(lambda: termios.tcflush(sys.stdin, termios.TCIFLUSH))
+
+
 @contextmanager
 def _lines() -> Iterator[None]:
     """Let the terminal deliver and echo whole lines of input in the `with` block."""
-    before = termios.tcgetattr(sys.stdin)
-    cooked = termios.tcgetattr(sys.stdin)
+    before = _end_if_closed(lambda: termios.tcgetattr(sys.stdin))
+    cooked = list(before)
+    # Python 3.12.0 and 3.12.1 clear ICRNL in `tty.setcbreak`. Without it, Enter ends no line.
+    cooked[0] |= termios.ICRNL
     cooked[3] |= termios.ICANON | termios.ECHO
-    termios.tcsetattr(sys.stdin, termios.TCSANOW, cooked)
+    _end_if_closed(lambda: termios.tcsetattr(sys.stdin, termios.TCSANOW, cooked))
     try:
         yield
     finally:
-        termios.tcsetattr(sys.stdin, termios.TCSANOW, before)
+        # The terminal may have been closed.
+        with suppress(OSError, termios.error):
+            termios.tcsetattr(sys.stdin, termios.TCSANOW, before)
 
 
 def _wrapped(text: str) -> str:

@@ -169,8 +169,9 @@ class Robots:
         while True:
             try:
                 return await call()
-            except NOT_READY_ERRORS:
-                self.gone = "the Zenoh bus is stuck; the page tries again by itself"
+            except NOT_READY_ERRORS as error:
+                why = str(error) if isinstance(error, NoThreadError) else "the Zenoh bus is stuck"
+                self.gone = f"{why}; the page tries again by itself"
                 await asyncio.sleep(RETRY_DELAY_S)
 
     async def _follow(self, watch: Watch) -> None:

@@ -44,7 +44,7 @@ It includes the error with which the person made the marks beside the robot.
 FIRST_TURN_RATE = 1.2
 """Turn rate of the first turn in place, rad/s, if the robot does not skid."""
 
-FIRST_TURN_TIMEOUT = 1.1
+FIRST_TURN_TIMEOUT_FACTOR = 1.1
 """Timeout of the first turn, as a multiple of the longest time for a full turn.
 
 The robot with the largest effective track (`MAX_TRACK_RATIO`) needs the longest time.
@@ -87,7 +87,7 @@ def once_round(setup: Setup, until: str, asks: tuple[Ask, ...] = (), *measures: 
         asks: the questions after the turn.
         measures: the measurements that follow from the answers.
     """
-    longest = FIRST_TURN_TIMEOUT * 2 * math.pi * MAX_TRACK_RATIO
+    longest = FIRST_TURN_TIMEOUT_FACTOR * 2 * math.pi * MAX_TRACK_RATIO
     rate = abs(setup.command(FIRST_TURN_RATE)) * setup.rate_per_command
     words = f"The robot turns left in place. Press SPACE {until}"
     turn = setup.spin(FIRST_TURN_RATE, longest / rate)

@@ -155,3 +155,26 @@ def test_the_facts_are_learned_again_if_the_daemon_restarts_while_it_is_queried(
     world.passes(1.0)
     assert world.queries == 2
     assert world.known_timeout_s == before_s + 2.0
+
+
+class StartingWorld(World):
+    """A world whose daemon restarts during the first query of the bridge."""
+
+    restarted = False
+
+    def _learn(self, robot: Client) -> Facts:
+        facts = super()._learn(robot)
+        if not self.restarted:
+            self.restarted = True
+            self.restart()
+        return facts
+
+
+def test_a_restart_of_the_daemon_while_the_bridge_starts_is_noticed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    world = StartingWorld(monkeypatch)
+    before_s = world.known_timeout_s
+    world.passes(1.0)
+    assert world.known_timeout_s == before_s + 1.0
+    assert world.queries == 1

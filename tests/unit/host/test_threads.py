@@ -69,6 +69,10 @@ def test_a_result_that_arrives_while_its_caller_is_cancelled_is_released_without
         threading.stack_size(usual)
     if result is None:
         assert is_released.wait(5.0)
+    else:
+        # Wait until the thread of `call` has decided.
+        for thread in [t for t in threading.enumerate() if t.name == "call"]:
+            thread.join(5.0)
     assert released == ([7] if result is None else [])
 
 

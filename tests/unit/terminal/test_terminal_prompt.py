@@ -76,6 +76,31 @@ def test_q_quits_at_every_question(types: Types, asked: Callable[[TerminalPrompt
             asked(person)
 
 
+@pytest.mark.parametrize(
+    "asked",
+    [
+        lambda p: p.ask("Which wheel?", ("fl", "rr")),
+        lambda p: p.number(DISTANCE),
+        lambda p: p.start("Go."),
+        lambda p: p.keys(5.0),
+    ],
+)
+@pytest.mark.parametrize("when", ["before the question", "at the question"])
+def test_a_terminal_that_closes_ends_the_question_without_another_error(
+    asked: Callable[[TerminalPrompt], object], when: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    master, slave = pty.openpty()
+    hand = threading.Timer(0.0 if when == "before the question" else 0.3, os.close, [master])
+    with open(slave) as terminal:
+        monkeypatch.setattr("sys.stdin", terminal)
+        hand.start()
+        if when == "before the question":
+            hand.join()
+        with pytest.raises(KeyboardInterrupt):
+            asked(TerminalPrompt())
+    hand.join()
+
+
 def test_a_line_that_was_typed_before_the_question_does_not_answer_it(types: Types) -> None:
     types("fl\n")
     time.sleep(0.4)
