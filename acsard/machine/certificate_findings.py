@@ -80,7 +80,7 @@ def renewal(tls: str, whose: str) -> str:
     if not whose and name == ROBOT_NAME:
         there = (
             ""
-            if (directory / CA_KEY).exists()
+            if os.path.exists(directory / CA_KEY)
             else f", after you have copied {CA_KEY} into that directory"
         )
         return f"run `{_command('renew', directory)}`{there}"
@@ -95,9 +95,14 @@ def renewal(tls: str, whose: str) -> str:
 
 
 def _mend_of_absent(directory: Path) -> str:
-    if (directory / CA_KEY).exists():
+    try:
+        has_authority = (directory / CA_KEY).exists()
+        is_empty = not directory.is_dir() or not any(directory.iterdir())
+    except PermissionError:
+        return f"run this check again with sudo: this user may not look into {directory}"
+    if has_authority:
         return f"run `{_command('renew', directory)}`, or run this check again with sudo"
-    if not directory.is_dir() or not any(directory.iterdir()):
+    if is_empty:
         return (
             f"run `{_command('init', directory)}`, or copy the files that `acsard tls add` made "
             "into that directory"
@@ -109,7 +114,9 @@ def _mend_of_absent(directory: Path) -> str:
 
 
 def _command(action: str, directory: Path) -> str:
-    there = next(one for one in (directory, *directory.absolute().parents) if one.exists())
+    places = (directory, *directory.absolute().parents)
+    # In contrast to `Path.exists`, this raises no error if this user may not enter a directory.
+    there = next(one for one in places if os.path.exists(one))
     program = "acsard"
     if not os.access(there, os.W_OK):
         # sudo does not search this user's PATH, so the command contains the full path of acsard.

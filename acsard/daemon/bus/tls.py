@@ -31,7 +31,14 @@ def require_usable(directory: str) -> None:
     Raises `CertificateError` for a missing or unusable file, and `NotPermittedError` for a file
     that this user may not read. The error's message says how to fix the problem.
     """
-    if not Path(directory).is_dir():
+    try:
+        is_there = Path(directory).is_dir()
+    except PermissionError:
+        raise NotPermittedError(
+            f"no permission to enter the directory that contains {directory}: use sudo, or make "
+            "copies of the certificates that you may read"
+        ) from None
+    if not is_there:
         raise CertificateError(
             f"there is no directory {directory}: name the directory with {CA}, {CERTIFICATE} and "
             f"{KEY} that `acsard tls init` or `acsard tls add` made"

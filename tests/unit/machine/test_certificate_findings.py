@@ -6,7 +6,9 @@ import os
 import re
 import shlex
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import pytest
 
@@ -16,11 +18,14 @@ from acsard.core.values import NS_PER_S
 from acsard.daemon.bus import certificate_watch
 from acsard.daemon.bus.tls import AUTHORITY, ends, require_usable
 from acsard.host import clock
+from acsard.host.errors import NotPermittedError
 from acsard.machine.authority import Authority
 from acsard.machine.certificate_findings import certificates, renewal, router_certificates
 from acsard.machine.finding import Finding
 
 DAY_NS = 86400 * NS_PER_S
+
+NOBODY = 65534
 
 PEM = ("ca.pem", "certificate.pem", "key.pem")
 
@@ -154,6 +159,35 @@ def test_for_a_directory_of_root_sudo_with_the_program_path_is_advised(fleet: Pa
     Authority.load(fleet, str).issue(fleet, "robot", ["localhost"], 9.9)
     fleet.chmod(0o555)
     assert re.match(r"run `sudo /\S+acsard tls renew --directory ", finding(fleet).mend)
+
+
+@pytest.fixture
+def other_user() -> Iterator[None]:
+    """Run the test as a user who is not root, if root runs the tests."""
+    root = os.geteuid() == 0
+    if root:
+        os.seteuid(NOBODY)
+    yield
+    if root:
+        os.seteuid(0)
+
+
+@pytest.mark.parametrize("mode", [0o600, 0o311], ids=["may not enter", "may not list"])
+def test_for_a_directory_that_this_user_may_not_look_into_sudo_is_advised(
+    other_user: None, mode: int
+) -> None:
+    with TemporaryDirectory() as place:
+        directory = Path(place) / "tls"
+        directory.mkdir(mode=mode)
+        try:
+            (told, *_) = certificates(str(directory))
+            assert "sudo" in told.mend
+            Path(place).chmod(0o600)
+            with pytest.raises(NotPermittedError, match="sudo"):
+                require_usable(str(directory))
+        finally:
+            Path(place).chmod(0o700)
+            directory.chmod(0o700)
 
 
 def test_for_a_key_that_other_users_can_read_chmod_is_advised(fleet: Path) -> None:
