@@ -86,6 +86,12 @@ HALTED = (Mode.STOPPED, Mode.FAULT, Mode.SHUTDOWN)
 
 NS_PER_MS = 1_000_000
 
+CANNOT_MOVE = (
+    ", but the robot cannot move: limits.linear_speed and limits.angular_speed are 0; set a "
+    "higher limit"
+)
+"""Part of the reason while a source drives and both speed limits are 0."""
+
 MAX_REFUSAL_LENGTH = 200
 """Largest number of characters of the text in `state` about a refused message. The text may quote
 the message of a client, which can be long."""
@@ -636,7 +642,10 @@ class Robot:
     def _reason(self) -> str:
         match self._life.mode:
             case Mode.DRIVING:
-                return f"driving: {chosen(self._choice)}{self.session.note}"
+                limits = self.config.limits
+                moves = limits.linear_speed or limits.angular_speed
+                held = "" if moves else CANNOT_MOVE
+                return f"driving: {chosen(self._choice)}{held}{self.session.note}"
             case Mode.READY:
                 return f"{chosen(self._choice)}{self.session.note}"
             case Mode.WAITING:

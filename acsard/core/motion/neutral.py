@@ -14,6 +14,8 @@ speeds.
 
 from __future__ import annotations
 
+from msgspec.structs import replace
+
 from acsard.core.motion.emergency_stop import CATCH_UP_NS
 from acsard.core.motion.freshness import MAX_PROOF_NS, Verdict
 from acsard.core.values import REST, Command
@@ -56,8 +58,9 @@ class Sender:
         self._number: int | None = None
         """Sequence number of the last accepted command, or None."""
         self._ended: Command | None = None
-        """The last zero that ended a speed although the zero itself was not accepted, or None. An
-        older speed that arrives after this zero must not move the robot again."""
+        """The last zero, or None if a later command has arrived. An older speed that arrives after
+        this zero must not move the robot again. If the zero was accepted, its stamp is left
+        out."""
         self.clock = ""
         """Name of the clock that stamped the last command passed to `take`."""
         self.twist = REST
@@ -256,6 +259,9 @@ class Sender:
                 self.twist = REST
             else:
                 self._ended = None
+        if zero and self._ended is None:
+            # `Freshness` compares its stamp with those of the same clock.
+            self._ended = replace(command, stamp_ns=None)
 
     def _tell_apart(self, zero: bool, now_ns: int, present: bool) -> None:
         """`present` is false if this command ends a silence of the sender."""
@@ -266,11 +272,15 @@ class Sender:
 
     def _overtaken(self, command: Command, zero: Command) -> bool:
         """Return whether this command was sent before `zero` but arrived after it."""
-        if command.stamp_ns is None or zero.stamp_ns is None or command.clock != zero.clock:
+        # The network delays an accepted command by at most about the timeout. If the stamp or the
+        # number of `zero` is later for longer than that, it was wrong, or the sender has restarted
+        # its numbers. Then it must not keep the robot at rest.
+        if command.clock != zero.clock:
+            # Stamps of two clocks cannot be compared, but a sender numbers all its commands.
+            recent = command.arrived_ns - zero.arrived_ns <= self._timeout_ns
+            return recent and _later(zero.sequence, command.sequence)
+        if command.stamp_ns is None or zero.stamp_ns is None:
             return False
-        # The network delays an accepted command by at most about the timeout. If the stamp of
-        # `zero` is later by more than that, this stamp was wrong, and must not keep the robot at
-        # rest.
         return 0 < zero.stamp_ns - command.stamp_ns <= self._timeout_ns
 
     def _doubt(self, command: Command, why: Verdict) -> None:

@@ -1042,6 +1042,16 @@ def test_a_commander_that_never_sent_a_zero_does_not_drive() -> None:
     assert bench.out.source == "app"
 
 
+@pytest.mark.parametrize("angular", [0.0, 1.0])
+def test_the_reason_says_that_a_robot_with_the_limits_0_cannot_move(angular: float) -> None:
+    limits = LimitsConfig(linear_speed=0.0, angular_speed=angular)
+    bench = Bench(Config(limits=limits)).linked()
+    bench.step(REST)
+    out = bench.step(GO)
+    assert (out.mode, out.applied.linear) == ("driving", 0.0)
+    assert ("limits.linear_speed and limits.angular_speed are 0" in out.reason) == (not angular)
+
+
 def test_after_a_zero_a_command_drives() -> None:
     bench = Bench().linked()
     bench.step(REST)

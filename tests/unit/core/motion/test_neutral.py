@@ -626,3 +626,34 @@ def test_no_twist_of_a_sender_that_no_zero_has_armed_is_followed(
         for other, twist in TWISTS.items():
             if followed == twist:
                 assert other in armed
+
+
+@each(
+    ("number", "clock", "after_ms", "twist"),
+    [
+        (7, "b", 1, REST),
+        (7, "b", 251, GO),
+        (9, "b", 1, GO),
+        (None, "b", 1, GO),
+        (7, "a", 1, GO),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("verdict", ["fresh", "unproven"])
+def test_a_numbered_speed_of_another_clock_that_a_zero_overtook_does_not_move_the_robot(
+    verdict: Verdict, number: int | None, clock: str, after_ms: int, twist: Twist
+) -> None:
+    """Clock "a" stamps the zero, as for `TwistStamped()` of a ROS node that stamps its speeds."""
+
+    def sent_by(clock: str, number: int | None, twist: Twist, at_ms: int) -> Command:
+        at_ns = at_ms * MS
+        return Command("high", twist, at_ns, at_ns, clock, "node", sequence=number)
+
+    one = sender()
+    one.take(sent_by("b", 5, REST, 0), 0)
+    one.take(sent_by("b", 6, GO, 50), 0)
+    one.take(sent_by("a", 8, REST, 100), 0, verdict)
+    assert one.twist == REST
+    one.take(sent_by(clock, number, GO, 100 + after_ms), 0)
+    assert one.twist == twist
+    one.take(sent_by("b", 10, GO, 200), 0)
+    assert one.twist == GO
