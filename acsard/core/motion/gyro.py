@@ -11,6 +11,11 @@ opposite sign, degrees or zero is reported and not used (`gyro_trial.py`). If a 
 if its rate does not match the wheels at all, the heading comes from the wheels.
 
 A sample that arrives late is included in the turn of the next line, so no turn is lost.
+
+A sample whose rate jumps counts only if the next sample confirms the jump. A gyro that repeats one
+rate exactly while the wheels stand still is assumed to hang, and its turn is taken back. If gyro
+and wheels contradict each other for so long that the gyro is not used any more, either of them may
+be right. The difference of their turns is then added to the uncertainty of the heading.
 """
 
 from __future__ import annotations
@@ -57,6 +62,23 @@ MAX_SLIP_S = 5.0
 """Longest plausible slip, s. If gyro and wheels contradict each other for longer, the gyro is not
 used until they agree again."""
 
+MAX_JUMP = 2.0
+"""Change of the rate from one sample to the next, rad/s, above which the next sample must confirm
+it. At 100 samples per second, it is a change of 200 rad/s2: a defect on the wire, or a push. At 10
+samples per second, it is a change of 20 rad/s2, which is more than the motors of a usual robot
+cause."""
+
+CONFIRMED_FRACTION = 0.5
+"""Fraction of a jump of the rate that must remain in the next sample. After a push, friction slows
+the robot down within some hundredths of a second. After a wrong sample, nothing of the jump
+remains."""
+
+FROZEN_S = 1.0
+"""Time at rest after which a gyro that repeats one rate exactly is assumed to hang, s. The noise of
+a gyro, and a hand that turns the robot, change the last digits of the rate within a few samples.
+The time is shorter than `REST_S` plus `NEW_BIAS_TIME_S`, after which a low rate becomes the
+bias."""
+
 TRUSTED_BLOCKS = 20.0
 """Number of blocks of 0.1 s in which the robot must turn before the measured ratio of the gyro's
 turn to the wheels' turn is used."""
@@ -75,7 +97,7 @@ STATUS_TEXTS: dict[GyroDoes, str] = {
     "dead": "the gyro is not used, because it measures no turn while the wheels turn the robot: "
     "check the gyro",
     "not believed": "the gyro is not used, because its rate does not match the wheels at all: does "
-    "its z axis point up?",
+    "its z axis point up, and does its rate change?",
 }
 
 
@@ -135,6 +157,12 @@ class Gyro:
         self._variance = 0.0
         """Variance of the part of `_angle` that `turn` has not returned yet, rad2."""
         self._slip_s = self._slipped_s = 0.0
+        self._reading: float | None = None
+        """Rate in the last sample that was used, with the bias, rad/s; None before the first
+        sample."""
+        self._repeated_s, self._frozen = 0.0, False
+        """`_repeated_s` is the time for which the gyro has repeated the rate `_reading` exactly, s.
+        `_frozen` is whether the gyro is assumed to hang until its rate changes."""
         self._noise = 0.0
         """Variance of the present turn rate, rad2/s2."""
         self._hole = False
@@ -203,22 +231,43 @@ class Gyro:
             self._compare(wheels, angle, dt)
         if resting:
             self._shift()
+        # While the robot rests, a rate that is only the bias counts as 0.
+        if min(self._rest_s, self._repeated_s) >= FROZEN_S and self._rate != 0.0:
+            self._frozen = True
         self._judge(silent)
-        if lost or tried or self._does not in ("used", "disagrees"):
+        if lost or tried:
             return None
-        rolled = angle / max(TURN_RATIO_RANGE[0], self._match.ratio)
+        ratio = max(TURN_RATIO_RANGE[0], self._match.ratio)
+        noise = self._noise + self._bias.variance
+        if self._does not in ("used", "disagrees"):
+            return self._doubted(ratio * wheels, dt, noise)
+        if dt > 0.0:
+            self._sum_up(angle, ratio * wheels)
+        rolled = angle / ratio
         if not self._trial.open:
             angle, variance = angle + self._owed, variance + self._owed_variance
-            self.forgive()
-        noise = self._noise + self._bias.variance
+            self._forget_owed()
         return Turn(angle, variance, self._rate, noise, rolled, self._does == "disagrees")
 
     def forgive(self) -> None:
-        """Drop the pending correction of the heading, for example because a new pose was set."""
+        """Drop pending corrections and doubts of the heading, because a new pose was set."""
+        self._contradicted = 0.0
+        """The gyro's turn minus the wheels' turn since they contradict each other, rad. It contains
+        only turns that `turn` has returned, and it is 0 without a contradiction."""
+        self._forget_owed()
+        self._forget_repeated()
+
+    def _forget_owed(self) -> None:
         self._owed = self._owed_variance = 0.0
         """`_owed` is the pending correction of the heading: the gyro's turn minus the wheels' turn
         while the gyro was not proven, rad. It is added to the heading when the gyro is proven.
         `_owed_variance` is its variance, rad2."""
+
+    def _forget_repeated(self) -> None:
+        self._repeated = self._repeated_wheels = 0.0
+        """Sums over the feedback lines since the rate of the gyro changed, rad: the gyro's turn
+        minus the wheels' turn (`_repeated`), and the wheels' turn (`_repeated_wheels`). They
+        contain only lines for which `turn` has returned the gyro's turn."""
 
     def taken_back(self, turn: float) -> float:
         """Return the angle that the caller must subtract from the heading, rad.
@@ -252,6 +301,14 @@ class Gyro:
         bias, heard = self._bias, self._heard
         until_ns += self._delay_ns
         while heard and heard[0][0] <= until_ns:
+            jump = 0.0 if self._reading is None else heard[0][1].rate - self._reading
+            if abs(jump) > MAX_JUMP:
+                if len(heard) == 1:
+                    break
+                remaining = jump + heard[1][1].rate - heard[0][1].rate
+                if remaining / jump < CONFIRMED_FRACTION:
+                    heard.popleft()
+                    continue
             time_ns, sample = heard.popleft()
             time_ns -= self._delay_ns
             span_ns = SILENCE_TIMEOUT_NS if self._told_ns is None else time_ns - self._told_ns
@@ -259,6 +316,10 @@ class Gyro:
             self._told_ns = time_ns if self._told_ns is None else max(time_ns, self._told_ns)
             passed = max(0, span_ns) / NS_PER_S
             span = passed if span_ns < SILENCE_TIMEOUT_NS else 0.0
+            self._repeated_s += span
+            if sample.rate != self._reading:
+                self._reading, self._repeated_s, self._frozen = sample.rate, 0.0, False
+                self._forget_repeated()
             bias.drift(passed)
             stands = resting and bias.rest(sample.rate, sample.variance, span)
             self._rate = 0.0 if stands else sample.rate - bias.value
@@ -286,7 +347,7 @@ class Gyro:
             self._owed_variance += variance
             self.owes = True
         else:
-            self.forgive()
+            self._forget_owed()
         return True
 
     def _compare(self, wheels: float, angle: float, dt: float) -> None:
@@ -297,6 +358,32 @@ class Gyro:
         else:
             self._slip_s = max(0.0, self._slip_s - dt)
         self._slipped_s = self._slipped_s + dt if self._slip_s > 0.0 else 0.0
+
+    def _sum_up(self, angle: float, wheels: float) -> None:
+        """Add a line to the sums of the turns that are in doubt if the gyro proves wrong.
+
+        `angle` and `wheels` are the turns of the robot according to gyro and wheels, rad.
+        """
+        off = angle - wheels
+        self._repeated += off
+        self._repeated_wheels += wheels
+        self._contradicted = self._contradicted + off if self._slip_s > 0.0 else 0.0
+
+    def _doubted(self, wheels: float, dt: float, noise: float) -> Turn | None:
+        """Return the turn of the line in which the gyro begins not to be used; None in all others.
+
+        This turn is the wheels' turn of the line, `wheels` rad in `dt` s, with the correction and
+        the uncertainty of the earlier turns. `noise` is the variance of its rate, rad2/s2.
+        """
+        angle, deviation = 0.0, self._contradicted
+        if self._frozen:
+            # The wheels give the turn since the gyro hangs.
+            angle, deviation = -self._repeated, self._match.deviation * self._repeated_wheels
+        if dt <= 0.0 or (angle == 0.0 and deviation == 0.0):
+            return None
+        self._contradicted = 0.0
+        self._forget_repeated()
+        return Turn(wheels + angle, deviation * deviation, wheels / dt, noise)
 
     def _shift(self) -> None:
         """Call this only while the robot is at rest. Otherwise the heading would jump."""
@@ -316,7 +403,7 @@ class Gyro:
             self._does = "silent"
         elif not self._bias.known:
             self._does = "waiting for rest"
-        elif wrong or self._slipped_s > MAX_SLIP_S:
+        elif wrong or self._frozen or self._slipped_s > MAX_SLIP_S:
             self._does = "not believed"
         else:
             self._does = "disagrees" if self._slip_s > 0.0 else "used"

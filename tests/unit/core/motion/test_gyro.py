@@ -55,6 +55,8 @@ class Bench:
         self.does: list[GyroDoes] = []
         self.other = False
         """Whether the next sample is the first one of another sender."""
+        self.distort: Rate = lambda rate: rate
+        """What the gyro reports instead of the given rate."""
         self._sampled_ns, self._sampled = self.now_ns, 0.0
         self._samples = first
         self._way: list[GyroSample] = []
@@ -97,7 +99,7 @@ class Bench:
         if span_ns < self.sample_ns:
             return
         mean = (self.true - self._sampled) * NS_PER_S / span_ns
-        said = self.sign * mean + self.bias + self.noise * gauss(3, self._samples)
+        said = self.distort(self.sign * mean + self.bias + self.noise * gauss(3, self._samples))
         at_ns = self.now_ns + self.late_ns
         stamp_ns = self.now_ns + self.clock_ns if self.stamped else None
         if not self.silent:
@@ -427,6 +429,208 @@ def test_the_deviation_of_the_learned_track_is_a_share_of_the_track() -> None:
     assert one.deviation == MIN_TRACK_STD
     assert other.share == pytest.approx(1.7, rel=0.05)
     assert other.deviation == pytest.approx(0.2 / 1.7, rel=0.3)
+
+
+# wrong samples
+
+
+def proved(noise: float = 0.0) -> Bench:
+    """Return a robot without slip whose gyro is proven, and which has stood still since then."""
+    bench = Bench(skid=1.0, noise=noise)
+    bench.run(REST_FIRST)
+    for rate in (1.0, -1.0):
+        bench.run(2.0, rate)
+    bench.run(2.0)
+    assert bench.says() == "used"
+    bench.told = bench.true = bench.variance = 0.0
+    return bench
+
+
+def spoiled(bench: Bench, values: list[float]) -> None:
+    """Let the gyro report these rates, rad/s, and then the true ones again."""
+    left = list(values)
+    bench.distort = lambda rate: left.pop(0) if left else rate
+
+
+@pytest.mark.parametrize("missing_ms", [0, 50, 150, 170, 500])
+@pytest.mark.parametrize("wrong", [34.9, -49.9, 3.0])
+@pytest.mark.parametrize("rate", [0.0, 0.5])
+def test_one_wrong_sample_does_not_turn_the_robot(
+    missing_ms: int, wrong: float, rate: float
+) -> None:
+    bench = proved()
+    bench.run(0.5, rate)
+    bench.silent = True
+    bench.run(missing_ms / 1000, rate)
+    bench.silent = False
+    spoiled(bench, [wrong])
+    off = []
+    for _ in range(100):
+        bench.run(DT, rate)
+        off.append(abs(bench.told - bench.true))
+    assert max(off) < 0.01
+    assert bench.says() == "used"
+
+
+@pytest.mark.parametrize("rate", [0.0, 0.5])
+def test_one_wrong_sample_of_a_slow_gyro_does_not_turn_the_robot(rate: float) -> None:
+    bench = Bench(skid=1.0, sample_ms=90)
+    bench.run(2.0)
+    bench.run(3.0, 0.5)
+    bench.run(1.0, rate)
+    spoiled(bench, [34.9])
+    bench.run(0.3, rate)
+    bench.run(2.0)
+    assert bench.says() == "used"
+    assert bench.told == pytest.approx(bench.true, abs=0.01)
+
+
+def test_two_wrong_samples_that_contradict_each_other_do_not_turn_the_robot() -> None:
+    bench = proved()
+    spoiled(bench, [30.0, -20.0])
+    bench.run(1.0)
+    assert bench.told == pytest.approx(0.0, abs=1e-6)
+
+
+@pytest.mark.parametrize("fast", [2.5, 8.0, -30.0])
+@pytest.mark.parametrize("lines", [2, 3, 30])
+def test_a_person_who_turns_the_robot_with_a_jerk_is_followed(fast: float, lines: int) -> None:
+    bench = proved()
+    bench.run(lines * DT, fast, skid=0.0, still=True)
+    bench.run(0.1)
+    assert bench.told == pytest.approx(lines * DT * fast)
+
+
+def test_a_bump_that_dies_out_quickly_is_followed() -> None:
+    bench = proved()
+    for rate in (6.0, 4.0, 2.5, 1.5, 0.8):
+        bench.run(DT, rate, skid=0.0, still=True)
+    bench.run(0.1)
+    assert bench.told == pytest.approx(0.148)
+
+
+def test_a_sample_without_a_jump_counts_in_the_line_in_which_it_arrives() -> None:
+    bench = proved()
+    for rate in (1.9, 3.8, 5.7, 3.9, 2.0, 0.1):
+        bench.run(DT, rate, skid=0.0, still=True)
+        assert bench.told == pytest.approx(bench.true)
+
+
+def test_a_jump_counts_in_the_line_of_the_sample_after_it() -> None:
+    bench = proved()
+    bench.run(DT, 5.0, skid=0.0, still=True)
+    assert bench.told == 0.0
+    bench.run(DT, 5.0, skid=0.0, still=True)
+    assert bench.told == pytest.approx(bench.true)
+
+
+# a gyro that repeats its last rate, or contradicts the wheels for long
+
+
+def frozen(bench: Bench) -> None:
+    """Let the gyro repeat its next rate forever."""
+    kept: list[float] = []
+
+    def repeated(rate: float) -> float:
+        kept.append(rate)
+        return kept[0]
+
+    bench.distort = repeated
+
+
+@pytest.mark.parametrize("rate", [0.15, 0.31, 1.01, -3.0])
+@pytest.mark.parametrize("turning", [0.05, 1.0])
+def test_the_turn_of_a_gyro_that_repeats_one_rate_is_taken_back_at_rest(
+    rate: float, turning: float
+) -> None:
+    bench = proved(0.002)
+    bench.run(2.0, rate)
+    frozen(bench)
+    bench.run(turning, rate)
+    bench.run(0.25, lambda t: rate * (1.0 - t / 0.25))
+    bench.run(1.5)
+    assert abs(bench.told - bench.true) < 3.0 * math.sqrt(bench.variance) < 0.4 * abs(rate) + 0.02
+    assert bench.told == pytest.approx(bench.true, abs=0.05 * abs(rate) + 0.01)
+    assert bench.says() == "not believed"
+    told, true = bench.told, bench.true
+    bench.run(4.0)
+    bench.run(2.0, 0.5)
+    assert bench.told - told == pytest.approx(bench.true - true)
+    bench.distort = lambda rate: rate
+    bench.run(1.0, 0.5)
+    bench.run(2.0)
+    assert bench.says() == "used"
+
+
+def test_a_turn_is_taken_back_only_in_a_line_that_covers_a_known_time() -> None:
+    bench = proved()
+    bench.distort = lambda _: 0.5
+    bench.run(0.9)
+    for _ in range(20):
+        bench.now_ns += LINE_NS
+        bench._sample()
+    bench.gyro.hear(tuple(bench._way))
+    bench._way = []
+    assert bench.gyro.turn(bench.now_ns, 0.0, 0.0, still=True) is None
+    assert bench.says() == "not believed"
+    bench.run(DT)
+    assert bench.told == pytest.approx(0.0, abs=1e-6)
+
+
+def test_a_turn_by_hand_of_some_seconds_is_not_taken_back() -> None:
+    bench = proved(0.002)
+    bench.run(4.0, 0.5, skid=0.0, still=True)
+    assert bench.says() == "disagrees"
+    assert bench.told == pytest.approx(bench.true, abs=0.01)
+
+
+def test_a_gyro_that_repeats_its_bias_at_rest_is_used() -> None:
+    bench = proved()
+    frozen(bench)
+    bench.run(1.0)
+    assert bench.says() == "used"
+    bench.distort = lambda rate: rate
+    bench.run(3.0, 1.0)
+    assert bench.says() == "used"
+    assert bench.told == pytest.approx(bench.true, abs=0.01)
+
+
+def test_the_turn_before_a_new_pose_is_not_taken_back() -> None:
+    bench = proved(0.002)
+    bench.run(2.0, 1.0)
+    frozen(bench)
+    bench.run(0.1, 1.0)
+    bench.run(0.5)
+    bench.gyro.forgive()
+    bench.told = 0.0
+    bench.run(1.5)
+    assert bench.told == pytest.approx(0.0, abs=0.02)
+
+
+@pytest.mark.parametrize("moving", [False, True])
+def test_a_long_contradiction_of_gyro_and_wheels_is_in_the_variance(moving: bool) -> None:
+    bench = proved(0.002)
+    if moving:  # The gyro hangs in a turn, and the robot then drives straight.
+        bench.distort = lambda _: 1.0
+    else:  # A person turns the robot.
+        bench.distort = lambda rate: 1.0 + rate
+    bench.run(6.0, still=not moving)
+    assert bench.says() == "not believed"
+    assert 4.0 < bench.told < 1.1 * math.sqrt(bench.variance) < 6.0
+    told, variance = bench.told, bench.variance
+    bench.run(0.5, still=False)
+    assert (bench.told, bench.variance) == (told, variance)
+
+
+def test_an_ordinary_slip_does_not_widen_the_variance() -> None:
+    spinning, rolling = proved(0.002), proved(0.002)
+    for _ in range(3):
+        for bench, skid in ((spinning, 16.0), (rolling, 1.0)):
+            bench.run(2.0, 0.1, skid=skid)
+            bench.run(2.0, 0.5)
+    assert "disagrees" in spinning.does
+    assert spinning.told == rolling.told
+    assert spinning.variance == rolling.variance
 
 
 # uncertainty

@@ -121,6 +121,8 @@ class Turning:
         self.robot.checks.gyro = self.gyro
         self.now_ns, self.true, self.rate = NS_PER_S, 0.0, 0.0
         self.does: list[str] = []
+        self.hangs_at: float | None = None
+        """The rate that the gyro repeats forever, rad/s; None if it works."""
         self.run(1.0, Twist())
 
     def run(self, seconds: float, twist: Twist, dead: bool = False, gap: bool = False) -> None:
@@ -141,7 +143,8 @@ class Turning:
             rate = before + (twist.angular - before) * share
             self.true += (rate + self.rate) / 200 if gap else rate / 100
             self.rate = rate
-            self.gyro.hear((GyroSample(self.now_ns, None, rate * self.scale),))
+            measured = rate * self.scale if self.hangs_at is None else self.hangs_at
+            self.gyro.hear((GyroSample(self.now_ns, None, measured),))
             if gap and number < lines:
                 continue
             at = Instant(self.now_ns, self.now_ns)
@@ -199,6 +202,21 @@ def proved(scale: float) -> Turning:
     bench.run(1.0, Twist())
     assert bench.gyro.status.does == "used"
     return bench
+
+
+@pytest.mark.parametrize("drives_on", [False, True])
+def test_the_heading_of_a_gyro_that_hangs_is_taken_back_or_in_the_covariance(
+    drives_on: bool,
+) -> None:
+    bench = proved(1.0)
+    bench.run(1.0, Twist(0.0, 1.0))
+    bench.hangs_at = 1.0
+    bench.run(8.0, Twist(0.5 if drives_on else 0.0, 0.0))
+    assert bench.gyro.status.does == "not believed"
+    assert abs(bench.off) < 2.0 * math.sqrt(bench.yaw_variance)
+    if not drives_on:
+        assert abs(bench.off) < 0.02
+        assert math.sqrt(bench.yaw_variance) < 0.7
 
 
 @pytest.mark.slow
