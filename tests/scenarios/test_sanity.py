@@ -12,7 +12,15 @@ from itertools import product
 import pytest
 
 from acsard.core.config.contradictions import contradictions
-from acsard.core.config.settings import Config, LimitsConfig, McuConfig, SimConfig, WheelMap
+from acsard.core.config.settings import (
+    Config,
+    ControlConfig,
+    FeedbackConfig,
+    LimitsConfig,
+    McuConfig,
+    SimConfig,
+    WheelMap,
+)
 from acsard.core.simulator.faults import Fault
 from acsard.core.values import NS_PER_S, WHEELS, Received
 from tests.scenarios.world import World
@@ -82,6 +90,38 @@ def test_repeated_impossible_lines_are_a_fault_within_thirty_milliseconds(world:
         world.run(1.0)
     assert stopped(world)
     assert world.state.x == pytest.approx(x, abs=0.2)
+
+
+@pytest.mark.parametrize(
+    ("counts", "known", "rate", "bound"),
+    [
+        (16, False, 100.0, 5.0),
+        (96, False, 100.0, 5.0),
+        (400, False, 300.0, 4.5),
+        (96, True, 100.0, 5.0),
+    ],
+)
+def test_one_count_is_no_impossible_speed_although_it_looks_faster_than_the_bound(
+    counts: int, known: bool, rate: float, bound: float
+) -> None:
+    """At 100 Hz, one count of 96 in a line looks like 6.5 rad/s."""
+    world = World(
+        Config(
+            mcu=McuConfig(encoder_counts=counts if known else 0),
+            control=ControlConfig(rate=rate),
+            limits=LimitsConfig(linear_speed=0.2, angular_speed=1.0, wheel_speed=4.0),
+            feedback=FeedbackConfig(wheel_speed=bound),
+            sim=SimConfig(encoder_counts=counts),
+        )
+    )
+    assert contradictions(world.config) == []
+    world.run(1.0)
+    for speed in (0.2, -0.2, 0.2):
+        world.drive(speed, seconds=2.0)
+        assert (world.state.mode, told(world, "fault")) == ("driving", [])
+        world.send(0.0)
+        world.run(0.5)
+    assert world.state.counters.get("line_implausible", 0) <= 10
 
 
 @pytest.mark.slow

@@ -66,6 +66,7 @@ def made(seed: int, seconds: float | None = None) -> Plan:
         )
         if not problems(config):
             break
+    _draw_low_bound(random.Random(f"low bound {seed}"), config)
     if "other dialect" in kinds:
         extras["board"] += _dialect(dice, config["mcu"])
     sources = [source["name"] for source in config["commands"]["sources"]]
@@ -96,6 +97,23 @@ def made(seed: int, seconds: float | None = None) -> Plan:
     board_inputs.add(plan)
     bad_moments.add(plan)
     return plan
+
+
+def _draw_low_bound(dice: random.Random, config: dict[str, Any]) -> None:
+    """In a tenth of the plans put `feedback.wheel_speed` just above the limit of the wheels.
+
+    In some of these plans the wheels are so slow that one encoder count looks faster than the
+    bound.
+    """
+    if dice.random() >= 0.1:
+        return
+    limits, sim = config["limits"], config["sim"]
+    if dice.random() < 0.5:
+        limits["wheel_speed"] = round(dice.uniform(3.0, 6.0), 2)
+        if "encoder_counts" not in sim:
+            sim["encoder_counts"] = 96 if config["control"]["rate"] in (100.0, "auto") else 400
+    bound = round(limits["wheel_speed"] * dice.uniform(1.11, 1.3), 2)
+    config["feedback"] = config.get("feedback", {}) | {"wheel_speed": bound}
 
 
 def _draw_routers(dice: random.Random, plan: Plan) -> None:

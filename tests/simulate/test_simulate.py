@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import random
 import re
 import shutil
@@ -89,6 +90,20 @@ def test_a_sender_sends_the_same_without_the_other_senders() -> None:
 
 
 @pytest.mark.slow
+def test_some_plans_have_a_bound_of_the_feedback_below_one_encoder_count() -> None:
+    """The bound is just above the limit of the wheels, and all these plans are legal."""
+    below = 0
+    for seed in range(500):
+        config = made(seed, 20.0)["config"]
+        bound = config.get("feedback", {}).get("wheel_speed", 80.0)
+        if bound < 1.31 * config["limits"]["wheel_speed"]:
+            assert problems(config) == []
+            counts, rate = config["sim"].get("encoder_counts", 3200), config["control"]["rate"]
+            step = math.tau / counts * (100.0 if rate == "auto" else rate)
+            below += step > bound
+    assert below >= 3
+
+
 def test_a_quiet_plan_breaks_no_promise() -> None:
     assert played(quiet()).finding == ""
 

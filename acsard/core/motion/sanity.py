@@ -8,6 +8,9 @@ low and true lines are rejected. `wheel_faults.py` checks whether the wheels fol
 A plain line has no checksum, so a damaged line may look possible, and then the true lines after it
 look impossible. Therefore a possible line is trusted only if it agrees with the possible line
 before it. A line that is not trusted is outvoted by two later lines that agree with each other.
+
+An encoder quantizes the reported speed of its wheel: one count in a short time looks like a high
+speed. Therefore each bound is widened by the quantization step of the wheel.
 """
 
 from __future__ import annotations
@@ -39,10 +42,28 @@ COUNT_MARGIN = 2
 """Encoder counts by which two reports of a wheel at constant speed may differ, because each report
 may be wrong by one count."""
 
+COARSEST_COUNT = math.tau / 16
+"""Angle of one count of the coarsest encoder that is expected, rad. Before the steps are learned,
+only a speed of up to one such count in the time of the line may be over `feedback.wheel_speed`."""
+
+MIN_COUNT_S = 0.005
+"""Shortest time of a line for `COARSEST_COUNT`, s. Firmware rarely counts for a shorter time."""
+
+MAX_STEP = COARSEST_COUNT / MIN_COUNT_S
+"""Highest speed that a learned quantization step may excuse: 78.5 rad/s. Steps that are not proven
+never widen the default bound of 80 rad/s."""
+
+MAX_REPORTS = 2
+"""Largest number of successive lines that report the same encoder count. Firmware that is asked
+again very soon has no new counts, and repeats its speeds once."""
+
 MIN_INTERVAL_S = 0.004
 """Shortest time between two feedback lines, s. Lines follow each other this quickly while this
 computer catches up after a stall. A single encoder count in so short a time looks like a high
 speed."""
+
+
+NOT_FAST = (0, 0, 0, 0)
 
 
 class Sanity:
@@ -68,6 +89,9 @@ class Sanity:
         """Longest time that a recent feedback line covers, s. The speeds in a line are means over
         the time that the line covers. A line that covers t s counts as recent for t s."""
         self._impossible = 0
+        self._fast = NOT_FAST
+        """For each wheel, the number of successive lines, up to the last line, in which the wheel
+        was over `feedback.wheel_speed`."""
         self._lines = self._dropped = 0
         """Numbers of feedback lines in the present window: all lines (`_lines`), and impossible
         lines (`_dropped`)."""
@@ -81,7 +105,7 @@ class Sanity:
         The next feedback line is still compared with the last possible line, which is not trusted
         any more.
         """
-        self._trusted, self._impossible = False, 0
+        self._trusted, self._impossible, self._fast = False, 0, NOT_FAST
 
     @property
     def doubtful(self) -> bool:
@@ -116,6 +140,8 @@ class Sanity:
                     agrees = not self._trusted and self._agrees(feedback, longest)
                     self._rejected = [*self._rejected[1 - FAULT_LINES :], (speeds, self._since)]
                     why = "" if agrees else why
+        else:
+            self._fast = NOT_FAST
         self._count(why)
         if why:
             self._impossible += 1
@@ -161,18 +187,33 @@ class Sanity:
 
     def _too_fast(self, line: Feedback) -> str:
         wheels, fastest = line.speeds.as_tuple(), self._settings.wheel_speed
-        turned = _proven(line)
-        for name, now, step, angle in zip(
-            WHEELS, wheels, line.steps, turned or wheels, strict=True
-        ):
-            # A quantization step allows excess speed only if encoder counts prove the step. A
-            # faulty encoder may show any step.
-            size, room = abs(now), 0.0
+        turned, own = _proven(line), line.dt - line.bridged
+        # A line without a known time moves nothing, so no count in it is excused.
+        count = COARSEST_COUNT / max(own, MIN_COUNT_S) if own > 0.0 else 0.0
+        # While other wheels rest, damaged lines of one wheel look like the steps of its encoder.
+        learned = max(line.steps) < math.inf
+        a, b, c, d = (
+            lines + 1 if abs(now) > fastest else 0
+            for now, lines in zip(wheels, self._fast, strict=True)
+        )
+        self._fast = a, b, c, d
+        rows = zip(WHEELS, wheels, line.steps, turned or wheels, self._fast, strict=True)
+        for name, now, step, angle, lines in rows:
+            size = abs(now)
+            if not lines:
+                continue
             if line.count and turned is not None:
                 # If the line reports n counts, n - 1 of them certainly occurred in its time.
                 room = size * min(1.0, line.count / abs(angle)) if angle else size
-            elif turned is not None and step < math.inf:
+            elif learned and size <= MAX_STEP:
                 room = step
+            elif learned or size > count:
+                room = 0.0  # No encoder has so large a step, so the line is damaged.
+            else:
+                # A board that is asked again very soon repeats the speeds of the line before. So n
+                # successive fast lines have at least n / 2 counts, and all but one of these counts
+                # certainly occurred. A lasting speed is soon evident, although the step is unknown.
+                room = size * min(1.0, MAX_REPORTS / lines)
             if size > fastest + room:
                 return f"{name} at {now:.2f} rad/s is over feedback.wheel_speed"
         return ""
