@@ -773,7 +773,8 @@ class RobotMachine(RuleBasedStateMachine):
         """No axis changes faster than its limits since the last line that left."""
         limits, applied, last = self.limits, outputs.applied, self.sent_twist
         dt = (self.now_ns - self.sent_ns) / NS_PER_S
-        if self.broken or (applied == REST and dt > 0.25):
+        silent = self.reported is not None and self.now_ns - self.reported_ns > 500 * MS
+        if self.broken or silent or (applied == REST and dt > 0.25):
             last = REST  # it was cut meanwhile, so no ramp applied
         braking = outputs.mode in ("stopped", "fault", "shutdown")
         longest = max(0.05, 1.5 / self.config.rate_hz)
