@@ -258,6 +258,7 @@ class Robot:
         due = inputs.tick or (inputs.at_once and news)
         line = self._drive(inputs) if due else None
         applied = self._limiter.twist
+        self._odometry.command(applied)
         link = self.session.link
         # Use `_value_`, because the property `value` of an enum runs Python code.
         reason = self._reason()

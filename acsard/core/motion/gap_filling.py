@@ -312,8 +312,9 @@ class Gaps:
 
     `follow` measures s while lines arrive without gaps. The configured acceleration limits are not
     used, because robots seldom accelerate that much. The deviation is limited to the motion at the
-    higher of the two speeds before and after the gap. Therefore a robot that stood still before and
-    after a gap is assumed not to have moved in it.
+    highest of three speeds: the speeds before and after the gap, and the highest speed that was
+    commanded in it. Therefore a robot that stood still before and after a gap, and had no command
+    to move, is assumed not to have moved in it.
     """
 
     def __init__(self) -> None:
@@ -353,7 +354,12 @@ class Gaps:
         self._first, self._seconds, self._distance, self._turn = twist, 0.0, 0.0, 0.0
 
     def bridge(
-        self, seconds: float, before: Twist, after: Twist, doubtful: float = 0.0
+        self,
+        seconds: float,
+        before: Twist,
+        after: Twist,
+        commanded: Twist,
+        doubtful: float = 0.0,
     ) -> tuple[float, float]:
         """Return a pair: the variances of distance (m2) and turn (rad2) that a filled gap adds.
 
@@ -364,11 +370,13 @@ class Gaps:
             seconds: the duration of the gap, s.
             before: the twist before the gap.
             after: the twist after the gap.
+            commanded: the highest speeds that were commanded in the gap, m/s and rad/s, both
+                without sign.
             doubtful: the part of the gap, s, in which the robot is assumed to have had the twist
                 `after`, but had the twist `before` with the probability 1/2.
         """
         bridged, given = self._bridged + seconds, self._given
-        along, yaw = self.unseen(bridged, before, after)
+        along, yaw = self.unseen(bridged, before, after, commanded)
         self.interrupt(after)
         self._bridged, self._given = bridged, (max(along, given[0]), max(yaw, given[1]))
         late = doubtful * (before.linear - after.linear)
@@ -378,12 +386,16 @@ class Gaps:
             max(0.0, yaw - given[1]) + late_turn**2 / 2,
         )
 
-    def unseen(self, seconds: float, before: Twist, after: Twist) -> tuple[float, float]:
+    def unseen(
+        self, seconds: float, before: Twist, after: Twist, commanded: Twist = REST
+    ) -> tuple[float, float]:
         """Return the variances of the distance (m2) and the turn (rad2) in a gap of `seconds` s.
 
-        `before` and `after` are the twists before and after the gap.
+        `before` and `after` are the twists before and after the gap. `commanded` contains the
+        highest speeds that were commanded in it, m/s and rad/s, both without sign. The default
+        is for callers that do not know the commands.
         """
         scale = (seconds / ACCELERATION_SPAN_S) ** VARIANCE_POWER
-        fastest = max(abs(before.linear), abs(after.linear)) * seconds
-        turning = max(abs(before.angular), abs(after.angular)) * seconds
+        fastest = max(abs(before.linear), abs(after.linear), commanded.linear) * seconds
+        turning = max(abs(before.angular), abs(after.angular), commanded.angular) * seconds
         return min(self._along * scale, fastest**2), min(self._turning * scale, turning**2)

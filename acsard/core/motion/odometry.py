@@ -117,6 +117,11 @@ class Odometry:
         """Twist in the last feedback line, m/s and rad/s."""
         self.speeds = STILL
         """Wheel speeds in the last feedback line, rad/s."""
+        self._commanded = self._highest = REST
+        """`_commanded` is the twist that was commanded last. `_highest` contains the highest linear
+        and angular speed that was commanded since the last feedback line, both without sign."""
+        self._folded = False
+        """Whether a feedback line was used since the last command."""
         self.gaps, self.unseen, self.bridged = 0, 0.0, 0.0
         """Statistics of the gaps in the feedback. `gaps` and `unseen` are the number and the total
         duration, s, of the gaps in which the robot moved but the pose could not follow. `bridged`
@@ -166,6 +171,21 @@ class Odometry:
         """
         ms = {"gap_ms": round(1e3 * self.unseen), "gaps_filled_ms": round(1e3 * self.bridged)}
         return {name: count for name, count in ({"gaps": self.gaps} | ms).items() if count}
+
+    def command(self, twist: Twist) -> None:
+        """Record the twist, m/s and rad/s, that the motors are commanded from now on.
+
+        The daemon calls this in each control step, after the feedback lines of this step. In a gap
+        of the feedback, the robot may have driven as fast as the commands.
+        """
+        if self._folded or twist != self._commanded:
+            # The robot may still follow the previous command, because the board reacts late.
+            highest = self._commanded if self._folded else self._highest
+            self._highest = Twist(
+                max(abs(highest.linear), abs(twist.linear)),
+                max(abs(highest.angular), abs(twist.angular)),
+            )
+            self._commanded, self._folded = twist, False
 
     def skip(self, feedback: Feedback) -> None:
         """Ignore the speeds of an implausible feedback line (see `sanity.py`).
@@ -221,7 +241,7 @@ class Odometry:
         variances = self._twist_variances(twist, feedback, at_rest, turn, slips)
         if turn is not None and dt > 0.0:
             twist = Twist(linear, turn.rate)
-        self.twist, self.speeds = twist, speeds
+        self.twist, self.speeds, self._folded = twist, speeds, True
         track = checks.learn(turned)
         if track is not None:
             self.turn_by(track)
@@ -318,7 +338,9 @@ class Odometry:
         bridged, doubtful = rolled.bridged, rolled.doubtful
         if bridged > 0.0:
             self.bridged += bridged
-            self._uncertainty.doubt(*self._gaps.bridge(bridged, before, twist, doubtful))
+            self._uncertainty.doubt(
+                *self._gaps.bridge(bridged, before, twist, self._highest, doubtful)
+            )
         elif feedback.gap:
             self._gaps.interrupt(twist)
         else:
@@ -340,11 +362,11 @@ class Odometry:
 
     def _stand(self, seconds: float, before: Twist, after: Twist) -> None:
         """Add the uncertainty of `seconds` s of unknown motion, but do not move the pose."""
-        if before != REST or after != REST:
+        if before != REST or after != REST or self._highest != REST:
             self.gaps += 1
             self.unseen += seconds
         self._uncertainty.stand(
             seconds * (before.linear + after.linear) / 2,
             seconds * (before.angular + after.angular) / 2,
-            *self._gaps.unseen(seconds, before, after),
+            *self._gaps.unseen(seconds, before, after, self._highest),
         )

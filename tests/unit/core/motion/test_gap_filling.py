@@ -331,7 +331,7 @@ CRUISE = Twist(0.5, 0.5)
 
 
 def test_the_acceleration_is_guessed_until_it_is_measured() -> None:
-    along, yaw = Gaps().unseen(ACCELERATION_SPAN_S, CRUISE, CRUISE)
+    along, yaw = Gaps().unseen(ACCELERATION_SPAN_S, CRUISE, CRUISE, REST)
     assert along == pytest.approx((ASSUMED_ACCELERATION.linear * ACCELERATION_SPAN_S**2 / 2) ** 2)
     assert yaw == pytest.approx((ASSUMED_ACCELERATION.angular * ACCELERATION_SPAN_S**2 / 2) ** 2)
 
@@ -339,10 +339,10 @@ def test_the_acceleration_is_guessed_until_it_is_measured() -> None:
 def test_a_steady_drive_makes_gaps_certain() -> None:
     gaps = Gaps()
     gaps.interrupt(CRUISE)
-    guessed = gaps.unseen(0.3, CRUISE, CRUISE)
+    guessed = gaps.unseen(0.3, CRUISE, CRUISE, REST)
     for _ in range(6000):
         gaps.follow(CRUISE, 0.01)
-    measured = gaps.unseen(0.3, CRUISE, CRUISE)
+    measured = gaps.unseen(0.3, CRUISE, CRUISE, REST)
     assert measured[0] < 0.02 * guessed[0]
     assert measured[1] < 0.02 * guessed[1]
 
@@ -353,42 +353,44 @@ def test_the_uncertainty_of_a_gap_follows_the_measured_accelerations_of_a_jerky_
     gaps = Gaps()
     for i in range(30_000):
         gaps.follow(Twist(0.4 if i // 10 % 2 else 0.6, 0.0), 0.01)
-    along, yaw = gaps.unseen(ACCELERATION_SPAN_S, CRUISE, CRUISE)
+    along, yaw = gaps.unseen(ACCELERATION_SPAN_S, CRUISE, CRUISE, REST)
     assert 0.004**2 < along < 0.02**2
     assert yaw < 1e-5
 
 
 def test_time_at_rest_does_not_change_the_uncertainty_of_gaps() -> None:
     gaps = Gaps()
-    before = gaps.unseen(0.3, CRUISE, CRUISE)
+    before = gaps.unseen(0.3, CRUISE, CRUISE, REST)
     for _ in range(6000):
         gaps.follow(REST, 0.01)
-    assert gaps.unseen(0.3, CRUISE, CRUISE) == before
+    assert gaps.unseen(0.3, CRUISE, CRUISE, REST) == before
 
 
 def test_a_gap_between_two_rests_has_no_uncertainty() -> None:
-    assert Gaps().unseen(5.0, REST, REST) == (0.0, 0.0)
+    assert Gaps().unseen(5.0, REST, REST, REST) == (0.0, 0.0)
 
 
-def test_the_uncertainty_of_a_gap_is_bounded_by_its_faster_speed() -> None:
-    along, yaw = Gaps().unseen(30.0, Twist(0.1, -0.2), Twist(-0.5, 0.1))
-    assert (along, yaw) == pytest.approx((15.0**2, 6.0**2))
+def test_the_uncertainty_of_a_gap_is_bounded_by_its_fastest_speed() -> None:
+    before, after = Twist(0.1, -0.2), Twist(-0.5, 0.1)
+    assert Gaps().unseen(30.0, before, after, REST) == pytest.approx((15.0**2, 6.0**2))
+    faster = Gaps().unseen(30.0, before, after, Twist(0.6, 0.3))
+    assert faster == pytest.approx((18.0**2, 9.0**2))
 
 
 def test_a_line_between_two_gaps_makes_their_errors_independent() -> None:
     gaps = Gaps()
-    first = gaps.bridge(0.3, CRUISE, CRUISE)
+    first = gaps.bridge(0.3, CRUISE, CRUISE, REST)
     gaps.follow(CRUISE, 0.01)
-    assert gaps.bridge(0.3, CRUISE, CRUISE) == first
-    assert gaps.bridge(0.3, CRUISE, CRUISE)[0] > 20 * first[0]
+    assert gaps.bridge(0.3, CRUISE, CRUISE, REST) == first
+    assert gaps.bridge(0.3, CRUISE, CRUISE, REST)[0] > 20 * first[0]
 
 
 def test_a_command_to_rest_that_may_be_lost_makes_the_motion_uncertain() -> None:
     """The robot is assumed to have stood for 0.2 s, but it moved on with the probability 1/2."""
     before, after = Twist(0.5, 1.0), Twist(0.1, -1.0)
-    sure = Gaps().bridge(0.5, before, after)
-    unsure = Gaps().bridge(0.5, before, after, doubtful=0.2)
+    sure = Gaps().bridge(0.5, before, after, REST)
+    unsure = Gaps().bridge(0.5, before, after, REST, doubtful=0.2)
     assert (unsure[0] - sure[0], unsure[1] - sure[1]) == near(
         (0.2 * 0.4) ** 2 / 2, (0.2 * 2.0) ** 2 / 2
     )
-    assert Gaps().bridge(0.5, REST, REST, doubtful=0.2) == (0.0, 0.0)
+    assert Gaps().bridge(0.5, REST, REST, REST, doubtful=0.2) == (0.0, 0.0)

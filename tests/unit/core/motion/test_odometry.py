@@ -20,7 +20,7 @@ from acsard.core.motion.learned_track import Track
 from acsard.core.motion.odometry import Odometry
 from acsard.core.motion.path import arc
 from acsard.core.motion.uncertainty import MAX_VARIANCE, UNKNOWN_POSE
-from acsard.core.values import Estimate, Instant, Pose, PoseCovariance, Twist, WheelSpeeds
+from acsard.core.values import REST, Estimate, Instant, Pose, PoseCovariance, Twist, WheelSpeeds
 from tests.each import each
 from tests.unit.core.motion.liars import fold
 from tests.vectors.drive import (
@@ -358,6 +358,29 @@ def test_the_errors_of_several_gaps_add_up_without_cancelling() -> None:
         robot.fold(feedback(10.0, 10.0, 0.01))
         estimate = robot.fold(feedback(10.0, 10.0, 0.0, gap=0.1))
     assert math.sqrt(estimate.covariance.xx) == pytest.approx(0.5, rel=0.01)
+
+
+def test_a_robot_commanded_to_move_in_a_gap_may_have_moved_between_two_rests() -> None:
+    robot = odometry()
+    robot.fold(feedback(0.0, 0.0, 0.01))
+    robot.command(Twist(-0.4, 0.0))
+    robot.command(REST)
+    covariance = robot.fold(feedback(0.0, 0.0, 0.0, gap=1.0)).covariance
+    assert matrix(covariance)[0, 0] > matrix(START)[0, 0] + 0.1**2
+    assert matrix(covariance)[2, 2] == matrix(START)[2, 2]
+    assert robot.missed() == {"gaps": 1, "gap_ms": 1000}
+
+
+def test_only_the_commands_since_the_line_before_a_gap_count_in_it() -> None:
+    """The command before that line counts too, because the robot may still follow it."""
+    robot = odometry()
+    robot.command(Twist(0.4, 0.0))
+    robot.fold(feedback(0.0, 0.0, 0.01))
+    robot.command(REST)
+    assert robot.fold(feedback(0.0, 0.0, 0.0, gap=1.0)).covariance != START
+    grown = robot.fold(feedback(0.0, 0.0, 0.01)).covariance
+    robot.command(REST)
+    assert robot.fold(feedback(0.0, 0.0, 0.0, gap=1.0)).covariance == grown
 
 
 def test_a_gap_of_a_robot_that_stood_before_and_after_adds_nothing() -> None:
