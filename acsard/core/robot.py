@@ -616,10 +616,13 @@ class Robot:
 
     def _drive(self, inputs: Inputs) -> bytes | None:
         now_ns, twist, limiter = inputs.now.mono_ns, self._choice.twist, self._limiter
+        pressed = self._made_of is None
         self._made_of = (self._choice.arrived_ns, self._life.mode)
         limiter.state, said_ns = self._said
         since = (now_ns - said_ns) / NS_PER_S
-        if self.session.link != "up" or since > WRITE_PAUSE_S:
+        if pressed or self.session.link != "up" or since > WRITE_PAUSE_S:
+            # The first line after a press contains zeros, even if the input is already released and
+            # the commands that arrived meanwhile may move the robot.
             limiter.cut()
         elif self._life.mode is Mode.DRIVING and twist is not None:
             limiter.follow(twist, min(since, self._max_dt))

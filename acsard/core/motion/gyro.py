@@ -73,11 +73,12 @@ CONFIRMED_FRACTION = 0.5
 the robot down within some hundredths of a second. After a wrong sample, nothing of the jump
 remains."""
 
-FROZEN_S = 1.0
+FROZEN_S = 0.8
 """Time at rest after which a gyro that repeats one rate exactly is assumed to hang, s. The noise of
 a gyro, and a hand that turns the robot, change the last digits of the rate within a few samples.
-The time is shorter than `REST_S` plus `NEW_BIAS_TIME_S`, after which a low rate becomes the
-bias."""
+The time is shorter than `NEW_BIAS_TIME_S`, after which a low rate becomes the bias. A coarse gyro
+that rotates evenly with a robot at rest, for example on a turntable, looks like a gyro that
+hangs."""
 
 TRUSTED_BLOCKS = 20.0
 """Number of blocks of 0.1 s in which the robot must turn before the measured ratio of the gyro's
@@ -139,6 +140,8 @@ class Gyro:
         self._does: GyroDoes = "silent"
         self.events: list[Event] = []
         """Log events of the last call of `turn`."""
+        self._doubt = 0.0
+        """Variance, rad2, that the next turn must add to the heading."""
         self._begin()
 
     def _begin(self) -> None:
@@ -160,15 +163,21 @@ class Gyro:
         self._reading: float | None = None
         """Rate in the last sample that was used, with the bias, rad/s; None before the first
         sample."""
-        self._repeated_s, self._frozen = 0.0, False
+        self._repeated_s = self._rested_s = 0.0
         """`_repeated_s` is the time for which the gyro has repeated the rate `_reading` exactly, s.
-        `_frozen` is whether the gyro is assumed to hang until its rate changes."""
+        `_rested_s` is the part of this time in which the robot was at rest, s."""
+        self._frozen = False
+        """Whether the gyro is assumed to hang until its rate changes."""
         self._noise = 0.0
         """Variance of the present turn rate, rad2/s2."""
         self._hole = False
         """Whether samples are missing since the last feedback line, or the gyro was silent at that
         line."""
-        self.forgive()
+        self._contradicted = 0.0
+        """The gyro's turn minus the wheels' turn since they contradict each other, rad. It contains
+        only turns that `turn` has returned, and it is 0 without a contradiction."""
+        self._forget_owed()
+        self._forget_repeated()
 
     @property
     def status(self) -> GyroStatus:
@@ -195,6 +204,7 @@ class Gyro:
             if sample.anew:
                 # The track is a property of wheels and floor, so it stays valid with another gyro.
                 self._learned = self.learned
+                self._end_contradiction()
                 self._begin()
             self._hole |= len(self._heard) == self._heard.maxlen
             self._heard.append((self._time_of(sample), sample))
@@ -216,7 +226,12 @@ class Gyro:
         resting = self._rest_s > REST_S
         self._take(at_ns, resting)
         ahead = SILENCE_TIMEOUT_NS if self._told_ns is None else at_ns - self._told_ns
-        silent = ahead - max(0, self._delay_ns) >= SILENCE_TIMEOUT_NS
+        age_ns = ahead - max(0, self._delay_ns)
+        if self._heard and self._told_ns is not None:
+            # A sample that waits for the confirmation of its jump is not used yet, but the gyro is
+            # not silent.
+            age_ns = min(age_ns, at_ns - self._heard[0][0] + min(0, self._delay_ns))
+        silent = age_ns >= SILENCE_TIMEOUT_NS
         held = 0.0 if resting or silent else self._rate * max(0, ahead) / NS_PER_S
         angle, variance = self._angle + held - self._given, self._variance
         self._given, self._variance = self._angle + held, 0.0
@@ -232,28 +247,26 @@ class Gyro:
         if resting:
             self._shift()
         # While the robot rests, a rate that is only the bias counts as 0.
-        if min(self._rest_s, self._repeated_s) >= FROZEN_S and self._rate != 0.0:
+        if resting and self._rested_s >= FROZEN_S and self._rate != 0.0:
             self._frozen = True
         self._judge(silent)
-        if lost or tried:
-            return None
         ratio = max(TURN_RATIO_RANGE[0], self._match.ratio)
         noise = self._noise + self._bias.variance
-        if self._does not in ("used", "disagrees"):
+        if lost:
+            self._end_contradiction()
+        if lost or tried or self._does not in ("used", "disagrees"):
             return self._doubted(ratio * wheels, dt, noise)
-        if dt > 0.0:
-            self._sum_up(angle, ratio * wheels)
+        self._sum_up(angle, ratio * wheels, dt)
         rolled = angle / ratio
         if not self._trial.open:
             angle, variance = angle + self._owed, variance + self._owed_variance
             self._forget_owed()
+        variance, self._doubt = variance + self._doubt, 0.0
         return Turn(angle, variance, self._rate, noise, rolled, self._does == "disagrees")
 
     def forgive(self) -> None:
         """Drop pending corrections and doubts of the heading, because a new pose was set."""
-        self._contradicted = 0.0
-        """The gyro's turn minus the wheels' turn since they contradict each other, rad. It contains
-        only turns that `turn` has returned, and it is 0 without a contradiction."""
+        self._contradicted = self._doubt = 0.0
         self._forget_owed()
         self._forget_repeated()
 
@@ -264,10 +277,11 @@ class Gyro:
         `_owed_variance` is its variance, rad2."""
 
     def _forget_repeated(self) -> None:
-        self._repeated = self._repeated_wheels = 0.0
-        """Sums over the feedback lines since the rate of the gyro changed, rad: the gyro's turn
-        minus the wheels' turn (`_repeated`), and the wheels' turn (`_repeated_wheels`). They
-        contain only lines for which `turn` has returned the gyro's turn."""
+        self._repeated = self._repeated_wheels = self._repeated_gaps = 0.0
+        """Sums over the feedback lines since the rate of the gyro changed: the gyro's turn minus
+        the wheels' turn, rad (`_repeated`), the wheels' turn, rad (`_repeated_wheels`), and the
+        squares of the gyro's turns in gaps of the feedback, rad2 (`_repeated_gaps`). They contain
+        only lines for which `turn` has returned the gyro's turn."""
 
     def taken_back(self, turn: float) -> float:
         """Return the angle that the caller must subtract from the heading, rad.
@@ -317,8 +331,14 @@ class Gyro:
             passed = max(0, span_ns) / NS_PER_S
             span = passed if span_ns < SILENCE_TIMEOUT_NS else 0.0
             self._repeated_s += span
+            self._rested_s += span if resting else 0.0
             if sample.rate != self._reading:
-                self._reading, self._repeated_s, self._frozen = sample.rate, 0.0, False
+                if self._repeated_s >= FROZEN_S and self._slipped_s >= SLIP_S:
+                    # The gyro may have hung while it contradicted the wheels. At the start of a
+                    # turn, a slow gyro contradicts them for a shorter time.
+                    self._end_contradiction()
+                self._reading, self._frozen = sample.rate, False
+                self._repeated_s = self._rested_s = 0.0
                 self._forget_repeated()
             bias.drift(passed)
             stands = resting and bias.rest(sample.rate, sample.variance, span)
@@ -359,31 +379,46 @@ class Gyro:
             self._slip_s = max(0.0, self._slip_s - dt)
         self._slipped_s = self._slipped_s + dt if self._slip_s > 0.0 else 0.0
 
-    def _sum_up(self, angle: float, wheels: float) -> None:
+    def _sum_up(self, angle: float, wheels: float, dt: float) -> None:
         """Add a line to the sums of the turns that are in doubt if the gyro proves wrong.
 
-        `angle` and `wheels` are the turns of the robot according to gyro and wheels, rad.
+        `angle` and `wheels` are the turns of the robot according to gyro and wheels, rad. `dt` is
+        the time of the line, s; 0 after a gap, in which only the gyro knows the turn.
         """
         off = angle - wheels
+        self._repeated_gaps += 0.0 if dt > 0.0 else angle * angle
         self._repeated += off
         self._repeated_wheels += wheels
         self._contradicted = self._contradicted + off if self._slip_s > 0.0 else 0.0
 
-    def _doubted(self, wheels: float, dt: float, noise: float) -> Turn | None:
-        """Return the turn of the line in which the gyro begins not to be used; None in all others.
+    def _end_contradiction(self) -> None:
+        """Add the turns that gyro and wheels contradicted to the doubt of the heading.
 
-        This turn is the wheels' turn of the line, `wheels` rad in `dt` s, with the correction and
-        the uncertainty of the earlier turns. `noise` is the variance of its rate, rad2/s2.
+        Call this if nobody can tell any more whether the gyro or the wheels were right, for example
+        because the gyro is silent now.
         """
-        angle, deviation = 0.0, self._contradicted
-        if self._frozen:
-            # The wheels give the turn since the gyro hangs.
-            angle, deviation = -self._repeated, self._match.deviation * self._repeated_wheels
-        if dt <= 0.0 or (angle == 0.0 and deviation == 0.0):
-            return None
+        self._doubt += self._contradicted * self._contradicted
         self._contradicted = 0.0
-        self._forget_repeated()
-        return Turn(wheels + angle, deviation * deviation, wheels / dt, noise)
+
+    def _doubted(self, wheels: float, dt: float, noise: float) -> Turn | None:
+        """Return the turn of a line if earlier turns are in doubt; otherwise None.
+
+        Call this in lines whose turn comes from the wheels. The result is the wheels' turn of the
+        line, `wheels` rad in `dt` s, with the correction and the uncertainty of the earlier turns.
+        `noise` is the variance of its rate, rad2/s2.
+        """
+        angle = 0.0
+        if self._frozen:
+            # The wheels give the turn since the gyro hangs, but in a gap nobody knows it.
+            angle, self._contradicted = -self._repeated, 0.0
+            deviation = self._match.deviation * self._repeated_wheels
+            self._doubt += deviation * deviation + self._repeated_gaps
+            self._forget_repeated()
+        self._end_contradiction()
+        if dt <= 0.0 or (angle == 0.0 and self._doubt == 0.0):
+            return None
+        variance, self._doubt = self._doubt, 0.0
+        return Turn(wheels + angle, variance, wheels / dt, noise)
 
     def _shift(self) -> None:
         """Call this only while the robot is at rest. Otherwise the heading would jump."""

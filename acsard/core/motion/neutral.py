@@ -17,7 +17,7 @@ from __future__ import annotations
 from msgspec.structs import replace
 
 from acsard.core.motion.emergency_stop import CATCH_UP_NS
-from acsard.core.motion.freshness import MAX_PROOF_NS, Verdict
+from acsard.core.motion.freshness import MAX_JITTER_NS, MAX_PROOF_NS, Verdict
 from acsard.core.values import REST, Command
 
 # Programs without a sender id and without a GID may share an identity. These rules apply to them:
@@ -277,7 +277,8 @@ class Sender:
         # its numbers. Then it must not keep the robot at rest.
         if command.clock != zero.clock:
             # Stamps of two clocks cannot be compared, but a sender numbers all its commands.
-            recent = command.arrived_ns - zero.arrived_ns <= self._timeout_ns
+            passed_ns = command.arrived_ns - zero.arrived_ns
+            recent = passed_ns <= self._timeout_ns + MAX_JITTER_NS
             return recent and _later(zero.sequence, command.sequence)
         if command.stamp_ns is None or zero.stamp_ns is None:
             return False

@@ -63,7 +63,7 @@ computer catches up after a stall. A single encoder count in so short a time loo
 speed."""
 
 
-NOT_FAST = (0, 0, 0, 0)
+NOT_FAST, AT_REST = (0, 0, 0, 0), (0.0, 0.0, 0.0, 0.0)
 
 
 class Sanity:
@@ -92,6 +92,8 @@ class Sanity:
         self._fast = NOT_FAST
         """For each wheel, the number of successive lines, up to the last line, in which the wheel
         was over `feedback.wheel_speed`."""
+        self._totals = AT_REST
+        """For each wheel, the sum of the sizes of its speeds in the lines of `_fast`, rad/s."""
         self._lines = self._dropped = 0
         """Numbers of feedback lines in the present window: all lines (`_lines`), and impossible
         lines (`_dropped`)."""
@@ -124,7 +126,7 @@ class Sanity:
         longest = self._longest - since if self._longest > since else 0.0
         self._longest = longest if longest > since else since
         if feedback.gap:
-            self._last = None
+            self._last, self._fast = None, NOT_FAST
             self._rejected.clear()
         speeds, last = feedback.speeds, self._last
         wheels = speeds.as_tuple()
@@ -197,8 +199,15 @@ class Sanity:
             for now, lines in zip(wheels, self._fast, strict=True)
         )
         self._fast = a, b, c, d
-        rows = zip(WHEELS, wheels, line.steps, turned or wheels, self._fast, strict=True)
-        for name, now, step, angle, lines in rows:
+        front_right, front_left, rear_left, rear_right = (
+            abs(now) + (total if lines > 1 else 0.0)
+            for now, total, lines in zip(wheels, self._totals, self._fast, strict=True)
+        )
+        self._totals = front_right, front_left, rear_left, rear_right
+        rows = zip(
+            WHEELS, wheels, line.steps, turned or wheels, self._fast, self._totals, strict=True
+        )
+        for name, now, step, angle, lines, total in rows:
             size = abs(now)
             if not lines:
                 continue
@@ -206,13 +215,17 @@ class Sanity:
                 # If the line reports n counts, n - 1 of them certainly occurred in its time.
                 room = size * min(1.0, line.count / abs(angle)) if angle else size
             elif learned and size <= MAX_STEP:
+                # The sum of n reported speeds is wrong by at most one step, or by two steps if
+                # lines are repeated. So a lasting speed is soon evident.
                 room = step
+                if total / lines > fastest + step * min(1.0, MAX_REPORTS / lines):
+                    room = 0.0
             elif learned or size > count:
                 room = 0.0  # No encoder has so large a step, so the line is damaged.
             else:
                 # A board that is asked again very soon repeats the speeds of the line before. So n
                 # successive fast lines have at least n / 2 counts, and all but one of these counts
-                # certainly occurred. A lasting speed is soon evident, although the step is unknown.
+                # certainly occurred.
                 room = size * min(1.0, MAX_REPORTS / lines)
             if size > fastest + room:
                 return f"{name} at {now:.2f} rad/s is over feedback.wheel_speed"

@@ -528,6 +528,18 @@ def test_a_command_against_a_bumper_is_ignored_also_without_the_neutral_first_ru
     assert bench.step(BACK).mode == "driving"
 
 
+@pytest.mark.parametrize("marks", [REAR + FREE, REAR])
+def test_the_line_after_a_press_is_zero_even_if_commands_that_came_with_it_may_move_the_robot(
+    marks: bytes,
+) -> None:
+    bench = Button(FREE, replace(AWAY, commands=CommandsConfig(neutral_first=False)))
+    bench.driving()
+    out = bench.status(marks).step(GO)
+    assert (out.applied, out.mode) == (REST, "driving")
+    out = bench.status(FREE).step(GO)
+    assert 0.0 < out.applied.linear < 0.1
+
+
 def test_silent_bumpers_latch_a_stop_also_if_a_press_would_only_limit() -> None:
     bench = Button(FREE, AWAY)
     bench.driving()

@@ -577,6 +577,81 @@ def test_a_turn_is_taken_back_only_in_a_line_that_covers_a_known_time() -> None:
     assert bench.told == pytest.approx(0.0, abs=1e-6)
 
 
+@pytest.mark.parametrize("rest", [0.3, 0.9])
+def test_the_turn_of_a_gyro_that_hangs_is_taken_back_over_a_gap_and_the_gap_is_in_doubt(
+    rest: float,
+) -> None:
+    bench = proved(0.002)
+    frozen(bench)
+    bench.run(0.05, 1.0)
+    bench.run(rest)
+    turn = over_a_gap(bench, 0.5, 0.0)
+    assert turn is not None
+    bench.told += turn.angle
+    bench.run(3.0)
+    assert bench.told == pytest.approx(bench.true, abs=0.01)
+    assert math.sqrt(bench.variance) == pytest.approx(0.5, abs=0.02)
+
+
+@pytest.mark.parametrize("rest", [0.7, 0.9])
+def test_several_short_rests_show_that_a_gyro_hangs(rest: float) -> None:
+    bench = proved(0.002)
+    frozen(bench)
+    bench.run(0.05, 0.15)
+    for _ in range(3):
+        bench.run(2.0, still=False)
+        bench.run(rest)
+    assert bench.says() == "not believed"
+    assert bench.told == pytest.approx(bench.true, abs=0.01)
+
+
+@pytest.mark.parametrize("end", ["silent", "another gyro", "recovers"])
+@pytest.mark.parametrize("moving", [False, True])
+def test_a_contradiction_that_nobody_can_decide_any_more_is_in_the_variance(
+    moving: bool, end: str
+) -> None:
+    bench = proved(0.002)
+    frozen(bench)
+    bench.run(0.05, 1.0)
+    bench.run(4.0 if moving else 0.9, still=not moving)
+    if end == "silent":
+        bench.silent = True
+    else:
+        bench.distort, bench.other = lambda rate: rate, end == "another gyro"
+    bench.run(1.0, still=False)
+    bench.run(1.0)
+    assert abs(bench.told - bench.true) == pytest.approx(math.sqrt(bench.variance), rel=0.1)
+
+
+def test_a_new_pose_ends_the_doubt_of_a_contradiction() -> None:
+    bench = proved(0.002)
+    frozen(bench)
+    bench.run(0.05, 1.0)
+    bench.run(2.0, still=False)
+    bench.gyro.forgive()
+    bench.silent, bench.variance = True, 0.0
+    bench.run(1.0, still=False)
+    assert math.sqrt(bench.variance) < 0.3
+
+
+@pytest.mark.parametrize("sample_ms", [110, 150, 170, 190])
+def test_a_slow_gyro_that_waits_for_the_confirmation_of_a_jump_is_not_silent(
+    sample_ms: int,
+) -> None:
+    """The robot stops from 4 rad/s within a third of a second, between two samples."""
+    bench = Bench(skid=1.0, sample_ms=sample_ms)
+    bench.run(REST_FIRST + 1.0)
+    for rate in (1.0, -1.0):
+        bench.run(2.0, rate)
+    bench.run(2.0)
+    bench.does.clear()
+    bench.run(1.5, lambda t: min(4.0, 8.0 * t))
+    bench.run(2.0, lambda t: max(0.0, 4.0 - 12.0 * t))
+    assert "silent" not in bench.does
+    assert bench.told == pytest.approx(bench.true, abs=0.06)
+    assert bench.variance < 1e-4
+
+
 def test_a_turn_by_hand_of_some_seconds_is_not_taken_back() -> None:
     bench = proved(0.002)
     bench.run(4.0, 0.5, skid=0.0, still=True)

@@ -632,7 +632,8 @@ def test_no_twist_of_a_sender_that_no_zero_has_armed_is_followed(
     ("number", "clock", "after_ms", "twist"),
     [
         (7, "b", 1, REST),
-        (7, "b", 251, GO),
+        (7, "b", 300, REST),
+        (7, "b", 301, GO),
         (9, "b", 1, GO),
         (None, "b", 1, GO),
         (7, "a", 1, GO),

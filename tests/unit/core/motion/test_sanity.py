@@ -248,10 +248,21 @@ def test_a_speed_of_the_limit_and_one_learned_step_is_possible(wheel: int, sign:
     assert WHEELS[wheel] in sanity.impossible(stepping(only(wheel, sign * 11.55), 6.54))
 
 
-def test_a_learned_step_excuses_a_speed_however_long_it_lasts() -> None:
-    sanity = Sanity(FeedbackConfig(wheel_speed=5.0))
-    lines = [stepping(only(1, 7.35), 6.54)] * 100
-    assert verdicts(sanity, *lines) == [True] * 100
+def test_a_learned_step_excuses_fast_lines_only_as_long_as_their_mean_may_be_possible() -> None:
+    """A speed of 5.4 rad/s is reported as one or no step of 6.54 rad/s, a lasting one as steps."""
+    sanity = Sanity(FeedbackConfig(wheel_speed=5.5))
+    steps = [stepping(only(1, speed), 6.54) for speed in (*(6.54,) * 5, 0.0)]
+    assert verdicts(sanity, *steps * 20) == [True] * 120
+    lasting = [sanity.impossible(stepping(only(1, 7.35), 6.54)) for _ in range(10)]
+    assert [why == "" for why in lasting] == [True] * 7 + [False] * 3
+    assert sanity.doubtful
+
+
+def test_the_time_before_a_gap_does_not_count_for_a_lasting_speed() -> None:
+    sanity = Sanity(FeedbackConfig(wheel_speed=5.5))
+    fast = stepping(only(1, 7.35), 6.54)
+    lines = [fast] * 7 + [msgspec.structs.replace(fast, dt=0.0, gap=0.5)] + [fast] * 6
+    assert verdicts(sanity, *lines) == [True] * 14
 
 
 def test_the_step_of_one_wheel_excuses_nothing_before_the_steps_of_the_others_are_known() -> None:
