@@ -133,6 +133,7 @@ class Run:
         commands that came meanwhile arrive together at this time."""
         self._full_ns = self._blocked_ns = -NS
         """When the disk was last seen full, and the output was last seen blocked."""
+        self._hangs_until_ns = 0
         self._whole = False
         """The last step sent a whole line."""
         self.epilogue = False
@@ -362,7 +363,7 @@ class Run:
 
     def _do(self, event: dict[str, Any]) -> None:
         product = self.product
-        if event["do"] not in ("wall", "disk", "call"):
+        if event["do"] not in ("wall", "disk", "call", "gyro"):
             self.liveness.event(disarms=disarms(event))
         lasts_ns = min(
             int(event.get("for", 0.0) * NS),
@@ -431,6 +432,8 @@ class Run:
                     product.stall_in_step(lasts_ns / NS)
             case "suspend":
                 self._suspend(lasts_ns)
+            case "gyro":
+                self._spoil_gyro(event["fault"], after_ns)
             case "wall":
                 product.step_wall(event["by"])
             case "disk":
@@ -439,6 +442,21 @@ class Run:
             case "restart":
                 if product.alive:
                     self._restart(event, after_ns)
+
+    def _spoil_gyro(self, fault: list[Any], until_ns: int) -> None:
+        """Have the gyro report one wrong rate, or repeat a rate until then."""
+        gyro, (name, *values) = self.product.gyro, fault
+        self.counts[f"gyro {name}"] += 1
+        if name == "wrong":
+            gyro.spoil(*values)
+            return
+        gyro.hanging = True
+        self._hangs_until_ns = max(until_ns, self._hangs_until_ns)
+
+        def works() -> None:
+            gyro.hanging = self.true_ns < self._hangs_until_ns
+
+        self.at(until_ns, works)
 
     def _look(self) -> None:
         """Judge the speeds and the pose in `state`, unless the host has just slept or stalled."""
@@ -703,7 +721,9 @@ class Run:
         witness.cut |= not witness.linked
         self._whole = bool(seen.lines) and seen.lines[-1][1].endswith(b"\n")
         for at_ns, line in seen.lines:
+            before = witness.last
             witness.line(at_ns + offset, line, self._fed_ns, seen.decided_ns + offset)
+            self.followed.line(true_ns, before, witness.last)
             if witness.linked:  # the daemon that has lost the link believes no line
                 self.echo.line(at_ns + offset, witness.last)
                 if self.half_duplex.on:
@@ -720,6 +740,7 @@ class Run:
             self.damage.look(true_ns, self._lines, self._stalled_ns == true_ns)
         if seen.estimates:
             lies, truth = self._names, self.product.truth()
+            self.pose.gyro(true_ns, self.product.gyro)
             self.pose.see(true_ns, seen.estimates, truth, offset, lies)
             if self.half_duplex.on:
                 self.half_duplex.see(true_ns, seen.mode, seen.estimates[-1][1:3], truth[1:3])

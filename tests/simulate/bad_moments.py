@@ -48,8 +48,8 @@ def removed(plan: Plan) -> Plan:
     }
 
 
-NEW = {"flip", "half_duplex", "constant_answers"}
-"""Events and faults of the board that only these plans have."""
+NEW = {"flip", "half_duplex", "constant_answers", "gyro"}
+"""Events and faults that an older simulator does not know."""
 
 
 def _best(plan: Plan) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-from tests.simulate.ages import Wish
+from tests.simulate.ages import MARGIN_NS, Wish
 from tests.simulate.product import HELD
 from tests.simulate.promises import BrokenError, Witness
 from tests.simulate.roads import FOREIGN, NS, Message, Sample, stable
@@ -36,8 +36,13 @@ UNBROKEN_NS = NS
 PLACE_NS = 5 * NS // 2
 """A sender that goes on keeps the robot for this time, also while its stamps are in doubt."""
 
+NUMBERED = ("client", "page", "signed", "rmw")
+"""Ways whose messages have numbers."""
+
 KNOWN_NS = 240 * NS
 """The daemon knows a clock for this time at least."""
+
+Wheels = tuple[float, ...]
 
 Who = tuple[str, str]
 """Source and identity of a sender."""
@@ -54,6 +59,14 @@ class Command(NamedTuple):
     clock: str
     v: float
     w: float
+    numbered: bool
+    """It has a number, and its sender does not share its identity."""
+    overtaken: bool = False
+    """A later zero of the same sender arrived just before it, so it may not move the robot."""
+
+    @property
+    def zero(self) -> bool:
+        return not (self.v or self.w or self.message.junk)
 
 
 class Run:
@@ -99,6 +112,11 @@ class Followed:
         """The same for the commands since the last step, of which a full buffer may drop some."""
         self._rests_ns: dict[Who, int] = {}
         """Arrival of the newest zero of each sender, by the robot's clock."""
+        self._latest: dict[Who, Command] = {}
+        """The last command that arrived from each sender."""
+        self._slowest: tuple[float, float] | None = None
+        """The lowest speed and turn rate since the followed command is one that a zero overtook,
+        None if it is not such a command."""
         self._zero_ns: dict[Who, int] = {}
         """When the newest zero of each sender was sent, of those that arrived."""
         self._before: dict[str, Command] = {}
@@ -124,7 +142,11 @@ class Followed:
         if wish is None:
             return
         who = sender["source"], sample.identity
-        found = Command(at_ns, wish.arrived_ns, who, sender, message, sample.clock, wish.v, wish.w)
+        numbered = sender["way"] in NUMBERED and not sample.shared
+        found = Command(
+            at_ns, wish.arrived_ns, who, sender, message, sample.clock, wish.v, wish.w, numbered
+        )
+        found = self._latest[who] = found._replace(overtaken=self._is_overtaken(found))
         if not (wish.v or wish.w or message.junk):
             self._rests_ns[who] = at_ns
             self._zero_ns[who] = max(message.sent_ns, self._zero_ns.get(who, 0))
@@ -146,6 +168,24 @@ class Followed:
         if self._certain(found, sample, wish):
             self._waiting[who] = found
 
+    def _is_overtaken(self, found: Command) -> bool:
+        """Return whether a zero of the same sender overtook this speed on the network.
+
+        A zero that came earlier by more than the timeout may belong to another use of the numbers.
+        """
+        zero, timeout_ns = self._latest.get(found.who), self._witness.timeout[found.who[0]]
+        return (
+            zero is not None
+            and zero.zero
+            and not found.zero
+            and zero.numbered
+            and found.numbered
+            and zero.sender is found.sender
+            and zero.message.number > found.message.number
+            and found.arrived_ns - zero.arrived_ns < timeout_ns - MARGIN_NS
+            and found.who[0] not in self._witness.churned
+        )
+
     def _go_on(self, at_ns: int) -> None:
         """Note a command of the sender that keeps the robot, unless it was silent before."""
         assert self._keeper is not None
@@ -161,7 +201,7 @@ class Followed:
         witness, sender, message = self._witness, found.sender, found.message
         newest = self._newest.get(sample.clock, 0)
         self._newest[sample.clock] = max(newest, message.number)
-        if found.who[0] in witness.churned or message.junk:
+        if found.who[0] in witness.churned or message.junk or sender.get("stamps_speeds"):
             return False
         if not sample.clock:
             # A zero of a shared identity counts only behind its pause.
@@ -217,7 +257,7 @@ class Followed:
             overtakes_ns = 2 * self._witness.timeout[holder.who[0]]
         if self._rests_ns.get(holder.who, -overtakes_ns - 1) > holder.arrived_ns - overtakes_ns:
             return None
-        return holder.v, holder.w
+        return None if holder.overtaken else (holder.v, holder.w)
 
     @property
     def sender(self) -> dict[str, Any] | None:
@@ -260,6 +300,33 @@ class Followed:
         self._holder = None if disarmed else found
         if disarmed:
             self._keeper = None
+
+    def line(self, true_ns: int, before: Wheels, wheels: Wheels) -> None:
+        """Judge a line: while the robot follows a speed that a zero overtook, it slows down.
+
+        `before` has the wheel speeds of the line before it.
+        """
+        witness, holder = self._witness, self._holder
+        # A limited jerk lets a speed grow on for a moment.
+        sure = witness.mode == "driving" and "linear_jerk" not in witness.limits
+        sure &= not (witness.pending or witness.away)
+        if holder is None or not holder.overtaken or not sure:
+            self._slowest = None
+            return
+        v, w = map(abs, witness.twist(wheels))
+        if self._slowest is None:
+            old_v, old_w = map(abs, witness.twist(before))
+            self._slowest = old_v, old_w
+            witness.counts["overtaken speeds"] += 1
+        least_v, least_w = self._slowest
+        room = 0.022 * witness.radius
+        if v > least_v + room or w > least_w + room / witness.half:
+            raise BrokenError(
+                "a speed that a zero overtook moves nothing", true_ns,
+                f"{holder.who} sent number {holder.message.number} before its zero, and the robot "
+                f"speeds up from {least_v:.3f} m/s, {least_w:.3f} rad/s to {v:.3f}, {w:.3f}",
+            )  # fmt: skip
+        self._slowest = min(v, least_v), min(w, least_w)
 
     def _first_keeps(self, true_ns: int, decided_ns: int, found: Command) -> None:
         """The robot leaves a sender that is not silent only for a source of higher priority.

@@ -10,7 +10,7 @@ from __future__ import annotations
 import random
 from typing import Any
 
-from tests.simulate import bad_moments, board_inputs
+from tests.simulate import bad_moments, board_inputs, gyro_faults
 from tests.simulate.product import problems
 
 Plan = dict[str, Any]
@@ -26,6 +26,10 @@ KINDS = (
     "crashes", "damaged file", "kills on a full disk", "sender bursts", "bad stamps",
 )  # fmt: skip
 """The kinds of trouble that a run may have."""
+
+LATER_KINDS = ("wrong gyro samples", "hanging gyro", "unstamped zeros")
+"""More kinds of trouble. They have dice of their own, so the plans without them stay as they
+were."""
 
 WAYS = (
     "client",
@@ -97,6 +101,13 @@ def made(seed: int, seconds: float | None = None) -> Plan:
     plan["events"] = sorted(events, key=lambda one: one["at"])
     board_inputs.add(plan)
     bad_moments.add(plan)
+    if "moment" not in plan:  # in a plan with a moment nothing else happens
+        dice = random.Random(f"later kinds {seed}")
+        later = [kind for kind in LATER_KINDS if dice.random() < share]
+        plan["kinds"] = sorted([*kinds, *later])
+        gyro_faults.add(plan, later)
+        if "unstamped zeros" in later:
+            _draw_unstamped_zeros(random.Random(f"unstamped zeros {seed}"), plan)
     return plan
 
 
@@ -137,6 +148,31 @@ def _draw_routers(dice: random.Random, plan: Plan) -> None:
         sender.update(way="routed", routers=routers, wheels=False, churn=False)
         if together:
             sender["source"] = senders[0]["source"]
+
+
+def _draw_unstamped_zeros(dice: random.Random, plan: Plan) -> None:
+    """Let programs with an id stamp only their speeds, and often end a drive with a single zero.
+
+    A ROS node does so that fills the header of its speeds, and ends with an empty `TwistStamped`.
+    The daemon then takes the stamp of the header for a speed, and that of the attachment for a
+    zero, so two clocks stamp the messages of one sender. The network often swaps the last two
+    messages of a drive.
+    """
+    ids = [sender["id"] for sender in plan["senders"]]
+    for sender in plan["senders"]:
+        way, phases = sender["way"], sender["phases"]
+        if way not in ("rmw", "signed", "header") or ids.count(sender["id"]) > 1:
+            continue
+        if sender["churn"] or sender["bad_stamps"]:
+            continue
+        if way == "header":  # without an attachment its messages have no numbers
+            sender["way"] = "rmw"
+        ends = [
+            [after[0], dice.random() < 0.7]
+            for before, after in zip(phases, phases[1:], strict=False)
+            if (before[1] or before[2]) and after[1] == after[2] == 0.0 and dice.random() < 0.8
+        ]
+        sender.update(stamps_speeds=True, ends=ends, wheels=False)
 
 
 def _draw_lawful_driver(dice: random.Random, plan: Plan) -> bool:

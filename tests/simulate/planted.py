@@ -41,8 +41,8 @@ FIRST_SEED = 1
 
 MEASURED_WITH = (
     "plan", "roads", "actors", "ages", "bad_moments", "board_inputs", "course", "damage",
-    "followed", "jerk", "liveness", "log_lines", "plugging", "pose", "product", "promises",
-    "reasons", "reports", "spread",
+    "followed", "gyro_faults", "jerk", "liveness", "log_lines", "plugging", "pose", "product",
+    "promises", "reasons", "reports", "spread",
 )  # fmt: skip
 """Modules of the simulator that make the plans, play them and judge them."""
 

@@ -7,6 +7,7 @@ from collections import deque
 from collections.abc import Sequence
 from typing import Any
 
+from tests.simulate.gyro_faults import GyroFaults
 from tests.simulate.promises import BrokenError
 from tests.simulate.roads import NS
 
@@ -53,7 +54,47 @@ a line then shows a speed over an inexact time."""
 ROOM_M, ROOM_RAD = 0.02, 0.03
 """Allowed beside the covariance: a sample's time is known to a few ms."""
 
+HANG_REST_NS = 16 * NS // 10
+"""Time at rest after which the turn of a gyro that hangs is certainly taken back. The product waits
+until wheels and gyro have repeated for 1 s that they contradict each other."""
+
+HANG_RATE = 0.1
+"""Rate, rad/s, from which on a gyro that hangs certainly reports more than its bias. A gyro that
+hangs at its bias looks like a sound one at rest, and like slipping wheels in a turn of up to 5 s."""
+
+CONTRADICTS, CONTRADICTED_NS = 0.5, 13 * NS // 2
+"""Difference of the rates of gyro and robot, rad/s, from which on wheels and gyro certainly
+contradict each other, and the time after which their difference is in the covariance. The product
+believes the gyro for 5 s, because the wheels may slip."""
+
+HANG_GAP_NS = 3 * NS // 20
+"""If estimates are missing for this time, the product may not know whether the gyro hangs."""
+
+SETTLES_NS, SETTLES_AT_REST_NS = NS // 2, 5 * NS // 2
+"""Time after a hang from which on the pose is judged again. If the product may have learned a wrong
+bias from the gyro that hung, it must rest for the second time before."""
+
 Pose = tuple[float, float, float]
+
+
+class Hang:
+    """A gyro that repeats one rate, as the omniscient view knows it."""
+
+    def __init__(self, at_ns: int, rate: float) -> None:
+        self.rate = rate
+        """What it reports instead of the true turn rate, rad/s, without its bias."""
+        self.sure = True
+        """Since it began, nothing else has disturbed the odometry."""
+        self.turned = False
+        """The true and the estimated heading at its begin, `begun`, are known."""
+        self.begun = self.agreed = 0.0, 0.0
+        """The true and the estimated heading when the hang began, and when wheels and gyro last
+        agreed, rad."""
+        self.begun_ns = self.agreed_ns = self.seen_ns = at_ns
+        self.true_yaw = 0.0
+        """The true heading at the last estimate, rad."""
+        self.taken_back = False
+        """The robot has rested for so long that the product knows that the gyro hangs."""
 
 
 class PoseWitness:
@@ -96,6 +137,17 @@ class PoseWitness:
         self._unproved: float | None = None
         """True turns since the wheels lied, rad, until a gyro has corrected the heading for that.
         None if no correction is possible."""
+        self._bias: float = config.get("sim", {}).get("gyro_bias", 0.0)
+        self._hang: Hang | None = None
+        """The present hang of the gyro."""
+        self._settles_ns = self._settles_at_rest_ns = 0
+        """The pose is judged again from the first of these times on, if the robot has also stood
+        since the second one for `SETTLES_AT_REST_NS`. The second one is 0 if it need not stand."""
+        self._moved_ns = 0
+        """When the true pose last changed."""
+        self._spoiled = self._spoiled_before = 0.0
+        """Turn that wrong samples of the gyro may have added up to now, and up to the anchor,
+        rad."""
         self._placed = False
         self._asked: Pose | None = None
         """The pose that a call of this step has set, if its time is known."""
@@ -119,8 +171,22 @@ class PoseWitness:
         A board that was only `mute` leaves a gap, which is judged by itself.
         """
         self._anchor = self._expected = None
+        if self._hang is not None:
+            self._hang.sure = False
         if not mute:
             self._before = None
+
+    def gyro(self, now_ns: int, faults: GyroFaults) -> None:
+        """Note the rate that the gyro repeats, if it hangs, and its wrong samples."""
+        self._spoiled = faults.spoiled
+        if faults.hung is not None and self._hang is None:
+            self.doubt()
+            self._hang = Hang(now_ns, faults.hung - self._bias)
+        elif faults.hung is None and self._hang is not None:
+            self._settles_ns = now_ns + SETTLES_NS
+            self._settles_at_rest_ns = 0 if self._hang.sure else now_ns
+            self._hang = None
+            self.doubt()
 
     def mended(self, fault: str, at_ns: int) -> None:
         """Note that a fault of the board ended."""
@@ -155,6 +221,8 @@ class PoseWitness:
     ) -> None:
         """Judge the estimates of one step."""
         at_ns, x, y, yaw, _ = truth
+        if not self._true or math.dist(self._true[-1][1], (x, y, yaw)) > STANDS / 100:
+            self._moved_ns = now_ns
         self._true.append((at_ns + offset_ns, (x, y, yaw)))
         self._speed = self._present_speed()
         lies = not LIARS.isdisjoint(faults) or now_ns < self._known_ns
@@ -165,6 +233,8 @@ class PoseWitness:
             self._unproved += abs(math.remainder(yaw - self._true[-2][1][2], math.tau))
         if lies:
             self.doubt(silent_only)
+        if self._spoils_pose(now_ns):
+            self._before = None
         before = self._before
         if before is not None and silent_only:
             self._gap(now_ns, before, estimates[0], offset_ns, at_ns, (x, y, yaw))
@@ -206,6 +276,11 @@ class PoseWitness:
                 )
         if lies or self._drifts:
             return
+        if self._spoils_pose(now_ns):
+            self._anchor = self._expected = None
+            if self._hang is not None and self._hang.sure:
+                self._hung(now_ns, at_ns, pose, covariance, self._hang)
+            return
         # A robot that stood before a gap may have been pushed in it.
         stood = self._before is not None and self._before[3] < MOVES
         if last is not None and at_ns - last[0] >= GAP_NS and (self._seldom or stood):
@@ -220,7 +295,7 @@ class PoseWitness:
             self._expected = None
         if self._anchor is None:
             self._anchor = true, pose
-            self._room = by_time
+            self._room, self._spoiled_before = by_time, self._spoiled
             return
         expected = _through(self._anchor, true)
         dx, dy = pose[0] - expected[0], pose[1] - expected[1]
@@ -230,6 +305,7 @@ class PoseWitness:
         by_time += self._unsure_m
         room = ROOM_M + self._room + by_time
         room_yaw = ROOM_RAD + self._room / self.track + by_time / self.track
+        room_yaw += self._spoiled - self._spoiled_before
         allowed = SIGMAS * math.sqrt(xx + yy) + room + far * room_yaw
         off = math.hypot(dx, dy)
         if off > allowed:
@@ -244,6 +320,49 @@ class PoseWitness:
             raise BrokenError(
                 "the pose stays within its covariance", now_ns,
                 f"{dyaw:.3f} rad off, sigma {math.sqrt(yawyaw):.4f}",
+            )  # fmt: skip
+
+    def _spoils_pose(self, now_ns: int) -> bool:
+        """Return whether the gyro hangs, or has hung so shortly before that it is not judged."""
+        if self._hang is not None or now_ns < self._settles_ns:
+            return True
+        rests_ns = self._settles_at_rest_ns
+        if rests_ns and now_ns - max(rests_ns, self._moved_ns) < SETTLES_AT_REST_NS:
+            return True
+        self._settles_at_rest_ns = 0
+        return False
+
+    def _hung(
+        self, now_ns: int, at_ns: int, pose: Pose, covariance: tuple[float, ...], hang: Hang
+    ) -> None:
+        """Judge the heading while the gyro hangs.
+
+        The position is not judged, because a heading that is taken back was wrong on the way.
+        """
+        true, yaw = self._true_at(at_ns), pose[2]
+        passed_ns, hang.seen_ns = at_ns - hang.seen_ns, at_ns
+        if true is None or passed_ns > HANG_GAP_NS:
+            hang.sure = False
+            return
+        if not hang.turned:
+            hang.turned, hang.begun, hang.agreed = True, (true[2], yaw), (true[2], yaw)
+        turned = math.remainder(true[2] - hang.true_yaw, math.tau)
+        hang.true_yaw = true[2]
+        if passed_ns > 0 and abs(turned * NS / passed_ns - hang.rate) < CONTRADICTS:
+            hang.agreed_ns, hang.agreed = at_ns, (true[2], yaw)
+        rests = at_ns - max(self._moved_ns, hang.begun_ns) > HANG_REST_NS
+        hang.taken_back |= rests and abs(hang.rate) > HANG_RATE
+        contradicted = at_ns - hang.agreed_ns > CONTRADICTED_NS
+        if not (hang.taken_back or contradicted):
+            return
+        true_then, then = hang.begun if hang.taken_back else hang.agreed
+        off = math.remainder(yaw - then - (true[2] - true_then), math.tau)
+        sigma, room = math.sqrt(covariance[5]), ROOM_RAD + 0.1 * self._speed / self.track
+        name = "taken back" if hang.taken_back else "in the covariance"
+        if abs(off) > SIGMAS * sigma + room:
+            raise BrokenError(
+                f"the turn of a gyro that hangs is {name}", now_ns,
+                f"{off:.3f} rad off, sigma {sigma:.4f}, the gyro repeats {hang.rate:.3f} rad/s",
             )  # fmt: skip
 
     def _gap(

@@ -15,6 +15,7 @@ from itertools import repeat
 from typing import Any
 
 import msgspec
+from msgspec.structs import replace
 
 import acsard
 from acsard.core.config.parsing import ConfigError, parse
@@ -23,7 +24,7 @@ from acsard.core.incoming.queries import Query
 from acsard.core.messages.encodings import encode as encode_message
 from acsard.core.simulator.baud_mismatch import garbled
 from acsard.core.simulator.fake_mcu import FakeMcu
-from acsard.core.simulator.simulated_robot import WatchedMcu
+from acsard.core.simulator.simulated_robot import Sight, WatchedMcu
 from acsard.core.values import Estimate as Measured
 from acsard.core.values import Event, Instant, Latches, Outputs, Received
 from acsard.daemon.latch_rules import (
@@ -38,6 +39,7 @@ from acsard.daemon.latch_rules import (
 )
 from acsard.daemon.pacing import Period
 from tests.scenarios.world import START, World
+from tests.simulate.gyro_faults import GyroFaults
 
 START_NS = START.mono_ns
 WALL_OFFSET_NS = START.wall_ns - START.mono_ns
@@ -176,6 +178,7 @@ class Product:
         self.drops: Callable[[str], None] = lambda key: None
         """Called with the key of each sample that the inbox drops: the oldest unread one of it."""
         self.echo = False
+        self.gyro = GyroFaults()
         self.unplugged_ns = self.plugged_ns = START_NS
         """When the board was last unplugged, and plugged in: a daemon that starts finds it so."""
         self._world = World(self._config, keeper=self.disk)
@@ -185,6 +188,8 @@ class Product:
         world = self._world
         world.bus.wanted = set()
         world.watch = self._watch
+        if isinstance(world.mcu, WatchedMcu):
+            world.mcu._see = self._sight
         self.dropped = 0
         feed = world.port.feed
 
@@ -193,6 +198,9 @@ class Product:
             feed(received)
 
         world.port.feed = noticed  # type: ignore[method-assign]
+
+    def _sight(self, sight: Sight) -> None:
+        self._world._see(replace(sight, gyro=self.gyro.reported(sight.gyro)))
 
     def _watch(self, outputs: Outputs) -> None:
         world = self._world
@@ -414,7 +422,7 @@ class Product:
             other.vehicle.pose = pose
             if isinstance(other, WatchedMcu):
                 other._look_ns = self.now_ns + 10_000_000
-                other._see = world._see
+                other._see = self._sight
                 other._history[0] = (self.now_ns, 0.0)
             world.mcu = other
             self.board(self._faults)
@@ -496,8 +504,6 @@ class Product:
         world.now_ns = world.next_period_ns = old.now_ns
         world.wall_offset_ns = old.wall_offset_ns
         world.mcu = old.mcu
-        if isinstance(world.mcu, WatchedMcu):
-            world.mcu._see = world._see
         if old.port.mcu is not None:
             world.port.plug(world.mcu)
         self.plugged_ns = self.now_ns

@@ -157,7 +157,7 @@ class Reasons:
             return
         clock = self._clock(one.clock, at_ns, delay_ns)
         wild = (sender.get(name) for name in ("clock", "twice", "swap", "bad_stamps"))
-        clock.odd |= any(wild)
+        clock.odd |= any(wild) or sender.get("stamps_speeds", False)
         clock.odd |= one.clock in self.run.witness.shared_clocks
         clock.proved |= clock.known(at_ns, self.run.witness.timeout[source])
         clock.believed |= clock.may_be_known(at_ns, self.run.witness.timeout[source])

@@ -21,6 +21,10 @@ FOREIGN = ("signed", "rmw", "header", "zenoh", "routed", "bridged")
 AHEAD_NS = NS // 2
 """Zenoh replaces a timestamp that is further ahead of the receiver's clock."""
 
+SWAPPED_NS = 2_000_000
+"""If the network swaps the last two messages of a drive, the speed arrives this long after the
+zero."""
+
 LAST_STAMP = 2**63 - 1
 """No attachment has a higher stamp, and each stamp is above 0: another attachment is ignored."""
 
@@ -65,12 +69,15 @@ def messages(sender: dict[str, Any], seed: int, seconds: float, wall_ns: int) ->
     found: list[Message] = []
     last_ns, number, t = 0, 0, float(sender["from"])
     phases, place = sender["phases"], -1
+    ends, ended = dict(sender.get("ends", ())), -1
     while t < min(sender["to"], seconds):
         while place + 1 < len(phases) and phases[place + 1][0] <= t:
             place += 1
         chance = [dice.random() for _ in range(6)]
         wish: list[Any] = phases[place][1:] if place >= 0 else [None, None]
-        if wish[0] is not None:
+        # A drive in `ends` has a single zero at its end.
+        repeats = place >= 0 and phases[place][0] in ends and place == ended
+        if wish[0] is not None and not repeats:
             number += 1
             late = sender["delay"] + _jitter(sender["jitter"], chance[0]) + _held(sender, t)
             arrives_ns = int((t + late) * NS)
@@ -85,6 +92,8 @@ def messages(sender: dict[str, Any], seed: int, seconds: float, wall_ns: int) ->
                     stamp_ns = bad_stamps.choice(BAD_STAMPS)
                 v, w = float(wish[0]), float(wish[1])
                 message = Message(int(t * NS), arrives_ns, v, w, stamp_ns, number, junk)
+                if place >= 0 and ends.get(phases[place][0]):
+                    _let_last_wait(found, number - 1, arrives_ns + SWAPPED_NS)
                 found.append(message)
                 if chance[5] < sender["twice"]:
                     again_ns = arrives_ns + int(chance[0] * 0.4 * NS)
@@ -92,10 +101,18 @@ def messages(sender: dict[str, Any], seed: int, seconds: float, wall_ns: int) ->
                 if "doubled" in sender:
                     again_ns = arrives_ns + int(sender["doubled"] * NS)
                     found.append(message._replace(arrives_ns=again_ns))
+            ended = place
         hz = _hz(sender, t)
         t += (0.9 + 0.2 * chance[0]) / hz if sender["jitter"] else 1 / hz
     end_ns = int((seconds + 0.2) * NS)
     return sorted((one for one in found if one.arrives_ns < end_ns), key=lambda m: m.arrives_ns)
+
+
+def _let_last_wait(found: list[Message], number: int, until_ns: int) -> None:
+    """Let the message with this number, which is the last one so far, arrive at this time."""
+    for place in range(max(0, len(found) - 2), len(found)):
+        if found[place].number == number:
+            found[place] = found[place]._replace(arrives_ns=until_ns)
 
 
 def _hz(sender: dict[str, Any], t: float) -> float:
@@ -191,6 +208,8 @@ def sample(
             identity, shared, clock = by_key, True, ""
         case "bridge":
             identity, shared, clock = f"bridge/{source}", True, ""
+    if sender.get("stamps_speeds") and (message.v or message.w):
+        clock = f"header {own}"  # the attachment has the stamps of the zeros
     via = "bridge" if way.startswith("bridge") else "rmw" if way == "rmw" else "native"
     if stamp_ns is not None and not keeps:
         session, stamp_ns, shared, clock = "", None, True, ""
@@ -247,10 +266,10 @@ def _payload(
         linear, angular = {"x": v}, {"z": w}
     if sender["form"] == "cdr" or via != "native" or math.isnan(v):
         sideways = 1.0 if message.junk == "cancels" else 0.0
-        return key, _cdr(message, linear["x"], sideways, angular["z"], sender["way"], options)
+        return key, _cdr(sender, message, linear["x"], sideways, angular["z"], options)
     body: dict[str, Any] = {"linear": linear, "angular": angular}
-    if sender["way"] == "header":
-        seconds, nanoseconds = _seconds(message)
+    if _is_stamped(sender):
+        seconds, nanoseconds = _seconds(sender, message)
         body = {"header": {"stamp": {"sec": seconds, "nanosec": nanoseconds}}, "twist": body}
     if sender["form"] == "msgpack":
         return key, msgspec.msgpack.encode(body)
@@ -258,20 +277,35 @@ def _payload(
 
 
 def _cdr(
-    message: Message, v: float, sideways: float, w: float, way: str, options: dict[str, Any]
+    sender: dict[str, Any],
+    message: Message,
+    v: float,
+    sideways: float,
+    w: float,
+    options: dict[str, Any],
 ) -> bytes:
     twist = struct.pack("<6d", v, sideways, 0.0, 0.0, 0.0, w)
-    name = "TwistStamped" if way == "header" else "Twist"
+    name = "TwistStamped" if _is_stamped(sender) else "Twist"
     options["encoding"] = f"application/cdr;geometry_msgs/msg/{name}"
-    if way != "header":
+    if not _is_stamped(sender):
         return b"\0\1\0\0" + twist
-    seconds, nanoseconds = _seconds(message)
+    seconds, nanoseconds = _seconds(sender, message)
     # An empty frame_id is a length of 1 and a NUL; the doubles are aligned to 8.
     return b"\0\1\0\0" + struct.pack("<iIIB3x", seconds, nanoseconds, 1, 0) + twist
 
 
-def _seconds(message: Message) -> tuple[int, int]:
-    """Return the stamp as the header has it, with signed seconds of 32 bits."""
+def _is_stamped(sender: dict[str, Any]) -> bool:
+    """Return whether this sender sends messages with a header."""
+    return sender["way"] == "header" or sender.get("stamps_speeds", False)
+
+
+def _seconds(sender: dict[str, Any], message: Message) -> tuple[int, int]:
+    """Return the stamp as the header has it, with signed seconds of 32 bits.
+
+    It is 0 in a zero of a sender that stamps only its speeds.
+    """
+    if sender.get("stamps_speeds") and not (message.v or message.w):
+        return 0, 0
     return divmod(min(message.stamp_ns, (2**31 - 1) * NS), NS)
 
 

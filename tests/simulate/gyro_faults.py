@@ -1,0 +1,114 @@
+"""Plans whose gyro reports wrong rates, and the wrong rates.
+
+`deploy/ros2/README.md` does not promise anything about such a gyro. The limits that the product
+states are in `acsard/core/motion/gyro.py`, and `pose.py` allows them: a wrong sample that differs
+by at most 2 rad/s from the true one counts, and a rate that repeats is taken back only after 1 s of
+rest. Two similar wrong samples in a row count too, so no plan has them.
+
+The plans have dice of their own, so the plans without these faults stay as they are.
+"""
+
+from __future__ import annotations
+
+import random
+from typing import Any
+
+Plan = dict[str, Any]
+
+SAMPLE_S = 0.01
+"""Interval of the simulated gyro, s."""
+
+HIGHEST = 34.9
+"""Highest wrong rate, rad/s, which is 2000 degrees per second, the end of the range of many
+gyros."""
+
+APART_S = 0.1
+"""Shortest time between two wrong samples, s."""
+
+PASSES = 2.1
+"""A wrong sample that differs by at most this from the true one may count, rad/s."""
+
+
+def add(plan: Plan, kinds: list[str]) -> None:
+    """Give a plan with a gyro the faults of these kinds."""
+    if not plan["config"].get("odometry", {}).get("gyro"):
+        return
+    if "wrong gyro samples" in kinds:
+        _add_wrong_samples(plan, random.Random(f"wrong gyro samples {plan['seed']}"))
+    if "hanging gyro" in kinds:
+        _add_hangs(plan, random.Random(f"hanging gyro {plan['seed']}"))
+    plan["events"].sort(key=lambda one: one["at"])
+
+
+def _moment(plan: Plan, dice: random.Random) -> float:
+    """Return a time, mostly one at which a sender turns the robot or has just stopped it."""
+    changes = [p[0] for s in plan["senders"] for p in s["phases"] if p[0] > 1.0]
+    if changes and dice.random() < 0.7:
+        return float(min(dice.choice(changes) + dice.uniform(-0.5, 2.0), plan["seconds"]))
+    return dice.uniform(1.0, plan["seconds"])
+
+
+def _add_wrong_samples(plan: Plan, dice: random.Random) -> None:
+    times: list[float] = []
+    for _ in range(1 + int(plan["seconds"] / dice.choice((2.0, 10.0, 30.0)))):
+        at = _moment(plan, dice)
+        for _ in range(dice.choice((1, 1, 1, 3, 10))):
+            if all(abs(at - other) > APART_S for other in times):
+                times.append(at)
+            at += dice.uniform(1.5 * APART_S, 1.0)
+    highest = dice.choice((HIGHEST, HIGHEST, 5.0))
+    for at in times:
+        rate = dice.choice((highest, dice.uniform(0.0, highest))) * dice.choice((-1, 1))
+        fault = ["wrong", round(rate, 3)]
+        plan["events"].append({"at": round(at, 3), "do": "gyro", "fault": fault})
+
+
+def _add_hangs(plan: Plan, dice: random.Random) -> None:
+    """Let the gyro hang, often when a turn ends, so that it repeats the rate of the turn."""
+    ends = [
+        after[0]
+        for sender in plan["senders"]
+        for before, after in zip(sender["phases"], sender["phases"][1:], strict=False)
+        if before[2] and not after[2]
+    ]
+    at = 0.0
+    for _ in range(1 + int(plan["seconds"] / 30)):
+        at = max(at + 1.0, _moment(plan, dice))
+        if ends and dice.random() < 0.6:
+            at = max(1.0, dice.choice(ends) + dice.choice((-2.0, -0.1, 0.1)) * dice.random())
+        lasts = round(dice.choice((0.3, 1.5, 4.0, 9.0)) * dice.uniform(0.7, 1.3), 3)
+        event = {"at": round(at, 3), "do": "gyro", "for": lasts, "fault": ["hangs"]}
+        plan["events"].append(event)
+
+
+class GyroFaults:
+    """The rates that a gyro reports instead of the measured ones."""
+
+    def __init__(self) -> None:
+        self.hanging = False
+        """The gyro repeats its next rate until this is false again."""
+        self.hung: float | None = None
+        """The rate that it repeats, rad/s, None while it works."""
+        self.spoiled = 0.0
+        """Turn that the wrong samples may have added which look like right ones, rad."""
+        self._wrong: float | None = None
+
+    def spoil(self, rate: float) -> None:
+        """Have the next sample report this rate, rad/s, unless the gyro hangs."""
+        self._wrong = rate
+
+    def reported(self, measured: float) -> float:
+        """Return the rate that the gyro reports for a measured one, rad/s."""
+        wrong, self._wrong = self._wrong, None
+        if not self.hanging:
+            self.hung = None
+        elif self.hung is None:
+            self.hung = measured
+        if self.hung is not None:
+            return self.hung
+        if wrong is None:
+            return measured
+        if abs(wrong - measured) <= PASSES:
+            # It counts for its own interval, and until the next sample it is the present rate.
+            self.spoiled += 2.0 * SAMPLE_S * abs(wrong - measured)
+        return wrong
