@@ -107,7 +107,8 @@ def made(seed: int, seconds: float | None = None) -> Plan:
         plan["kinds"] = sorted([*kinds, *later])
         gyro_faults.add(plan, later)
         if "unstamped zeros" in later:
-            _draw_unstamped_zeros(random.Random(f"unstamped zeros {seed}"), plan)
+            senders = plan["senders"][1:] if driven else plan["senders"]
+            _draw_unstamped_zeros(random.Random(f"unstamped zeros {seed}"), senders)
     return plan
 
 
@@ -150,23 +151,23 @@ def _draw_routers(dice: random.Random, plan: Plan) -> None:
             sender["source"] = senders[0]["source"]
 
 
-def _draw_unstamped_zeros(dice: random.Random, plan: Plan) -> None:
-    """Let programs with an id stamp only their speeds, and often end a drive with a single zero.
+def _draw_unstamped_zeros(dice: random.Random, senders: list[dict[str, Any]]) -> None:
+    """Let some senders stamp only their speeds, and often end a drive with a single zero.
 
     A ROS node does so that fills the header of its speeds, and ends with an empty `TwistStamped`.
     The daemon then takes the stamp of the header for a speed, and that of the attachment for a
     zero, so two clocks stamp the messages of one sender. The network often swaps the last two
     messages of a drive.
     """
-    ids = [sender["id"] for sender in plan["senders"]]
-    for sender in plan["senders"]:
-        way, phases = sender["way"], sender["phases"]
-        if way not in ("rmw", "signed", "header") or ids.count(sender["id"]) > 1:
+    ids = [sender["id"] for sender in senders]
+    for sender in senders:
+        phases = sender["phases"]
+        if sender["way"] not in ("rmw", "signed", "header", "client") or ids.count(sender["id"]) > 1:
             continue
         if sender["churn"] or sender["bad_stamps"]:
             continue
-        if way == "header":  # without an attachment its messages have no numbers
-            sender["way"] = "rmw"
+        if sender["way"] != "signed":
+            sender["way"] = "rmw"  # `header` has no numbers, and the stamps of `client` are steady
         ends = [
             [after[0], dice.random() < 0.7]
             for before, after in zip(phases, phases[1:], strict=False)
