@@ -1,15 +1,16 @@
 """Plans whose gyro reports wrong rates, and the wrong rates.
 
-`deploy/ros2/README.md` does not promise anything about such a gyro. The limits that the product
-states are in `acsard/core/motion/gyro.py`, and `pose.py` allows them: a wrong sample that differs
-by at most 2 rad/s from the true one counts, and a rate that repeats is taken back only after 1 s of
-rest. Two similar wrong samples in a row count too, so no plan has them.
+`acsard/core/motion/gyro.py` states what the product does with such rates, and `pose.py` allows its
+limits: a wrong sample that differs by at most 2 rad/s from the rate before it counts, and a rate
+that repeats is taken back only after 1 s of rest. Two similar wrong samples in a row count too, so
+no plan has them.
 
 The plans have dice of their own, so the plans without these faults stay as they are.
 """
 
 from __future__ import annotations
 
+import itertools
 import random
 from typing import Any
 
@@ -68,7 +69,7 @@ def _add_hangs(plan: Plan, dice: random.Random) -> None:
     ends = [
         after[0]
         for sender in plan["senders"]
-        for before, after in zip(sender["phases"], sender["phases"][1:], strict=False)
+        for before, after in itertools.pairwise(sender["phases"])
         if before[2] and not after[2]
     ]
     at = 0.0

@@ -7,6 +7,7 @@ random part of the kinds of trouble off, because one kind of trouble often hides
 
 from __future__ import annotations
 
+import itertools
 import random
 from typing import Any
 
@@ -162,15 +163,15 @@ def _draw_unstamped_zeros(dice: random.Random, senders: list[dict[str, Any]]) ->
     ids = [sender["id"] for sender in senders]
     for sender in senders:
         phases = sender["phases"]
-        if sender["way"] not in ("rmw", "signed", "header", "client") or ids.count(sender["id"]) > 1:
+        if sender["way"] not in ("rmw", "signed", "header", "client"):
             continue
-        if sender["churn"] or sender["bad_stamps"]:
+        if sender["churn"] or sender["bad_stamps"] or ids.count(sender["id"]) > 1:
             continue
         if sender["way"] != "signed":
             sender["way"] = "rmw"  # `header` has no numbers, and the stamps of `client` are steady
         ends = [
             [after[0], dice.random() < 0.7]
-            for before, after in zip(phases, phases[1:], strict=False)
+            for before, after in itertools.pairwise(phases)
             if (before[1] or before[2]) and after[1] == after[2] == 0.0 and dice.random() < 0.8
         ]
         sender.update(stamps_speeds=True, ends=ends, wheels=False)

@@ -55,12 +55,13 @@ ROOM_M, ROOM_RAD = 0.02, 0.03
 """Allowed beside the covariance: a sample's time is known to a few ms."""
 
 HANG_REST_NS = 16 * NS // 10
-"""Time at rest after which the turn of a gyro that hangs is certainly taken back. The product waits
-until wheels and gyro have repeated for 1 s that they contradict each other."""
+"""Time at rest after which the turn of a gyro that hangs is certainly taken back. The product does
+so after 1 s, in which the wheels report no motion and the gyro repeats its rate."""
 
 HANG_RATE = 0.1
 """Rate, rad/s, from which on a gyro that hangs certainly reports more than its bias. A gyro that
-hangs at its bias looks like a sound one at rest, and like slipping wheels in a turn of up to 5 s."""
+hangs at its bias looks like a sound one at rest. In a turn of up to 5 s, it looks like a sound one
+whose wheels slip."""
 
 CONTRADICTS, CONTRADICTED_NS = 0.5, 13 * NS // 2
 """Difference of the rates of gyro and robot, rad/s, from which on wheels and gyro certainly
@@ -72,7 +73,7 @@ HANG_GAP_NS = 3 * NS // 20
 
 SETTLES_NS, SETTLES_AT_REST_NS = NS // 2, 5 * NS // 2
 """Time after a hang from which on the pose is judged again. If the product may have learned a wrong
-bias from the gyro that hung, it must rest for the second time before."""
+bias during the hang, the robot must also have stood for the second time."""
 
 Pose = tuple[float, float, float]
 

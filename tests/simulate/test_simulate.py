@@ -27,16 +27,17 @@ from tests.scenarios.world import START
 from tests.simulate import __main__ as main
 from tests.simulate import pairs, shrink
 from tests.simulate.actors import Result, Run, played
-from tests.simulate.ages import Ages
+from tests.simulate.ages import Ages, Wish
 from tests.simulate.bad_moments import MOMENTS, NEW
 from tests.simulate.board_inputs import Inputs, kinds
 from tests.simulate.course import Course
 from tests.simulate.damage import Damage
 from tests.simulate.followed import Followed
+from tests.simulate.gyro_faults import GyroFaults
 from tests.simulate.jerk import Slope
 from tests.simulate.log_lines import LogLines
 from tests.simulate.pairs import OURS, Pair, Trace
-from tests.simulate.plan import KINDS, Plan, _rare_events, made
+from tests.simulate.plan import KINDS, LATER_KINDS, Plan, _rare_events, made
 from tests.simulate.plugging import Plugging
 from tests.simulate.pose import PoseWitness
 from tests.simulate.product import HELD, Disk, Product, Seen, problems
@@ -76,7 +77,7 @@ def test_a_seed_gives_the_same_bytes_again_also_when_its_plan_was_written_to_a_f
 def test_every_configuration_of_a_plan_is_legal_and_every_kind_of_trouble_is_drawn() -> None:
     plans = [made(seed) for seed in range(30)]
     assert [problems(one["config"]) for one in plans] == [[]] * 30
-    assert {kind for one in plans for kind in one["kinds"]} == set(KINDS)
+    assert {kind for one in plans for kind in one["kinds"]} == {*KINDS, *LATER_KINDS}
 
 
 def test_a_sender_sends_the_same_without_the_other_senders() -> None:
@@ -775,6 +776,105 @@ def test_only_a_gyro_may_correct_the_heading_once_and_soon_after_a_wheel_fault(
         turned(0.0, 2.0, set())
     with pytest.raises(BrokenError, match=promise):
         turned(0.0, 1.0, set())
+
+
+def hung(rests_s: float, rate: float, off: float, deviation: float) -> None:
+    """Judge a robot that rests, whose gyro repeats `rate`, and whose heading is wrong by `off`."""
+    pose, gyro = PoseWitness({"odometry": {"gyro": True}}), GyroFaults()
+    covariance = (0.0001, 0.0, 0.0, 0.0001, 0.0, deviation**2)
+
+    def step(at_ns: int, yaw: float) -> None:
+        pose.gyro(at_ns, gyro)
+        truth = at_ns, 0.0, 0.0, 0.0, 0.0
+        pose.see(at_ns, [(at_ns, 0.0, 0.0, yaw, covariance, ())], truth, 0, set())
+
+    step(0, 0.0)
+    gyro.hanging = True
+    assert gyro.reported(rate) == gyro.reported(0.0) == rate
+    for n in range(1, int(rests_s * 100)):
+        step(n * NS // 100, off if n > 5 else 0.0)
+    gyro.hanging = False
+    assert gyro.reported(0.0) == 0.0
+    for n in range(int(rests_s * 100), int(rests_s * 100) + 100):
+        step(n * NS // 100, off)
+
+
+def test_the_turn_of_a_gyro_that_hangs_may_stay_only_until_the_robot_has_rested() -> None:
+    with pytest.raises(BrokenError, match="a gyro that hangs is taken back"):
+        hung(1.7, 0.5, 0.3, 0.01)
+    hung(1.5, 0.5, 0.3, 0.01)
+    hung(1.7, 0.5, 0.02, 0.01)
+    hung(1.7, 0.5, 0.3, 0.1)
+
+
+def test_a_gyro_that_hangs_at_its_bias_may_be_believed() -> None:
+    hung(6.0, 0.05, 0.3, 0.01)
+
+
+def test_a_long_contradiction_of_a_gyro_that_hangs_is_in_the_covariance() -> None:
+    pose, gyro = PoseWitness({"odometry": {"gyro": True}}), GyroFaults()
+    gyro.hanging = True
+    gyro.reported(1.0)
+
+    def turn(seconds: float, deviation: float) -> None:
+        for n in range(int(seconds * 100)):
+            at_ns, covariance = n * NS // 100, (1.0, 0.0, 0.0, 1.0, 0.0, deviation**2)
+            pose.gyro(at_ns, gyro)
+            truth = at_ns, n / 100, 0.0, 0.0, 0.0
+            pose.see(at_ns, [(at_ns, n / 100, 0.0, n / 100, covariance, ())], truth, 0, set())
+
+    turn(6.0, 0.01)
+    pose, at_least = PoseWitness({"odometry": {"gyro": True}}), math.pi / 6.0
+    turn(9.0, at_least)
+    pose = PoseWitness({"odometry": {"gyro": True}})
+    with pytest.raises(BrokenError, match="a gyro that hangs is in the covariance"):
+        turn(7.0, 0.01)
+
+
+@pytest.mark.parametrize(("rate", "allowed"), [(1.5, True), (3.0, False)])
+def test_only_a_wrong_sample_near_the_true_rate_may_count(rate: float, allowed: bool) -> None:
+    gyro = GyroFaults()
+    gyro.spoil(rate)
+    assert [gyro.reported(0.0), gyro.reported(0.0)] == [rate, 0.0]
+    assert gyro.spoiled == pytest.approx(0.02 * rate if allowed else 0.0)
+
+
+@pytest.mark.parametrize(("speed", "finding"), [(0.5, False), (0.7, True)])
+def test_a_robot_may_not_speed_up_by_a_speed_that_a_zero_overtook(
+    speed: float, finding: bool
+) -> None:
+    witness = witnessed()
+    followed = Followed(witness)
+    source = witness.config["commands"]["sources"][0]["name"]
+    sender = {"way": "rmw", "source": source, "clock": [], "stamps_speeds": True, "ends": []}
+    for number, v, at_ns in ((1, 1.0, NS), (3, 0.0, NS + 50_000_000), (2, 1.0, NS + 52_000_000)):
+        message = Message(at_ns, at_ns, v, 0.0, at_ns, number, "")
+        clock = "header s0" if v else "s0"
+        one = Sample(f"cmd/{source}", b"", {}, "s0", False, clock)
+        wish = Wish(at_ns, v, 0.0)
+        followed.command(sender, message, one, at_ns, wish)
+    witness.mode = "driving"
+    followed.step(at_ns + 1, at_ns + 1, at_ns, "driving", "up")
+    assert followed.wish is None
+    before, after = ((one / witness.radius,) * 4 for one in (0.6, speed))
+    if finding:
+        with pytest.raises(BrokenError, match="a speed that a zero overtook"):
+            followed.line(at_ns, before, after)
+    else:
+        followed.line(at_ns, before, after)
+
+
+def test_a_drive_may_end_with_a_single_zero_that_overtakes_the_last_speed() -> None:
+    phases = [[0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]
+    sender = driven()["senders"][0] | {"id": "s0", "way": "rmw", "phases": phases}
+    sender |= {"stamps_speeds": True, "ends": [[1.0, True]]}
+    sent = messages(sender, 1, 2.0, 0)
+    zeros = [one for one in sent if one.sent_ns >= NS]
+    assert len(zeros) == 1
+    assert sent[-2:] == [zeros[0], sent[-1]]
+    assert sent[-1].number == zeros[0].number - 1
+    clocks = [sample(sender, one, PLAIN["config"], 0).clock for one in sent[-2:]]
+    assert clocks == ["s0", "header s0"]
 
 
 CLEARED = "cleared; each sender must send a zero"
