@@ -296,7 +296,7 @@ def _cdr(
 
 def _is_stamped(sender: dict[str, Any]) -> bool:
     """Return whether this sender sends messages with a header."""
-    return sender["way"] == "header" or sender.get("stamps_speeds", False)
+    return sender["way"] == "header" or bool(sender.get("stamps_speeds"))
 
 
 def _seconds(sender: dict[str, Any], message: Message) -> tuple[int, int]:
