@@ -113,7 +113,7 @@ class Followed:
         self._rests_ns: dict[Who, int] = {}
         """Arrival of the newest zero of each sender, by the robot's clock."""
         self._latest: dict[Who, Command] = {}
-        """The last command that arrived from each sender."""
+        """The last command that arrived from each sender, without overtaken speeds."""
         self._slowest: tuple[float, float] | None = None
         """The lowest speed and turn rate since the followed command is one that a zero overtook,
         None if it is not such a command."""
@@ -146,7 +146,10 @@ class Followed:
         found = Command(
             at_ns, wish.arrived_ns, who, sender, message, sample.clock, wish.v, wish.w, numbered
         )
-        found = self._latest[who] = found._replace(overtaken=self._is_overtaken(found))
+        if self._is_overtaken(found):
+            found = found._replace(overtaken=True)
+        else:
+            self._latest[who] = found
         if not (wish.v or wish.w or message.junk):
             self._rests_ns[who] = at_ns
             self._zero_ns[who] = max(message.sent_ns, self._zero_ns.get(who, 0))
@@ -183,7 +186,6 @@ class Followed:
             and zero.sender is found.sender
             and zero.message.number > found.message.number
             and found.arrived_ns - zero.arrived_ns < timeout_ns - MARGIN_NS
-            and found.who[0] not in self._witness.churned
         )
 
     def _go_on(self, at_ns: int) -> None:
@@ -310,6 +312,8 @@ class Followed:
         # A limited jerk lets a speed grow on for a moment.
         sure = witness.mode == "driving" and "linear_jerk" not in witness.limits
         sure &= not (witness.pending or witness.away)
+        # Senders that change their identity may push out the record of the zero.
+        sure &= holder is not None and holder.who[0] not in witness.churned
         if holder is None or not holder.overtaken or not sure:
             self._slowest = None
             return
