@@ -411,6 +411,7 @@ class Run:
                 product.tear(event["taken"])
             case "flip":
                 product.flip(event["place"], event["mask"], event["behind"])
+                self.pose.flip()
                 self._flipped = event["behind"] + 1
                 self._troubled("flip")
                 self.damage.forget()

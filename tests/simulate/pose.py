@@ -116,6 +116,8 @@ class PoseWitness:
         turn = COARSE_COUNTS * math.tau / 96 if counts == 96 and not told else 0.0
         self._unsure_m: float = turn * drive.get("wheel_radius", 0.05)
         """Distance that such encoders may be off, m."""
+        self._per_flip_m = self.fastest / 2 / config.get("control", {}).get("rate", 100.0)
+        """Distance by which one damaged speed of one line may move the pose, m."""
         self._known_ns = 0
         """From when on the lines show the motion again."""
         rate = config.get("control", {}).get("rate")
@@ -176,6 +178,10 @@ class PoseWitness:
             self._hang.sure = False
         if not mute:
             self._before = None
+
+    def flip(self) -> None:
+        """Note a damaged line of a plain link, whose speed may look like a possible one."""
+        self._unsure_m += self._per_flip_m
 
     def gyro(self, now_ns: int, faults: GyroFaults) -> None:
         """Note the rate that the gyro repeats, if it hangs, and its wrong samples."""

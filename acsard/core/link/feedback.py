@@ -340,7 +340,12 @@ class Timeline:
                 return answered
         slot = self._slots.place(self._rest)
         if slot is None:
-            return self._placed_by_reads()
+            placed, latest_ns = self._placed_by_reads(), self._prompts.latest_ns
+            if speaks is False and latest_ns and latest_ns + self._usual_ns < placed.due_ns:
+                # This reply waited in a stall, and its command was taken for a lost one. A board
+                # that only answers took its sample when the last command arrived, or before.
+                placed = replace(placed, due_ns=latest_ns)
+            return placed
         if answered is not None:
             self._compare(answered, slot)
         return slot if slot.due_ns <= came_ns else replace(slot, due_ns=came_ns)

@@ -531,6 +531,16 @@ class PromptedTimes:
         lost."""
         return self._batched and self._losses > LOSSY_FRACTION
 
+    @property
+    def latest_ns(self) -> int:
+        """Latest monotonic time at which a usual reply to the last command comes, ns.
+
+        It is 0 before the first command, and while the usual delay is unknown.
+        """
+        if self._sent is None or self._delay is None:
+            return 0
+        return self._sent + int(self._delay)
+
     def left(self, at_ns: int) -> None:
         """Record that a command was written at the monotonic time `at_ns`, ns."""
         if self._sent is not None:

@@ -341,7 +341,9 @@ class Gyro:
                 self._repeated_s = self._rested_s = 0.0
                 self._forget_repeated()
             bias.drift(passed)
-            stands = resting and bias.rest(sample.rate, sample.variance, span)
+            # The rate of a gyro that hangs is not its bias.
+            learns = resting and not self._frozen
+            stands = learns and bias.rest(sample.rate, sample.variance, span)
             self._rate = 0.0 if stands else sample.rate - bias.value
             self._noise = max(bias.noise, sample.variance)
             self._angle += self._rate * span

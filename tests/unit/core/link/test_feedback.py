@@ -312,6 +312,17 @@ def test_the_dt_of_an_answer_is_the_time_between_the_prompting_lines() -> None:
     assert (found.gap, found.bridged) == (0.0, 0.0)
 
 
+def test_replies_that_waited_in_a_stall_beyond_the_open_commands_cover_no_time_of_it() -> None:
+    """The board samples only when a command arrives, and in the stall none arrived."""
+    bench = prompted(Bench(counts=0), 80)
+    bench.timeline.left(bench.now_ns + 2 * MS)
+    bench.now_ns += 1200 * MS
+    bench.timeline.read(Instant(bench.now_ns, bench.now_ns), 3 * LENGTH, 3, 0)
+    found = [bench.timeline.place(SPEEDS, None, 0, LENGTH, False) for _ in range(3)]
+    assert sum(line.dt for line in found) < 0.02
+    assert all(line.gap == line.bridged == 0.0 for line in found)
+
+
 def test_the_dt_of_an_answer_that_names_its_line_is_that_of_the_named_lines() -> None:
     bench = Bench(counts=0)
     for number, ms in enumerate((0, 10, 20, 37)):

@@ -577,6 +577,18 @@ def test_a_turn_is_taken_back_only_in_a_line_that_covers_a_known_time() -> None:
     assert bench.told == pytest.approx(0.0, abs=1e-6)
 
 
+def test_the_rate_of_a_gyro_that_hangs_does_not_become_its_bias() -> None:
+    bench = proved(0.002)
+    frozen(bench)
+    bench.run(0.05, 0.15)
+    bench.run(3.0)
+    assert bench.says() == "not believed"
+    bench.distort = lambda rate: rate
+    bench.run(10.0, still=False)
+    assert bench.says() == "used"
+    assert bench.told == pytest.approx(bench.true, abs=0.02)
+
+
 @pytest.mark.parametrize("rest", [0.3, 0.9])
 def test_the_turn_of_a_gyro_that_hangs_is_taken_back_over_a_gap_and_the_gap_is_in_doubt(
     rest: float,
