@@ -116,7 +116,8 @@ class PoseWitness:
         turn = COARSE_COUNTS * math.tau / 96 if counts == 96 and not told else 0.0
         self._unsure_m: float = turn * drive.get("wheel_radius", 0.05)
         """Distance that such encoders may be off, m."""
-        self._per_flip_m = self.fastest / 2 / config.get("control", {}).get("rate", 100.0)
+        rate = config.get("control", {}).get("rate", 100.0)
+        self._per_flip_m = self.fastest / 2 / (100.0 if rate == "auto" else rate)
         """Distance by which one damaged speed of one line may move the pose, m."""
         self._known_ns = 0
         """From when on the lines show the motion again."""
