@@ -1894,6 +1894,24 @@ def test_a_reason_without_the_client_that_stopped_the_robot_is_a_finding() -> No
         inputs.step(2, pressed, 0, True, dict)
 
 
+@pytest.mark.parametrize(("clients", "daemon", "finding"), [
+    (3, False, True), (4, False, False), (3, True, False),
+])  # fmt: skip
+def test_a_reason_may_leave_out_a_client_only_if_it_names_four_others(
+    clients: int, daemon: bool, finding: bool
+) -> None:
+    witness = Witness(PLAIN["config"])
+    inputs = Inputs(witness, reports=True)
+    witness.stops = [0]
+    inputs.asked(0, "op1")
+    causes = [f"was stopped by client {n}, before the restart" for n in range(clients)]
+    causes += ["stopped when the daemon started, because the disk is full"] * daemon
+    reason = "; also ".join(["front bumper pressed", *causes])
+    expected = pytest.raises(BrokenError, match="keeps the name") if finding else nullcontext()
+    with expected:
+        inputs.step(1, Seen(0, 0, "stopped", reason, None, "up", [], ()), 0, True, dict)
+
+
 def test_a_message_in_a_hole_is_lost_and_every_message_of_a_doubling_network_comes_twice() -> None:
     sender = driven()["senders"][0]
     numbers = [one.number for one in messages(sender, 0, 2.0, 0)]
