@@ -106,6 +106,8 @@ class Followed:
         """The command that was followed in the last step."""
         self._keeper: Command | None = None
         """The last command that was followed of the sender that keeps the robot."""
+        self._higher: list[Wish] = []
+        """Commands since the last step of sources of higher priority than that sender."""
         self._going_ns = 0
         """Arrival of the last command of that sender, followed or not. It was never silent."""
         self._goes_ns = 0
@@ -157,14 +159,8 @@ class Followed:
             priority = self._witness.priority
             if self._keeper.who == who:
                 self._go_on(at_ns)
-            elif priority[who[0]] > priority[self._keeper.who[0]] and (
-                not sample.clock
-                or wish.arrived_ns - message.sent_ns < self._witness.timeout[who[0]]
-            ):
-                # If a sender of higher priority gets the robot, also one that must send a zero, the
-                # first of the others to come gets the robot behind it. The daemon may refuse this
-                # command nevertheless.
-                self._keeper = None
+            elif priority[who[0]] > priority[self._keeper.who[0]]:
+                self._higher.append(wish)
         self._arrived[at_ns] = None if at_ns in self._arrived else found
         if len(self._arrived) > KEPT:
             del self._arrived[next(iter(self._arrived))]
@@ -274,7 +270,10 @@ class Followed:
     def step(
         self, true_ns: int, decided_ns: int, followed_ns: int | None, mode: str, link: str
     ) -> None:
-        """Judge the command that the robot follows in a step that began at `decided_ns`."""
+        """Judge the command that the robot follows in a step that began at `decided_ns`.
+
+        The witness has judged the ages of all commands before.
+        """
         witness = self._witness
         armed_since_ns = witness.armed_since_ns
         disarmed = armed_since_ns != self._armed_since_ns or (mode == "fault" != self._mode)
@@ -288,6 +287,12 @@ class Followed:
             self._going_ns = max(self._going_ns, self._goes_ns)
         self._waiting.clear()
         self._count = self._goes_ns = 0
+        if any(wish.fresh for wish in self._higher):
+            # If a sender of higher priority gets the robot, also one that must send a zero, the
+            # first of the others to come gets the robot behind it. The daemon may refuse this
+            # command nevertheless.
+            self._keeper = None
+        self._higher.clear()
         found = None if followed_ns is None else self._arrived.get(followed_ns)
         if found is not None:
             self._first_keeps(true_ns, decided_ns, found)

@@ -1609,7 +1609,7 @@ def test_a_sender_that_goes_on_keeps_the_robot_although_its_commands_are_refused
 
 
 @pytest.mark.parametrize(("source", "late_s", "finding"), [
-    ("teleop", 0.01, False), ("teleop", 2.0, True), ("nav", 0.01, True),
+    ("teleop", 0.01, False), ("teleop", 1.0, False), ("teleop", 2.0, True), ("nav", 0.01, True),
 ])  # fmt: skip
 def test_a_command_of_higher_priority_may_end_the_place_of_the_first_sender(
     source: str, late_s: float, finding: bool
@@ -1631,6 +1631,7 @@ def test_a_command_of_higher_priority_may_end_the_place_of_the_first_sender(
             wish = witness.command(sender, one, found, at_ns)
             followed.command(sender, one, found, at_ns, wish)
             followed_ns = None if name == source else at_ns
+            witness.read()
             followed.step(at_ns + 1, at_ns + 1, followed_ns, "driving", "up")
 
 
