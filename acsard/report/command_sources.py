@@ -16,6 +16,7 @@ from acsard.core.robot import Robot
 from acsard.core.thinning import Band
 from acsard.core.values import NS_PER_S, Command, Outputs, Twist
 from acsard.recording.recorded_steps import Step
+from acsard.report.robot_reader import RobotReader
 
 SOURCE_STATES = ("refused", "waits", "sends", "drives")
 """States of a command source that is not silent, the most important state first.
@@ -46,8 +47,14 @@ MAX_SENDERS = 256
 class CommandSources:
     """The states of all command sources over time."""
 
-    def __init__(self, sources: Sequence[Source]) -> None:
-        """Prepare for the first step. `sources` are the sources in the configuration."""
+    def __init__(self, sources: Sequence[Source], reader: RobotReader) -> None:
+        """Prepare for the first step.
+
+        Args:
+            sources: the sources in the configuration.
+            reader: the reader of the robots that replay the steps.
+        """
+        self._reader = reader
         self._timeouts = {
             source.name: source.timeout for source in sorted(sources, key=lambda s: -s.priority)
         }
@@ -96,7 +103,7 @@ class CommandSources:
     def _find_refused(self, step: Step, t: float, robot: Robot) -> None:
         # The robot's counters show the reasons, but not the sources. A source counts as refused if
         # the last command that the robot accepted from it is older than its command in this step.
-        counted = Counter({name: robot.counters[f"command_{name}"] for name in REFUSED})
+        counted = Counter(self._reader.refused(robot))
         new, self._counted = counted - self._counted, counted
         same, self._robot = robot is self._robot, robot
         # A robot from a recorded state has also counted the refusals before this step.
@@ -104,7 +111,7 @@ class CommandSources:
             return
         words = "; ".join(REFUSED[reason] for reason in new)
         now_ns = step.inputs.now.mono_ns
-        ages = {source.name: source.age_s for source in robot.snapshot(now_ns).sources}
+        ages = {source.name: source.age_s for source in self._reader.sources(robot, now_ns)}
         for command in step.inputs.commands:
             age_s = ages.get(command.source)
             if age_s is None or age_s * NS_PER_S > now_ns - command.arrived_ns + 1:
@@ -137,7 +144,7 @@ class CommandSources:
     def _states(self, step: Step, t: float, robot: Robot) -> Iterator[tuple[str, str, str]]:
         """Yield the name, state and reason of each source. A silent source has the state ""."""
         mode, reason, _, driver = step.recorded.status
-        for source in robot.snapshot(step.inputs.now.mono_ns).sources:
+        for source in self._reader.sources(robot, step.inputs.now.mono_ns):
             refusal, wait = self._refusal(source.name, t), source.waits_for
             if mode == "driving" and source.name == driver:
                 yield source.name, "drives", waiting(wait)

@@ -202,16 +202,15 @@ def drawn(
     """
     about, replayed = recording.about, DisplayReplay(recording)
     began = about.wall_ns / NS_PER_S
-    data = ReportData(replayed.config, began + span.begin, began + span.end)
-    with replayed.state_errors():
-        for number, (step, outputs, robot) in enumerate(replayed.steps()):
-            if number % PROGRESS_STEPS == 0:
-                progress(step.inputs.now.wall_ns)
-            data.step(step, outputs, robot)
-            if data.over:
-                # Read the rest of the recording too, so that the notes count every damaged place.
-                deque(recording.messages(), maxlen=0)
-                break
+    data = ReportData(replayed.config, began + span.begin, began + span.end, replayed.state_errors)
+    for number, (step, outputs, robot) in enumerate(replayed.steps()):
+        if number % PROGRESS_STEPS == 0:
+            progress(step.inputs.now.wall_ns)
+        data.step(step, outputs, robot)
+        if data.over:
+            # Read the rest of the recording too, so that the notes count every damaged place.
+            deque(recording.messages(), maxlen=0)
+            break
     if data.began is None:
         raise RecordingError(
             f"{recording.path} has no step in that span of time, so there is nothing to draw: "

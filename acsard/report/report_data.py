@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections import Counter, deque
 from collections.abc import Mapping
+from contextlib import nullcontext
 
 from msgspec import Struct
 
@@ -22,6 +23,7 @@ from acsard.core.values import NS_PER_S, Outputs, Twist
 from acsard.recording.recorded_steps import US_PER_S, Step
 from acsard.recording.timeline import TimelineEntry, TimelineWriter
 from acsard.report.command_sources import MAX_TEXT_LENGTH, SAMPLE_PERIOD_S, CommandSources
+from acsard.report.robot_reader import RobotErrors, RobotReader
 
 NS_PER_MS = 1_000_000
 
@@ -293,7 +295,11 @@ class ReportData:
     """
 
     def __init__(
-        self, config: Config, begin: float | None = None, end: float | None = None
+        self,
+        config: Config,
+        begin: float | None = None,
+        end: float | None = None,
+        robot_errors: RobotErrors = nullcontext,
     ) -> None:
         """Prepare for the first step.
 
@@ -301,6 +307,7 @@ class ReportData:
             config: the configuration at the beginning of the recording.
             begin: wall-clock time at which the report begins, s since 1970; None for no limit.
             end: wall-clock time at which the report ends, s since 1970; None for no limit.
+            robot_errors: function that returns the context manager for each use of the robot.
         """
         self._window = (-math.inf if begin is None else begin, math.inf if end is None else end)
         self.config = config
@@ -316,7 +323,8 @@ class ReportData:
         )
         """Commanded speeds and measured speeds of the wheels, rad/s, in the order of `WHEELS`."""
         self.modes, self.links = Band(MODES), Band(LINKS)
-        self.sources = CommandSources(config.commands.sources)
+        self._reader = RobotReader(robot_errors)
+        self.sources = CommandSources(config.commands.sources, self._reader)
         self.serial = SerialCounts()
         self.lateness = Lateness(config.rate_hz)
         self.marks = Marks()
@@ -387,6 +395,7 @@ class ReportData:
             if not known:
                 self.missing += step.number - (self._number or 0) - 1
             self.steps += 1
+            self._reader.check(outputs)
             self._speeds(step, outputs, t)
             self._serial(step, outputs, robot, t, known)
             self._sample(step, t, robot, refused)
@@ -470,10 +479,7 @@ class ReportData:
 
     def _serial(self, step: Step, outputs: Outputs, robot: Robot, t: float, known: bool) -> None:
         inputs, sent = step.inputs, step.recorded.sent is not None
-        session = robot.session
-        rejected = {f"line_{reason}": count for reason, count in session.rejects.items()}
-        impossible = {"line_implausible": robot.counters["line_implausible"]}
-        self.serial.step(t, sent, {"lines": session.good_lines} | rejected | impossible)
+        self.serial.step(t, sent, self._reader.lines(robot))
         if inputs.tick:
             self.lateness.tick(t, inputs.now.mono_ns, inputs.missed, known)
         elif outputs.due and sent:

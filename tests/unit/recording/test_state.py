@@ -6,6 +6,7 @@ import pickle
 import random
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from msgspec.structs import replace
@@ -14,6 +15,7 @@ from acsard.core.config.settings import Config
 from acsard.core.guard import Memory
 from acsard.core.motion.freshness import Freshness
 from acsard.core.robot import Robot
+from acsard.core.thinning import Curve
 from acsard.core.values import NS_PER_S, REST, Command, Instant
 from acsard.host.errors import RecordingError
 from acsard.recording import file_replay
@@ -161,14 +163,38 @@ def test_a_wrong_part_of_a_state_behind_a_gap_is_reported_with_its_place(
         drawn(Recording(path))
 
 
+def say_many(counters: Any, name: str) -> None:
+    counters[name] = "many"
+
+
+READ_BY_REPORTS: dict[str, Callable[[Robot], None]] = {
+    "words for a count of commands": lambda robot: say_many(robot.counters, "command_stale"),
+    "words for a count of lines": lambda robot: say_many(robot.session.rejects, "checksum"),
+    "a number for the counts of lines": lambda robot: setattr(robot.session, "rejects", 5),
+}
+
+
+@pytest.mark.parametrize("how", READ_BY_REPORTS)
 def test_a_report_of_a_robot_with_a_wrong_counter_is_refused_with_a_message(
-    taped: Tape, tmp_path: Path
+    how: str, taped: Tape, tmp_path: Path
 ) -> None:
     robot, memory = thaw(taped.states[100])
-    robot.counters["command_stale"] = "many"  # type: ignore[assignment]
+    READ_BY_REPORTS[how](robot)
     spoilt = replace_state(taped, freeze(robot, memory))
     spoilt.write(path := tmp_path / "spoilt.mcap", Config(), 100)
     with pytest.raises(RecordingError, match="cannot read the robot state"):
+        page.drawn(Recording(path), "")
+
+
+def test_a_defect_of_the_report_is_not_reported_as_a_wrong_robot_state(
+    taped: Tape, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise ZeroDivisionError
+
+    taped.write(path := tmp_path / "whole.mcap", Config(), 100)
+    monkeypatch.setattr(Curve, "add", fail)
+    with pytest.raises(ZeroDivisionError):
         page.drawn(Recording(path), "")
 
 
@@ -182,10 +208,9 @@ def replace_state(tape: Tape, state: bytes) -> Tape:
 def drawn(recording: Recording) -> None:
     """Replay a recording as a report does."""
     looked = DisplayReplay(recording)
-    report = ReportData(looked.config)
-    with looked.state_errors():
-        for step, outputs, robot in looked.steps():
-            report.step(step, outputs, robot)
+    report = ReportData(looked.config, robot_errors=looked.state_errors)
+    for step, outputs, robot in looked.steps():
+        report.step(step, outputs, robot)
     if looked.notes:
         raise RecordingError(looked.notes[0])
 
