@@ -9,11 +9,15 @@ from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from threading import Thread
+from unittest import mock
 
 import pytest
 import zenoh
+from cryptography.hazmat.primitives.asymmetric import ec
+from msgspec.structs import replace
 
-from acsard.daemon.bus.zenoh_sessions import client_session
+from acsard.core.config.settings import BusConfig, Config
+from acsard.daemon.bus.zenoh_sessions import client_session, daemon_session
 from acsard.host.errors import CertificateError, MendableError, UnreachableError
 from acsard.machine import authority as making
 from acsard.machine.authority import Authority
@@ -32,6 +36,9 @@ def _tls(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ours.issue(place / "robot", "robot", ALL_NAMES, 1)
     ours.issue(place / "robot ended", "robot", ALL_NAMES, -1)
     ours.issue(place / "robot elsewhere", "robot", ["robot.example"], 1)
+    # OpenSSL accepts a key of this curve, and Zenoh does not.
+    with mock.patch.object(ec, "SECP256R1", ec.SECP521R1):
+        ours.issue(place / "P-521", "client", [], 1)
     ours.issue(place / "robot barred", "robot", [*ALL_NAMES, "elsewhere.example"], 1)
     Authority.make(place / "other ca", "other", 10).issue(place / "stranger", "client", [], 1)
     mixed = place / "mixed"  # it knows the robot's authority but shows another's certificate
@@ -129,6 +136,21 @@ def test_the_error_says_what_is_wrong_with_the_client_s_certificate(
     tls: Path, robot: str, shown: str, sentence: str
 ) -> None:
     assert sentence in str(told(robot, str(tls / shown)))
+
+
+def test_a_tool_with_a_key_that_zenoh_refuses_names_the_key(tls: Path, robot: str) -> None:
+    error = told(robot, str(tls / "P-521"))
+    assert isinstance(error, CertificateError)
+    assert f"the key {tls / 'P-521' / 'key.pem'} cannot be used" in str(error)
+    assert "(failed to parse private key" in str(error)
+
+
+def test_a_daemon_with_a_key_that_zenoh_refuses_names_the_key_instead_of_waiting_for_its_router(
+    tls: Path, robot: str
+) -> None:
+    bus = BusConfig(listen=(free_endpoint(),), connect=(robot,), tls=str(tls / "P-521"))
+    with pytest.raises(CertificateError, match=r"the key \S*P-521/key\.pem cannot be used"):
+        daemon_session(replace(Config(), bus=bus)).close()
 
 
 def test_the_error_names_a_host_that_does_not_resolve(tls: Path) -> None:

@@ -64,7 +64,7 @@ class CertificateFiles:
     def refused(self) -> str:
         """Return the reason why Zenoh refuses the present files, or "" if Zenoh accepts them.
 
-        Call this after `renewed` has returned True. The call takes half a second.
+        Call this after `renewed` has returned True. The call takes some milliseconds.
         """
         return certificate_trouble(*self._files)
 

@@ -48,7 +48,8 @@ def daemon_session(config: Config) -> zenoh.Session:
     """Open the daemon's session: a Zenoh peer or client without multicast discovery.
 
     In client mode this call blocks until the router answers, so call it in a thread. Raises
-    `InUseError` if the session cannot listen, for example on an address that is in use.
+    `InUseError` if the session cannot listen, for example on an address that is in use. Raises
+    `CertificateError` if Zenoh refuses the certificate files that a TLS router requires.
     """
     bus = config.bus
     settings = _base(bus.mode) | {
@@ -62,6 +63,8 @@ def daemon_session(config: Config) -> zenoh.Session:
     }
     settings |= _listening() | _limits(config, access_control(config))
     if any(endpoint.startswith(TLS_PREFIX) for endpoint in bus.connect):
+        # With files that Zenoh refuses, the session would open, and never reach the router.
+        _require_accepted(bus.tls)
         settings |= _tls(bus.tls)
     if bus.connect:
         settings |= RETRY_SETTINGS
@@ -92,12 +95,18 @@ def gateway_session(config: Config) -> zenoh.Session:
         return _opened(settings, bus.outside)
     except InUseError:
         # Zenoh's error is of the same type for an address in use and for files that it refuses.
-        why = certificate_trouble(*files_in(bus.tls))
-        if not why:
-            raise
+        _require_accepted(bus.tls)
+        raise
+
+
+def _require_accepted(directory: str) -> None:
+    """Raise `CertificateError` if Zenoh refuses the certificate files in a TLS directory."""
+    why = certificate_trouble(*files_in(directory))
+    if why:
         raise CertificateError(
-            f"the certificates in {bus.tls} cannot be used: OpenSSL accepts them, but Zenoh does "
-            f"not ({why}); to make certificates that Zenoh accepts, {RENEW_ADVICE}"
+            f"{directory}/{CERTIFICATE} with the key {directory}/{KEY} cannot be used: OpenSSL "
+            f"accepts these files, but Zenoh does not ({why}); to make files that Zenoh accepts, "
+            f"{RENEW_ADVICE}"
         ) from None
 
 
@@ -105,7 +114,7 @@ def certificate_trouble(authority: Path, certificate: Path, key: Path) -> str:
     """Return the reason why Zenoh cannot listen with these certificate files, or "" if it can.
 
     OpenSSL accepts some files that Zenoh refuses: certificates without extensions (X.509 version
-    1), and keys of the curves P-521 and Ed448. This call takes half a second.
+    1), and keys of the curves P-521 and Ed448. This call takes some milliseconds.
     """
     files = {
         "root_ca_certificate": str(authority),
@@ -113,14 +122,16 @@ def certificate_trouble(authority: Path, certificate: Path, key: Path) -> str:
         "listen_private_key": str(key),
         "enable_mtls": True,
     }
-    settings = _base("router") | {
+    # A session in the mode "router" would take half a second to open.
+    settings = _base("peer") | {
         "listen/endpoints": [f"{TLS_PREFIX}127.0.0.1:0"],
         "transport/link/tls": files,
     }
     try:
         zenoh.open(_config(settings)).close()
     except zenoh.ZError as error:
-        return first_line(error)
+        # The rest of the text is about the endpoint above, which the operator does not know.
+        return first_line(error).rpartition("unexpected error: ")[2]
     return ""
 
 
@@ -219,7 +230,10 @@ def client_session(endpoint: str, tls: str = "") -> zenoh.Session:
     try:
         return zenoh.open(_config(settings))
     except zenoh.ZError as error:
-        reason = trouble(endpoint, tls) if secured else ""
+        reason = ""
+        if secured:
+            _require_accepted(tls)
+            reason = trouble(endpoint, tls)
         # The message leaves out Zenoh's own error, which names Zenoh's source files.
         raise UnreachableError(
             f"no daemon answers at {endpoint}: "
