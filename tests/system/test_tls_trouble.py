@@ -17,6 +17,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from msgspec.structs import replace
 
 from acsard.core.config.settings import BusConfig, Config
+from acsard.daemon.bus.tls import trouble
 from acsard.daemon.bus.zenoh_sessions import client_session, daemon_session
 from acsard.host.errors import CertificateError, MendableError, UnreachableError
 from acsard.machine import authority as making
@@ -40,6 +41,11 @@ def _tls(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with mock.patch.object(ec, "SECP256R1", ec.SECP521R1):
         ours.issue(place / "P-521", "client", [], 1)
     ours.issue(place / "robot barred", "robot", [*ALL_NAMES, "elsewhere.example"], 1)
+    old = Authority.make(place / "old ca", "old", -1)
+    old.issue(place / "old client", "client", [], 1)
+    old.issue(place / "old robot", "robot", ALL_NAMES, 1)
+    old.issue(place / "old robot elsewhere", "robot", ["robot.local"], 1)
+    old.issue(place / "old robot ended", "robot", ALL_NAMES, -1)
     Authority.make(place / "other ca", "other", 10).issue(place / "stranger", "client", [], 1)
     mixed = place / "mixed"  # it knows the robot's authority but shows another's certificate
     shutil.copytree(place / "stranger", mixed)
@@ -47,6 +53,7 @@ def _tls(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(making, "datetime", Later)
         ours.issue(place / "robot later", "robot", ALL_NAMES, 1)
+        old.issue(place / "old robot later", "robot", ALL_NAMES, 1)
     return place
 
 
@@ -122,6 +129,29 @@ def test_the_error_says_what_is_wrong_with_the_robot_s_certificate(
         error = told(endpoint, str(tls / "client"))
     assert isinstance(error, UnreachableError)
     assert sentence in str(error)
+
+
+@pytest.mark.parametrize(
+    ("robot_has", "sentence"),
+    [
+        ("old robot elsewhere", "tls renew --address 127.0.0.1"),
+        ("old robot ended", "the certificate of 127.0.0.1 has expired"),
+        ("old robot later", "the certificate of 127.0.0.1 is not valid yet"),
+    ],
+)
+def test_an_expired_authority_does_not_hide_what_is_wrong_with_the_robot_s_certificate(
+    tls: Path, robot_has: str, sentence: str
+) -> None:
+    endpoint = free_endpoint().replace("tcp/", "tls/")
+    with listening(tls / robot_has, endpoint):
+        assert sentence in str(told(endpoint, str(tls / "old client")))
+
+
+def test_zenoh_ignores_that_the_authority_has_expired_so_no_trouble_is_reported(tls: Path) -> None:
+    endpoint = free_endpoint().replace("tcp/", "tls/")
+    with listening(tls / "old robot", endpoint):
+        client_session(endpoint, str(tls / "old client")).close()
+        assert trouble(endpoint, str(tls / "old client")) == ""
 
 
 @pytest.mark.parametrize(

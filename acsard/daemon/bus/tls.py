@@ -12,12 +12,14 @@ import ipaddress
 import socket
 import ssl
 import time
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from acsard.core.config.settings import TLS_PREFIX
 from acsard.core.values import NS_PER_S
+from acsard.host import clock
 from acsard.host.errors import CertificateError, NotPermittedError
 
 CA, CERTIFICATE, KEY = "ca.pem", "certificate.pem", "key.pem"
@@ -288,12 +290,19 @@ def _tls_trouble(plain: socket.socket, host: str, directory: str) -> str:
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.load_verify_locations(f"{directory}/{CA}")
     _load(context, directory)
+    # Zenoh ignores the dates of an authority, but OpenSSL rejects each certificate of an expired
+    # authority before it looks at the rest. Such a connection fails for another reason.
+    outdated = any(map(_wrong_date, context.get_ca_certs()))
+    if outdated:
+        context.verify_flags |= NO_CHECK_TIME
     try:
         with context.wrap_socket(plain, server_hostname=host) as link:
+            if outdated and (code := _wrong_date(link.getpeercert() or {})):
+                return _server_rejected(code, "", host, directory)
             link.settimeout(REFUSAL_WAIT_S)
             link.recv(1)
     except ssl.SSLCertVerificationError as error:
-        return _server_rejected(error, host, directory)
+        return _server_rejected(error.verify_code, error.verify_message, host, directory)
     except ssl.SSLError as error:
         return _client_rejected(error.reason or str(error), host, directory)
     except TimeoutError:
@@ -306,38 +315,46 @@ def _tls_trouble(plain: socket.socket, host: str, directory: str) -> str:
     return ""
 
 
-def _server_rejected(error: ssl.SSLCertVerificationError, host: str, directory: str) -> str:
+def _wrong_date(certificate: Mapping[str, Any]) -> int:
+    """Return OpenSSL's error code if a decoded certificate is not valid now, or 0 if it is."""
+    now = clock.now().wall_ns / NS_PER_S
+    if now > ssl.cert_time_to_seconds(certificate["notAfter"]):
+        return EXPIRED
+    return NOT_YET if now < ssl.cert_time_to_seconds(certificate["notBefore"]) else 0
+
+
+def _server_rejected(code: int, reason: str, host: str, directory: str) -> str:
+    """Return an error message; `code` and `reason` are OpenSSL's error code and its text."""
     now = time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime())
-    reason = error.verify_message
-    match error.verify_code:
-        case code if code == EXPIRED:
+    match code:
+        case _ if code == EXPIRED:
             return (
                 f"the certificate of {host} has expired, according to this machine's clock "
                 f"({now}); if the clock is right, {RENEW_ADVICE}"
             )
-        case code if code == NOT_YET:
+        case _ if code == NOT_YET:
             return (
                 f"the certificate of {host} is not valid yet, according to this machine's clock "
                 f"({now}); either correct this machine's clock (`timedatectl`), or correct the "
                 "clock of the machine that made the certificate and then renew the certificate"
             )
-        case code if code in (WRONG_NAME, WRONG_ADDRESS):
+        case _ if code in (WRONG_NAME, WRONG_ADDRESS):
             return (
                 f"the certificate of the server is not for {host}; connect to a name or address "
                 f"that the certificate contains, or run `acsard tls renew --address {host}` on the "
                 "robot; the command says what to do next"
             )
-        case code if code in UNSIGNED:
+        case _ if code in UNSIGNED:
             return (
                 f"the authority in {directory}/{CA} did not sign the certificate of {host} "
                 f"({reason}); use a certificate directory that `acsard tls add` made for this robot"
             )
-        case code if code in BARRED:
+        case _ if code in BARRED:
             return (
                 f"the authority in {directory}/{CA} may not sign for the names in the certificate "
                 f"of {host} ({reason}); to make one without these names, {RENEW_ADVICE}"
             )
-        case code if code == WRONG_PURPOSE:
+        case _ if code == WRONG_PURPOSE:
             return (
                 f"the certificate of {host} is not for a TLS server ({reason}); to make one for "
                 f"servers and clients, {RENEW_ADVICE}"
