@@ -13,6 +13,7 @@ from typing import Any
 
 import msgspec
 import zenoh
+from msgspec import field
 
 from acsard.client.commander import (
     MAX_OPEN_TIMEOUT_S,
@@ -22,9 +23,10 @@ from acsard.client.commander import (
     no_command,
 )
 from acsard.client.driving import UnheardError, drive
+from acsard.core.incoming.imu import UNKNOWN_COVARIANCE
 from acsard.core.incoming.queries import BUSY
 from acsard.core.messages import schema
-from acsard.core.messages.encodings import Decoder, encode, encoding_name
+from acsard.core.messages.encodings import Decoder, Format, decode_cdr, encode, encoding_name
 from acsard.core.messages.keys_and_roles import (
     VERBS,
     by_key,
@@ -505,6 +507,40 @@ class Client:
         return NotDrivenError(f"{error}; {us.words()}" if unexplained else str(error))
 
 
+class _PartialImu(schema.Imu, frozen=True, kw_only=True):
+    """An `Imu` in which all fields except `angular_velocity` may be missing."""
+
+    header: schema.Header = schema.Header()
+    orientation: schema.Quaternion = schema.Quaternion()
+    orientation_covariance: schema.Covariance3 = field(default_factory=UNKNOWN_COVARIANCE.copy)
+    angular_velocity: schema.Vector3
+    angular_velocity_covariance: schema.Covariance3 = field(default_factory=UNKNOWN_COVARIANCE.copy)
+    linear_acceleration: schema.Vector3 = schema.Vector3()
+    linear_acceleration_covariance: schema.Covariance3 = field(
+        default_factory=UNKNOWN_COVARIANCE.copy
+    )
+
+
+class _ImuDecoder(Decoder[schema.Imu]):
+    """Decoder that accepts each form of an `Imu` that the daemon accepts.
+
+    In JSON and msgpack only `angular_velocity` is required.
+    """
+
+    def __init__(self) -> None:
+        super().__init__(_PartialImu)
+
+    def decode_as(self, form: Format, payload: bytes) -> schema.Imu:
+        return (
+            decode_cdr(schema.Imu, payload) if form == "cdr" else super().decode_as(form, payload)
+        )
+
+
+def decoder_of(kind: type) -> Decoder[Any]:
+    """Return the decoder for messages of the type `kind`."""
+    return _ImuDecoder() if kind is schema.Imu else Decoder(kind)
+
+
 @lru_cache(maxsize=64)
 def decoder(name: str) -> Decoder[Any]:
     """Return the decoder for the messages of the key `name`.
@@ -513,4 +549,4 @@ def decoder(name: str) -> Decoder[Any]:
     """
     topic = by_key(name)
     cls = None if topic is None else schema.MESSAGES.get(topic.type)
-    return Decoder(cls or dict)
+    return decoder_of(cls or dict)

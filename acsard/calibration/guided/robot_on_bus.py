@@ -22,7 +22,7 @@ from acsard.calibration.log_table import APPLIED, FOUR, Floats, Table
 from acsard.calibration.runs import Log, Run, on_arrival_clock, runs
 from acsard.client.commander import OPENING_PERIOD_S, OPENING_S, SEND_PERIOD_S, ZEROS
 from acsard.client.follower import FIRST_STATE_TIMEOUT_S, Watch
-from acsard.client.synchronous import Client
+from acsard.client.synchronous import Client, decoder_of
 from acsard.core.config.settings import Config
 from acsard.core.messages.encodings import DecodeError, Decoder
 from acsard.core.messages.keys_and_roles import by_key
@@ -67,7 +67,7 @@ class Sensor:
     def __init__(self, session: zenoh.Session, key: str, types: tuple[type, ...]) -> None:
         self.key = key
         self._samples = Subscription(queue_on(session, key, latched=False), key)
-        self._decoders: list[Decoder[Any]] = [Decoder(type_) for type_ in types]
+        self._decoders: list[Decoder[Any]] = [decoder_of(type_) for type_ in types]
 
     def receive(self, take: Take, now: float) -> int:
         """Pass each message that has arrived to `take`, and return the number of messages.

@@ -174,7 +174,12 @@ def test_a_message_that_does_not_fit_into_the_csv_log_is_left_out_and_reported_o
     turn = Imu(Header(), Quaternion(), unknown, Vector3(z=0.5), unknown, Vector3(), unknown)
     wheels = [JointState(Header(), [], [], [1.0] * count, []) for count in (1, 4)]
     payloads = {
-        "imu": [b'{"a\\u001b":1}', encode(turn, "json"), b"\xff", encode(turn, "json")],
+        "imu": [
+            b'{"a\\u001b":1}',
+            encode(turn, "json"),
+            b"\xff",
+            b'{"angular_velocity":{"z":0.5}}',
+        ],
         "wheel_states": [encode(wheel, "json") for wheel in wheels],
     }
     heard: list[None] = []

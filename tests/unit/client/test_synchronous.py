@@ -1,4 +1,4 @@
-"""Tests of the attachment that the client puts on each command, without a bus."""
+"""Tests of the commands that the client sends and the messages that it decodes, without a bus."""
 
 from __future__ import annotations
 
@@ -16,12 +16,17 @@ from acsard.client import Client, NoAnswerError
 from acsard.client.asynchronous import AsyncClient
 from acsard.client.commander import MAX_OPEN_TIMEOUT_S, MIN_SPACING_S, no_command
 from acsard.client.driving import UnheardError
+from acsard.client.synchronous import decoder
 from acsard.core.config.settings import DriveConfig, JointsConfig
 from acsard.core.incoming.commands import Arrival, Receiver
+from acsard.core.incoming.imu import reading
+from acsard.core.messages.encodings import FORMATS, DecodeError, Format, encode
+from acsard.core.messages.schema import Header, Imu, Quaternion, Time, Vector3
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.values import NS_PER_S, REST, Command
 from acsard.daemon.bus.identity import Identity
 from acsard.host import clock
+from tests.each import each
 
 RECEIVER = Receiver(JointsConfig(), Kinematics(DriveConfig()))
 
@@ -91,8 +96,8 @@ def test_two_clients_of_one_connection_keep_the_spacing_between_commands(session
     one = client_of(session)
     other = one.like("acsar")
     begun = time.monotonic()
-    for each in (one, other) * 5:
-        each.send(0.0)
+    for sender in (one, other) * 5:
+        sender.send(0.0)
     assert time.monotonic() - begun > 8.9 * MIN_SPACING_S
 
 
@@ -275,3 +280,37 @@ def test_a_drive_without_arriving_commands_ends_with_a_documented_error(
     found = client_of(session).unheard(UnheardError(no_command("app")))
     assert type(found).__name__ in client.__doc__.split()
     assert isinstance(found, client.NotDrivenError)
+
+
+TURN = b'{"angular_velocity":{"z":0.5}}'
+UNKNOWN = [0.0] * 9
+WHOLE = Imu(
+    Header(Time(1, 2), "imu"),
+    Quaternion(),
+    UNKNOWN,
+    Vector3(z=0.5),
+    [0.5] * 9,
+    Vector3(),
+    UNKNOWN,
+)
+
+
+@each("form", FORMATS)
+def test_an_imu_message_is_decoded_from_every_form(form: Format) -> None:
+    assert encode(decoder("imu").decode("", encode(WHOLE, form)), "json") == encode(WHOLE, "json")
+
+
+@each("payload", [TURN, b"\x81\xb0angular_velocity\x81\xa1z\xcb?\xe0\x00\x00\x00\x00\x00\x00"])
+def test_an_imu_message_needs_only_the_angular_velocity_as_for_the_daemon(payload: bytes) -> None:
+    arrival = Arrival("imu", True, payload, "", 0, None, "")
+    message = decoder("imu").decode("", payload)
+    assert message.angular_velocity.z == reading(arrival).rate == 0.5
+    assert message.angular_velocity_covariance == UNKNOWN
+
+
+@each("payload", [b"{}", b'{"angular_velocity":{"z":0.5},"gyro":1}'])
+def test_an_imu_message_that_the_daemon_refuses_is_not_decoded(payload: bytes) -> None:
+    with pytest.raises(DecodeError):
+        reading(Arrival("imu", True, payload, "", 0, None, ""))
+    with pytest.raises(DecodeError):
+        decoder("imu").decode("", payload)
