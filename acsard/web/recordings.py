@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import calendar
+import codecs
 import gzip
 import signal
 import time
@@ -370,11 +371,12 @@ async def _body(child: Process) -> bytes:
 async def _listened(child: Process, one: _Drawing) -> str:
     """Return the child's error text. A line of digits is the progress in percent."""
     assert child.stderr is not None
-    said = ""
+    # A read may end within a character, so the decoder keeps the first bytes of this character.
+    said, decoder = "", codecs.getincrementaldecoder("utf-8")(errors="replace")
     while part := await child.stderr.read(1 << 12):
-        *lines, rest = (said + part.decode(errors="replace")).split("\n")
+        *lines, rest = (said + decoder.decode(part)).split("\n")
         words = [line for line in lines if not line.isdecimal()]
         numbers = [int(line) for line in lines if line.isdecimal() and len(line) <= 3]
         one.percent = min(100, max([one.percent, *numbers]))
         said = "\n".join([*words, rest])[-2000:]
-    return said.strip().removeprefix("acsard: ")
+    return (said + decoder.decode(b"", final=True)).strip().removeprefix("acsard: ")

@@ -144,6 +144,17 @@ async def test_a_failed_report_has_its_reason_and_the_next_request_starts_it_aga
     found.end()
 
 
+@each(
+    ("end", "shown"),
+    [("'ä is missing'.encode()", "xä is missing"), ("b'\\xc3'", "x\N{REPLACEMENT CHARACTER}")],
+)
+async def test_a_character_across_two_reads_of_an_error_text_is_whole(end: str, shown: str) -> None:
+    """The server reads at most 4096 bytes at once."""
+    program = f"import sys; sys.stderr.buffer.write(b'x' * 4095 + {end}); sys.exit(1)"
+    told = await become(drawn_by(program), A, "failed")
+    assert told.text.lstrip("x") == shown.lstrip("x")
+
+
 async def test_a_missing_report_program_is_reported() -> None:
     told = await become(Reports(("/nowhere/acsard",)), A, "ready", "failed")
     assert "No such file" in told.text
