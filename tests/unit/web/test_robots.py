@@ -9,6 +9,7 @@ from typing import Any
 
 import msgspec
 import pytest
+import zenoh
 from msgspec.structs import replace
 
 from acsard.client.follower import FIRST_STATE_TIMEOUT_S, QUERY_PERIOD_S, SILENT_S, Watch
@@ -147,6 +148,38 @@ class Known(Robot):
 
     def get(self, name: str) -> Any:
         return INFO if name == "info" else msgspec.to_builtins(Config())
+
+
+@each(
+    ("error", "reason"),
+    [
+        (
+            NoThreadError("this process cannot start another thread (no memory)"),
+            "this process cannot start another thread (no memory); the page tries again by itself",
+        ),
+        (TimeoutError(), "the Zenoh bus is stuck; the page tries again by itself"),
+        (zenoh.ZError("closed"), "the Zenoh bus is stuck; the page tries again by itself"),
+    ],
+)
+async def test_the_page_says_why_it_cannot_follow_the_robot_yet(
+    error: Exception, reason: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    errors = iter([error])
+
+    async def in_thread(call: Callable[[], Any], timeout: float | None, *_: object) -> Any:
+        # Of the threads at the start, only that of the subscription has a time limit.
+        if timeout is not None and (failure := next(errors, None)):
+            raise failure
+        return call()
+
+    monkeypatch.setattr(robots, "in_thread", in_thread)
+    client: Any = Known()
+    page = Robots(Address("tcp/x:1", "acsar", ""), lambda: client, ABOUT, Counts())
+    running = asyncio.create_task(page.run())
+    for _ in range(10):
+        await asyncio.sleep(0)
+    assert page.gone == reason
+    running.cancel()
 
 
 @each("failing", [0, 1, 2, 3])
