@@ -19,27 +19,12 @@ from acsard.foxglove.bridge import Bridge
 from acsard.foxglove.robot_facts import Facts
 from acsard.host import clock
 from acsard.host.errors import ReplyError
+from tests.unit.foxglove.status_messages import Server
 
 UNREADABLE = ReplyError("cannot read the robot's state; use the same version here")
 
 GONE = "the daemon of robot acsar is gone; `acsard foxglove` waits for it"
 BACK = "the daemon of robot acsar is back"
-
-
-class Server:
-    """The server's status messages: each text, or the id of one that was withdrawn."""
-
-    def __init__(self) -> None:
-        self.shown: list[str] = []
-
-    def publish_status(self, text: str, level: object, stays: str | None) -> None:
-        self.shown.append(text)
-
-    def remove_status(self, ids: list[str]) -> None:
-        self.shown += [f"without {one}" for one in ids]
-
-    def publish_parameter_values(self, values: object) -> None:
-        pass
 
 
 class World:

@@ -10,23 +10,11 @@ from acsard.client.commander import GRACE_S
 from acsard.core.values import NS_PER_S
 from acsard.foxglove.notices import MAX_WAITING, REPEAT_RATE, Notices, Objections
 from acsard.host import clock
+from tests.unit.foxglove.status_messages import Server
 
 OBJECTS_NS = int(GRACE_S * NS_PER_S)
 
 WHY = "stopped by request"
-
-
-class Server:
-    """The server's status messages: each text, or the id of one that was withdrawn."""
-
-    def __init__(self) -> None:
-        self.shown: list[str] = []
-
-    def publish_status(self, text: str, level: object, stays: str | None) -> None:
-        self.shown.append(text)
-
-    def remove_status(self, ids: list[str]) -> None:
-        self.shown += [f"without {one}" for one in ids]
 
 
 def shown(notices: Notices, *, newcomers: bool = False) -> list[str]:

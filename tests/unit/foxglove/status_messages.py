@@ -1,0 +1,19 @@
+"""A stand-in for the Foxglove server, which keeps the status messages that viewers would see."""
+
+from __future__ import annotations
+
+
+class Server:
+    """The server's status messages: each text, or the id of one that was withdrawn."""
+
+    def __init__(self) -> None:
+        self.shown: list[str] = []
+
+    def publish_status(self, text: str, level: object, stays: str | None) -> None:
+        self.shown.append(text)
+
+    def remove_status(self, ids: list[str]) -> None:
+        self.shown += [f"without {one}" for one in ids]
+
+    def publish_parameter_values(self, values: object) -> None:
+        pass
