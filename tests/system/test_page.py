@@ -541,6 +541,14 @@ def test_a_gamepad_that_disconnects_releases_the_stick(page: Phone) -> None:
     bus.at_rest()
 
 
+def test_a_page_that_connects_again_says_why_it_has_released_the_stick(page: Phone) -> None:
+    """The page gets a new sender id if its clock was set, although the connection is sound."""
+    page.hold()
+    page.browser.js("{ const now = Date.now; Date.now = () => now() + 60000; } 1")
+    page.shows("told", "released: this device slept, or its clock was set")
+    page.bus.at_rest()
+
+
 def test_a_gamepad_that_the_browser_does_not_know_drives_nothing_and_says_so(page: Phone) -> None:
     pad = PAD.replace("AXES", "[0, -1, 0, 0]").replace("HELD", "true").replace("standard", "")
     commands = page.bus.count("commands")

@@ -142,7 +142,7 @@ export class Link extends EventTarget {
     // look late, so the page reconnects, which gives it a new sender id.
     const stood = before !== null && Math.abs(this.#ahead - before) > STOOD;
     if (stood || performance.now() - this.#heard > SILENT) {
-      this.#end(stood ? "this device slept, or its clock was set" : "no answer");
+      this.#end(stood ? "this device slept, or its clock was set" : "the robot does not answer");
       this.#connect();
       return;
     }

@@ -398,7 +398,7 @@ link.addEventListener("up", () => {
   views.waiting();
 });
 link.addEventListener("down", ({ detail }) => {
-  drive.release("released: the connection is lost");
+  drive.release(`released: ${detail.reason || "the connection is lost"}`);
   tried = true;
   camera.connected = false;
   heard = -Infinity;
