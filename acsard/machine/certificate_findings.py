@@ -19,9 +19,11 @@ from acsard.daemon.bus.tls import (
     KEY,
     common_name,
     ends,
+    files_in,
     host_of,
     require_usable,
 )
+from acsard.daemon.bus.zenoh_sessions import certificate_trouble
 from acsard.host.clock import now
 from acsard.host.errors import MendableError
 from acsard.host.extras import install
@@ -52,6 +54,10 @@ def certificates(tls: str) -> Iterator[Finding]:
         require_usable(tls)
     except MendableError as error:
         yield Finding("certificates", "failure", str(error), _mend_of_absent(directory))
+        return
+    if why := certificate_trouble(*files_in(tls)):
+        text = f"Zenoh refuses {directory / CERTIFICATE} with the key {directory / KEY} ({why})"
+        yield Finding("certificates", "failure", text, renewal(tls, ""))
         return
     found = ends(tls)
     level, words = expiry(found, now().wall_ns)

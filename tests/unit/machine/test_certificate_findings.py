@@ -11,6 +11,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import pytest
+from cryptography.hazmat.primitives.asymmetric import ec
 
 from acsard.cli import main
 from acsard.core.config.settings import BusConfig, Config
@@ -66,6 +67,20 @@ def test_the_advised_command_renews_the_robots_own_certificate(
     Authority.load(fleet, str).issue(fleet, "robot", ["localhost"], 9.9)
     told = finding(fleet)
     assert (told.level, told.text) == ("warning", f"{fleet}: expires in 10 days")
+    typed(told.mend, fleet, monkeypatch)
+    assert finding(fleet).level == "ok"
+
+
+def test_the_advised_command_replaces_a_key_that_only_zenoh_refuses(
+    fleet: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch:
+        # OpenSSL accepts a key of this curve, and Zenoh does not.
+        patch.setattr(ec, "SECP256R1", ec.SECP521R1)
+        Authority.load(fleet, str).issue(fleet, "robot", ["localhost"], 100)
+    told = finding(fleet)
+    assert told.level == "failure"
+    assert f"the key {fleet}/key.pem (failed to parse private key" in told.text
     typed(told.mend, fleet, monkeypatch)
     assert finding(fleet).level == "ok"
 
