@@ -138,6 +138,25 @@ def test_a_board_is_checked_without_a_daemon_and_the_lines_are_written(
     assert written == {"front_right": "+b", "front_left": "+a"}
 
 
+def test_the_lifted_wheels_can_be_confirmed_by_the_keyboard_alone(
+    browser: Browser, tmp_path: Path
+) -> None:
+    alone = NoDaemon(tmp_path)
+    with Page(alone, tmp_path) as server:
+        person = Person(browser, server)
+        person.begin("check", **{"check-port": "sim"})
+        person.asked("tick this")
+        # From the question, Tab leads to the box. Space is STOP everywhere, so Enter ticks the box.
+        browser.type_key("Tab")
+        assert browser.js("document.activeElement.id") == "guide-tick"
+        browser.type_key("Enter")
+        browser.type_key("Tab")
+        browser.type_key("Enter")
+        person.asked("which wheel did motor a turn")
+        person.click("guide-leave")
+        person.ended("ended")
+
+
 @pytest.fixture
 def skidding(tmp_path: Path) -> Iterator[tuple[Daemon, Bus, Page]]:
     with running(tmp_path, config=SKIDDING) as (daemon, bus), Page(daemon, tmp_path) as server:

@@ -178,7 +178,10 @@ export class Guide {
     tick.id = "guide-tick";
     go.disabled = true;
     tick.addEventListener("change", () => (go.disabled = !tick.checked));
-    return [made("label", "tick", tick, ` ${LABELS[answers[0]] ?? answers[0]}`), go];
+    // Space is STOP, so Enter ticks the box for a person without a pointer.
+    tick.addEventListener("keydown", (event) => event.key === "Enter" && !event.repeat && tick.click());
+    const hint = made("small", "quiet", "(Enter ticks this: Space is STOP)");
+    return [made("label", "tick", tick, ` ${LABELS[answers[0]] ?? answers[0]}`, hint), go];
   }
 
   #number({ unit, usual }) {
