@@ -79,6 +79,11 @@ def driven(words: Sequence[str], where: Path, bus: Bus, **more: str) -> None:
     bus.at_rest()
 
 
+def printed(page: Page) -> str:
+    """Return the address on the machine itself as the page prints it, with a slash at the end."""
+    return f"{page.here}/"
+
+
 @pytest.mark.slow
 @pytest.mark.nightly
 def test_the_node_program_drives_the_robot(page: Page, standing: Bus, tmp_path: Path) -> None:
@@ -86,7 +91,7 @@ def test_the_node_program_drives_the_robot(page: Page, standing: Bus, tmp_path: 
     version = run([node, "--version"], tmp_path)
     flags = ["--experimental-websocket"] if version < "v22" else []
     words = [node, *flags, str(CLIENTS / "node/drive.mjs")]
-    driven([*words, page.here], tmp_path, standing)
+    driven([*words, printed(page)], tmp_path, standing)
     away = [*words, page.away, page.invite("operator", "node")]
     driven(away, tmp_path, standing, NODE_EXTRA_CA_CERTS=str(page.tls / "ca.pem"))
 
@@ -96,7 +101,7 @@ def test_the_node_program_drives_the_robot(page: Page, standing: Bus, tmp_path: 
 def test_the_java_program_drives_the_robot(page: Page, standing: Bus, tmp_path: Path) -> None:
     java = program("java", "it runs the program")
     words = [java, str(CLIENTS / "java/Drive.java")]
-    driven([*words, page.here], tmp_path, standing)
+    driven([*words, printed(page)], tmp_path, standing)
     nowhere = f"http://{free_endpoint().partition('/')[2]}"
     missing = subprocess.run(
         [*words, nowhere], capture_output=True, text=True, timeout=60, check=False
@@ -111,7 +116,7 @@ def test_the_go_program_drives_the_robot(page: Page, standing: Bus, kept: Path) 
     go = program("go", "it builds the program")
     here = copied("go", kept)
     run([go, "build", "-o", "drive", "."], here)
-    driven([str(here / "drive"), page.here], here, standing)
+    driven([str(here / "drive"), printed(page)], here, standing)
     away = [str(here / "drive"), page.away, page.invite("operator", "go")]
     driven(away, here, standing, SSL_CERT_FILE=str(page.tls / "ca.pem"))
 
@@ -120,7 +125,7 @@ def test_the_go_program_drives_the_robot(page: Page, standing: Bus, kept: Path) 
 def test_the_program_for_curl_stops_and_releases_the_robot(page: Page, standing: Bus) -> None:
     program("curl", "the program calls it")
 
-    here = {"ADDRESS": page.here}
+    here = {"ADDRESS": printed(page)}
     away = {"ADDRESS": page.away, "CURL_CA_BUNDLE": str(page.tls / "ca.pem")}
 
     def asks(verb: str, robot: dict[str, str] = here) -> dict[str, Any]:

@@ -5,6 +5,7 @@
 set -e
 
 robot=${ADDRESS:-http://127.0.0.1:8080}
+robot=${robot%/} # the page prints its address with a slash at the end
 
 ask() {
     curl --silent --show-error --fail-with-body --max-time 5 --write-out '\n' \

@@ -41,7 +41,7 @@ func main() {
 		options.HTTPHeader = http.Header{"Authorization": {"Bearer " + os.Args[2]}}
 	}
 	ctx := context.Background()
-	socket, _, err := websocket.Dial(ctx, strings.Replace(address, "http", "ws", 1)+"/ws", options)
+	socket, _, err := websocket.Dial(ctx, strings.TrimSuffix(strings.Replace(address, "http", "ws", 1), "/")+"/ws", options)
 	if err != nil {
 		log.Fatal(err)
 	}

@@ -53,7 +53,7 @@ public class Drive implements WebSocket.Listener {
         if (arguments.length > 1) {
             builder.header("Authorization", "Bearer " + arguments[1]);
         }
-        URI place = URI.create(address.replaceFirst("http", "ws") + "/ws");
+        URI place = URI.create(address.replaceFirst("http", "ws").replaceFirst("/$", "") + "/ws");
         WebSocket socket;
         try {
             socket = builder.buildAsync(place, new Drive()).join();

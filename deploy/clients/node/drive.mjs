@@ -5,7 +5,7 @@ const [address = "http://127.0.0.1:8080", token] = process.argv.slice(2);
 const PERIOD_MS = 50;
 
 const socket = new WebSocket(
-  address.replace("http", "ws") + "/ws",
+  address.replace("http", "ws").replace(/\/$/, "") + "/ws",
   token ? ["acsard", "acsard.token." + token] : [],
 );
 const say = (message) => socket.send(JSON.stringify(message));
