@@ -25,9 +25,10 @@ public class Drive implements WebSocket.Listener {
         if (last) {
             Matcher found = ODOMETRY.matcher(text);
             if (found.find()) {
-                System.out.printf(Locale.ROOT, "x %.3f m, y %.3f m, %.3f m/s%n",
+                // One println writes the whole line, even if the program ends at this moment.
+                System.out.println(String.format(Locale.ROOT, "x %.3f m, y %.3f m, %.3f m/s",
                     Double.valueOf(found.group(1)), Double.valueOf(found.group(2)),
-                    Double.valueOf(found.group(3)));
+                    Double.valueOf(found.group(3))));
             } else if (text.indexOf("\"refused\"") >= 0) {
                 System.err.println(text);
             }
