@@ -185,6 +185,47 @@ LATE = """(() => {
 """Makes STOP fail, and 31 s pass at its fourth attempt."""
 
 
+WATCHED = """(() => {
+    window.sent = 0, window.menus = [];
+    WebSocket.prototype.send = () => window.sent++;
+    addEventListener("contextmenu", (event) => window.menus.push(event.defaultPrevented));
+    return true;
+})()"""
+"""Counts the commands instead of sending them, and notes which menus the page prevents."""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(CHROMIUM is None, reason="needs chromium-headless-shell")
+def test_the_dashboard_of_the_manual_never_drives_while_a_menu_hides_the_release_of_the_button(
+    server: Page, bus: Bus, origin: str, tmp_path: Path
+) -> None:
+    text = block("html").replace("http://127.0.0.1:8080", server.here)
+    (tmp_path / "index.html").write_text(text)
+    with served(tmp_path, origin), browsing() as browser:
+
+        def mouse(kind: str, button: str) -> None:
+            x, y = browser.middle("forward")
+            how = {"x": x, "y": y, "button": button, "clickCount": 1}
+            browser.ask("Input.dispatchMouseEvent", type=f"mouse{kind}", **how)
+
+        browser.open(origin)
+        until(lambda: "ready" in browser.text("state"), PATIENCE_S, "it is connected")
+        browser.js(WATCHED)
+        # A right button opens a menu. A browser does not report its release while the menu is open.
+        mouse("Pressed", "right")
+        time.sleep(0.5)
+        mouse("Released", "right")
+        assert browser.js("window.sent") == 0
+        assert browser.js("window.menus") == [False]
+        # With Ctrl, macOS opens the menu by the left button, which drives here.
+        mouse("Pressed", "left")
+        until(lambda: browser.js("window.sent") > 2, PATIENCE_S, "it drives")
+        menu = "new MouseEvent('contextmenu', {bubbles: true, cancelable: true})"
+        browser.js(f"document.getElementById('forward').dispatchEvent({menu})")
+        assert browser.js("window.menus") == [False, True]
+        mouse("Released", "left")
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None, reason="needs chromium-headless-shell")
 def test_the_dashboard_of_the_manual_drives_until_a_finger_takes_over_and_stops(
@@ -208,7 +249,7 @@ def test_the_dashboard_of_the_manual_drives_until_a_finger_takes_over_and_stops(
         shows("ready by nobody")
         phone.size(*PHONE)
         phone.open(server.here)
-        browser.js("document.getElementById('forward').onpointerdown()")
+        browser.js("document.getElementById('forward').onpointerdown({button: 0})")
         shows("driving by app")
         until(lambda: drives("app"), PATIENCE_S, "the dashboard drives")
         phone.hold(lambda: drives("teleop"))
