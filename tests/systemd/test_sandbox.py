@@ -252,6 +252,7 @@ def test_a_bus_that_is_opened_by_mistake_cannot_be_reached_from_other_computers(
         ("ttyUSB", 188, 200, "0"),
         ("ttyACM", 166, 200, "0"),
         ("ttyS", 4, 127, "0"),
+        ("ttyAMA", 204, 100, "0"),
         ("fuse", 10, 229, "77"),
     ],
 )
