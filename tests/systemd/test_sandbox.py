@@ -247,6 +247,24 @@ def test_a_bus_that_is_opened_by_mistake_cannot_be_reached_from_other_computers(
 
 
 @pytest.mark.parametrize(
+    "address", ["10.9.8.7", "172.16.9.8", "192.168.9.8", "169.254.9.8", "fd00::9"]
+)
+def test_lan_conf_admits_every_network_that_is_private_or_link_local(
+    container: Container, board: Board, address: str
+) -> None:
+    networks = re.findall(r"^IPAddressAllow=.*\n", (DEPLOY / "lan.conf").read_text(), re.M)
+    container.drop_in("networks.conf", "[Service]\n" + "".join(networks))
+    container.run("ip", "address", "replace", address, "dev", "lo")
+    where = f"[{address}]" if ":" in address else address
+    container.write(CONFIG, f'{USUAL}[bus]\nlisten = ["tcp/{where}:7448"]\ninsecure = true\n')
+    try:
+        assert container.start().code == 0
+        assert reaches(container, address)
+    finally:
+        container.run("ip", "address", "delete", address, "dev", "lo")
+
+
+@pytest.mark.parametrize(
     ("kind", "major", "minor", "code"),
     [
         ("ttyUSB", 188, 200, "0"),
