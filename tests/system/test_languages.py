@@ -7,6 +7,7 @@ kept in pytest's cache.
 
 from __future__ import annotations
 
+import asyncio
 import json
 import re
 import shutil
@@ -18,6 +19,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from aiohttp import web
+from aiohttp.test_utils import TestServer
 
 from tests.pages import blocks
 from tests.system.browser import Page
@@ -84,13 +87,39 @@ def printed(page: Page) -> str:
     return f"{page.here}/"
 
 
+def node_program(where: Path) -> list[str]:
+    """Return the words that run the program for Node."""
+    node = program("node", "it runs the program")
+    flags = ["--experimental-websocket"] if run([node, "--version"], where) < "v22" else []
+    return [node, *flags, str(CLIENTS / "node/drive.mjs")]
+
+
+@pytest.mark.slow
+async def test_the_node_program_says_why_the_page_closed_its_connection(tmp_path: Path) -> None:
+    async def closes(request: web.Request) -> web.WebSocketResponse:
+        opened = web.WebSocketResponse()
+        await opened.prepare(request)
+        await opened.receive()
+        await opened.close(code=1008, message=b"the token has expired")
+        return opened
+
+    stand_in = web.Application()
+    stand_in.router.add_get("/ws", closes)
+    words = node_program(tmp_path)
+    async with TestServer(stand_in) as server:
+        address = f"http://{server.host}:{server.port}"
+        node = await asyncio.create_subprocess_exec(
+            *words, address, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+        )
+        out, err = await node.communicate()
+    assert node.returncode == 1, (out, err)
+    assert f"no connection to {address}: the token has expired\n" in err.decode()
+
+
 @pytest.mark.slow
 @pytest.mark.nightly
 def test_the_node_program_drives_the_robot(page: Page, standing: Bus, tmp_path: Path) -> None:
-    node = program("node", "it runs the program")
-    version = run([node, "--version"], tmp_path)
-    flags = ["--experimental-websocket"] if version < "v22" else []
-    words = [node, *flags, str(CLIENTS / "node/drive.mjs")]
+    words = node_program(tmp_path)
     driven([*words, printed(page)], tmp_path, standing)
     away = [*words, page.away, page.invite("operator", "node")]
     driven(away, tmp_path, standing, NODE_EXTRA_CA_CERTS=str(page.tls / "ca.pem"))

@@ -27,14 +27,20 @@ socket.onmessage = ({ data }) => {
   const speed = value.twist.twist.linear.x;
   console.log(`x ${x.toFixed(3)} m, y ${y.toFixed(3)} m, ${speed.toFixed(3)} m/s`);
 };
-socket.onerror = () => {
-  console.error(`no connection to ${address}`);
-  process.exitCode = 1;
-};
+let done = false;
+function lost(reason) {
+  if (done) return;
+  console.error(reason ? `no connection to ${address}: ${reason}` : `no connection to ${address}`);
+  process.exit(1);
+}
+socket.onerror = () => lost("");
+// A closed socket drops every message without an error.
+socket.onclose = ({ reason }) => lost(reason);
 socket.onopen = async () => {
   say({ subscribe: "odom", rate: 10 });
   await drive(0, 0.75); // the robot follows a new sender only after some zeros
   await drive(0.2, 2);
   await drive(0, 1);
+  done = true;
   socket.close();
 };
