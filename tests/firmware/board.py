@@ -8,17 +8,19 @@ from __future__ import annotations
 
 import binascii
 import json
+import math
 import os
 import select
 import shutil
 import subprocess
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from tests.system.harness import until
+from tests.system.harness import PATIENCE_S, until
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -129,6 +131,8 @@ class Status(NamedTuple):
     """Add this to a virtual time to get the monotonic clock's."""
     skipped_ns: int
     """Virtual time for which this machine was too slow."""
+    fetched: int
+    """Bytes that the runner has read from the port since it started."""
     load: float
     """Share of its time in which the processor did not sleep."""
     resets: int
@@ -168,6 +172,8 @@ class Board:
         self._held = b""
         self.path = ""
         """The path of its port."""
+        self.stepped = False
+        """Whether the board's time passes only in `step`."""
 
     def __enter__(self) -> Board:
         self._errors = tempfile.TemporaryFile()
@@ -209,6 +215,26 @@ class Board:
         self.path = self.command("plug")["pty"]
         return self.path
 
+    @contextmanager
+    def in_steps(self) -> Iterator[None]:
+        """Let the board's time pass only in `step` while entered.
+
+        The board then never waits for its host, nor the host for the board. The motors, the
+        watchdog and the pace of the lines are the same on a busy machine as on an idle one.
+        """
+        self.command("pause")
+        self.stepped = True
+        try:
+            yield
+        finally:
+            self.stepped = False
+            self.command("resume")
+
+    def step(self, ms: int) -> None:
+        """Let this much of the board's time pass, as fast as this machine can."""
+        assert self.stepped, "this board's time is the wall clock's"
+        self.command(f"bench {ms}")
+
     def status(self) -> Status:
         """Return the true state."""
         told = self.command("status")
@@ -243,6 +269,8 @@ class Board:
 def passes(board: Board, ms: float) -> Status:
     """Return the state after this much of the board's time."""
     end = board.status().virtual_ns + ms * MS
+    if board.stepped:
+        board.step(math.ceil(ms))
     return until(
         lambda: status if (status := board.status()).virtual_ns >= end else None,
         10.0 + ms / 100,
@@ -327,10 +355,15 @@ def read_reply(line: bytes, at: float = 0.0) -> Reply:
 
 
 class Host:
-    """A program at the board's port that a test controls."""
+    """A program at the board's port that a test controls.
 
-    def __init__(self, path: str) -> None:
+    It keeps the pace of the wall clock. With a board that is `stepped`, it keeps the pace of the
+    board: each of its waits lets that time pass there.
+    """
+
+    def __init__(self, path: str, board: Board | None = None) -> None:
         self._fd = os.open(path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK | os.O_CLOEXEC)
+        self._board = board
         self._held = b""
         self._sequence = 0
         self._stopped = False
@@ -343,19 +376,30 @@ class Host:
     def __exit__(self, *error: object) -> None:
         os.close(self._fd)
 
+    @property
+    def _stepped(self) -> Board | None:
+        return self._board if self._board is not None and self._board.stepped else None
+
     def send(self, line: bytes, end: bytes = b"\r\n") -> None:
         """Send one line."""
         self.write(line + end)
 
     def write(self, data: bytes) -> None:
         """Send bytes unchanged."""
+        length, fetched = len(data), self._stepped.status().fetched if self._stepped else 0
         while data:
             select.select([], [self._fd], [], ANSWER_S)
             data = data[os.write(self._fd, data) :]
+        if (board := self._stepped) is not None:
+            # The kernel's thread that carries bytes through a pty may be late. The board's time
+            # waits for it.
+            until(lambda: board.status().fetched >= fetched + length, 3.0, "the line is fetched")
         self.sent_ns = time.monotonic_ns()
 
     def lines(self, wait: float = 0.0) -> list[tuple[float, bytes]]:
         """Return the received lines without their ends. Waits up to that time for the first."""
+        if self._stepped is not None:
+            self._stepped.step(round(1000 * wait))
         while select.select([self._fd], [], [], wait)[0]:
             data = os.read(self._fd, 65536)
             if not data:
@@ -368,7 +412,7 @@ class Host:
 
     def says(self, text: bytes, within: float = 3.0) -> bytes:
         """Return the first line that contains `text`."""
-        deadline = time.monotonic() + within
+        deadline = time.monotonic() + within + PATIENCE_S
         heard: list[bytes] = []
         while time.monotonic() < deadline:
             for _, line in self.lines(0.05):
@@ -381,7 +425,7 @@ class Host:
         """Send a line and wait for its answer, which is the next line to come."""
         self.lines()
         self.send(line)
-        deadline = time.monotonic() + within
+        deadline = time.monotonic() + within + PATIENCE_S
         while time.monotonic() < deadline:
             for at, got in self.lines(0.05):
                 return read_reply(got, at)
@@ -398,7 +442,7 @@ class Host:
 
     def stop(self, within: float = 3.0) -> None:
         """Send stops until one is answered: after a boot the board accepts nothing else."""
-        deadline = time.monotonic() + within
+        deadline = time.monotonic() + within + PATIENCE_S
         self._stopped = False
         self.lines()
         while time.monotonic() < deadline:
@@ -422,6 +466,13 @@ class Host:
         replies: list[Reply] = []
         if not self._stopped:
             self.stop()
+        if (board := self._stepped) is not None:
+            for _ in range(round(seconds / period)):
+                self.send(checked(speeds_line(speeds), self._sequence, letters))
+                self._sequence = (self._sequence + 1) % 256
+                board.step(round(1000 * period))
+                replies += [read_reply(line, at) for at, line in self.lines()]
+            return replies
         began = time.monotonic()
         sent, again = 0, 0
         while sent < round(seconds / period):

@@ -112,5 +112,12 @@ def board(runner: Path, firmware: Path) -> Iterator[Board]:
 @pytest.fixture
 def host(board: Board) -> Iterator[Host]:
     """A host at its port."""
-    with Host(board.path) as host:
+    with Host(board.path, board) as host:
         yield host
+
+
+@pytest.fixture
+def in_steps(board: Board) -> Iterator[None]:
+    """Let the board's time pass only while its host waits."""
+    with board.in_steps():
+        yield

@@ -150,6 +150,7 @@ static int master = -1;
 static bool opened; /* somebody has the port open */
 static uint8_t incoming[QUEUE], outgoing[QUEUE];
 static size_t incoming_head, incoming_tail, outgoing_length;
+static uint64_t fetched; /* bytes that the host has written to the port and the board may take */
 static bool receiving;
 
 static void fail(const char *format, ...)
@@ -649,6 +650,7 @@ static void look_at_port(void)
 
         if (got <= 0)
             break;
+        fetched += (uint64_t)got;
         for (i = 0; i < got; i++)
             incoming[incoming_head++ % QUEUE] = buffer[i];
     }
@@ -726,12 +728,12 @@ static void print_status(void)
     for (i = 0; i < MOTORS; i++)
         advance(&motors[i], avr->cycle);
     printf("{\"virtual_ns\":%" PRId64 ",\"wall_ns\":%" PRId64 ",\"base_ns\":%" PRId64
-           ",\"skipped_ns\":%" PRId64 ",\"load\":%.4f,\"resets\":%u,\"running\":%s,\"on_ns\":%" PRId64
+           ",\"skipped_ns\":%" PRId64 ",\"fetched\":%" PRIu64 ",\"load\":%.4f,\"resets\":%u,\"running\":%s,\"on_ns\":%" PRId64
            ",\"off_ns\":%" PRId64 ",\"heard_ns\":%" PRId64
            ",\"answer_ns\":%" PRId64 ",\"wanted_ns\":%" PRId64 ",\"set_points\":%u,\"wrong\":%u"
            ",\"wrong_one\":[%d,%d,%d,%d],\"open\":%s,\"contact_ns\":%" PRId64
            ",\"reported_ns\":%" PRId64 ",\"motors\":[",
-           virtual_ns(), wall_ns(), base_ns, skipped_ns, 1.0 - (double)slept / (double)avr->cycle,
+           virtual_ns(), wall_ns(), base_ns, skipped_ns, fetched, 1.0 - (double)slept / (double)avr->cycle,
            resets, motors_run ? "true" : "false", on_ns, off_ns, heard_ns, answer_ns, wanted_ns,
            set_points, wrong, wrong_one.hundredths[0], wrong_one.hundredths[1], wrong_one.hundredths[2],
            wrong_one.hundredths[3], opened ? "true" : "false", contact_ns, reported_ns);
