@@ -100,8 +100,11 @@ def asks(terminal: Terminal, program: Program, words: str, times: int, within: f
     until(look, within, f"{words!r} for the {times}. time")
 
 
-def begun(terminal: Terminal, program: Program, bus: Bus) -> None:
-    """Wait until the first leg moves. Starts it again if a busy machine has disturbed it."""
+def begun(terminal: Terminal, program: Program, bus: Bus) -> int:
+    """Wait until the first leg moves; return how often it was started.
+
+    Starts it again if a busy machine has disturbed it.
+    """
     asks(terminal, program, STARTS, 1, 10.0)
     terminal.press("\n")
     starts = 1
@@ -116,6 +119,26 @@ def begun(terminal: Terminal, program: Program, bus: Bus) -> None:
 
     until(moves, 20.0, "the first leg moves")
     assert bus.state()["source"] == "app"
+    return starts
+
+
+def ends(terminal: Terminal, program: Program, starts: int) -> None:
+    """Wait until the program ends with 1. Its first leg was started this number of times.
+
+    If a busy machine disturbs the leg before its cause does, the program asks for a repetition. The
+    cause then ends the leg that is started again.
+    """
+
+    def ended() -> bool:
+        nonlocal starts
+        if (asked := shown(terminal).count(STARTS)) > starts and program.process.poll() is None:
+            assert "was disturbed" in shown(terminal)
+            terminal.press("\n")
+            starts = asked
+        return program.process.poll() is not None
+
+    until(ended, 10.0, "the leg ends")
+    assert program.ended(5.0) == 1
 
 
 TRIES = 3
@@ -335,18 +358,18 @@ def test_the_reason_that_ended_a_leg_is_reported(tmp_path: Path, how: str) -> No
         running(tmp_path, config=SKIDDING) as (daemon, bus),
         calibrating(daemon) as (terminal, program),
     ):
-        begun(terminal, program, bus)
+        starts = begun(terminal, program, bus)
         if how == "stop":
             bus.put("stop", {})
             why = "the robot is stopped"
         elif how == "teleop":
             with bus.commanding(0.0, source="teleop"):
-                assert program.ended(5.0) == 1
+                ends(terminal, program, starts)
             why = "teleop commands the robot now"
         else:
             terminal.press("\x03")
             why = "the operator ended the drive"
-        assert program.ended(5.0) == 1
+        ends(terminal, program, starts)
         until(lambda: not any(bus.state()["wheels"]), 5.0, "at rest")
         assert why in terminal.screen
 
