@@ -527,10 +527,16 @@ def test_on_a_robot_that_is_a_peer_programs_need_no_router_and_reach_no_other_ro
         before = one.count("commands")
         for key in ("cmd/app", "stop"):
             here.session.put(f"{ONE}/{key}", TWIST)
-        assert not list(here.session.get(f"{ONE}/srv/stop", timeout=0.3))
+        replies = here.session.get(f"{ONE}/srv/stop", timeout=5.0)
+        # On a busy machine Zenoh itself ends a query that nobody answers, with this error.
+        assert {b"Timeout"} >= {
+            (reply.ok or reply.err).payload.to_bytes()  # type: ignore[union-attr]
+            for reply in replies
+        }
         two.ask("info")
         fleet.comes(lambda: False)
-        assert (one.state()["mode"], one.count("commands")) == ("ready", before)
+        one.comes_to("ready")
+        assert one.count("commands") == before
     two.at_rest()
 
 
