@@ -286,7 +286,9 @@ class Sender:
 
     def _doubt(self, command: Command, why: Verdict) -> None:
         if is_zero(command) and (
-            _later(command.stamp_ns, self._stamp_ns) or _later(command.sequence, self._number)
+            (self._stamp_ns is None and self._number is None)
+            or _later(command.stamp_ns, self._stamp_ns)
+            or _later(command.sequence, self._number)
         ):
             # The sender does not want its last speed any more, however late this zero may be.
             self.twist, self._ended = REST, command

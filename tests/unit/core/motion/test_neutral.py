@@ -658,3 +658,15 @@ def test_a_numbered_speed_of_another_clock_that_a_zero_overtook_does_not_move_th
     assert one.twist == twist
     one.take(sent_by("b", 10, GO, 200), 0)
     assert one.twist == GO
+
+
+def test_a_speed_that_the_first_zero_of_a_sender_overtook_does_not_move_the_robot() -> None:
+    """The zero arms the sender, although the clock that stamps it is not proven yet."""
+    one = sender()
+    one.take(Command("high", GO, 0, 0, "b", "node", sequence=7), 0, "unproven")
+    one.take(Command("high", REST, 100 * MS, 100 * MS, "a", "node", sequence=9), 0, "unproven")
+    assert one.armed(100 * MS)
+    one.take(Command("high", GO, 102 * MS, 50 * MS, "b", "node", sequence=8), 0)
+    assert one.twist == REST
+    one.take(Command("high", GO, 150 * MS, 150 * MS, "b", "node", sequence=10), 0)
+    assert one.twist == GO
