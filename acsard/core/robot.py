@@ -139,8 +139,9 @@ class Robot:
         """The command and the mode from which the last line was computed. The command is given by
         its arrival time (monotonic, ns), or None without a command. After a press of the emergency
         stop or a bumper, the whole pair is None, so that a new line is due immediately."""
-        self._made_ns = 0
-        """Monotonic time at which the last line was computed, ns."""
+        self._made_ns = self._pressed_ns = 0
+        """Monotonic times, ns: of the last computed line, and of the last press of the emergency
+        stop or a bumper."""
         self._made = self._said = (self._limiter.state, 0)
         """Two pairs of a limiter state and the monotonic time of this state, ns. `_made` is the
         pair of the last computed line. `_said` is the pair of the last line that was written to
@@ -378,7 +379,7 @@ class Robot:
         if estop.pressed_now or bumpers.pressed_now:
             # Do not ramp: the hardware has cut the motors, or the robot touches an obstacle.
             self._limiter.cut()
-            self._speeds, self._made_of = STILL, None
+            self._speeds, self._made_of, self._pressed_ns = STILL, None, now.mono_ns
             self._made = self._said = (self._limiter.state, self._made_ns)
         if estop.driver_fault:
             self._fault(DRIVER_FAULT_REASON, now, events)
@@ -616,13 +617,13 @@ class Robot:
 
     def _drive(self, inputs: Inputs) -> bytes | None:
         now_ns, twist, limiter = inputs.now.mono_ns, self._choice.twist, self._limiter
-        pressed = self._made_of is None
         self._made_of = (self._choice.arrived_ns, self._life.mode)
         limiter.state, said_ns = self._said
         since = (now_ns - said_ns) / NS_PER_S
+        pressed = said_ns < self._pressed_ns
         if pressed or self.session.link != "up" or since > WRITE_PAUSE_S:
-            # The first line after a press contains zeros, even if the input is already released and
-            # the commands that arrived meanwhile may move the robot.
+            # The first written line after a press contains zeros, even if the input is already
+            # released and the commands that arrived meanwhile may move the robot.
             limiter.cut()
         elif self._life.mode is Mode.DRIVING and twist is not None:
             limiter.follow(twist, min(since, self._max_dt))

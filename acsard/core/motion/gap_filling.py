@@ -46,6 +46,11 @@ FIRST, MOST = 4.0, 300.0
 `ACCELERATION_SPAN_S` s has the weight 1, and `ASSUMED_ACCELERATION` has the weight `FIRST`. The
 total weight is limited to `MOST` (a minute of driving)."""
 
+MAX_COMMANDED_S = 1.0
+"""Longest time for which a command may have moved the robot in a gap, s. Without feedback, the
+daemon commands rest before this time ends. If the board receives nothing, its watchdog stops the
+motors."""
+
 VARIANCE_POWER = 5
 """Exponent: the variance of the motion in a gap grows with this power of the gap's duration."""
 
@@ -313,8 +318,8 @@ class Gaps:
     `follow` measures s while lines arrive without gaps. The configured acceleration limits are not
     used, because robots seldom accelerate that much. The deviation is limited to the motion at the
     highest of three speeds: the speeds before and after the gap, and the highest speed that was
-    commanded in it. Therefore a robot that stood still before and after a gap, and had no command
-    to move, is assumed not to have moved in it.
+    commanded in it (for `MAX_COMMANDED_S` at most). Therefore a robot that stood still before and
+    after a gap, and had no command to move, is assumed not to have moved in it.
     """
 
     def __init__(self) -> None:
@@ -396,6 +401,9 @@ class Gaps:
         is for callers that do not know the commands.
         """
         scale = (seconds / ACCELERATION_SPAN_S) ** VARIANCE_POWER
-        fastest = max(abs(before.linear), abs(after.linear), commanded.linear) * seconds
-        turning = max(abs(before.angular), abs(after.angular), commanded.angular) * seconds
+        driven = min(seconds, MAX_COMMANDED_S)
+        fastest = max(abs(before.linear), abs(after.linear)) * seconds
+        fastest = max(fastest, commanded.linear * driven)
+        turning = max(abs(before.angular), abs(after.angular)) * seconds
+        turning = max(turning, commanded.angular * driven)
         return min(self._along * scale, fastest**2), min(self._turning * scale, turning**2)

@@ -26,7 +26,7 @@ from collections import deque
 from msgspec import Struct
 
 from acsard.core.link.minimum_delay import MinimumDelay
-from acsard.core.motion.gyro_bias import LEARNING_TIME_S, Bias
+from acsard.core.motion.gyro_bias import LEARNING_TIME_S, MAX_BIAS, Bias
 from acsard.core.motion.gyro_match import WINDOW_S, Match
 from acsard.core.motion.gyro_trial import TURN_RATIO_RANGE, Trial
 from acsard.core.motion.learned_track import MIN_TRACK_STD, Track
@@ -67,6 +67,15 @@ MAX_JUMP = 2.0
 it. At 100 samples per second, it is a change of 200 rad/s2: a defect on the wire, or a push. At 10
 samples per second, it is a change of 20 rad/s2, which is more than the motors of a usual robot
 cause."""
+
+LOST_NS = NS_PER_S
+"""Age of the gyro's last sample from which nobody can tell any more whether gyro or wheels were
+right in a contradiction before it, ns."""
+
+MAX_BIAS_STEP = 0.06
+"""Largest change of the bias that is learned from a rate that repeats exactly, rad/s. A coarse
+gyro, or a simulated one without noise, repeats its bias. A gyro that hangs repeats a higher
+rate."""
 
 CONFIRMED_FRACTION = 0.5
 """Fraction of a jump of the rate that must remain in the next sample. After a push, friction slows
@@ -165,7 +174,8 @@ class Gyro:
         sample."""
         self._repeated_s = self._rested_s = 0.0
         """`_repeated_s` is the time for which the gyro has repeated the rate `_reading` exactly, s.
-        `_rested_s` is the part of this time in which the robot was at rest, s."""
+        `_rested_s` is the part of this time in which the robot was at rest, although this rate is
+        not the bias, s."""
         self._frozen = False
         """Whether the gyro is assumed to hang until its rate changes."""
         self._noise = 0.0
@@ -252,10 +262,10 @@ class Gyro:
         self._judge(silent)
         ratio = max(TURN_RATIO_RANGE[0], self._match.ratio)
         noise = self._noise + self._bias.variance
-        if lost:
+        if age_ns >= LOST_NS:
             self._end_contradiction()
         if lost or tried or self._does not in ("used", "disagrees"):
-            return self._doubted(ratio * wheels, dt, noise)
+            return self._doubted(ratio * wheels, dt, noise, lost)
         self._sum_up(angle, ratio * wheels, dt)
         rolled = angle / ratio
         if not self._trial.open:
@@ -331,24 +341,36 @@ class Gyro:
             passed = max(0, span_ns) / NS_PER_S
             span = passed if span_ns < SILENCE_TIMEOUT_NS else 0.0
             self._repeated_s += span
-            self._rested_s += span if resting else 0.0
-            if sample.rate != self._reading:
-                if self._repeated_s >= FROZEN_S and self._slipped_s >= SLIP_S:
-                    # The gyro may have hung while it contradicted the wheels. At the start of a
-                    # turn, a slow gyro contradicts them for a shorter time.
-                    self._end_contradiction()
-                self._reading, self._frozen = sample.rate, False
-                self._repeated_s = self._rested_s = 0.0
-                self._forget_repeated()
+            repeats = sample.rate == self._reading
+            if not repeats:
+                self._end_repetition()
+                self._reading = sample.rate
             bias.drift(passed)
-            # The rate of a gyro that hangs is not its bias.
-            learns = resting and not self._frozen
-            stands = learns and bias.rest(sample.rate, sample.variance, span)
+            learns = not self._frozen or abs(sample.rate - bias.value) < MAX_BIAS_STEP
+            stands = resting and learns and bias.rest(sample.rate, sample.variance, span)
             self._rate = 0.0 if stands else sample.rate - bias.value
+            self._rested_s += span if resting and repeats and not stands else 0.0
             self._noise = max(bias.noise, sample.variance)
             self._angle += self._rate * span
             if not stands:
                 self._variance += self._noise * span * span
+
+    def _end_repetition(self) -> None:
+        """Call this if the rate of the gyro changes."""
+        # The gyro may have hung while it contradicted the wheels. But if an even turn with slipping
+        # wheels began a repetition, the wheels turn more than the robot.
+        gyro = self._repeated + self._repeated_wheels
+        before = self._repeated_s >= self._slipped_s + SLIP_S
+        hung = before or abs(gyro) > abs(self._repeated_wheels)
+        # At the start of a turn, a slow gyro contradicts the wheels for a shorter time.
+        if hung and self._repeated_s >= FROZEN_S and self._slipped_s >= SLIP_S:
+            self._end_contradiction()
+        if self._frozen and self._reading is not None and abs(self._reading) <= MAX_BIAS:
+            # Perhaps the gyro did not hang, but its bias has changed.
+            off = self._reading - self._bias.value
+            self._bias.variance = max(self._bias.variance, off * off)
+        self._repeated_s, self._rested_s, self._frozen = 0.0, 0.0, False
+        self._forget_repeated()
 
     # Comparison with the wheels.
 
@@ -402,12 +424,13 @@ class Gyro:
         self._doubt += self._contradicted * self._contradicted
         self._contradicted = 0.0
 
-    def _doubted(self, wheels: float, dt: float, noise: float) -> Turn | None:
+    def _doubted(self, wheels: float, dt: float, noise: float, lost: bool) -> Turn | None:
         """Return the turn of a line if earlier turns are in doubt; otherwise None.
 
         Call this in lines whose turn comes from the wheels. The result is the wheels' turn of the
         line, `wheels` rad in `dt` s, with the correction and the uncertainty of the earlier turns.
-        `noise` is the variance of its rate, rad2/s2.
+        `noise` is the variance of its rate, rad2/s2. `lost` is whether samples of the gyro are
+        missing; then a contradiction may go on.
         """
         angle = 0.0
         if self._frozen:
@@ -416,7 +439,8 @@ class Gyro:
             deviation = self._match.deviation * self._repeated_wheels
             self._doubt += deviation * deviation + self._repeated_gaps
             self._forget_repeated()
-        self._end_contradiction()
+        if not lost:
+            self._end_contradiction()
         if dt <= 0.0 or (angle == 0.0 and self._doubt == 0.0):
             return None
         variance, self._doubt = self._doubt, 0.0

@@ -93,7 +93,9 @@ class Sanity:
         """For each wheel, the number of successive lines, up to the last line, in which the wheel
         was over `feedback.wheel_speed`."""
         self._totals = AT_REST
-        """For each wheel, the sum of the sizes of its speeds in the lines of `_fast`, rad/s."""
+        """For each wheel, the sum of the sizes of its speeds in the lines of `_fast`, rad/s. If a
+        speed is over the bound by more than one quantization step, the line is damaged, and only
+        one step counts."""
         self._lines = self._dropped = 0
         """Numbers of feedback lines in the present window: all lines (`_lines`), and impossible
         lines (`_dropped`)."""
@@ -200,8 +202,10 @@ class Sanity:
         )
         self._fast = a, b, c, d
         front_right, front_left, rear_left, rear_right = (
-            abs(now) + (total if lines > 1 else 0.0)
-            for now, total, lines in zip(wheels, self._totals, self._fast, strict=True)
+            min(abs(now), fastest + step) + (total if lines > 1 else 0.0)
+            for now, total, step, lines in zip(
+                wheels, self._totals, line.steps, self._fast, strict=True
+            )
         )
         self._totals = front_right, front_left, rear_left, rear_right
         rows = zip(

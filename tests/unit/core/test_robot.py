@@ -536,7 +536,8 @@ def test_the_line_after_a_press_is_zero_even_if_commands_that_came_with_it_may_m
     bench.driving()
     out = bench.status(marks).step(GO)
     assert (out.applied, out.mode) == (REST, "driving")
-    out = bench.status(FREE).step(GO)
+    assert bench.status(FREE).step(GO, superseded=True).applied == REST
+    out = bench.step(GO)
     assert 0.0 < out.applied.linear < 0.1
 
 

@@ -374,7 +374,9 @@ def test_the_uncertainty_of_a_gap_is_bounded_by_its_fastest_speed() -> None:
     before, after = Twist(0.1, -0.2), Twist(-0.5, 0.1)
     assert Gaps().unseen(30.0, before, after, REST) == pytest.approx((15.0**2, 6.0**2))
     faster = Gaps().unseen(30.0, before, after, Twist(0.6, 0.3))
-    assert faster == pytest.approx((18.0**2, 9.0**2))
+    assert faster == pytest.approx((15.0**2, 6.0**2))
+    assert Gaps().unseen(30.0, REST, REST, Twist(0.6, 0.3)) == pytest.approx((0.6**2, 0.3**2))
+    assert Gaps().unseen(0.5, REST, REST, Twist(0.0001, 0.0)) == pytest.approx((0.00005**2, 0.0))
 
 
 def test_a_line_between_two_gaps_makes_their_errors_independent() -> None:

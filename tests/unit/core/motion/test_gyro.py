@@ -434,9 +434,9 @@ def test_the_deviation_of_the_learned_track_is_a_share_of_the_track() -> None:
 # wrong samples
 
 
-def proved(noise: float = 0.0) -> Bench:
+def proved(noise: float = 0.0, sample_ms: int = 10) -> Bench:
     """Return a robot without slip whose gyro is proven, and which has stood still since then."""
-    bench = Bench(skid=1.0, noise=noise)
+    bench = Bench(skid=1.0, noise=noise, sample_ms=sample_ms)
     bench.run(REST_FIRST)
     for rate in (1.0, -1.0):
         bench.run(2.0, rate)
@@ -633,6 +633,63 @@ def test_a_contradiction_that_nobody_can_decide_any_more_is_in_the_variance(
     bench.run(1.0, still=False)
     bench.run(1.0)
     assert abs(bench.told - bench.true) == pytest.approx(math.sqrt(bench.variance), rel=0.1)
+
+
+@pytest.mark.parametrize("sample_ms", [10, 100])
+@pytest.mark.parametrize(("step", "off"), [(0.012, 0.02), (0.05, 0.02), (0.15, 3.2)])
+def test_the_changed_bias_of_a_gyro_without_noise_is_learned_or_in_the_variance(
+    sample_ms: int, step: float, off: float
+) -> None:
+    bench = proved(sample_ms=sample_ms)
+    bench.bias += step
+    bench.run(3.0)
+    bench.told = bench.true = bench.variance = 0.0
+    bench.run(1.0, 0.3)
+    bench.run(20.0, still=False)
+    assert abs(bench.told - bench.true) < min(off, 1.1 * math.sqrt(bench.variance) + 0.02)
+    bench.run(3.0)
+    bench.told = bench.true = 0.0
+    bench.run(20.0, still=False)
+    assert bench.told == pytest.approx(bench.true, abs=0.02)
+
+
+@pytest.mark.parametrize("sample_ms", [20, 50])
+def test_a_coarse_gyro_that_is_slower_than_the_lines_does_not_hang_when_the_robot_stops(
+    sample_ms: int,
+) -> None:
+    bench = Bench(skid=1.0, sample_ms=sample_ms)
+    begun_ns = bench.now_ns
+    bench.distort = lambda rate: (
+        0.008 * (round(rate / 0.008) + (bench.now_ns < begun_ns + 600 * MS))
+    )
+    bench.run(REST_FIRST)
+    for rate in (0.5, -0.5):
+        bench.run(4.0, rate)
+    bench.run(2.0)
+    bench.does.clear()
+    bench.told = bench.true
+    for number in range(6):
+        bench.run(
+            6.0 + DT * number, 0.002, skid=15.0
+        )  # Unequal tires turn the wheels by 0.03 rad/s.
+        bench.run(1.5)
+    assert bench.does == []
+    assert bench.told == pytest.approx(bench.true, abs=0.1)
+
+
+@pytest.mark.parametrize("dropout", [0.0, 0.25])
+def test_neither_an_even_slip_nor_a_short_dropout_in_it_is_in_the_variance(dropout: float) -> None:
+    bench = proved()
+    for _ in range(3):
+        bench.run(1.5, 0.5, skid=3.0)
+        bench.silent = dropout > 0.0
+        bench.run(dropout, 0.5, skid=1.0)
+        bench.silent = False
+        bench.run(1.5, 0.5, skid=3.0)
+        bench.run(3.0, 0.5)
+        bench.run(1.0)
+    assert "disagrees" in bench.does
+    assert math.sqrt(bench.variance) < 0.05
 
 
 def test_a_new_pose_ends_the_doubt_of_a_contradiction() -> None:

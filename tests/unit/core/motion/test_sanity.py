@@ -258,6 +258,14 @@ def test_a_learned_step_excuses_fast_lines_only_as_long_as_their_mean_may_be_pos
     assert sanity.doubtful
 
 
+def test_a_damaged_line_does_not_make_the_fast_lines_after_it_impossible() -> None:
+    sanity = Sanity(FeedbackConfig(wheel_speed=20.0))
+    for _ in range(20):
+        assert sanity.impossible(stepping(only(1, 70.0), 10.5)) != ""
+        steps = [stepping(only(1, speed), 10.5) for speed in (21.0, 21.0, 21.0, 10.5, 10.5)]
+        assert verdicts(sanity, *steps) == [True] * 5
+
+
 def test_the_time_before_a_gap_does_not_count_for_a_lasting_speed() -> None:
     sanity = Sanity(FeedbackConfig(wheel_speed=5.5))
     fast = stepping(only(1, 7.35), 6.54)
