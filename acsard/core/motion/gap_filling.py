@@ -47,9 +47,9 @@ FIRST, MOST = 4.0, 300.0
 total weight is limited to `MOST` (a minute of driving)."""
 
 MAX_COMMANDED_S = 1.0
-"""Longest time for which a command may have moved the robot in a gap, s. Without feedback, the
-daemon commands rest before this time ends. If the board receives nothing, its watchdog stops the
-motors."""
+"""Longest time for which a command is assumed to have moved the robot in a gap, s. Without
+feedback, the daemon usually commands rest much earlier. If the board receives nothing, its watchdog
+stops the motors."""
 
 VARIANCE_POWER = 5
 """Exponent: the variance of the motion in a gap grows with this power of the gap's duration."""

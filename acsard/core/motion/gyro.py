@@ -73,9 +73,13 @@ LOST_NS = NS_PER_S
 right in a contradiction before it, ns."""
 
 MAX_BIAS_STEP = 0.06
-"""Largest change of the bias that is learned from a rate that repeats exactly, rad/s. A coarse
-gyro, or a simulated one without noise, repeats its bias. A gyro that hangs repeats a higher
-rate."""
+"""Largest change of the bias that is learned from a rate that repeats exactly, rad/s, if the gyro
+also repeats its rates without a defect, as a coarse gyro or a simulated one without noise does.
+Such a gyro that hangs at a lower rate looks like a gyro whose bias has changed."""
+
+MAX_REPEATING, MIN_CHANCE = 0.6, 1e-6
+"""A gyro certainly hangs if it usually repeats a smaller fraction of its samples at rest than
+`MAX_REPEATING`, and if the chance of the present repetition is smaller than `MIN_CHANCE`."""
 
 CONFIRMED_FRACTION = 0.5
 """Fraction of a jump of the rate that must remain in the next sample. After a push, friction slows
@@ -85,8 +89,8 @@ remains."""
 FROZEN_S = 0.8
 """Time at rest after which a gyro that repeats one rate exactly is assumed to hang, s. The noise of
 a gyro, and a hand that turns the robot, change the last digits of the rate within a few samples.
-The time is shorter than `NEW_BIAS_TIME_S`, after which a low rate becomes the bias. A coarse gyro
-that rotates evenly with a robot at rest, for example on a turntable, looks like a gyro that
+The time is shorter than `NEW_BIAS_TIME_S`, so that no such rate becomes the bias before. A coarse
+gyro that rotates evenly with a robot at rest, for example on a turntable, looks like a gyro that
 hangs."""
 
 TRUSTED_BLOCKS = 20.0
@@ -177,7 +181,15 @@ class Gyro:
         `_rested_s` is the part of this time in which the robot was at rest, although this rate is
         not the bias, s."""
         self._frozen = False
-        """Whether the gyro is assumed to hang until its rate changes."""
+        """Whether the gyro is assumed to hang, until its rate changes or becomes the bias."""
+        self._repeats = self._rested = self._alike = 0
+        """Numbers of samples: those that repeat the rate `_reading`, those at rest with the rate of
+        the bias while the gyro does not hang (`_rested`), and those of `_rested` that repeat the
+        rate of the sample before (`_alike`)."""
+        self._unsure = 0.0
+        self._suspect: float | None = None
+        """Variance of the bias, rad2/s2, because the rate `_suspect`, rad/s, that the gyro repeated
+        at rest may have been the new bias; 0 and None without such a rate."""
         self._noise = 0.0
         """Variance of the present turn rate, rad2/s2."""
         self._hole = False
@@ -250,7 +262,8 @@ class Gyro:
         lost, self._hole = silent or self._hole, silent
         self._since_rest_s = 0.0 if resting else self._since_rest_s + dt
         # The error of the bias is the same in each line, so it does not average out.
-        variance += 2.0 * self._bias.variance * self._since_rest_s * dt
+        bias_variance = self._bias.variance + self._unsure
+        variance += 2.0 * bias_variance * self._since_rest_s * dt
         tried = False if lost else self._try(wheels, angle, variance, dt, resting)
         if not lost and self._bias.known and dt > 0.0 and not self._trial.open:
             self._compare(wheels, angle, dt)
@@ -344,10 +357,16 @@ class Gyro:
             repeats = sample.rate == self._reading
             if not repeats:
                 self._end_repetition()
-                self._reading = sample.rate
+                self._reading, self._repeats = sample.rate, 0
+            self._repeats += repeats
             bias.drift(passed)
-            learns = not self._frozen or abs(sample.rate - bias.value) < MAX_BIAS_STEP
+            new = abs(sample.rate - bias.value) < MAX_BIAS_STEP or sample.rate == self._suspect
+            learns = not self._frozen or (new and not self._hangs)
             stands = resting and learns and bias.rest(sample.rate, sample.variance, span)
+            if stands:
+                self._unsure, self._rested_s, self._frozen = 0.0, 0.0, False
+                if not self._hangs:
+                    self._rested, self._alike = self._rested + 1, self._alike + repeats
             self._rate = 0.0 if stands else sample.rate - bias.value
             self._rested_s += span if resting and repeats and not stands else 0.0
             self._noise = max(bias.noise, sample.variance)
@@ -355,20 +374,27 @@ class Gyro:
             if not stands:
                 self._variance += self._noise * span * span
 
+    @property
+    def _hangs(self) -> bool:
+        """Whether the present repetition is much longer than any of a gyro without a defect."""
+        share = (self._alike + 1) / (self._rested + 1)
+        return share < MAX_REPEATING and share**self._repeats < MIN_CHANCE
+
     def _end_repetition(self) -> None:
         """Call this if the rate of the gyro changes."""
         # The gyro may have hung while it contradicted the wheels. But if an even turn with slipping
         # wheels began a repetition, the wheels turn more than the robot.
         gyro = self._repeated + self._repeated_wheels
         before = self._repeated_s >= self._slipped_s + SLIP_S
-        hung = before or abs(gyro) > abs(self._repeated_wheels)
+        hung = before or self._hangs or abs(gyro) > abs(self._repeated_wheels)
         # At the start of a turn, a slow gyro contradicts the wheels for a shorter time.
         if hung and self._repeated_s >= FROZEN_S and self._slipped_s >= SLIP_S:
             self._end_contradiction()
-        if self._frozen and self._reading is not None and abs(self._reading) <= MAX_BIAS:
+        suspect = self._reading if self._frozen and not self._hangs else None
+        if suspect is not None and abs(suspect) <= MAX_BIAS:
             # Perhaps the gyro did not hang, but its bias has changed.
-            off = self._reading - self._bias.value
-            self._bias.variance = max(self._bias.variance, off * off)
+            off = suspect - self._bias.value
+            self._unsure, self._suspect = off * off, suspect
         self._repeated_s, self._rested_s, self._frozen = 0.0, 0.0, False
         self._forget_repeated()
 
@@ -419,7 +445,7 @@ class Gyro:
         """Add the turns that gyro and wheels contradicted to the doubt of the heading.
 
         Call this if nobody can tell any more whether the gyro or the wheels were right, for example
-        because the gyro is silent now.
+        because the gyro has been silent for `LOST_NS`.
         """
         self._doubt += self._contradicted * self._contradicted
         self._contradicted = 0.0

@@ -286,7 +286,7 @@ class Sender:
 
     def _doubt(self, command: Command, why: Verdict) -> None:
         if is_zero(command) and (
-            (self._stamp_ns is None and self._number is None)
+            self.arrived_ns is None
             or _later(command.stamp_ns, self._stamp_ns)
             or _later(command.sequence, self._number)
         ):

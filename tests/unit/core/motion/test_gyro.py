@@ -643,6 +643,7 @@ def test_the_changed_bias_of_a_gyro_without_noise_is_learned_or_in_the_variance(
     bench = proved(sample_ms=sample_ms)
     bench.bias += step
     bench.run(3.0)
+    assert bench.says() == "used" or step > 0.06
     bench.told = bench.true = bench.variance = 0.0
     bench.run(1.0, 0.3)
     bench.run(20.0, still=False)
@@ -690,6 +691,45 @@ def test_neither_an_even_slip_nor_a_short_dropout_in_it_is_in_the_variance(dropo
         bench.run(1.0)
     assert "disagrees" in bench.does
     assert math.sqrt(bench.variance) < 0.05
+
+
+@pytest.mark.parametrize("before", [0.0, 0.3])
+def test_a_gyro_that_hangs_as_a_turn_begins_and_then_recovers_leaves_the_turn_in_the_variance(
+    before: float,
+) -> None:
+    bench = proved(0.002)
+    frozen(bench)
+    bench.run(before + DT)
+    bench.run(3.0, 1.0)
+    bench.distort = lambda rate: rate
+    bench.run(2.0, still=False)
+    assert abs(bench.told - bench.true) == pytest.approx(math.sqrt(bench.variance), rel=0.1)
+
+
+@pytest.mark.parametrize("rate", [0.02, 0.04, 0.055])
+def test_a_low_rate_at_which_a_noisy_gyro_hangs_does_not_become_its_bias(rate: float) -> None:
+    bench = proved(0.002)
+    bench.run(1.0, rate)
+    frozen(bench)
+    bench.run(0.05, rate)
+    bench.run(3.0)
+    bench.distort = lambda rate: rate
+    bench.told = bench.true
+    bench.run(20.0, still=False)
+    assert bench.told == pytest.approx(bench.true, abs=0.05)
+
+
+@pytest.mark.parametrize("noise", [0.002, 0.0])
+def test_a_turn_by_hand_after_a_repeated_rate_does_not_become_the_bias(noise: float) -> None:
+    bench = proved(noise)
+    frozen(bench)
+    bench.run(DT, 0.1)
+    bench.run(3.0)
+    bench.distort = lambda rate: rate
+    bench.told = bench.true
+    bench.run(2.0, 0.3, skid=0.0, still=True)
+    bench.run(3.0, still=False)
+    assert bench.told == pytest.approx(bench.true, abs=0.05 if noise else 0.3)
 
 
 def test_a_new_pose_ends_the_doubt_of_a_contradiction() -> None:

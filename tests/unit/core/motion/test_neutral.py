@@ -670,3 +670,23 @@ def test_a_speed_that_the_first_zero_of_a_sender_overtook_does_not_move_the_robo
     assert one.twist == REST
     one.take(Command("high", GO, 150 * MS, 150 * MS, "b", "node", sequence=10), 0)
     assert one.twist == GO
+
+
+def test_the_first_zero_after_a_demand_for_zeros_ends_older_speeds_whatever_came_before() -> None:
+    """A program has restarted with a new clock and lower numbers."""
+    one = sender()
+    one.take(Command("high", REST, 0, 0, "b", "node", sequence=500), 0)
+    one.require_neutral()
+    one.take(Command("high", REST, 100 * MS, 100 * MS, "a", "node", sequence=11), 0, "unproven")
+    one.take(Command("high", GO, 102 * MS, 50 * MS, "c", "node", sequence=10), 0)
+    assert one.twist == REST
+
+
+def test_a_doubtful_zero_does_not_stop_a_sender_whose_commands_have_neither_stamp_nor_number() -> (
+    None
+):
+    one = sender()
+    one.take(Command("high", REST, 0, None, "", "node"), 0)
+    one.take(Command("high", GO, 50 * MS, None, "", "node"), 0)
+    one.refuse(Command("high", REST, 60 * MS, 10 * MS, "a", "node", sequence=3), "stale")
+    assert one.twist == GO
