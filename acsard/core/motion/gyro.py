@@ -182,14 +182,16 @@ class Gyro:
         not the bias, s."""
         self._frozen = False
         """Whether the gyro is assumed to hang, until its rate changes or becomes the bias."""
-        self._repeats = self._rested = self._alike = 0
-        """Numbers of samples: those that repeat the rate `_reading`, those at rest with the rate of
-        the bias while the gyro does not hang (`_rested`), and those of `_rested` that repeat the
-        rate of the sample before (`_alike`)."""
-        self._unsure = 0.0
+        self._repeats = 0
+        """Number of samples since the last change of the rate that repeat the rate `_reading`."""
+        self._usual = self._usual_repeats = 0
+        """Numbers of the samples that measured the bias at rest: all of them (`_usual`), and those
+        that repeated the rate of the sample before them. Samples of a gyro that hangs do not
+        count."""
         self._suspect: float | None = None
-        """Variance of the bias, rad2/s2, because the rate `_suspect`, rad/s, that the gyro repeated
-        at rest may have been the new bias; 0 and None without such a rate."""
+        """A rate that the gyro repeated at rest and that may be its new bias, rad/s, or None."""
+        self._unsure = 0.0
+        """Variance that the bias has because of `_suspect`, rad2/s2."""
         self._noise = 0.0
         """Variance of the present turn rate, rad2/s2."""
         self._hole = False
@@ -354,11 +356,11 @@ class Gyro:
             passed = max(0, span_ns) / NS_PER_S
             span = passed if span_ns < SILENCE_TIMEOUT_NS else 0.0
             self._repeated_s += span
-            repeats = sample.rate == self._reading
-            if not repeats:
+            same = sample.rate == self._reading
+            if not same:
                 self._end_repetition()
-                self._reading, self._repeats = sample.rate, 0
-            self._repeats += repeats
+                self._reading = sample.rate
+            self._repeats += same
             bias.drift(passed)
             new = abs(sample.rate - bias.value) < MAX_BIAS_STEP or sample.rate == self._suspect
             learns = not self._frozen or (new and not self._hangs)
@@ -366,9 +368,10 @@ class Gyro:
             if stands:
                 self._unsure, self._rested_s, self._frozen = 0.0, 0.0, False
                 if not self._hangs:
-                    self._rested, self._alike = self._rested + 1, self._alike + repeats
+                    self._usual += 1
+                    self._usual_repeats += same
             self._rate = 0.0 if stands else sample.rate - bias.value
-            self._rested_s += span if resting and repeats and not stands else 0.0
+            self._rested_s += span if resting and same and not stands else 0.0
             self._noise = max(bias.noise, sample.variance)
             self._angle += self._rate * span
             if not stands:
@@ -376,14 +379,18 @@ class Gyro:
 
     @property
     def _hangs(self) -> bool:
-        """Whether the present repetition is much longer than any of a gyro without a defect."""
-        share = (self._alike + 1) / (self._rested + 1)
+        """Whether the gyro has repeated its rate for so long that it must have a defect.
+
+        A gyro that often repeats its rate without a defect is never found in this way.
+        """
+        share = (self._usual_repeats + 1) / (self._usual + 1)
         return share < MAX_REPEATING and share**self._repeats < MIN_CHANCE
 
     def _end_repetition(self) -> None:
         """Call this if the rate of the gyro changes."""
-        # The gyro may have hung while it contradicted the wheels. But if an even turn with slipping
-        # wheels began a repetition, the wheels turn more than the robot.
+        # The gyro may have hung while it contradicted the wheels. But a gyro without noise also
+        # repeats its rate in an even turn with slipping wheels. Then the repetition begins with the
+        # slip, and the wheels turn more than the robot.
         gyro = self._repeated + self._repeated_wheels
         before = self._repeated_s >= self._slipped_s + SLIP_S
         hung = before or self._hangs or abs(gyro) > abs(self._repeated_wheels)
@@ -395,7 +402,7 @@ class Gyro:
             # Perhaps the gyro did not hang, but its bias has changed.
             off = suspect - self._bias.value
             self._unsure, self._suspect = off * off, suspect
-        self._repeated_s, self._rested_s, self._frozen = 0.0, 0.0, False
+        self._repeated_s, self._rested_s, self._repeats, self._frozen = 0.0, 0.0, 0, False
         self._forget_repeated()
 
     # Comparison with the wheels.

@@ -670,9 +670,8 @@ def test_a_coarse_gyro_that_is_slower_than_the_lines_does_not_hang_when_the_robo
     bench.does.clear()
     bench.told = bench.true
     for number in range(6):
-        bench.run(
-            6.0 + DT * number, 0.002, skid=15.0
-        )  # Unequal tires turn the wheels by 0.03 rad/s.
+        # Because of unequal tires, the wheels report a turn of 0.03 rad/s.
+        bench.run(6.0 + DT * number, 0.002, skid=15.0)
         bench.run(1.5)
     assert bench.does == []
     assert bench.told == pytest.approx(bench.true, abs=0.1)
