@@ -729,9 +729,8 @@ FAULTS = (
         "        if rolled.unknown > 1e9:\n            self._stand",
         Edit(
             ODOMETRY,
-            "self._uncertainty.doubt(\n                *self._gaps.bridge(bridged, before, twist, "
-            "self._highest, doubtful)\n            )",
-            "self._gaps.interrupt(twist)",
+            "            self._uncertainty.doubt(along + by_counts, yaw + turn_by_counts)\n",
+            "",
         ),
     ),
     fault(

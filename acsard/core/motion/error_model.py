@@ -240,12 +240,27 @@ class TwistUncertainty:
         `seconds` is the time for which all wheels have reported zero speed, s. `step` is the
         quantization step of the wheel speeds, rad/s; 0 if it is unknown.
         """
-        quantum = (max(self._count, step * self._period) / seconds) ** 2
+        linear, angular = self.rounding(seconds, step)
         return TwistVariances(
-            max(MIN_TWIST_VARIANCE, self._to_linear * quantum),
+            max(MIN_TWIST_VARIANCE, linear),
             MIN_TWIST_VARIANCE,
-            max(MIN_TWIST_VARIANCE, self._to_angular * quantum),
+            max(MIN_TWIST_VARIANCE, angular),
         )
+
+    def rounding(self, still: float, step: float = 0.0) -> tuple[float, float]:
+        """Return the part of the variances of the twist that the encoder counts cause.
+
+        The result is a pair: the variances of the linear speed, m2/s2, and of the turn rate,
+        rad2/s2.
+
+        Args:
+            still: the time for which all wheels have reported zero speed, s. A wheel that turns
+                has reported at most one count in this time.
+            step: the quantization step of the wheel speeds, rad/s; 0 if it is unknown.
+        """
+        period = self._period
+        quantum = (max(self._count, step * period) / max(period, still)) ** 2
+        return self._to_linear * quantum, self._to_angular * quantum
 
     def slipping(self, variances: TwistVariances) -> TwistVariances:
         """Return `variances` times `SLIP_FACTOR`, but at most `MAX_TWIST_VARIANCE`. Use this while

@@ -383,6 +383,49 @@ def test_only_the_commands_since_the_line_before_a_gap_count_in_it() -> None:
     assert robot.fold(feedback(0.0, 0.0, 0.0, gap=1.0)).covariance == grown
 
 
+@pytest.mark.parametrize("seconds", [0.1, -1.0], ids=["filled", "not filled"])
+@pytest.mark.parametrize("known", [True, False], ids=["step known", "step unknown"])
+def test_a_gap_between_speeds_of_single_counts_is_in_the_covariance(
+    seconds: float, known: bool
+) -> None:
+    """With 96 counts per turn, a line of a slow wheel contains one count or none.
+
+    If the gap is not filled (negative `seconds`), the pose lacks its whole motion.
+    """
+    dice, count = np.random.default_rng(5), math.tau / 96
+    kinematics, errors = Kinematics(DriveConfig()), []
+    rates = {side: -count / period for side, period in (("left", 0.02), ("right", 0.03))}
+    for _ in range(200):
+        robot, now = odometry(), 0.0
+        angles = {side: count * dice.random() for side in rates}
+        for number in range(10):
+            gap = abs(seconds) if number == 8 else 0.0
+            own = dice.uniform(0.004, 0.016)
+            for side, rate in rates.items():
+                angles[side] += rate * gap
+            before = {side: count * math.floor(angle / count) for side, angle in angles.items()}
+            for side, rate in rates.items():
+                angles[side] += rate * own
+            now += gap + own
+            left, right = (
+                (count * math.floor(angles[side] / count) - before[side]) / own for side in rates
+            )
+            line = replace(
+                feedback(left, right, own + gap, 0.0),
+                bridged=gap,
+                steps=(count / 0.004 if known else math.inf,) * 4,
+            )
+            if gap and seconds < 0.0:
+                line = replace(line, dt=0.0, bridged=0.0, gap=own + gap)
+            estimate = robot.fold(line)
+        _, turn = kinematics.moved((rates["right"], rates["left"], rates["left"], rates["right"]))
+        off = math.remainder(estimate.pose.yaw - turn * now, math.tau)
+        errors.append(off / math.sqrt(estimate.covariance.yawyaw))
+    assert max(map(abs, errors)) < 4.0
+    # The deviation is not far too large either.
+    assert np.std(errors) > 0.1 or seconds < 0.0
+
+
 def test_a_gap_of_a_robot_that_stood_before_and_after_adds_nothing() -> None:
     robot = odometry()
     robot.fold(feedback(0.0, 0.0, 0.01))
