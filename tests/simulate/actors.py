@@ -415,7 +415,7 @@ class Run:
                 self._flipped = event["behind"] + 1
                 self._troubled("flip")
                 self.damage.forget()
-            case "stall" | "stall in step":
+            case "stall" | "stall in step" if product.alive:
                 self._stalled_ns = after_ns
                 if "deaf" in event:
                     self._bus_ns = after_ns + int(event["deaf"] * NS)

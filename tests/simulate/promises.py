@@ -207,6 +207,7 @@ class Witness:
     def new_life(self, at_ns: int) -> None:
         """Note that the daemon started."""
         self.born_ns = at_ns
+        self._stalled = -NS, -NS
         if self.blocked_ns is not None:
             self.blocked_ns = at_ns  # this daemon has not yet had the time to find that out
         self.unfaulted_ns = -LOOK_NS
