@@ -411,6 +411,10 @@ RARE_LOSS_FRACTION = 0.002
 prove that a reply was lost. After a host stall, two commands are written close together, so the
 reply to the first command is late even if no reply was lost."""
 
+MAX_STALLED_REPLIES = 8
+"""Largest number of consecutive replies that a host stall can delay. If more replies seem delayed,
+the usual delay was too short, because it was measured on an unusually early reply."""
+
 MAX_USB_JITTER_NS = 350_000
 """If the mean deviation of the reply delay is at most this, ns, USB and the scheduler explain the
 deviation."""
@@ -488,6 +492,8 @@ class PromptedTimes:
         least reply delay, ns."""
         self._soon = 0.0
         """Least delay of the last replies, ns."""
+        self._stalled = 0
+        """Number of consecutive replies that a host stall seems to have delayed."""
         self._sent: int | None = None
         self._apart = self._missing = 0.0
         """`_apart` is the usual time between two commands, ns. `_missing` is the share of lost
@@ -727,8 +733,10 @@ class PromptedTimes:
             return 0
         error = self._at - line - delay
         size = abs(error)
-        if size >= delay and size >= 4 * spread:
+        if size >= delay and size >= 4 * spread and self._stalled < MAX_STALLED_REPLIES:
+            self._stalled += 1
             return 0  # a host stall has probably delayed this reply
+        self._stalled = 0
         self._delay = delay + FAST_GAIN * error
         self._least = min(self._least + LEAST_DELAY_GAIN * (delay - self._least), delay + error)
         self._spread += FAST_GAIN * (size - spread)

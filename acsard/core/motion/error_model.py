@@ -240,27 +240,20 @@ class TwistUncertainty:
         `seconds` is the time for which all wheels have reported zero speed, s. `step` is the
         quantization step of the wheel speeds, rad/s; 0 if it is unknown.
         """
-        linear, angular = self.rounding(seconds, step)
+        linear, angular = self.rounding((max(self._count, step * self._period) / seconds) ** 2)
         return TwistVariances(
             max(MIN_TWIST_VARIANCE, linear),
             MIN_TWIST_VARIANCE,
             max(MIN_TWIST_VARIANCE, angular),
         )
 
-    def rounding(self, still: float, step: float = 0.0) -> tuple[float, float]:
-        """Return the part of the variances of the twist that the encoder counts cause.
+    def rounding(self, square: float) -> tuple[float, float]:
+        """Return the variances of the twist that the quantization of the wheel speeds causes.
 
         The result is a pair: the variances of the linear speed, m2/s2, and of the turn rate,
-        rad2/s2.
-
-        Args:
-            still: the time for which all wheels have reported zero speed, s. A wheel that turns
-                has reported at most one count in this time.
-            step: the quantization step of the wheel speeds, rad/s; 0 if it is unknown.
+        rad2/s2. `square` is the square of the quantization step, rad2/s2.
         """
-        period = self._period
-        quantum = (max(self._count, step * period) / max(period, still)) ** 2
-        return self._to_linear * quantum, self._to_angular * quantum
+        return self._to_linear * square, self._to_angular * square
 
     def slipping(self, variances: TwistVariances) -> TwistVariances:
         """Return `variances` times `SLIP_FACTOR`, but at most `MAX_TWIST_VARIANCE`. Use this while

@@ -23,6 +23,7 @@ from acsard.core.link.codec import Motors
 from acsard.core.link.feedback import Feedback
 from acsard.core.link.link_state import WATCHDOG_S
 from acsard.core.motion.error_model import PERIOD_GAIN
+from acsard.core.motion.gyro import REST_S
 from acsard.core.motion.sanity import SPEED_MARGIN
 from acsard.core.values import REST, Twist, WheelSpeeds
 
@@ -50,6 +51,9 @@ MAX_COMMANDED_S = 1.0
 """Longest time for which a command is assumed to have moved the robot in a gap, s. Without
 feedback, the daemon usually commands rest much earlier. If the board receives nothing, its watchdog
 stops the motors."""
+
+STEP_DECAY = 0.05
+"""Fraction of the estimated quantization step that is forgotten with each line."""
 
 VARIANCE_POWER = 5
 """Exponent: the variance of the motion in a gap grows with this power of the gap's duration."""
@@ -407,3 +411,57 @@ class Gaps:
         turning = max(abs(before.angular), abs(after.angular)) * seconds
         turning = max(turning, commanded.angular * driven)
         return min(self._along * scale, fastest**2), min(self._turning * scale, turning**2)
+
+
+class Rounding:
+    """Estimates how much reported speeds differ from the true speeds if the encoders are coarse.
+
+    With few encoder counts, a line of a slow wheel contains one count or none, so its speed jumps
+    from line to line. Let v0, v1 and v2 be the speeds of a wheel in three consecutive lines. With
+    few counts, |v0 - 2 v1 + v2| / 2 is about one quantization step of the speed. With many counts
+    it is near 0, unless the acceleration changes.
+    """
+
+    def __init__(self) -> None:
+        self._last: Motors | None = None
+        self._older: Motors | None = None
+        """Speeds in the last line and in the line before it, rad/s; None before a gap."""
+        self._step = self._before = self._after = 0.0
+        """Quantization steps of the speeds, rad/s. `_step` is the largest recent one, less
+        `STEP_DECAY` for each line since. `_before` and `_after` are those of the last two lines,
+        and smaller if the wheels stood still."""
+
+    def add(self, speeds: Motors, own: float, still: float, after_gap: bool) -> None:
+        """Use the next line from the board.
+
+        Args:
+            speeds: the wheel speeds in the line, rad/s.
+            own: the time that the line covers, s, without a gap before it; 0 if it is unknown.
+            still: the time for which all wheels have reported zero speed, s. In this time, each
+                wheel turned by less than one count.
+            after_gap: whether a gap precedes the line.
+        """
+        last, older = self._last, self._older
+        if after_gap:
+            last = None
+        elif last is not None and older is not None and not speeds == last == older == AT_REST:
+            jumps = [abs(a - 2 * b + c) for a, b, c in zip(speeds, last, older, strict=True)]
+            self._step = max(self._step * (1 - STEP_DECAY), max(jumps) / 2)
+        self._last, self._older = speeds, last
+        self._before, self._after = self._after, self._step
+        if still > REST_S:
+            self._after = 0.0
+        elif still > 0.0:
+            self._after *= min(1.0, own / still)
+
+    @property
+    def square(self) -> float:
+        """Sum of the squares of the steps before and after the gap, rad2/s2.
+
+        Let e be the variance of a speed that is rounded to one step, which is step^2 / 12. In a gap
+        of t s, the speed before it is assumed for t / 2, and then the speed after it. So the
+        variance is (t / 2)^2 times the sum of both variances. But both wheels of a side turn alike,
+        so their errors are equal. In addition, a single line can contain an edge too many or too
+        few. Each fact doubles e. Therefore the variance is t^2 times that of independent wheels.
+        """
+        return self._before**2 + self._after**2

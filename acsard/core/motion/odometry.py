@@ -17,7 +17,6 @@ from __future__ import annotations
 import math
 from collections import deque
 from itertools import takewhile
-from operator import sub
 
 from msgspec import Struct
 from msgspec.structs import replace
@@ -33,6 +32,7 @@ from acsard.core.motion.gap_filling import (
     Gaps,
     Rolled,
     Rolling,
+    Rounding,
     plus,
 )
 from acsard.core.motion.gyro import REST_S, Turn
@@ -99,15 +99,14 @@ class Odometry:
         self._held = AT_REST
         """Angles that the wheels have rolled at rest, rad. The odometry adds these angles to the
         pose when they exceed two encoder counts (`_unsettled`) or when the robot drives."""
-        self._steps_of, self._coarsest, self._learned = AT_REST, 0.0, True
+        self._steps_of, self._coarsest = AT_REST, 0.0
         """`_steps_of` contains the quantization step of each wheel's speed in the last line, rad/s.
-        `_coarsest` is the largest known step of these, rad/s. `_learned` is whether one of them is
-        known."""
+        `_coarsest` is the largest known step of these, rad/s."""
         self._path = Path()
         self._errors = ErrorModel(odometry, kinematics)
         self._uncertainty = PoseUncertainty(self._errors, encoder_counts)
         self._twist_uncertainty = TwistUncertainty(self._errors, encoder_counts)
-        self._gaps = Gaps()
+        self._gaps, self._rounding = Gaps(), Rounding()
         self.checks = ConsistencyChecks(odometry, kinematics, encoder_counts, feedback)
         self._steps: deque[Step] = deque(maxlen=MAX_RECOMPUTED_LINES)
         self._unsettled = 2 * math.tau / (encoder_counts or ASSUMED_COUNTS)
@@ -115,10 +114,6 @@ class Odometry:
         count, the reported angle is not larger than this."""
         self._still = 0.0
         """Time for which all wheel speeds have been zero, s."""
-        self._counting = (math.inf, 0.0), (math.inf, 0.0)
-        """A pair for each of the last two feedback lines: `_still` at that line, s, and the
-        quantization step of its speeds, rad/s. While the step is unknown, the largest change of a
-        wheel's speed from one line to the next is used instead."""
         self.twist = REST
         """Twist in the last feedback line, m/s and rad/s."""
         self.speeds = STILL
@@ -231,7 +226,7 @@ class Odometry:
         if feedback.steps is not self._steps_of:
             self._steps_of = feedback.steps
             known = [step for step in feedback.steps if step < math.inf]
-            self._coarsest, self._learned = max(known, default=0.0), bool(known)
+            self._coarsest = max(known, default=0.0)
         if checks.look(feedback, rolled):
             self._take_back()
         turn, slips = checks.turn, checks.slips
@@ -240,11 +235,8 @@ class Odometry:
         twist = Twist(linear, angular / self._track.share)
         self._still = self._still + dt - feedback.bridged if believed == AT_REST else 0.0
         at_rest = self._still > REST_S
-        last_counting = self._counting[1]
-        step = self._coarsest
-        if not self._learned:
-            step = max(last_counting[1], _largest_change(self.speeds, speeds))
-        self._counting = last_counting, (self._still, step)
+        after_gap = rolled.bridged > 0.0 or rolled.unknown > 0.0
+        self._rounding.add(believed, dt - feedback.bridged, self._still, after_gap)
         if rolled.unknown > 0.0:
             self._stand(rolled.unknown, before, twist)
         turned = self._move(self._settled(rolled, at_rest), turn, speeds, slips)
@@ -350,9 +342,7 @@ class Odometry:
         if bridged > 0.0:
             self.bridged += bridged
             along, yaw = self._gaps.bridge(bridged, before, twist, self._highest, doubtful)
-            by_counts, turn_by_counts = self._rounding(bridged)
-            if self.checks.turn is not None:
-                turn_by_counts = 0.0
+            by_counts, turn_by_counts = self._rounded(bridged)
             self._uncertainty.doubt(along + by_counts, yaw + turn_by_counts)
         elif feedback.gap:
             self._gaps.interrupt(twist)
@@ -373,23 +363,15 @@ class Odometry:
             variances = spread.with_gyro(variances, gyro.rate_variance)
         return variances
 
-    def _rounding(self, seconds: float) -> tuple[float, float]:
-        """Return the variances that the encoder counts cause in a gap of `seconds` s.
+    def _rounded(self, seconds: float) -> tuple[float, float]:
+        """Return the variances that encoder counts cause in a gap of `seconds` s.
 
-        In one half of the gap, the speed before the gap is assumed, and in the other half the speed
-        after it. Both are rounded to whole counts. A robot at rest has no such error. The result is
-        a pair: the variances of the distance (m2) and the turn (rad2).
+        The result is a pair: the variances of the distance (m2) and the turn (rad2). If a gyro
+        provides the turn, its variance is 0.
         """
-        # `TwistUncertainty.rounding` assumes that the four errors are independent, and that each is
-        # at most half a count. But the wheels of a side turn alike, so their errors are equal, and
-        # a single line may have counted one edge too many or too few. Each fact doubles the
-        # variance. For half of the gap, the variance is therefore 4 (seconds / 2)^2 times larger.
-        along = yaw = 0.0
-        for still, step in self._counting:
-            if still <= REST_S:
-                linear, angular = self._twist_uncertainty.rounding(still, step)
-                along, yaw = along + linear, yaw + angular
-        return along * seconds * seconds, yaw * seconds * seconds
+        linear, angular = self._twist_uncertainty.rounding(self._rounding.square)
+        square = seconds * seconds
+        return linear * square, 0.0 if self.checks.turn is not None else angular * square
 
     def _stand(self, seconds: float, before: Twist, after: Twist) -> None:
         """Add the uncertainty of `seconds` s of unknown motion, but do not move the pose."""
@@ -397,15 +379,10 @@ class Odometry:
             self.gaps += 1
             self.unseen += seconds
         along, yaw = self._gaps.unseen(seconds, before, after, self._highest)
-        by_counts, turn_by_counts = self._rounding(seconds)
+        by_counts, turn_by_counts = self._rounded(seconds)
         self._uncertainty.stand(
             seconds * (before.linear + after.linear) / 2,
             seconds * (before.angular + after.angular) / 2,
             along + by_counts,
             yaw + turn_by_counts,
         )
-
-
-def _largest_change(before: WheelSpeeds, after: WheelSpeeds) -> float:
-    changes: list[float] = list(map(sub, after.as_tuple(), before.as_tuple()))
-    return max(map(abs, changes))

@@ -674,6 +674,18 @@ def test_a_delay_that_varies_by_4_ms_counts_as_processing_time_of_the_mcu() -> N
     assert bench.prompts.thinks
 
 
+def test_an_early_first_reply_does_not_hide_that_the_delay_varies() -> None:
+    """It answers a line that left before; all later replies seem to be delayed by a stall."""
+    bench, chance = Prompted(), random.Random(1)
+    bench.prompts = PromptedTimes(0)
+    bench.leave(0)
+    bench.reply(0.8)
+    for number in range(1, 300):
+        bench.leave(number * 10)
+        bench.reply(number * 10 + 6.5 + chance.uniform(0.0, 4.0))
+    assert bench.prompts.thinks
+
+
 def test_the_jitter_of_usb_does_not_count_as_processing_time_of_the_mcu() -> None:
     bench, chance = Prompted(), random.Random(1)
     for number in range(300):

@@ -19,6 +19,7 @@ from acsard.core.motion.gap_filling import (
     Gaps,
     Rolled,
     Rolling,
+    Rounding,
 )
 from acsard.core.values import REST, STILL, Instant, Twist, WheelSpeeds
 
@@ -396,3 +397,38 @@ def test_a_command_to_rest_that_may_be_lost_makes_the_motion_uncertain() -> None
         (0.2 * 0.4) ** 2 / 2, (0.2 * 2.0) ** 2 / 2
     )
     assert Gaps().bridge(0.5, REST, REST, REST, doubtful=0.2) == (0.0, 0.0)
+
+
+def rounding(*speeds: float, own: float = 0.01, gaps: tuple[int, ...] = ()) -> float:
+    """Return the step around a gap after lines with these speeds of all wheels, rad/s.
+
+    The lines with the indices `gaps` follow a gap.
+    """
+    found, still = Rounding(), 0.0
+    for number, speed in enumerate(speeds):
+        still = 0.0 if speed else still + own
+        found.add((speed,) * 4, own, still, number in gaps)
+    return math.sqrt(found.square / 2)
+
+
+def test_a_speed_that_jumps_by_single_counts_is_rounded_to_them() -> None:
+    assert rounding(*[0.0, 6.5, 0.0, 0.0, 6.5] * 20, 6.5) == pytest.approx(6.5, rel=0.15)
+    assert rounding(*[6.5, 13.0, 6.5] * 20) == pytest.approx(6.5, rel=0.1)
+
+
+def test_an_even_acceleration_is_no_rounding() -> None:
+    assert rounding(*[0.2 * number for number in range(100)], own=0.1) == pytest.approx(0.0)
+
+
+def test_a_change_of_the_speed_over_a_gap_is_no_rounding() -> None:
+    assert rounding(*[0.0] * 5, *[10.0] * 5, gaps=(5,)) == 0.0
+    assert rounding(*[0.0] * 5, *[10.0] * 5) > 1.0
+
+
+def test_the_longer_the_wheels_stand_the_less_a_count_means() -> None:
+    jumps = [0.0, 6.5] * 10
+    steps = [rounding(*jumps, *[0.0] * lines) for lines in (1, 2, 4, 8, 16, 24)]
+    assert steps == sorted(steps, reverse=True)
+    assert steps[0] > 6.0
+    assert 0.0 < steps[-2] < 0.5
+    assert steps[-1] == 0.0

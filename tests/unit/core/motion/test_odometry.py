@@ -426,6 +426,19 @@ def test_a_gap_between_speeds_of_single_counts_is_in_the_covariance(
     assert np.std(errors) > 0.1 or seconds < 0.0
 
 
+@pytest.mark.parametrize("dt", [0.11, 0.0], ids=["filled", "not filled"])
+def test_a_gyro_measures_the_turn_of_a_gap_between_speeds_of_single_counts(dt: float) -> None:
+    robot = odometry()
+    robot.checks.gyro = Says(Turn(0.0, 1e-6, 0.0, 1e-3))
+    for speed in (0.0, 6.5, 0.0, 6.5):
+        estimate = robot.fold(feedback(speed, speed, 0.01))
+    before, gap = estimate.covariance, 0.11 - dt
+    line = replace(feedback(0.0, 0.0, dt, gap), bridged=max(0.0, dt - 0.01))
+    after = robot.fold(line).covariance
+    assert after.xx > before.xx + 1e-5
+    assert after.yawyaw < before.yawyaw + 1e-5
+
+
 def test_a_gap_of_a_robot_that_stood_before_and_after_adds_nothing() -> None:
     robot = odometry()
     robot.fold(feedback(0.0, 0.0, 0.01))
