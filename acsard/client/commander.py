@@ -105,6 +105,9 @@ class Commander:
             each silence longer than `RELEASED_NS`. Set this for a sender that sends no zeros of its
             own. There is no zero after a shorter silence: with such a zero, a button that was held
             through a stop and a `clear` could drive the robot.
+        since_ns: the monotonic time at which the sender connected, ns. Set this for a sender that
+            may connect while a button is held. There is no zero before its first command if this
+            command arrives within `RELEASED_NS`. None means that no button was held.
         gathers: whether the first command after a silence waits for `BURST_WINDOW_NS`. If several
             commands arrive in this time, a congested link or a stalled process has delayed these
             commands. In this case they are dropped, except the last one if it is a zero. Set this
@@ -112,7 +115,9 @@ class Commander:
             commands.
     """
 
-    def __init__(self, *, leads: bool = False, gathers: bool = False) -> None:
+    def __init__(
+        self, *, leads: bool = False, gathers: bool = False, since_ns: int | None = None
+    ) -> None:
         self.replaced = self.stale = 0
         """Two counters of commands that were not sent. `replaced` counts the commands that a newer
         command replaced, and `stale` counts the commands that were too old or came in a burst."""
@@ -121,7 +126,9 @@ class Commander:
         self._last = Wish(REST)
         """The newest command, sent or not."""
         self._came_ns = 0
+        self._since_ns = since_ns
         self._heard_ns: int | None = None
+        """Monotonic times of the connection and of the newest command, ns; None if unknown."""
         self._lead = False
         self._hold_until_ns = 0
         self._burst = 0
@@ -143,7 +150,8 @@ class Commander:
         """
         silence = None if self._heard_ns is None else now_ns - self._heard_ns
         begins = silence is None or silence > SILENCE_NS
-        if silence is None or silence > RELEASED_NS:
+        before_ns = self._since_ns if self._heard_ns is None else self._heard_ns
+        if before_ns is None or now_ns - before_ns > RELEASED_NS:
             self._lead = self._leads
         if begins or (self._crowded and now_ns >= self._hold_until_ns):
             self._burst, self._crowded = 0, False

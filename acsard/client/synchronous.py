@@ -203,19 +203,27 @@ class Client:
         """
         return command_key("cmd", source, self.certificate)
 
-    def send(self, linear: float, angular: float = 0.0, *, stamp_ns: int | None = None) -> None:
+    def send(self, linear: float, angular: float = 0.0) -> None:
         """Send one command: `linear` m/s, `angular` rad/s (left is +).
 
         Repeat the call to keep the robot moving. The first call sends a zero instead, because the
-        daemon requires a zero before it follows a sender. A program that forwards commands passes
-        `stamp_ns`, the time of the command on the clock of the original sender, ns.
+        daemon requires a zero before it follows a sender.
         """
         with self._puts.turn():
             if self._opened:
-                self._put(linear, angular, stamp_ns)
+                self._put(linear, angular, None)
             else:
                 self._opened = True
-                self._put(0.0, 0.0, stamp_ns)
+                self._put(0.0, 0.0, None)
+
+    def forward(self, linear: float, angular: float, *, stamp_ns: int | None = None) -> None:
+        """Send a command of another sender, without a zero before it.
+
+        `linear` is in m/s, and `angular` in rad/s (left is +). `stamp_ns` is the time of the
+        command on the clock of that sender, ns; None if that sender has no clock.
+        """
+        with self._puts.turn():
+            self._put(linear, angular, stamp_ns)
 
     def end(self) -> None:
         """Close the connection. `connect` calls this at the end of its `with` block.

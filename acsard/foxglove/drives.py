@@ -3,7 +3,7 @@
 A panel repeats its command while a button is held, and sends nothing after the button is released.
 But the daemon lets a sender drive only after a zero command. So this module sends a zero command
 before the first command after each silence of more than 1.5 s. A shorter silence may be a pause of
-the network while the button is held.
+the network, or a new connection, while the button is held.
 
 If a burst of commands follows a silence, the network has delayed these commands, so this module
 drops them. The daemon could detect the delay only from stamps, which few panels send.
@@ -85,7 +85,8 @@ class Viewer:
     """A viewer that publishes commands, with its bus client, its `Commander` and its channels."""
 
     def __init__(self, robot: Client) -> None:
-        self.robot, self.commander = robot, Commander(leads=True, gathers=True)
+        self.robot = robot
+        self.commander = Commander(leads=True, gathers=True, since_ns=clock.steady_ns())
         self.channels: dict[int, tuple[str, str]] = {}
         """Maps a channel's id to (Zenoh encoding, ""). If messages on the channel cannot drive the
         robot, the value is ("", reason)."""
@@ -221,7 +222,7 @@ class Drives:
     def _send(self, robot: Client, wished: Wish) -> None:
         twist = wished.twist
         try:
-            robot.send(twist.linear, twist.angular, stamp_ns=wished.stamp_ns)
+            robot.forward(twist.linear, twist.angular, stamp_ns=wished.stamp_ns)
         except zenoh.ZError as error:
             words = "the bus accepts no commands, so the commands of all panels are lost"
             mend = "run `acsard doctor` on the robot"

@@ -707,6 +707,11 @@ class Panel(Speaker):
         self._server = Commander(leads=True, gathers=True)
         self._stamped = stamped
 
+    def connect(self) -> None:
+        """Connect again, as a new sender."""
+        self.name += "+"
+        self._server = Commander(leads=True, gathers=True, since_ns=self.world.now_ns)
+
     def button(self, linear: float, seconds: float, period: float = 0.1) -> None:
         """Hold a button."""
         for _ in range(round(seconds / period)):
@@ -738,6 +743,16 @@ def test_the_foxglove_panel_drives_when_its_button_is_released_and_pressed_again
     panel.release(2.0)
     drives(world, lambda: panel.button(FAST, 0.5))
     assert not ends_hold(world.state, "app")
+
+
+def test_a_new_connection_does_not_arm_a_panel_whose_button_is_held(world: World) -> None:
+    panel = Panel(world)
+    drives(world, lambda: panel.button(FAST, 1.0))
+    stop_and_clear(world, lambda: panel.button(FAST, CLEAR_S))
+    panel.connect()
+    stands(world, lambda: panel.button(FAST, 4.0))
+    panel.release(2.0)
+    drives(world, lambda: panel.button(FAST, 0.5))
 
 
 @pytest.mark.parametrize(("period", "pause"), [(0.1, 0.35), (0.1, 1.2), (0.5, 0.7), (1.0, 0.2)])

@@ -20,6 +20,7 @@ from mcap.reader import make_reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from websockets.exceptions import InvalidStatus
 
+from acsard.client.commander import RELEASED_NS
 from acsard.core.config.settings import JointsConfig
 from acsard.core.messages.encodings import FORMATS, encode, encoding_name
 from acsard.core.messages.schema import Header, JointState, Twist, TwistStamped, Vector3
@@ -104,11 +105,16 @@ def speed(linear: float, angular: float = 0.0) -> bytes:
     return json.dumps({"linear": axes | {"x": linear}, "angular": axes | {"z": angular}}).encode()
 
 
+CONNECTED_S = RELEASED_NS / NS_PER_S + 0.1
+"""Time after which a new channel that was silent may drive, s."""
+
+
 class Panel:
-    """Hold a button down: 20 messages a second."""
+    """Hold a button down: 20 messages a second. Press it as soon as the panel may drive."""
 
     def __init__(self, viewer: Viewer, data: bytes, encoding: str = "json") -> None:
         self._send, self.channel = viewer.publish_on("/cmd_vel", encoding, "geometry_msgs/Twist")
+        time.sleep(CONNECTED_S)
         self._data = data
         self._released = threading.Event()
         self._thread = threading.Thread(target=self._hold, daemon=True)
@@ -446,6 +452,27 @@ def test_a_held_button_drives_and_its_release_stops_the_robot(
 
 
 @SLOW
+def test_a_button_that_is_held_through_a_new_connection_does_not_drive(
+    shows: Shows, bus: Bus
+) -> None:
+    hold = b'{"linear": {"x": 0.4}, "angular": {}}'
+    with Viewer(shows.port) as viewer, Panel(viewer, hold) as panel:
+        driving(bus, 0.2)
+        bus.get("srv/stop")
+        panel.release()
+    with Viewer(shows.port) as viewer:
+        send, _ = viewer.publish_on("/cmd_vel", "json", "geometry_msgs/Twist")
+        assert bus.get("srv/clear")["success"]
+        bus.at_rest()
+        before = bus.state()["x"]
+        for _ in range(60):
+            send(hold)
+            time.sleep(0.05)
+        assert bus.state()["x"] == pytest.approx(before, abs=1e-3)
+        viewer.status("must send a zero")
+
+
+@SLOW
 def test_each_viewer_is_a_sender_of_its_own(viewer: Viewer, shows: Shows, bus: Bus) -> None:
     with Panel(viewer, speed(0.2)):
         first = driving(bus, 0.1)["sender"]
@@ -649,6 +676,7 @@ def test_commands_with_old_stamps_move_no_robot(viewer: Viewer, bus: Bus) -> Non
         send(json.dumps({"header": header, "twist": twist}).encode())
         time.sleep(0.05)
 
+    time.sleep(CONNECTED_S)
     began, until_driven = time.time_ns(), time.monotonic() + 20.0
     while (bus.state()["linear"] or 0.0) < 0.2 or time.time_ns() - began < NS_PER_S:
         assert time.monotonic() < until_driven, bus.state()["reason"]

@@ -54,6 +54,15 @@ def test_each_wish_is_sent_once_after_one_zero(panel: Panel) -> None:
     assert panel.gone == [REST, *[AHEAD] * 5]
 
 
+@pytest.mark.parametrize("leads", [False, True])
+def test_a_button_that_may_be_held_since_before_the_connection_gets_no_zero(leads: bool) -> None:
+    since_ns = 10 * NS_PER_S
+    commander = Commander(leads=True, since_ns=since_ns)
+    now_ns = since_ns + RELEASED_NS + leads
+    assert commander.take(Wish(AHEAD), now_ns) is None
+    assert commander.send(now_ns) == Wish(REST if leads else AHEAD)
+
+
 def test_no_command_is_sent_without_a_new_wish(panel: Panel) -> None:
     panel.press(AHEAD, times=2)
     before = len(panel.gone)

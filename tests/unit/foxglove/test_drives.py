@@ -92,7 +92,11 @@ class Viewers:
 
 @pytest.fixture
 def viewers() -> Iterator[Viewers]:
-    viewers = Viewers()
+    """Viewers that connected 2 s ago."""
+    ago_ns = clock.steady_ns() - 2 * NS_PER_S
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.setattr(clock, "steady_ns", lambda: ago_ns)
+        viewers = Viewers()
     yield viewers
     for session in viewers.sessions.values():
         session.free.set()
@@ -115,6 +119,15 @@ def test_a_viewer_that_leaves_while_its_message_is_decoded_sends_nothing_more(
     viewers.drives.outbox.flush(HOLD_S)
     assert viewers.heard(1, 3)[-1].twist == REST
     assert not viewers.drives.driving()
+
+
+def test_a_viewer_that_has_just_connected_sends_no_zero_of_its_own(viewers: Viewers) -> None:
+    """Its button may have been held since before the connection."""
+    for channel in (1, 2):
+        viewers.drives.withdrawn(1, channel)
+    viewers.drives.advertised(1, 3, "/cmd_vel", "cdr", "geometry_msgs/msg/Twist")
+    viewers.drives.came(1, 3, encode(AHEAD, "cdr"))
+    assert viewers.heard(1, 1)[0].twist.linear == 0.3
 
 
 def test_a_stamp_is_passed_on_and_the_added_zeros_use_the_same_clock(viewers: Viewers) -> None:
