@@ -105,9 +105,10 @@ class Commander:
             each silence longer than `RELEASED_NS`. Set this for a sender that sends no zeros of its
             own. There is no zero after a shorter silence: with such a zero, a button that was held
             through a stop and a `clear` could drive the robot.
-        since_ns: the monotonic time at which the sender connected, ns. Set this for a sender that
-            may connect while a button is held. There is no zero before its first command if this
-            command arrives within `RELEASED_NS`. None means that no button was held.
+        since_ns: the monotonic time at which the sender began to be able to send, ns. Set this for
+            a sender that may connect while a button is held. There is no zero before its first
+            command if this command arrives within `RELEASED_NS` of that time. None means that no
+            button was held.
         gathers: whether the first command after a silence waits for `BURST_WINDOW_NS`. If several
             commands arrive in this time, a congested link or a stalled process has delayed these
             commands. In this case they are dropped, except the last one if it is a zero. Set this
@@ -127,8 +128,9 @@ class Commander:
         """The newest command, sent or not."""
         self._came_ns = 0
         self._since_ns = since_ns
+        """Monotonic time since which the sender can send, ns; None if it does not matter."""
         self._heard_ns: int | None = None
-        """Monotonic times of the connection and of the newest command, ns; None if unknown."""
+        """Monotonic time of the newest command, ns; None before the first command."""
         self._lead = False
         self._hold_until_ns = 0
         self._burst = 0

@@ -461,9 +461,9 @@ def test_a_button_that_is_held_through_a_new_connection_does_not_drive(
         bus.get("srv/stop")
         panel.release()
     with Viewer(shows.port) as viewer:
-        send, _ = viewer.publish_on("/cmd_vel", "json", "geometry_msgs/Twist")
         assert bus.get("srv/clear")["success"]
         bus.at_rest()
+        send, _ = viewer.publish_on("/cmd_vel", "json", "geometry_msgs/Twist")
         before = bus.state()["x"]
         for _ in range(60):
             send(hold)

@@ -411,9 +411,10 @@ RARE_LOSS_FRACTION = 0.002
 prove that a reply was lost. After a host stall, two commands are written close together, so the
 reply to the first command is late even if no reply was lost."""
 
-MAX_STALLED_REPLIES = 8
-"""Largest number of consecutive replies that a host stall can delay. If more replies seem delayed,
-the usual delay was too short, because it was measured on an unusually early reply."""
+MAX_SUPPORT, MIN_SUPPORT = 200, -8
+"""Bounds of the support for the usual reply delay. Each reply with about this delay adds 1. Each
+reply that comes much later, as after a stall, subtracts 1. At `MIN_SUPPORT`, stalls no longer
+explain the late replies: the usual delay was measured on a reply that came unusually early."""
 
 MAX_USB_JITTER_NS = 350_000
 """If the mean deviation of the reply delay is at most this, ns, USB and the scheduler explain the
@@ -492,8 +493,8 @@ class PromptedTimes:
         least reply delay, ns."""
         self._soon = 0.0
         """Least delay of the last replies, ns."""
-        self._stalled = 0
-        """Number of consecutive replies that a host stall seems to have delayed."""
+        self._support = 0
+        """Support for the usual reply delay (see `MAX_SUPPORT`)."""
         self._sent: int | None = None
         self._apart = self._missing = 0.0
         """`_apart` is the usual time between two commands, ns. `_missing` is the share of lost
@@ -632,6 +633,7 @@ class PromptedTimes:
 
     def _start(self, delay_ns: int) -> None:
         self._delay = self._least = self._soon = float(delay_ns)
+        self._support = 0
 
     def _shorten(self, line: int) -> None:
         """Correct the usual delay if it was measured on a reply that a stall had delayed."""
@@ -705,6 +707,7 @@ class PromptedTimes:
                 # replies were lost, but the large spread of the delay had hidden the loss.
                 delay = self._delay = self._soon = soonest
                 wide = self._spread = 0.0
+                self._support = 0
         while len(left) > 1:
             apart = left[1] - left[0]
             if at - left[0] - delay <= max(apart / 2, wide) or at - left[1] < soonest:
@@ -733,10 +736,11 @@ class PromptedTimes:
             return 0
         error = self._at - line - delay
         size = abs(error)
-        if size >= delay and size >= 4 * spread and self._stalled < MAX_STALLED_REPLIES:
-            self._stalled += 1
-            return 0  # a host stall has probably delayed this reply
-        self._stalled = 0
+        if size < delay or size < 4 * spread:
+            self._support = min(self._support + 1, MAX_SUPPORT)
+        elif self._support > MIN_SUPPORT:
+            self._support -= 1
+            return 0  # a stall has probably delayed this reply
         self._delay = delay + FAST_GAIN * error
         self._least = min(self._least + LEAST_DELAY_GAIN * (delay - self._least), delay + error)
         self._spread += FAST_GAIN * (size - spread)

@@ -419,27 +419,32 @@ class Rounding:
     With few encoder counts, a line of a slow wheel contains one count or none, so its speed jumps
     from line to line. Let v0, v1 and v2 be the speeds of a wheel in three consecutive lines. With
     few counts, |v0 - 2 v1 + v2| / 2 is about one quantization step of the speed. With many counts
-    it is near 0, unless the acceleration changes.
+    it is near 0, unless the acceleration changes or a line is damaged.
     """
 
     def __init__(self) -> None:
         self._last: Motors | None = None
+        """Speeds in the last line, rad/s; None before the first line."""
         self._older: Motors | None = None
-        """Speeds in the last line and in the line before it, rad/s; None before a gap."""
-        self._step = self._before = self._after = 0.0
-        """Quantization steps of the speeds, rad/s. `_step` is the largest recent one, less
-        `STEP_DECAY` for each line since. `_before` and `_after` are those of the last two lines,
-        and smaller if the wheels stood still."""
+        """Speeds in the line before it, rad/s; None if a gap lies between the two lines."""
+        self._step = 0.0
+        """The largest recent quantization step, rad/s, less `STEP_DECAY` for each line since."""
+        self._before = self._after = 0.0
+        """Quantization steps of the line before the last one, and of the last one, rad/s. While the
+        wheels stand still, they become smaller from line to line."""
 
-    def add(self, speeds: Motors, own: float, still: float, after_gap: bool) -> None:
+    def add(
+        self, speeds: Motors, own: float, still: float, after_gap: bool, largest: float
+    ) -> None:
         """Use the next line from the board.
 
         Args:
             speeds: the wheel speeds in the line, rad/s.
             own: the time that the line covers, s, without a gap before it; 0 if it is unknown.
-            still: the time for which all wheels have reported zero speed, s. In this time, each
-                wheel turned by less than one count.
+            still: the time for which all wheels have reported zero speed, s, without gaps. In this
+                time, each wheel turned by less than one count.
             after_gap: whether a gap precedes the line.
+            largest: the largest quantization step that is possible, rad/s.
         """
         last, older = self._last, self._older
         if after_gap:
@@ -447,12 +452,14 @@ class Rounding:
         elif last is not None and older is not None and not speeds == last == older == AT_REST:
             jumps = [abs(a - 2 * b + c) for a, b, c in zip(speeds, last, older, strict=True)]
             self._step = max(self._step * (1 - STEP_DECAY), max(jumps) / 2)
+        if self._step > largest:
+            self._step = largest
         self._last, self._older = speeds, last
         self._before, self._after = self._after, self._step
         if still > REST_S:
             self._after = 0.0
-        elif still > 0.0:
-            self._after *= min(1.0, own / still)
+        elif still > own > 0.0:
+            self._after *= own / still
 
     @property
     def square(self) -> float:

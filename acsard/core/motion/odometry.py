@@ -99,9 +99,10 @@ class Odometry:
         self._held = AT_REST
         """Angles that the wheels have rolled at rest, rad. The odometry adds these angles to the
         pose when they exceed two encoder counts (`_unsettled`) or when the robot drives."""
-        self._steps_of, self._coarsest = AT_REST, 0.0
+        self._steps_of, self._coarsest, self._largest_step = AT_REST, 0.0, 0.0
         """`_steps_of` contains the quantization step of each wheel's speed in the last line, rad/s.
-        `_coarsest` is the largest known step of these, rad/s."""
+        `_coarsest` is the largest known step of these, rad/s, and 0 if none is known.
+        `_largest_step` is the same, but infinite if none is known."""
         self._path = Path()
         self._errors = ErrorModel(odometry, kinematics)
         self._uncertainty = PoseUncertainty(self._errors, encoder_counts)
@@ -113,7 +114,7 @@ class Odometry:
         """Angle of two encoder counts, rad. If a wheel at rest rocks between the edges of one
         count, the reported angle is not larger than this."""
         self._still = 0.0
-        """Time for which all wheel speeds have been zero, s."""
+        """Time for which all wheel speeds have been zero, s, without filled gaps."""
         self.twist = REST
         """Twist in the last feedback line, m/s and rad/s."""
         self.speeds = STILL
@@ -227,6 +228,7 @@ class Odometry:
             self._steps_of = feedback.steps
             known = [step for step in feedback.steps if step < math.inf]
             self._coarsest = max(known, default=0.0)
+            self._largest_step = max(known, default=math.inf)
         if checks.look(feedback, rolled):
             self._take_back()
         turn, slips = checks.turn, checks.slips
@@ -236,7 +238,8 @@ class Odometry:
         self._still = self._still + dt - feedback.bridged if believed == AT_REST else 0.0
         at_rest = self._still > REST_S
         after_gap = rolled.bridged > 0.0 or rolled.unknown > 0.0
-        self._rounding.add(believed, dt - feedback.bridged, self._still, after_gap)
+        own = dt - feedback.bridged
+        self._rounding.add(believed, own, self._still, after_gap, self._largest_step)
         if rolled.unknown > 0.0:
             self._stand(rolled.unknown, before, twist)
         turned = self._move(self._settled(rolled, at_rest), turn, speeds, slips)
@@ -366,8 +369,8 @@ class Odometry:
     def _rounded(self, seconds: float) -> tuple[float, float]:
         """Return the variances that encoder counts cause in a gap of `seconds` s.
 
-        The result is a pair: the variances of the distance (m2) and the turn (rad2). If a gyro
-        provides the turn, its variance is 0.
+        The result is a pair: the variances of the distance (m2) and the turn (rad2). The latter is
+        0 if a gyro provides the turn.
         """
         linear, angular = self._twist_uncertainty.rounding(self._rounding.square)
         square = seconds * seconds

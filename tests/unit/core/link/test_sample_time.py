@@ -675,7 +675,7 @@ def test_a_delay_that_varies_by_4_ms_counts_as_processing_time_of_the_mcu() -> N
 
 
 def test_an_early_first_reply_does_not_hide_that_the_delay_varies() -> None:
-    """It answers a line that left before; all later replies seem to be delayed by a stall."""
+    """All later replies seem to be delayed by a stall."""
     bench, chance = Prompted(), random.Random(1)
     bench.prompts = PromptedTimes(0)
     bench.leave(0)
@@ -684,6 +684,17 @@ def test_an_early_first_reply_does_not_hide_that_the_delay_varies() -> None:
         bench.leave(number * 10)
         bench.reply(number * 10 + 6.5 + chance.uniform(0.0, 4.0))
     assert bench.prompts.thinks
+
+
+def test_a_stall_of_the_board_does_not_change_the_usual_delay() -> None:
+    """After the stall, the board answers its queue of lines, one reply per read."""
+    bench = Prompted().talk(200)
+    delay = bench.prompts.latest_ns - 1990 * MS
+    for number in range(200, 230):
+        bench.leave(number * 10)
+    for number in range(200, 230):
+        bench.reply(2300 + (number - 199) * 6, asked_ms=number * 10)
+    assert bench.prompts.latest_ns - 2290 * MS == pytest.approx(delay, abs=MS)
 
 
 def test_the_jitter_of_usb_does_not_count_as_processing_time_of_the_mcu() -> None:

@@ -399,16 +399,22 @@ def test_a_command_to_rest_that_may_be_lost_makes_the_motion_uncertain() -> None
     assert Gaps().bridge(0.5, REST, REST, REST, doubtful=0.2) == (0.0, 0.0)
 
 
-def rounding(*speeds: float, own: float = 0.01, gaps: tuple[int, ...] = ()) -> float:
+def rounding(
+    *speeds: float,
+    own: float = 0.01,
+    gaps: tuple[int, ...] = (),
+    largest: float = math.inf,
+) -> float:
     """Return the step around a gap after lines with these speeds of all wheels, rad/s.
 
-    The lines with the indices `gaps` follow a gap.
+    The lines with the indices `gaps` follow a gap that is not filled.
     """
-    found, still = Rounding(), 0.0
+    rounded, still = Rounding(), 0.0
     for number, speed in enumerate(speeds):
-        still = 0.0 if speed else still + own
-        found.add((speed,) * 4, own, still, number in gaps)
-    return math.sqrt(found.square / 2)
+        covered = 0.0 if number in gaps else own
+        still = 0.0 if speed else still + covered
+        rounded.add((speed,) * 4, covered, still, number in gaps, largest)
+    return math.sqrt(rounded.square / 2)
 
 
 def test_a_speed_that_jumps_by_single_counts_is_rounded_to_them() -> None:
@@ -416,11 +422,25 @@ def test_a_speed_that_jumps_by_single_counts_is_rounded_to_them() -> None:
     assert rounding(*[6.5, 13.0, 6.5] * 20) == pytest.approx(6.5, rel=0.1)
 
 
-def test_an_even_acceleration_is_no_rounding() -> None:
+def test_a_jump_beyond_the_known_step_is_not_taken_for_rounding() -> None:
+    jumps = [10.0] * 5 + [1.0] + [10.0] * 5
+    assert rounding(*jumps, largest=0.05) == pytest.approx(0.05, rel=0.3)
+
+
+def test_a_single_jump_is_forgotten() -> None:
+    after = [rounding(*[10.0] * 5, 1.0, *[10.0] * lines) for lines in (2, 20, 100)]
+    assert after[0] > 2 * after[1] > 20 * after[2]
+
+
+def test_a_line_of_unknown_duration_that_reports_rest_may_hide_a_count() -> None:
+    assert rounding(*[0.0, 6.5] * 10, 0.0, 0.0, gaps=(21,)) > 4.0
+
+
+def test_an_even_acceleration_is_not_taken_for_rounding() -> None:
     assert rounding(*[0.2 * number for number in range(100)], own=0.1) == pytest.approx(0.0)
 
 
-def test_a_change_of_the_speed_over_a_gap_is_no_rounding() -> None:
+def test_a_change_of_the_speed_over_a_gap_is_not_taken_for_rounding() -> None:
     assert rounding(*[0.0] * 5, *[10.0] * 5, gaps=(5,)) == 0.0
     assert rounding(*[0.0] * 5, *[10.0] * 5) > 1.0
 

@@ -431,12 +431,35 @@ def test_a_gyro_measures_the_turn_of_a_gap_between_speeds_of_single_counts(dt: f
     robot = odometry()
     robot.checks.gyro = Says(Turn(0.0, 1e-6, 0.0, 1e-3))
     for speed in (0.0, 6.5, 0.0, 6.5):
-        estimate = robot.fold(feedback(speed, speed, 0.01))
+        line = replace(feedback(speed, speed, 0.01), steps=(math.inf,) * 4)
+        estimate = robot.fold(line)
     before, gap = estimate.covariance, 0.11 - dt
     line = replace(feedback(0.0, 0.0, dt, gap), bridged=max(0.0, dt - 0.01))
-    after = robot.fold(line).covariance
+    after = robot.fold(replace(line, steps=(math.inf,) * 4)).covariance
     assert after.xx > before.xx + 1e-5
     assert after.yawyaw < before.yawyaw + 1e-5
+
+
+def test_a_damaged_line_of_fine_encoders_is_not_taken_for_coarse_encoders() -> None:
+    grown = []
+    for damaged in (10.0, 1.0):
+        robot = odometry()
+        for speed in (10.0,) * 5 + (damaged,) + (10.0,) * 5:
+            line = replace(feedback(speed, 10.0, 0.01), steps=(0.05,) * 4)
+            before = robot.fold(line).covariance.yawyaw
+        line = replace(feedback(10.0, 10.0, 0.31), bridged=0.3, steps=(0.05,) * 4)
+        grown.append(robot.fold(line).covariance.yawyaw - before)
+    assert grown[1] < 1.5 * grown[0]
+
+
+def test_the_time_of_a_filled_gap_is_no_rest() -> None:
+    """The wheels of a slow robot stood in the line after the gap, but may have turned in it."""
+    robot, steps = odometry(), (6.5,) * 4
+    for speed in (6.5, 0.0, 0.0, 6.5, 0.0, 0.0):
+        robot.fold(replace(feedback(speed, speed, 0.01), steps=steps))
+    line = replace(feedback(0.0, 0.0, 0.31), bridged=0.3, steps=steps)
+    before, after = robot.fold(line), robot.fold(line)
+    assert after.covariance.xx > before.covariance.xx + 1e-5
 
 
 def test_a_gap_of_a_robot_that_stood_before_and_after_adds_nothing() -> None:
