@@ -32,6 +32,9 @@ MAX_FILE_BYTES = 1 << 30
 MAX_RECORD_BYTES = 1 << 28
 """Maximum size of a record in a bag, bytes. It is ample: a chunk of rosbag2 is below 1 MiB."""
 
+MAX_LOG_TIME_NS = (1 << 63) - 1
+"""Largest time of a message that the table can contain, ns."""
+
 BAG_DAMAGE = (*DAMAGE_ERRORS, RuntimeError, KeyError)
 """Exceptions that the MCAP reader and LZ4 raise for a damaged bag.
 
@@ -143,6 +146,8 @@ def _messages(file: Path, notes: list[str]) -> Iterator[RosMessage]:
             for schema, channel, one in _reader(stream).iter_messages(log_time_order=False):
                 type_ = "" if schema is None else schema.name
                 encoding = channel.message_encoding
+                if one.log_time > MAX_LOG_TIME_NS:
+                    raise KeyError(f"the time of a message is {one.log_time} ns")
                 yield RosMessage(channel.topic, type_, encoding, one.log_time, one.data)
         except EndOfFile:
             notes.append(f"{file.name} is cut off: only the messages before the cut are used")

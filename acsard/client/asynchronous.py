@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncIterator, Mapping
-from contextlib import aclosing, asynccontextmanager, closing
+from contextlib import aclosing, asynccontextmanager, closing, suppress
 from functools import partial
 from typing import Any
 
@@ -19,6 +19,9 @@ from acsard.daemon.bus.subscription import encoded
 from acsard.daemon.bus.zenoh_sessions import client_session
 from acsard.host.errors import NoAnswerError
 from acsard.host.threads import in_thread
+
+CLOSE_TIMEOUT_S = 5.0
+"""Time within which a connection must close, s."""
 
 
 @asynccontextmanager
@@ -38,8 +41,18 @@ async def connect_async(
     robot = Client(session, where.robot_id, source, where.tls, where.endpoint)
     try:
         yield AsyncClient(robot)
-    finally:
-        await in_thread(robot.end, 5.0)
+    except BaseException:
+        # A timeout must not replace the error of the caller's block.
+        with suppress(TimeoutError):
+            await in_thread(robot.end, CLOSE_TIMEOUT_S)
+        raise
+    try:
+        await in_thread(robot.end, CLOSE_TIMEOUT_S)
+    except TimeoutError:
+        raise NoAnswerError(
+            f"the connection could not be closed within {CLOSE_TIMEOUT_S:g} s, so the final zeros "
+            "may be lost: the robot stops after the timeout of its source"
+        ) from None
 
 
 class AsyncClient:

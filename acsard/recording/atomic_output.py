@@ -17,6 +17,11 @@ from typing import BinaryIO
 
 from acsard.host.errors import RecordingError
 from acsard.recording.file import Recording
+from acsard.recording.mcap_records import MAGIC
+
+PROFILE, HEADER_BYTES = b"acsard", 64
+"""Profile in the header of a recording, and size of the beginning of a file that contains it,
+bytes."""
 
 METADATA = "metadata.yaml"
 """Name of the file that describes a ROS bag."""
@@ -124,6 +129,11 @@ def _require_bag(directory: Path) -> None:
 
 
 def _recording(path: Path) -> Recording | None:
+    # `Recording` reads the whole file, and a ROS bag may be larger than the memory.
+    with path.open("rb") as stream:
+        begin = stream.read(HEADER_BYTES)
+    if not (begin.startswith(MAGIC) and PROFILE in begin):
+        return None
     try:
         return Recording(path)
     except RecordingError:

@@ -231,11 +231,11 @@ class Ring:
                 if not marker.with_name(f"{stem}{PART_SUFFIX}").exists():
                     # The recording of this marker is finished.
                     marker.unlink()
+            if self._open_to_all:
+                self._open_files()
         except OSError:
             self.close()
             raise
-        if self._open_to_all:
-            self._open_files()
 
     def _recover(self) -> None:
         for part in [path for path in listed(self._directory) if path.name.endswith(PART_SUFFIX)]:

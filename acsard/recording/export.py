@@ -260,30 +260,35 @@ class _MessageWriter(_Writer):
 
     def step(self, step: Step, outputs: Outputs) -> None:
         self._publisher.robot = self._run.robot
-        for message in self._publisher.step(step, outputs):
-            self._add(message)
+        with self._run.state_errors():
+            messages = list(self._publisher.step(step, outputs))
+        self._add(messages)
 
     def skip(self, step: Step, inside: bool) -> None:
-        for message in self._publisher.skip(step):
-            if inside:
-                self._add(message)
+        with self._run.state_errors():
+            messages = list(self._publisher.skip(step))
+        if inside:
+            self._add(messages)
 
     def end(self, ending: str = "") -> None:
-        for message in self._publisher.end(ending):
-            self._add(message)
+        with self._run.state_errors():
+            messages = list(self._publisher.end(ending))
+        self._add(messages)
 
-    def _add(self, published: Published) -> None:
-        number = self._channels.get((published.channel.name, published.source))
-        if number is None:
-            number = self._open(published.channel, published.source)
-        # MCAP has no times before 1970.
-        wall_ns = max(0, published.wall_ns)
-        self._counts[number] += 1
-        data = published.channel.encode(published.message)
-        self._writer.add_message(number, wall_ns, data, wall_ns, self._counts[number])
-        first, last = self.times if self.count else (wall_ns, wall_ns)
-        self.times = (min(first, wall_ns), max(last, wall_ns))
-        self.count += 1
+    def _add(self, messages: list[Published]) -> None:
+        for one in messages:
+            number = self._channels.get((one.channel.name, one.source))
+            if number is None:
+                number = self._open(one.channel, one.source)
+            # MCAP has no times before 1970.
+            wall_ns = max(0, one.wall_ns)
+            self._counts[number] += 1
+            with self._run.state_errors():
+                data = one.channel.encode(one.message)
+            self._writer.add_message(number, wall_ns, data, wall_ns, self._counts[number])
+            first, last = self.times if self.count else (wall_ns, wall_ns)
+            self.times = (min(first, wall_ns), max(last, wall_ns))
+            self.count += 1
 
     def _open(self, channel: Channel, source: str) -> int:
         kind = channel.schema_name
@@ -354,8 +359,7 @@ def export(
     run = RecordedRun(recording, other)
 
     def write(writer: _Writer, stream: BinaryIO) -> None:
-        with run.state_errors():
-            _write_steps(run, writer, recording, span, progress)
+        _write_steps(run, writer, recording, span, progress)
         if not writer.count:
             raise RecordingError(
                 f"{recording.path} has nothing in that span of time; correct --from and --to"
@@ -408,7 +412,8 @@ def _write_steps(
     for number, step in enumerate(run.steps()):
         if number % PROGRESS_STEPS == 0:
             progress(step.inputs.now.wall_ns)
-        outputs = replay_step(run.robot, step)
+        with run.state_errors():
+            outputs = replay_step(run.robot, step)
         if is_inside(step):
             writer.step(step, outputs)
         elif not over:

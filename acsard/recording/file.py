@@ -548,7 +548,7 @@ def rewrite(recording: Recording, path: Path, cut: str = "open") -> int:
                 writing.add(topic, wall_ns, data)
             count += 1
         writing.finish(recording.cut or ("" if recording.ended else cut), recording.why)
-    except (OSError, RecordingError):
+    except BaseException:
         writing.close()
         path.unlink()
         raise
@@ -566,7 +566,7 @@ def event_of(recording: Recording, data: bytes) -> TimelineEntry:
     """Decode a message of the channel `events`. Raises `RecordingError` if it is damaged."""
     try:
         return msgspec.json.decode(data, type=TimelineEntry)
-    except msgspec.MsgspecError as error:
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
         raise RecordingError(
             f"{recording.path} has an event that cannot be read: {error}"
         ) from None

@@ -172,7 +172,7 @@ def unfinished(data: bytes) -> Unfinished:
     """
     try:
         return _unfinished.decode(data)
-    except msgspec.MsgspecError as error:
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
         raise UnfinishedError(
             f"the step in which the daemon failed cannot be read: {error}"
         ) from None

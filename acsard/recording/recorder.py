@@ -135,13 +135,9 @@ class Recorder:
             self._hangs()
             self._full = True
             self._lost += 1
-            self._report(
-                Event(
-                    "recording",
-                    "the disk is too slow, so steps are missing in the recording",
-                    "warning",
-                )
-            )
+            cause = "the disk is too slow" if self._thread.is_alive() else "the recorder has ended"
+            text = f"{cause}, so steps are missing in the recording"
+            self._report(Event("recording", text, "warning"))
             return
         else:
             queue.append(taken)
@@ -209,6 +205,8 @@ class Recorder:
             self._writer.bug = self._bug(error)
         self._over.set()
         self._thread.join(CLOSE_S)
+        while self._events:
+            self._report(self._events.popleft())
         if self._thread.is_alive() and self._writer.bug is None:
             # A hanging disk may delay the marker too, but must not delay the end of the daemon.
             marking = threading.Thread(target=self._writer.mark_cut, args=["late"], daemon=True)

@@ -30,6 +30,12 @@ from acsard.machine.serial_ports import serial_devices
 from acsard.web.calls import Ending
 from acsard.web.socket_messages import Begin, Ended, FrameError, Guided, Press, Reply, Running
 
+MAX_ERROR_BYTES = 4000
+"""Size of the last part of the child's standard error that is kept for its error text, bytes."""
+
+CONTINUATION_BYTES = bytes(range(0x80, 0xC0))
+"""The bytes of a UTF-8 character after its first byte."""
+
 END_TIMEOUT_S = 6.0
 """Time, s, after which an interrupted child process is killed if it has not exited. Until then it
 can send zero speeds."""
@@ -214,7 +220,8 @@ class Guide:
     async def _live(self, errand: _Errand, asked: Begin) -> None:
         try:
             code, text = await errand.run(words(asked, self._reach, await self._ports(asked)))
-        except (FrameError, OSError, TimeoutError) as error:
+        # Python raises `RuntimeError` if it cannot start a thread for the child process.
+        except (FrameError, OSError, TimeoutError, RuntimeError) as error:
             code, text = (
                 int(Exit.USAGE),
                 str(error) or "listing the serial ports took too long: try again",
@@ -398,10 +405,21 @@ class _Errand:
     async def _overhear(self, process: Process) -> None:
         assert process.stderr is not None
         while said := await process.stderr.read(4096):
-            self._last = (self._last + said)[-4000:]
+            self._last = last_part(self._last + said)
 
     def _words(self) -> str:
         lines = self._last.decode(errors="replace").splitlines()
         if self.left and lines[-1:] == ["KeyboardInterrupt"]:
             return ""  # interrupted while the interpreter was starting
         return "\n".join(line.removeprefix("acsard: ") for line in lines).strip()
+
+
+def last_part(said: bytes) -> bytes:
+    """Return the last lines of `said`, at most `MAX_ERROR_BYTES`.
+
+    If the last line alone is longer, return its last characters.
+    """
+    kept = said[-MAX_ERROR_BYTES:]
+    if len(said) <= MAX_ERROR_BYTES:
+        return kept
+    return kept.partition(b"\n")[2] or kept.lstrip(CONTINUATION_BYTES)

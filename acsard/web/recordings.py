@@ -10,6 +10,7 @@ import signal
 import time
 from asyncio.subprocess import PIPE, Process
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -19,7 +20,7 @@ from acsard.core.values import NS_PER_S
 from acsard.host import clock
 from acsard.host.child import Limits, acsard, how_it_ended, running
 from acsard.host.errors import RecordingError
-from acsard.host.threads import in_thread
+from acsard.host.threads import NoThreadError, in_thread
 from acsard.recording.directory import NAME_TIME_FORMAT, PART_SUFFIX, is_being_recorded, listed
 from acsard.recording.end_record import how_it_ends, read_end
 from acsard.web.answers import READ_TIMEOUT_S, TroubleError
@@ -124,10 +125,13 @@ class BlackBox:
 
         def look() -> tuple[Path, tuple[int, int]] | None:
             path = next((path for path in _files(place) if path.name == name), None)
-            if path is None:
+            try:
+                seen = path.stat() if path is not None else None
+            except FileNotFoundError:  # the daemon has just renamed or deleted the file
                 return None
-            seen = path.stat()
-            return path, (seen.st_mtime_ns, seen.st_size)
+            return (
+                None if path is None or seen is None else (path, (seen.st_mtime_ns, seen.st_size))
+            )
 
         try:
             found = await in_thread(look, READ_TIMEOUT_S)
@@ -160,7 +164,12 @@ def rows(directory: Path) -> list[Recording]:
 
     If the directory does not exist, return [].
     """
-    return [_row(path) for path in _files(directory)]
+    found = []
+    for path in _files(directory):
+        # The daemon may rename or delete a file meanwhile.
+        with suppress(FileNotFoundError):
+            found.append(_row(path))
+    return found
 
 
 def _files(directory: Path) -> list[Path]:
@@ -321,9 +330,12 @@ class Reports:
             async with asyncio.timeout(DRAW_TIMEOUT_S):
                 body = await self._drawn(one)
                 one.packed = await in_thread(lambda: gzip.compress(body, 6, mtime=0), None)
+        except NoThreadError as error:
+            one.failed = str(error)
         except TimeoutError:
             one.failed = TOO_LONG
-        except (OSError, _FailedError) as error:
+        # Python raises `RuntimeError` if it cannot start a thread for the child process.
+        except (OSError, RuntimeError, _FailedError) as error:
             one.failed = str(error)
 
     async def _drawn(self, one: _Drawing) -> bytes:

@@ -18,13 +18,16 @@ from msgspec import Struct
 
 from acsard.client import Client
 from acsard.core.config.settings import Config
+from acsard.core.values import Event
 from acsard.daemon.bus.address import Address
 from acsard.daemon.bus.certificate_watch import CertificateFiles
 from acsard.daemon.bus.tls import CERTIFICATE, KEY, files_in, names_in
 from acsard.daemon.bus.zenoh_sessions import client_session
 from acsard.host.child import HEARTBEAT_S, Parent, end_with_parent
 from acsard.host.logs import Log
+from acsard.host.threads import in_thread
 from acsard.web.acceptor import READ_BYTES, Acceptor, Reader
+from acsard.web.answers import READ_TIMEOUT_S
 from acsard.web.app import Page
 from acsard.web.callers import is_loopback
 from acsard.web.guide import Guide, Reach
@@ -211,15 +214,26 @@ def _names(directory: str) -> set[str]:
 async def _renew(
     context: ssl.SSLContext, names: set[str], files: CertificateFiles, directory: str, log: Log
 ) -> None:
+    renewed, reported = False, ""
     while True:
         await asyncio.sleep(TIDY_S)
-        if not files.renewed():
+        # A hanging disk must not hang the page.
+        with suppress(TimeoutError):
+            renewed = await in_thread(files.renewed, READ_TIMEOUT_S) or renewed
+        if not renewed:
             continue
-        # If the files are replaced while they are read, a later round reads them again.
-        with suppress(OSError, ValueError):
+        try:
             _load(context, directory)
             names |= _names(directory)
-            log.info(
-                "configuration",
-                text="the page uses its new TLS certificate and keeps its open connections",
-            )
+        except (OSError, ValueError) as error:
+            # The files may just be in the process of being replaced. The next round tries again.
+            text = f"the page cannot use its new TLS certificate yet: {error}"
+            if text != reported:
+                log.event(Event("configuration", text, "warning"))
+            reported = text
+            continue
+        renewed, reported = False, ""
+        log.info(
+            "configuration",
+            text="the page uses its new TLS certificate and keeps its open connections",
+        )

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import pytest
 import zenoh
 
-from acsard.client import Client, connect, connect_async, synchronous
+from acsard.client import Client, asynchronous, connect, connect_async, synchronous
 from acsard.client.commander import GRACE_S
 from acsard.core.incoming.queries import BUSY
 from acsard.core.messages import schema
@@ -501,6 +501,19 @@ async def test_an_async_drive_runs_while_odometry_is_followed(shared: Daemon, fr
     assert len(seen) > 60 - 100 * late
     assert max(odom.twist.twist.linear.x for odom in seen) > 0.4
     assert seen[-1].pose.pose.position.x == pytest.approx(0.3, abs=0.03 + 0.5 * late)
+
+
+@pytest.mark.slow
+async def test_a_connection_that_does_not_close_keeps_the_error_of_the_program(
+    shared: Daemon, fresh: Bus, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(asynchronous, "CLOSE_TIMEOUT_S", 0.0)
+    with pytest.raises(NotDrivenError, match="no reason"):
+        async with connect_async(shared.endpoint):
+            raise NotDrivenError("no reason")
+    with pytest.raises(NoAnswerError, match="could not be closed"):
+        async with connect_async(shared.endpoint):
+            pass
 
 
 @pytest.mark.slow

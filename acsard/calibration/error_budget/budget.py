@@ -54,6 +54,10 @@ MIN_LINES = 20
 If there are fewer lines, the robot is assumed to stand still.
 """
 
+LEAST_SHARE = 0.2
+"""Smallest part of the distance and of the turns that must remain in the steps. Otherwise the robot
+only moved to and fro within steps, and the drive gives no errors."""
+
 STEP_S = 0.1
 """Minimum duration of the steps into which a measured drive is divided, s."""
 
@@ -201,7 +205,12 @@ def budget(received: Received, config: Config, metres: float = BUDGET_DISTANCE_M
     counts = still.counts or (round(math.tau / found.count) if found.count else 0)
     creeping = metres / max(rolled, LEAST_M) * moved.seconds / MAX_STEPS
     driving = Driving(lines, moved, found, model.kinematics, max(STEP_S, creeping), received.gyro)
-    model.rolls, model.turns = rolled >= LEAST_M, turned >= LEAST_RAD
+    # `_Model` repeats the steps, in which motion to and fro cancels.
+    net, net_turn = np.abs(driving.plain().rows[:, :2]).sum(axis=0).tolist()
+    model.rolls = net >= max(LEAST_M, LEAST_SHARE * rolled)
+    model.turns = net_turn >= max(LEAST_RAD, LEAST_SHARE * turned)
+    if not (model.rolls or model.turns):
+        return still
     return replace(
         still, metres=rolled, turned=math.degrees(turned), missing=moved.missing,
         unseen=moved.unseen, lateness=moved.lateness, quantum=found.quantum, counts=counts,

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from msgspec.structs import replace
 
-from acsard.core.config.settings import RecordConfig
+from acsard.core.config.settings import RECORD_VARIABLE, RecordConfig
 from acsard.core.values import NS_PER_S, Instant
 from acsard.recording import directory
 from acsard.recording.directory import (
@@ -360,7 +360,14 @@ def test_a_pipe_or_a_link_with_the_name_of_a_recording_is_not_a_recording(tmp_pa
     assert listed(tmp_path) == [whole]
 
 
-@pytest.mark.parametrize("event", [b"", b'{"seconds": 1e300, "name": "stop", "text": "stopped"}'])
+@pytest.mark.parametrize(
+    "event",
+    [
+        b"",
+        b'{"seconds": 1e300, "name": "stop", "text": "stopped"}',
+        b'{"seconds": 1, "name": "\xff", "text": ""}',
+    ],
+)
 def test_a_cut_file_that_this_version_cannot_read_stays_and_is_reported(
     tmp_path: Path, event: bytes
 ) -> None:
@@ -378,6 +385,23 @@ def test_a_cut_file_that_this_version_cannot_read_stays_and_is_reported(
     (said,) = one.messages
     assert path.name in said
     assert ("acsard/99" if not event else "an event that cannot be read") in said
+
+
+def test_a_disk_error_does_not_keep_the_directory_locked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (where := tmp_path / "record").mkdir()
+    monkeypatch.setattr(directory, "PRIVATE_STATE", tmp_path)
+    monkeypatch.setenv(RECORD_VARIABLE, str(where))
+    with monkeypatch.context() as failing:
+
+        def fails(one: Ring) -> None:
+            raise OSError(5, "Input/output error")
+
+        failing.setattr(Ring, "_open_files", fails)
+        with pytest.raises(OSError, match="Input/output error"):
+            Ring(RecordConfig(str(where)))
+    assert Ring(RecordConfig(str(where))).messages == []
 
 
 def test_an_incomplete_copy_is_deleted(tmp_path: Path) -> None:

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 import pytest
 from mcap.reader import make_reader
+from mcap.writer import Writer
 from msgspec.structs import replace
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader
@@ -31,6 +32,7 @@ from acsard.core.ros.channels import CHANNELS
 from acsard.core.ros.names import Qos
 from acsard.core.values import GyroSample, Instant
 from acsard.host.errors import RecordingError
+from acsard.recording import atomic_output
 from acsard.recording.atomic_output import replacing
 from acsard.recording.export import (
     CSV_HEADER,
@@ -250,6 +252,39 @@ def test_a_device_or_a_pipe_is_never_replaced(path: Path, tmp_path: Path) -> Non
         with pytest.raises(FileExistsError, match="this path is a device or a pipe"):
             export(Recording(path), pipe, kind, force=True)
     assert pipe.is_fifo()
+
+
+def test_a_large_file_of_another_program_is_not_read(
+    path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    other = tmp_path / "other.mcap"
+    with other.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start("ros2", "libmcap")
+        writer.finish()
+
+    def reads(path: Path) -> Recording:
+        raise AssertionError(f"{path} is read")
+
+    recording = Recording(path)
+    monkeypatch.setattr(atomic_output, "Recording", reads)
+    with pytest.raises(FileExistsError, match="--force overwrites it"):
+        export(recording, other, "mcap")
+
+
+def test_a_defect_of_the_export_is_not_reported_as_a_state_that_cannot_be_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tape, world = recorded_world(CONFIG, every=BATCH)
+    world.run(2 * BATCH / 100)
+    tape.write(recorded := tmp_path / "drive.mcap", CONFIG, first=BATCH)
+
+    def fails(*_: object, **__: object) -> None:
+        raise TypeError("defect")
+
+    monkeypatch.setattr(Writer, "add_message", fails)
+    with pytest.raises(TypeError, match="defect"):
+        export(Recording(recorded), tmp_path / "new.mcap", "mcap")
 
 
 def test_a_recording_is_never_replaced(path: Path, tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from acsard.calibration.guided.methods import METHODS
 from acsard.cli import parser
 from acsard.host.processes import Holder
 from acsard.machine.serial_ports import SerialDevice
-from acsard.web.guide import KEY, NO_DEVICE, Guide, Reach, boards, words
+from acsard.web.guide import KEY, NO_DEVICE, Guide, Reach, boards, last_part, words
 from acsard.web.socket_messages import Begin, FrameError
 from tests.each import each
 
@@ -167,3 +167,15 @@ def test_the_text_about_the_simulator_mentions_every_method() -> None:
 def test_an_invalid_key_is_refused_as_a_source_of_positions(key: str) -> None:
     assert not KEY.match(key)
     assert KEY.match("sim/pose")
+
+
+@each(
+    ("said", "kept"),
+    [
+        (b"short", "short"),
+        (b"x\n" * 2000 + b"last", "x\n" * 1997 + "last"),
+        ("ü".encode() * 3000 + b"x", "ü" * 1999 + "x"),
+    ],
+)
+def test_a_long_error_text_is_cut_between_lines_or_characters(said: bytes, kept: str) -> None:
+    assert last_part(said).decode() == kept

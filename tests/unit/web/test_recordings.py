@@ -31,6 +31,17 @@ def test_a_robot_that_has_just_started_has_no_recordings(tmp_path: Path) -> None
     assert rows(tmp_path / "record") == []
 
 
+def test_a_file_that_the_daemon_renames_meanwhile_does_not_hide_the_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    names = ["000001-20261121T070027Z.mcap", "000002-20261121T070127Z.mcap.part"]
+    for name in names:
+        (tmp_path / name).write_bytes(b"")
+    monkeypatch.setattr(reports, "listed", lambda place: [place / name for name in names])
+    (tmp_path / names[1]).rename(tmp_path / "000002-20261121T070127Z.mcap")
+    assert [one.name for one in rows(tmp_path)] == names[:1]
+
+
 def test_a_file_in_place_of_the_directory_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "record").write_text("")
     with pytest.raises(NotADirectoryError):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import stat
 from pathlib import Path
@@ -10,7 +11,8 @@ import msgspec
 import pytest
 from msgspec.structs import replace
 
-from acsard.host.errors import NotPermittedError, UsageError
+from acsard.host.errors import MendableError, NotPermittedError, UsageError
+from acsard.web import tokens
 from acsard.web.tokens import Token, Vault, owner_in
 
 
@@ -54,8 +56,13 @@ def test_an_unknown_token_is_not_valid(tmp_path: Path, text: str) -> None:
 def test_with_a_damaged_file_no_token_is_valid(tmp_path: Path) -> None:
     vault = Vault(tmp_path, "robot1")
     text, _ = vault.invite("maintainer", "me", 1)
-    vault.path.write_bytes(vault.path.read_bytes()[:-3])
-    assert owner_in(vault.all(), text) is None
+    whole = vault.path.read_bytes()
+    for damaged in (whole[:-3], whole.replace(b'"me"', '"mü"'.encode("latin-1")), b"[" * 100_000):
+        vault.path.write_bytes(damaged)
+        assert owner_in(vault.all(), text) is None
+        assert vault.counting() == frozenset()
+        with pytest.raises(UsageError, match="is not a list of tokens"):
+            vault.invite("viewer", "tv", 1)
 
 
 def test_a_damaged_file_is_not_written_over(tmp_path: Path) -> None:
@@ -123,3 +130,14 @@ def test_robots_that_share_the_file_know_their_own_tokens_alone(tmp_path: Path) 
 @pytest.mark.slow
 def test_a_stored_token_has_only_the_necessary_fields() -> None:
     assert Token.__struct_fields__ == ("name", "role", "digest", "made", "ends", "robot")
+
+
+def test_a_disk_that_refuses_to_write_is_reported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(path: Path, *_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(tokens, "replace", full)
+    with pytest.raises(MendableError, match=r"cannot write .*: No space left on device"):
+        Vault(tmp_path, "robot1").invite("viewer", "tv", 1)

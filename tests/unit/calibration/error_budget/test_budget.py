@@ -210,3 +210,18 @@ def test_the_largest_cause_is_chosen_among_the_requested_bases() -> None:
     millimetres, _ = found.total()
     assert millimetres is not None
     assert millimetres >= max(one.mm_per_100_m or 0.0 for one in found.shares)
+
+
+@pytest.mark.parametrize("back", [1.0, 0.9])
+def test_a_robot_that_only_moved_to_and_fro_within_a_step_has_no_measured_errors(
+    back: float,
+) -> None:
+    """In a long measurement the steps are long, so the motion in them cancels."""
+    radius, lines, angle = CONFIG.drive.wheel_radius, [], 0.0
+    for number in range(30_000):
+        ahead, behind = 1000 <= number < 1110, 1110 <= number < 1220
+        speed = round(0.1 * (ahead - back * behind) / radius, 2)
+        angle += 0.01 * speed
+        lines.append(Line(0.01 * number, (speed,) * 4, (angle,) * 4, 0.0, 0.0))
+    found = budget(Received(lines, [line.at - 0.001 for line in lines]), CONFIG)
+    assert found.still
