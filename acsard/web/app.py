@@ -43,7 +43,7 @@ from acsard.web.answers import (
 )
 from acsard.web.callers import PROTOCOL, RefusedError, cookie_name, tokens_offered
 from acsard.web.camera import SEND_TIMEOUT_S, Camera
-from acsard.web.guide import Choices
+from acsard.web.guide import SLOW_PORTS, Choices
 from acsard.web.limits import OPENINGS, PICTURES, STOPS, Seats
 from acsard.web.recordings import POLICY, BlackBox, Recording, Reports, ReportState, State
 from acsard.web.routes import FORM, JSON, RECORDINGS_ROLE, Body, Problem, Route, services, values
@@ -263,7 +263,11 @@ class Page:
         return reply(settings_in(msgspec.json.decode(await self._value("config"))))
 
     async def guide(self, request: web.Request) -> web.StreamResponse:
-        return reply(await self._parts.guide.choices(simulated=self._robots.about.simulated))
+        try:
+            choices = await self._parts.guide.choices(simulated=self._robots.about.simulated)
+        except TimeoutError:
+            raise TroubleError(503, SLOW_PORTS) from None
+        return reply(choices)
 
     async def service(self, request: web.Request) -> web.StreamResponse:
         """Call the robot's service that the path names.

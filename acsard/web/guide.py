@@ -30,6 +30,8 @@ from acsard.machine.serial_ports import serial_devices
 from acsard.web.calls import Ending
 from acsard.web.socket_messages import Begin, Ended, FrameError, Guided, Press, Reply, Running
 
+SLOW_PORTS = "listing the serial ports took too long: try again"
+
 MAX_ERROR_BYTES = 4000
 """Size of the last part of the child's standard error that is kept for its error text, bytes."""
 
@@ -224,7 +226,7 @@ class Guide:
         except (FrameError, OSError, TimeoutError, RuntimeError) as error:
             code, text = (
                 int(Exit.USAGE),
-                str(error) or "listing the serial ports took too long: try again",
+                str(error) or SLOW_PORTS,
             )
         finally:
             self._errand = None
