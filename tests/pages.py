@@ -276,7 +276,7 @@ COMMANDS: dict[str, How] = {
         "tests/simulate/test_planted.py",
         "test_a_row_whose_seed_finds_nothing_any_more_is_listed",
     ),
-    ".venv/bin/python -m tests.firmware.unchanged '842df6e9^'": Shown("needs the history"),
+    ".venv/bin/python -m tests.firmware.unchanged HEAD~1": Shown("needs the history"),
     ".venv/bin/python -m tests.mutation": Shown("takes long, for changes of the core"),
     ".venv/bin/python -m tests.mutation --safety": Shown("takes long, for the same"),
     ".venv/bin/python -m tests.pictures pictures": Elsewhere(

@@ -32,9 +32,11 @@ VIEWER_KEYS = frozenset(topic.key for topic in FOLLOWED)
 DECLARE_TIMEOUT_S = 3.0
 
 STATE_KEY = "state"
-"""Key of a robot's state. The server queries this key only for the page's own robot. For another
-robot, a router's storage could answer with an old state, even a week after the robot was switched
-off."""
+"""Key of a robot's state."""
+
+STORED_KEYS = (STATE_KEY, "odom")
+"""Keys that the server queries only for the page's own robot. For another robot, a router's storage
+could answer with an old value, even a week after the robot was switched off."""
 
 NOT_READY_ERRORS = (TimeoutError, zenoh.ZError, UsageError)
 """Errors that mean that the bus is stuck or the session is closed. A later attempt may succeed."""
@@ -151,7 +153,7 @@ class Streams:
 
     async def _declare(self, own: Client, robot: str, key: str, stream: Stream) -> Any:
         client = own.like(robot)
-        asks = key != STATE_KEY or own.key(key) == client.key(key)
+        asks = key not in STORED_KEYS or own.key(key) == client.key(key)
 
         def late(subscriber: Any) -> None:
             subscriber.undeclare()

@@ -18,10 +18,11 @@ static volatile bool ticked;
 
 static void pwm_start(void)
 {
-    /* Phase correct, top in ICR (mode 10): zero is a true zero, without the spike of fast PWM. */
+    /* Phase correct, top in ICR (mode 10): zero is a true zero, without the spike of fast PWM. The
+     * chip ignores writes to ICR until the timer has a mode with its top there (data sheet, 17.2.1). */
+    hardware_motors_off();
     ICR3 = (uint16_t)PWM_TOP;
     ICR4 = (uint16_t)PWM_TOP;
-    hardware_motors_off();
     PWM_DDR_3 |= PWM_PINS_3;
     PWM_DDR_4 |= PWM_PINS_4;
     DIRECTION_DDR = 0xFF;

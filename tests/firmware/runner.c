@@ -405,11 +405,22 @@ static void look_at_bridges(void)
     }
 }
 
-static void on_register(avr_irq_t *irq, uint32_t value, void *unused)
+/* The real chip ignores a write to ICR while the timer has no mode with its top there. simavr takes it. */
+static void check_top(uint16_t address)
+{
+    uint8_t a = avr->data[address == ICR3 ? TCCR3A : TCCR4A];
+    uint8_t b = avr->data[address == ICR3 ? TCCR3B : TCCR4B];
+
+    if (a & 1 || !(b >> 4 & 1))
+        fail("the firmware writes ICR of a timer whose mode does not use it: the chip ignores that");
+}
+
+static void on_register(avr_irq_t *irq, uint32_t value, void *address)
 {
     (void)irq;
     (void)value;
-    (void)unused;
+    if ((intptr_t)address == ICR3 || (intptr_t)address == ICR4)
+        check_top((uint16_t)(intptr_t)address);
     look_at_bridges();
     show_contacts();
 }
@@ -979,7 +990,8 @@ static void power_on(const char *path)
 
     for (i = 0; i < sizeof watched / sizeof *watched; i++)
         avr_irq_register_notify(
-            avr_iomem_getirq(avr, watched[i], NULL, AVR_IOMEM_IRQ_ALL), on_register, NULL);
+            avr_iomem_getirq(avr, watched[i], NULL, AVR_IOMEM_IRQ_ALL), on_register,
+            (void *)(intptr_t)watched[i]);
     after_reset();
     resets = 0;
 }

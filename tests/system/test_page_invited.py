@@ -154,3 +154,13 @@ def test_a_link_with_fewer_permissions_is_used_only_after_a_question(
         assert browser.js("location.hash") == ""
     finally:
         browser.ask("Page.removeScriptToEvaluateOnNewDocument", identifier=added["identifier"])
+
+
+def test_the_link_of_another_robot_still_names_it_after_the_invitation_was_accepted(
+    stranger: Stranger,
+) -> None:
+    """STOP by HTTP goes to the robot that the page shows, which it reads from the URL."""
+    browser, token = stranger.browser, stranger.server.invite("operator", "phone")
+    browser.open(f"{stranger.server.away}/?robot=other#token={token}")
+    until(lambda: "token" not in browser.js("location.href"), 15.0, "the token is used")
+    assert browser.js("location.search") == "?robot=other"

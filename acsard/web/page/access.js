@@ -14,7 +14,7 @@ export async function invited(waiting) {
   for (let replace = false; ; ) {
     const { status, error } = await shown(token, replace);
     if (status === 409 && !replace && (replace = confirm(`${error}. Use the link anyway?`))) continue;
-    if (status && status < 500 && status !== 429) history.replaceState(null, "", location.pathname);
+    if (status && status < 500 && status !== 429) history.replaceState(null, "", location.pathname + location.search);
     if (status === 409) return "";
     if (status === 401) return "this invitation is not valid: it has expired, was revoked, or is incomplete. Ask for a new one (acsard web --invite)";
     if (status && status < 500) return error;

@@ -198,7 +198,11 @@ export class Guide {
 
   #answer(value) {
     const question = this.#question;
-    if (!question || !this.#link.send({ reply: question.question, value })) return;
+    if (!question) return;
+    if (!this.#link.send({ reply: question.question, value })) {
+      text("guide-wrong", "not sent, because the connection is too slow: press again");
+      return;
+    }
     this.#question = null;
     $("guide-question").hidden = true;
     text("guide-doing", "running");

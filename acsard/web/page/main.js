@@ -61,7 +61,8 @@ let complaint = { why: "", at: 0 }; // the message about a button and its time, 
 let offer = ""; // the mode and the latch that the release button ends, "" while it is hidden
 let settling = 0; // time at which `offer` changed or the release button was last clicked, by performance.now()
 let down = null; // time at which a finger came down on the release button
-let period = 0; // seconds between two states of another robot
+let period = 0; // usual seconds between two states of another robot
+let before = 0; // seconds between the last two of them
 
 /** Return whether this page has the view Settings. The settings of another robot are on that robot's own page, and a
  *  user with the role viewer may not change any. */
@@ -256,7 +257,8 @@ function stated({ detail }) {
   // A state from long before this page opened says nothing about the present.
   if (!state && detail.age > 2 * lasts()) return;
   const since = state ? (milliseconds(detail.value.stamp) - milliseconds(state.stamp)) / 1000 : 0;
-  if (since > 0) period = Math.min(since, 10);
+  // After a single pause of the network, the shorter of two intervals is the usual one.
+  if (since > 0) [period, before] = [Math.min(since, before || since, 10), since];
   const other = state?.mode !== detail.value.mode;
   if (state && other) outdated();
   seen = true;

@@ -12,6 +12,7 @@
 const URGENT = 30000;
 const PAUSE = 300; // ms between two attempts
 const SLOW = 10000; // ms after which a page whose modules do not run says so
+const ROBOT = new URLSearchParams(location.search).get("robot") ?? undefined; // the robot that this page shows
 const BARRED = [401, 403]; // HTTP statuses of a page without a valid invitation
 const NOT_HERE = "STOP needs an invitation to this page: use the robot's own switch";
 const UNSURE = "STOP was not confirmed: look at the robot, and press STOP again";
@@ -116,11 +117,12 @@ function expiring(ms) {
   return controller.signal;
 }
 
-/** Send STOP by HTTP, because the WebSocket may be refused or may not be open yet. */
+/** Send STOP by HTTP, because the WebSocket may be refused or may not be open yet. The browser completes the
+ *  request even if the person leaves the page. */
 async function posted() {
   try {
-    const body = JSON.stringify({ robot: new URLSearchParams(location.search).get("robot") ?? undefined });
-    const answer = await fetch("api/srv/stop", { method: "POST", body, signal: expiring(3000) });
+    const body = JSON.stringify({ robot: ROBOT });
+    const answer = await fetch("api/srv/stop", { method: "POST", body, keepalive: true, signal: expiring(3000) });
     const told = await answer.json();
     return { ok: answer.ok, barred: BARRED.includes(answer.status), text: told.message ?? told.error ?? `${answer.status}` };
   } catch {
