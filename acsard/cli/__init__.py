@@ -16,6 +16,7 @@ import re
 import sys
 import traceback
 from collections.abc import Collection, Sequence
+from contextlib import suppress
 from copy import copy
 from decimal import Decimal
 from importlib import import_module
@@ -151,8 +152,11 @@ def main(argv: list[str] | None = None) -> int:
     except OSError as error:
         if not isinstance(error, BrokenPipeError) and error.errno != errno.ENOSPC:
             raise
-        # The program that reads this output (head, less) has ended, or the disk is full. Do not
-        # print a message, because it would be lost too.
+        # The program that reads this output (head, less) has ended, or a disk is full: that of the
+        # output, or that of a file.
+        if not isinstance(error, BrokenPipeError):
+            with suppress(OSError):
+                print(f"acsard: {error}", file=sys.stderr)
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return code if isinstance(error, BrokenPipeError) else code or int(Exit.FAILURE)
     except KeyboardInterrupt:

@@ -232,7 +232,14 @@ def _guided(
                 "--yes is only for the built-in simulator: this robot is real, and a person "
                 "must stand near it and start each leg. Leave --yes out"
             )
-        mine, config = config, msgspec.convert(client.get("config"), Config)
+        mine = config
+        try:
+            config = msgspec.convert(client.get("config"), Config)
+        except msgspec.ValidationError as error:
+            raise GuideError(
+                f"this version of acsard cannot read the daemon's configuration ({error}): use the "
+                f"daemon's version, {info.version}"
+            ) from None
         if args.write and (trouble := _differing(config, mine, where)):
             raise GuideError(trouble)
         name = _way(args, config)

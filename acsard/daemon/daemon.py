@@ -86,7 +86,9 @@ class Departure:
             self._manager.stopping()
         self._log.info("signal", signal=number.name, hurried=self.hurried)
         if self._starting is not None:
+            # A second signal must not cancel the end of the start.
             self._starting.cancel()
+            self._starting = None
         self._wake()
 
     def over(self, now_ns: int, at_rest: bool) -> bool:

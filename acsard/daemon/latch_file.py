@@ -245,9 +245,10 @@ class LatchFile:
             return
         self._lock = lock
         # Remove the temporary files of processes that were killed while they wrote.
-        for left in path.parent.glob(f".{path.name}.*"):
-            with suppress(OSError):
-                left.unlink()
+        with suppress(OSError):
+            for left in path.parent.glob(f".{path.name}.*"):
+                with suppress(OSError):
+                    left.unlink()
 
     # The control loop calls the methods below.
 

@@ -61,7 +61,8 @@ def replace(
                 os.fsync(new.fileno())
         os.replace(name, file)
     except BaseException:
-        os.unlink(name)
+        with suppress(OSError):
+            os.unlink(name)
         raise
 
 

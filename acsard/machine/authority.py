@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import ipaddress
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -21,6 +22,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from acsard.daemon.bus.tls import CA, CERTIFICATE, KEY
 from acsard.host.atomic_file import replace
+from acsard.host.errors import MendableError
 from acsard.machine.certificates import CA_KEY
 
 LOCAL_NAMES = ("local", "localhost")
@@ -71,8 +73,9 @@ class Authority:
             .add_extension(_constraints(addresses), critical=True)
             .sign(key, hashes.SHA256())
         )
-        _write(directory / CA, _pem(certificate), 0o644)
-        _write(directory / CA_KEY, _key_pem(key), 0o600)
+        _write(
+            {directory / CA_KEY: (_key_pem(key), 0o600), directory / CA: (_pem(certificate), 0o644)}
+        )
         return cls(certificate, key)
 
     @classmethod
@@ -134,12 +137,10 @@ class Authority:
             addresses: host names and IP addresses for which the certificate is valid.
             days: validity of the certificate, days.
         """
-        directory.mkdir(mode=0o755, parents=True, exist_ok=True)
         key = ec.generate_private_key(ec.SECP256R1())
         subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
         both = [ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH]
         names = [_general_name(address) for address in dict.fromkeys(addresses)]
-        signer = self._certificate.extensions.get_extension_for_class(x509.SubjectKeyIdentifier)
         builder = _builder(subject, self._certificate.subject, key.public_key(), days)
         if names:
             builder = builder.add_extension(x509.SubjectAlternativeName(names), critical=False)
@@ -147,15 +148,25 @@ class Authority:
             builder.add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
             .add_extension(_usage(signs=False), critical=True)
             .add_extension(x509.ExtendedKeyUsage(both), critical=False)
-            .add_extension(
-                x509.AuthorityKeyIdentifier.from_issuer_subject_key_identifier(signer.value),
-                critical=False,
-            )
+            .add_extension(self._identifier(), critical=False)
             .sign(self._key, hashes.SHA256())
         )
-        _write(directory / CA, _pem(self._certificate), 0o644)
-        _write(directory / CERTIFICATE, _pem(certificate), 0o644)
-        _write(directory / KEY, _key_pem(key), 0o600)
+        directory.mkdir(mode=0o755, parents=True, exist_ok=True)
+        _write(
+            {
+                directory / CA: (_pem(self._certificate), 0o644),
+                directory / CERTIFICATE: (_pem(certificate), 0o644),
+                directory / KEY: (_key_pem(key), 0o600),
+            }
+        )
+
+    def _identifier(self) -> x509.AuthorityKeyIdentifier:
+        try:
+            own = self._certificate.extensions.get_extension_for_class(x509.SubjectKeyIdentifier)
+        except x509.ExtensionNotFound:
+            # Another program has made this authority.
+            return x509.AuthorityKeyIdentifier.from_issuer_public_key(self._key.public_key())
+        return x509.AuthorityKeyIdentifier.from_issuer_subject_key_identifier(own.value)
 
 
 def _builder(
@@ -236,6 +247,24 @@ def _key_pem(key: ec.EllipticCurvePrivateKey) -> bytes:
     )
 
 
-def _write(path: Path, data: bytes, mode: int) -> None:
-    """Write a file that never has more permissions than `mode`, not even during the write."""
-    replace(path, data, mode=mode, owner=(os.geteuid(), os.getegid()))
+def _write(files: Mapping[Path, tuple[bytes, int]]) -> None:
+    """Write all of these files, or none of them: a key and its certificate belong together.
+
+    `files` contains the content and the mode of each file. A file never has more permissions than
+    its mode, not even during the write. Raises `MendableError` if the disk refuses a file.
+    """
+    new = {path: path.with_name(f"{path.name}.new") for path in files}
+    try:
+        for path, (data, mode) in files.items():
+            replace(new[path], data, mode=mode, owner=(os.geteuid(), os.getegid()))
+        for path, written in new.items():
+            written.replace(path)
+    except OSError as error:
+        if isinstance(error, PermissionError):
+            raise
+        text = f"cannot write {path}: {error.strerror}; the earlier files are unchanged"
+        raise MendableError(text) from None
+    finally:
+        for written in new.values():
+            with suppress(OSError):
+                written.unlink(missing_ok=True)

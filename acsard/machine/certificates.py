@@ -228,7 +228,10 @@ def _password() -> str:
             "the private key of the certificate authority is encrypted: run this command in a "
             "terminal, where it asks for the password",
         )
-    return getpass(f"password of {CA_KEY}: ")
+    try:
+        return getpass(f"password of {CA_KEY}: ")
+    except EOFError:
+        raise UsageError("no password was typed: run this command again") from None
 
 
 def _writable(directory: Path) -> None:

@@ -194,6 +194,8 @@ def answers(endpoint: str) -> bool:
         raise no_endpoint(endpoint)
     try:
         socket.create_connection((host.strip("[]"), int(port)), timeout=1.0).close()
+    except UnicodeError:  # the host has an empty or too long part
+        raise no_endpoint(endpoint) from None
     except OSError:
         return False
     return True

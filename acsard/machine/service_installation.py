@@ -21,6 +21,7 @@ from msgspec import Struct
 
 import acsard
 from acsard.host.atomic_file import replace
+from acsard.host.child import how_it_ended
 from acsard.host.errors import MendableError, NotPermittedError
 from acsard.host.processes import called
 
@@ -261,7 +262,8 @@ class Run(Struct, frozen=True):
         """
         try:
             done = called(self.words, 60.0)
-            failed = done.stderr.strip() if done.returncode else ""
+            code = done.returncode
+            failed = (done.stderr.strip() or how_it_ended(code)) if code else ""
         except (OSError, subprocess.TimeoutExpired) as error:
             failed = str(error)
         if failed and not self.may_fail:

@@ -134,7 +134,7 @@ class TerminalPrompt(Screen):
             _forget_input()
             while True:
                 self._print(f"\n{question}{choice} ")
-                line = _end_if_closed(lambda: sys.stdin.readline())
+                line = _end_if_closed(_line)
                 word = line.strip().lower()
                 if not line or word == QUIT_KEY:
                     raise KeyboardInterrupt
@@ -190,6 +190,13 @@ def _read() -> str:
     if not read:
         raise KeyboardInterrupt
     return read.decode(errors="replace")
+
+
+def _line() -> str:
+    try:
+        return sys.stdin.readline()
+    except UnicodeDecodeError:
+        return "?\n"  # no answer to any question
 
 
 def _end_if_closed(call: Callable[[], T]) -> T:

@@ -28,8 +28,8 @@ from acsard.daemon.bus.outlets import Outlets, direct
 from acsard.daemon.bus.router_links import RouterLinks
 from acsard.daemon.bus.zenoh_sessions import daemon_session
 from acsard.host import clock
-from acsard.host.errors import InUseError
-from acsard.host.threads import in_thread
+from acsard.host.errors import InUseError, MendableError
+from acsard.host.threads import NoThreadError, in_thread
 
 OPEN_TIMEOUT_S = 10.0
 CLOSE_TIMEOUT_S = 0.3
@@ -118,7 +118,15 @@ class ZenohBus:
     async def __aenter__(self) -> ZenohBus:
         # In client mode the daemon can do nothing without its router, so it waits for the router.
         patience_s = OPEN_TIMEOUT_S if self._config.bus.mode == "peer" else None
-        self._session = await in_thread(self._open, patience_s)
+        try:
+            self._session = await in_thread(self._open, patience_s)
+        except NoThreadError as error:
+            raise MendableError(f"cannot open the bus: {error}") from None
+        except TimeoutError:
+            raise MendableError(
+                f"the bus did not open within {patience_s:g} s: this computer is overloaded, or a "
+                "disk with certificates does not answer; start the daemon again"
+            ) from None
         return self
 
     def _open(self) -> zenoh.Session:

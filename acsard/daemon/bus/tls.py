@@ -272,7 +272,7 @@ def trouble(endpoint: str, directory: str) -> str:
             f"{host} does not answer on port {port}: is {host} switched on, and does a firewall "
             "drop connections?"
         )
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, OverflowError) as error:
         if isinstance(error, OSError) and error.errno in UNREACHABLE:
             return (
                 f"{host} cannot be reached ({error.strerror}): is {host} switched on, is it in "
@@ -295,8 +295,10 @@ def _tls_trouble(plain: socket.socket, host: str, directory: str) -> str:
     outdated = any(map(_wrong_date, context.get_ca_certs()))
     if outdated:
         context.verify_flags |= NO_CHECK_TIME
+    shaken = False
     try:
         with context.wrap_socket(plain, server_hostname=host) as link:
+            shaken = True
             if outdated and (code := _wrong_date(link.getpeercert() or {})):
                 return _server_rejected(code, "", host, directory)
             link.settimeout(REFUSAL_WAIT_S)
@@ -306,8 +308,11 @@ def _tls_trouble(plain: socket.socket, host: str, directory: str) -> str:
     except ssl.SSLError as error:
         return _client_rejected(error.reason or str(error), host, directory)
     except TimeoutError:
-        # The server waits for data, so both ends have accepted the certificates.
-        return ""
+        # If the handshake is over, the server waits for data: both ends have accepted the
+        # certificates.
+        if shaken:
+            return ""
+        return f"{host} accepts the connection, but does not answer the TLS handshake: restart it"
     except OSError:
         return (
             f"{host} closes the connection immediately: does a TLS endpoint of acsard listen there?"

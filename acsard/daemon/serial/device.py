@@ -150,7 +150,15 @@ def close(device: serial.Serial, *, lost: bool = False, wait_s: float = 0.0) -> 
             device.reset_output_buffer()
         except (OSError, termios.error):
             pass  # the device is gone, and with it the queued bytes
-    real, null = os.dup(fd), os.open(os.devnull, os.O_RDWR | os.O_CLOEXEC)
+    try:
+        null = os.open(os.devnull, os.O_RDWR | os.O_CLOEXEC)
+    except OSError:
+        return  # no descriptor is free, so the caller closes the device itself, with delay
+    try:
+        real = os.dup(fd)
+    except OSError:
+        os.close(null)
+        return
     os.dup2(null, fd, inheritable=False)
     os.close(null)
     thread = threading.Thread(target=_end, args=(real,), name="close port", daemon=True)

@@ -249,6 +249,16 @@ def test_the_temporary_file_of_a_killed_write_is_removed(tmp_path: Path, started
     assert not list(tmp_path.glob(f".{NAME}.*"))
 
 
+def test_a_directory_that_cannot_be_listed_does_not_keep_the_daemon_from_starting(
+    tmp_path: Path, started: Started, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(*_: object) -> None:
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    monkeypatch.setattr(Path, "glob", fails)
+    assert started(tmp_path)[1] is not None
+
+
 def test_a_file_system_without_locks_still_keeps_latches(
     tmp_path: Path, started: Started, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -150,3 +150,16 @@ def test_a_sync_that_fails_is_reported_and_leaves_no_descriptor_open(
     with pytest.raises(OSError, match="No space left"):
         sync(file)
     assert len(os.listdir("/proc/self/fd")) == before
+
+
+def test_a_temporary_file_that_is_gone_does_not_hide_the_error(
+    file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(handle: int) -> None:
+        for left in file.parent.glob(f".{file.name}.*"):
+            left.unlink()
+        raise OSError(5, "Input/output error")
+
+    monkeypatch.setattr(os, "fsync", fails)
+    with pytest.raises(OSError, match="Input/output error"):
+        replace(file, b"new")

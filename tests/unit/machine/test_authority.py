@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import errno
 import ipaddress
 import ssl
 from collections.abc import Sequence
 from contextlib import suppress
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from typing import Any
 
 import pytest
 from cryptography import x509
+from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec
 
+from acsard.host import atomic_file
+from acsard.host.errors import MendableError
 from acsard.machine import authority as making
 from acsard.machine.authority import Authority
 from tests.each import each
@@ -137,3 +143,35 @@ def test_a_person_s_certificate_is_valid_even_if_its_name_looks_like_a_host(
     ours.issue(tmp_path / "robot", "robot", ["robot1"], 1)
     ours.issue(tmp_path / "person", name, [f"{name}.local"], 1)
     assert connects(where, tmp_path / "robot", "robot1", tmp_path / "person")
+
+
+def test_a_disk_that_refuses_a_file_leaves_the_earlier_key_and_certificate(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mine = Authority.make(tmp_path / "ca", "test", 1, OWN)
+    mine.issue(tmp_path / "robot", "robot", ["robot1"], 1)
+    before = {path: path.read_bytes() for path in (tmp_path / "robot").iterdir()}
+    written, write = [], atomic_file.replace
+
+    def full(path: Path, *words: object, **options: Any) -> None:
+        written.append(path)
+        if len(written) == 3:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        write(path, *words, **options)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(making, "replace", full)
+    with pytest.raises(MendableError, match=r"cannot write .*: No space left on device"):
+        mine.issue(tmp_path / "robot", "robot", ["robot1"], 1)
+    assert {path: path.read_bytes() for path in (tmp_path / "robot").iterdir()} == before
+
+
+def test_an_authority_without_an_identifier_of_its_key_can_sign(tmp_path: Path) -> None:
+    key, now = ec.generate_private_key(ec.SECP256R1()), datetime.now(UTC)
+    name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "other")])
+    certificate = (
+        x509.CertificateBuilder(name, name, key.public_key(), 1, now, now + timedelta(days=1))
+        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+        .sign(key, hashes.SHA256())
+    )
+    Authority(certificate, key).issue(tmp_path, "robot", ["robot1"], 1)
+    assert (tmp_path / "certificate.pem").is_file()

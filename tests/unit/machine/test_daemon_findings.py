@@ -31,12 +31,13 @@ from acsard.core.messages.schema import (
 )
 from acsard.core.values import GyroDoes
 from acsard.daemon.bus.address import Address
-from acsard.host.errors import CertificateError, NoAnswerError
+from acsard.host.errors import CertificateError, NoAnswerError, UsageError
 from acsard.machine import daemon_findings
 from acsard.machine.daemon_findings import (
     GYRO_MENDS,
     MAX_KEYS,
     Running,
+    answers,
     certificate,
     check,
     clocks,
@@ -504,3 +505,9 @@ def test_the_last_causes_of_lateness_are_warnings_only_if_periods_are_missed_now
     )
     row = DiagnosticStatus(1, "acsard: control loop", "600 of 6000 periods missed", "acsar", [])
     assert {one.level for one in late(replace(calm, rows=(row,)))} == {"warning"}
+
+
+@pytest.mark.parametrize("host", ["a..b", "a" * 70])
+def test_a_host_that_cannot_exist_is_no_endpoint(host: str) -> None:
+    with pytest.raises(UsageError, match="endpoint"):
+        answers(f"tcp/{host}:7448")

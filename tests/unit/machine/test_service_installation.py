@@ -331,6 +331,14 @@ def test_a_directory_with_other_files_is_not_removed(tmp_path: Path) -> None:
     assert [path.name for path in (tmp_path / "bin").iterdir()] == ["other"]
 
 
+@pytest.mark.parametrize("words", [("false",), ("sh", "-c", "kill -9 $$")])
+def test_a_command_that_fails_without_a_message_ends_the_installation(
+    words: tuple[str, ...],
+) -> None:
+    with pytest.raises(MendableError, match=words[0]):
+        Run(words).do()
+
+
 def test_a_failing_command_ends_the_installation_unless_its_failure_is_permitted() -> None:
     words = ("sh", "-c", "echo no >&2; exit 1")
     with pytest.raises(MendableError, match="no"):

@@ -152,3 +152,15 @@ def test_a_rejected_client_certificate_has_the_alert_of_the_server() -> None:
     found = tls._client_rejected("SSLV3_ALERT_CERTIFICATE_REVOKED", "robot", "dir")
     assert "robot does not accept dir/certificate.pem (SSLV3_ALERT_CERTIFICATE_REVOKED)" in found
     assert "did not sign" in tls._client_rejected("TLSV1_ALERT_UNKNOWN_CA", "robot", "dir")
+
+
+@pytest.mark.slow
+def test_a_server_that_never_answers_the_handshake_is_reported(tmp_path: Path) -> None:
+    Authority.make(tmp_path, "test", 1, ["localhost"]).issue(tmp_path, "robot", ["localhost"], 1)
+    with socket.create_server(("127.0.0.1", 0)) as deaf:
+        found = trouble(f"tls/localhost:{deaf.getsockname()[1]}", str(tmp_path))
+    assert "does not answer the TLS handshake" in found
+
+
+def test_an_impossible_port_is_reported(tmp_path: Path) -> None:
+    assert "no program listens" in trouble("tls/localhost:99999999999999999999", str(tmp_path))
