@@ -191,7 +191,7 @@ def main_add(args: argparse.Namespace) -> int:
         return 0
     if args.write:
         names = write(change(args.write, keys, new=True)[f"access.{listed}"])
-        print(f"{place} is for {args.name}; {args.write} now has access.{listed} = {names}")
+        print(f"give {place} to {args.name}; {args.write} now contains access.{listed} = {names}")
     else:
         names = write(keys(config)[f"access.{listed}"])
         print(_ADDED.format(place=place, name=args.name, where=where))

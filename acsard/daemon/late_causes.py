@@ -185,7 +185,8 @@ def memory(late: Lateness) -> str:
 def disk(late: Lateness) -> str:
     """Return the cause in words if the control loop's thread waited for a disk, else "".
 
-    If `memory` applies, return "". One of two durations must be long enough:
+    If the function `memory` returns a cause, return "", because waiting for memory also counts as
+    waiting for a disk. One of two durations must be long enough:
 
     - the time for which the thread itself waited for a disk. Not every kernel measures this time.
     - the time in which any program waited for a disk. It counts only if the thread itself read from

@@ -141,7 +141,7 @@ class SettingsFile:
             self.differ = f"the daemon cannot compare its settings with its file ({error})"
 
     def use(self, config: Config) -> None:
-        """Compare the file with `config` from now on, and again whenever the file changes.
+        """Compare the file with `config` now, and again whenever the file changes.
 
         Args:
             config: the settings in force, but without the lower speed limit that a client may have

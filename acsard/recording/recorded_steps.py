@@ -57,7 +57,7 @@ class Start(NamedTuple):
 
     number: int
     state: bytes
-    """The robot and the memory of its guard, encoded by `state.freeze`; empty for a new robot."""
+    """The state of the robot and of its guard, encoded by `state.freeze`; empty for a new robot."""
     config: Config
     """Configuration before the step `number`, with all changes since the daemon's start."""
 

@@ -175,7 +175,7 @@ def _groups(files: Sequence[Path], chosen: dict[int, Contents]) -> list[list[int
 
 
 def _earlier(files: Sequence[Path], number: int, contents: Contents) -> list[int]:
-    """Return the indices of the files with the earlier part of a drive, the oldest file first.
+    """Return the indices of the earlier files of a drive, the oldest file first.
 
     It is the drive during which the file with the index `number` begins.
     """

@@ -182,9 +182,9 @@ def _messages() -> Described:
 
 
 def _flat(node: Any, before: str) -> Any:
-    """Replace references to `$defs` by references to components.
+    """Replace each reference to `$defs` by a reference to a component.
 
-    Their names begin with `before`.
+    The name of the component is the old name with the prefix `before`.
     """
     if isinstance(node, list):
         return [_flat(one, before) for one in node]

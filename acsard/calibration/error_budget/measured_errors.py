@@ -101,10 +101,10 @@ def _even(t: Floats) -> LineTimes:
 
 
 def _asked(t: Floats, sent: Floats) -> LineTimes | None:
-    """Estimate the delays for a board that answers each line of the daemon.
+    """Estimate how late the replies arrived, for a board that answers each line of the daemon.
 
-    Return None if `sent`, the times of the daemon's lines, does not cover the whole time of the
-    replies.
+    Return None if `sent`, the times of the daemon's lines, does not reach from the first reply to
+    the last.
     """
     if len(sent) < 3 or sent[0] > t[0] or len(sent) < len(t) / 2:
         return None
@@ -222,9 +222,8 @@ def motion(lines: list[Line], sent: Floats, kinematics: Kinematics, whole: bool)
         sent: the time at which the daemon sent each of its lines to the board, s.
         kinematics: the geometry of the robot.
         whole: whether this program received every feedback line that the daemon received. If it is
-            false, a line may have been lost only between the daemon and this program, which is not
-            an error of the odometry. Lost lines then count only in gaps that the odometry did not
-            fill.
+            false, a line that is missing here may have reached the daemon. It is then counted as an
+            error only if the odometry of the daemon has a gap too.
     """
     t = np.array([line.at for line in lines])
     found = line_times(t, sent)
@@ -491,10 +490,10 @@ class Driving:
         return self._steps(np.column_stack(variances))
 
     def contradicted(self) -> Steps:
-        """Return the steps with the errors that differences between front and rear wheels show.
+        """Return the steps, each with the error that its front and rear wheels show.
 
-        One wheel of each side is assumed to be right. The mean of both wheels is then wrong by
-        half of their difference.
+        On each side, one wheel is assumed to be right. The mean of both wheels is then wrong by
+        half of the difference between the two wheels.
         """
         turned = np.diff([line.positions for line in self._lines], axis=0)
         front_right, front_left, rear_left, rear_right = turned.T

@@ -23,7 +23,7 @@ STALL_REASON = (
 )
 
 RESPONSE_TIMEOUT_S = 1.5
-"""Time for which the robot may take to follow a changed command, including the ramp, s."""
+"""Time that the robot may take to follow a changed command, including the ramp, s."""
 
 DEVIATION_TIMEOUT_S = 1.0
 """Time for which the robot may deviate from the command, s, before the leg is halted."""

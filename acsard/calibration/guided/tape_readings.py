@@ -404,7 +404,7 @@ def calibrated(
 
 
 def _improvement(readings: Sequence[Reading], base: Base, fit: TapeFit, rate: Rates) -> Improvement:
-    """Compare the parameters by each reading's residual in a fit to all other readings."""
+    """Compare the present and the new parameters: predict each reading by a fit to the others."""
     sums = {name: np.zeros(3) for name in ("turn", "straight", "place")}
     present = fit.parameters.copy()
     present[: P.DELAY] = base.start()[: P.DELAY]

@@ -118,7 +118,7 @@ class Lateness:
 
         Only a good line from the board ends a silence. The built-in simulator runs on this
         computer, so this computer causes each of the simulator's silences. With the simulator, the
-        result is therefore True for every step that receives a good line.
+        result is therefore True for every good line, whether or not a silence was before it.
 
         Args:
             now_ns: the monotonic time of the control step, ns.

@@ -216,7 +216,7 @@ class FreeRunningTimes:
         return self._lag * self.usual
 
     def place(self, behind: int) -> Placed | None:
-        """Return the time of a line of the last read, or None if no clock has been found.
+        """Return the time of a line of the last read, or None if the board has no known rhythm.
 
         `behind` is the number of lines that follow the line in the read.
         """
@@ -281,10 +281,10 @@ class FreeRunningTimes:
     def _clocks(
         self, reads: list[Read], gaps: list[int]
     ) -> Iterator[tuple[list[int], float, float]]:
-        """Yield candidate clocks, the likelier ones first.
+        """Yield possible rhythms of the board's lines, the likelier ones first.
 
-        A candidate is a triple: the slot of each read's last line, the largest allowed lateness in
-        slots, and the period in ns.
+        Each is a triple: for each read, the number of the period (slot) in which its last line was
+        due; the largest allowed lateness in slots; and the period in ns.
         """
         # The configured periods come before the measured period, because for jittery lines they are
         # more reliable than half a second of data.

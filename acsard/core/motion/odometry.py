@@ -71,7 +71,7 @@ class Step(Struct, frozen=True, gc=False):
     turn: float
     """Change of the heading that this line caused, rad."""
     on_trial: bool
-    """Whether the turn came from the wheels because the gyro was not proven yet."""
+    """Whether the turn was computed from the wheels because the gyro was still on trial."""
     share: float = 1.0
     """Effective track that was used for this feedback line, divided by the configured track."""
 

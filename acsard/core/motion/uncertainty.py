@@ -83,9 +83,9 @@ class PoseUncertainty:
         self.set(0.0)
 
     def bend(self) -> None:
-        """Use the present effective track and columns of the error model from now on.
+        """Read the effective track and the columns of the error model again.
 
-        The error model must have as many columns as before.
+        Call this when they have changed. The error model must have as many columns as before.
         """
         beside = self._effects[len(self._parameters) :]
         self._parameters = self._model.columns

@@ -246,7 +246,10 @@ def _node(ros: RosConfig, zid: str) -> Node:
 
 
 def _bridge(ros: RosConfig, zid: str, names: tuple[RosName, ...]) -> Iterator[Endpoint]:
-    """Announce no topic with two types, because a DDS reader has only one type."""
+    """Yield an endpoint for each name. A name with two types is not announced to ROS.
+
+    The reason is that a DDS reader has only one type.
+    """
     for row in names:
         twins = [other for other in names if other.name == row.name]
         if row is not twins[0]:

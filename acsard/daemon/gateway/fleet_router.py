@@ -27,7 +27,7 @@ from acsard.host import clock
 from acsard.host.errors import InUseError, RouterFileError, UsageError
 
 EXAMPLE_ROBOT = "robot1"
-"""Id of the robot in the template."""
+"""Id of the example robot in `router.json5`, which is the template."""
 
 ROBOTS_COMMENT = "// This file is for {}. To make a file for your own robots:\n"
 """Comment near the top of the template and of the router's file. The ids of the robots replace

@@ -160,7 +160,7 @@ def connection_counts(holders: Sequence[str]) -> str:
 
 
 CHECK_PERIOD_S = 0.25
-"""Time between two observations of the session, and between two checks by the main thread, s."""
+"""Interval at which a thread looks at the Zenoh session, and the main thread at that thread, s."""
 
 MAX_MEMORY_BYTES = 192 << 20
 """Limit of the data memory of this process, bytes. The process needs 35 MB, or 72 MB if all

@@ -44,8 +44,8 @@ QUERY_TIMEOUT_S = 60.0
 class Gateway(Listener):
     """The TLS gateway, as a `Listener`.
 
-    The gateway admits clients only after the daemon has started. It reports the number of its
-    connections to the daemon.
+    The gateway admits clients only after the daemon has started. It tells the daemon how many
+    clients are connected.
     """
 
     most = MAX_SESSIONS - 1
