@@ -15,6 +15,7 @@ from msgspec.structs import replace
 
 from acsard.core.motion.lifecycle import number_after_restart, with_causes
 from acsard.core.values import NS_PER_S, AcsardError, Event, Instant, Latch, Latches
+from acsard.host.errors import MSGSPEC_ERRORS
 
 FORMAT = 1
 """Version of the latch file's format. A file with another version counts as unreadable."""
@@ -81,7 +82,7 @@ def decode(robot: str, data: bytes) -> Latches:
                 f"format {FORMAT})"
             )
         content = msgspec.convert(raw, _Content)
-    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+    except MSGSPEC_ERRORS as error:
         raise LatchFileError(f"it is damaged ({error})") from None
     if content.robot != robot:
         raise LatchFileError(f"it belongs to the robot {_safe(content.robot)!r:.60}")

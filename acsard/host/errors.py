@@ -10,7 +10,12 @@ from __future__ import annotations
 
 from enum import IntEnum
 
+import msgspec
+
 from acsard.core.values import AcsardError
+
+MSGSPEC_ERRORS = msgspec.MsgspecError, UnicodeDecodeError, RecursionError
+"""Exceptions that msgspec raises for damaged data. Only the first one is documented."""
 
 
 class Exit(IntEnum):

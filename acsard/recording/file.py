@@ -48,7 +48,7 @@ from msgspec import Struct
 
 from acsard.core.formatting import many
 from acsard.core.values import NS_PER_S
-from acsard.host.errors import RecordingError
+from acsard.host.errors import MSGSPEC_ERRORS, RecordingError
 from acsard.recording.end_record import (
     END_RECORD_NAME,
     EndRecord,
@@ -566,7 +566,7 @@ def event_of(recording: Recording, data: bytes) -> TimelineEntry:
     """Decode a message of the channel `events`. Raises `RecordingError` if it is damaged."""
     try:
         return msgspec.json.decode(data, type=TimelineEntry)
-    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+    except MSGSPEC_ERRORS as error:
         raise RecordingError(
             f"{recording.path} has an event that cannot be read: {error}"
         ) from None

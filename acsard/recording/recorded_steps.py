@@ -26,6 +26,7 @@ from acsard.core.values import (
     Outputs,
     Recording,
 )
+from acsard.host.errors import MSGSPEC_ERRORS
 
 US_PER_S = 1e6
 
@@ -172,7 +173,7 @@ def unfinished(data: bytes) -> Unfinished:
     """
     try:
         return _unfinished.decode(data)
-    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+    except MSGSPEC_ERRORS as error:
         raise UnfinishedError(
             f"the step in which the daemon failed cannot be read: {error}"
         ) from None

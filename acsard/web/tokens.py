@@ -21,7 +21,7 @@ from msgspec import Struct
 
 from acsard.core.values import Role
 from acsard.host.atomic_file import replace
-from acsard.host.errors import MendableError, NotPermittedError, UsageError
+from acsard.host.errors import MSGSPEC_ERRORS, MendableError, NotPermittedError, UsageError
 from acsard.web.callers import Who
 
 FILE, MODE = "tokens.json", 0o600
@@ -33,9 +33,6 @@ HOUR_S, DAY_S = 3600, 86400
 
 MAX_TOKENS = 200
 """Maximum number of tokens of one robot."""
-
-DAMAGE_ERRORS = msgspec.MsgspecError, UnicodeDecodeError, RecursionError
-"""Exceptions of msgspec for a damaged token file."""
 
 
 class Token(Struct, frozen=True):
@@ -95,7 +92,7 @@ class Vault:
             read = self._read
             if stamp != read[0]:
                 read = stamp, msgspec.json.decode(self.path.read_bytes(), type=list[Token])
-        except (OSError, *DAMAGE_ERRORS):
+        except (OSError, *MSGSPEC_ERRORS):
             # The file is missing or unreadable. A token that cannot be checked must not be
             # accepted.
             read = None, []
@@ -190,7 +187,7 @@ class Vault:
             return msgspec.json.decode(self.path.read_bytes(), type=list[Token])
         except FileNotFoundError:
             return []
-        except DAMAGE_ERRORS as error:
+        except MSGSPEC_ERRORS as error:
             raise UsageError(
                 f"{self.path} is not a list of tokens ({error}): correct it, or move it away "
                 "and invite all users again"
