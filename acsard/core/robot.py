@@ -159,8 +159,8 @@ class Robot:
         self._refused = ""
         self._refused_ns: int | None = None
         self._sanity = Sanity(config.feedback)
-        stops = () if latches.stop is None else latches.stop.causes
-        causes = [latch.why for latch in (latches.fault, *stops) if latch and not latch.by]
+        latched = [latch for latch in (latches.fault, latches.stop) if latch is not None]
+        causes = [one.why for latch in latched for one in latch.causes if not one.by]
         self._estop = EmergencyStop(config.safety.estop, PRESSED_REASON in causes)
         self._bumpers = Bumpers(config.safety)
         self._battery = Battery(config.battery, any(why.startswith(EMPTY_REASON) for why in causes))

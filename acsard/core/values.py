@@ -460,13 +460,13 @@ class Latch(Struct, frozen=True):
     kept: bool = False
     """True if the latch was set before the present run of the daemon."""
     earlier: tuple[Latch, ...] = ()
-    """The earlier causes of the same stop, each as a latch, the newest first. When a new cause
-    replaces a latch, the old latch moves to this tuple. The field `earlier` of the latches in this
-    tuple is empty."""
+    """The earlier causes of the same stop or fault, each as a latch, the newest first. When a new
+    cause replaces a latch, the old latch moves to this tuple. The field `earlier` of the latches in
+    this tuple is empty."""
 
     @property
     def causes(self) -> tuple[Latch, ...]:
-        """All causes of the same stop, each as a latch: this latch, then `earlier`."""
+        """All causes of the same stop or fault, each as a latch: this latch, then `earlier`."""
         return (self, *self.earlier)
 
     def each(self, change: Callable[[Latch], Latch]) -> Latch:

@@ -244,6 +244,26 @@ def test_a_fault_does_not_overwrite_a_stop(world: World) -> None:
     assert world.state.mode == "ready"
 
 
+def test_a_clear_of_one_fault_does_not_release_another_fault_that_came_after_it(
+    world: World,
+) -> None:
+    """The second fault ends by itself, so it would not latch again."""
+    with world.mcu.dead_motor(0):
+        world.drive(0.5, seconds=1.2)
+    assert world.state.mode == "fault"
+    seen = world.state.latch
+    with world.mcu.driver_fault(0.0, 0.3):
+        world.run(0.25)
+        assert world.state.latch > seen
+        world.run(1.0)  # until the board reports that the driver's fault is over
+    assert "a fault of a motor driver" in world.state.reason
+    assert "front_right wheel does not turn" in world.state.reason
+    reply = world.call("clear", msgspec.json.encode({"latch": seen}))
+    assert not reply.success
+    assert world.state.mode == "fault"
+    assert world.call("clear", msgspec.json.encode({"latch": world.state.latch})).success
+
+
 def test_a_stop_during_a_fault_is_latched_as_well(world: World) -> None:
     world.drive(0.5, seconds=1.0)
     runaway(world)

@@ -15,13 +15,15 @@ A pressed emergency stop at the robot, a pressed bumper (with `safety.bumper = "
 battery latch a stop too, and a fault of a motor driver latches a fault. `clear` releases nothing
 while one of these causes lasts.
 
-There is one latch for all causes of a stop. Each new cause gives this latch a new number. The latch
-keeps the earlier causes, so that the operator reads all of them before `clear` releases it.
+There is one latch for all causes of a stop, and one for all causes of a fault. Each new cause gives
+its latch a new number. The latch keeps the earlier causes, so that the operator reads all of them
+before `clear` releases it.
 """
 
 from __future__ import annotations
 
 import math
+import re
 from functools import lru_cache
 
 from msgspec.structs import replace
@@ -39,8 +41,14 @@ MAX_CLIENTS = 4
 first ones are kept, so that a flood of stops neither fills the reason in `state` nor hides the
 first client. The causes from the board need no limit, because there are only a few."""
 
+MAX_FAULTS = 8
+"""Largest number of causes of a fault that are kept. Further causes are ignored until `clear`."""
+
 LONG_AGO_NS = -(2**62)
 """Monotonic time that stands for "never", ns. It is earlier than every real time."""
+
+_VALUES = re.compile(r"[(\d]")
+"""The beginning of the measured values in the text of a fault."""
 
 _DAYS_TO_1970 = 719_468
 """Days from 0000-03-01 to 1970-01-01. `utc` counts years from March, so that the leap day is the
@@ -132,14 +140,18 @@ class Lifecycle:
         self._derive()
 
     def fault(self, why: str, now: Instant) -> bool:
-        """Latch a fault and return True. If a fault is already latched, only return False.
+        """Latch a fault and return True. If this cause is already latched, only return False.
 
-        `why` is the cause of the fault, as text.
+        `why` is the cause of the fault, as text. Two texts that differ only from their first number
+        or bracket on name the same cause, because the rest contains measured values.
         """
-        if self.latches.fault is not None:
-            return False
+        latch = self.latches.fault
+        if latch is not None:
+            known = [_without_values(cause.why) for cause in latch.causes]
+            if _without_values(why) in known or len(known) >= MAX_FAULTS:
+                return False
         self._faulted_ns = now.mono_ns
-        self._latch(fault=self._made(now, "", why))
+        self._latch(fault=with_causes(self._made(now, "", why), latch))
         return True
 
     # requests
@@ -204,7 +216,8 @@ class Lifecycle:
             set_ns = max(self._stopped_ns, self._faulted_ns)
         else:
             if number != latch.number:
-                still = f"in fault ({latch.why})" if latches.fault else _still(latch)
+                faults = "; also ".join(cause.why for cause in latch.causes)
+                still = f"in fault ({faults})" if latches.fault else _still(latch)
                 raise RefusedError(_not_in_force(number, still, "srv/clear"))
             set_ns = self._stopped_ns if latches.fault is None else self._faulted_ns
         if asked_ns <= set_ns or now.mono_ns == set_ns:
@@ -275,9 +288,10 @@ class Lifecycle:
         latches, held = self.latches, self._held
         if latches.next is not None:
             fault, stop = latches.fault, latches.stop
-            parts = [] if fault is None else [f"{fault.why}, latched {_when(fault)}"]
+            faults = () if fault is None else fault.causes
+            parts = [f"{cause.why}, latched {_when(cause)}" for cause in faults]
             causes = () if stop is None else stop.causes
-            if held and held not in [latch.why for latch in (fault, *causes) if latch]:
+            if held and held not in [latch.why for latch in (*faults, *causes)]:
                 # The cause that lasts differs from all latched causes. For example, one of two
                 # pressed bumpers has been released.
                 parts.append(held)
@@ -355,7 +369,7 @@ class Lifecycle:
 
 
 def with_causes(latch: Latch, before: Latch | None) -> Latch:
-    """Return `latch`, the new latch of a stop, with the earlier causes of the stop added to it.
+    """Return `latch`, the new latch of a stop or a fault, with the earlier causes added to it.
 
     `before` is the latch that `latch` replaces, or None. Its causes become the earlier causes,
     except a cause that equals the new one. Of the earlier causes that came from clients, at most
@@ -365,6 +379,10 @@ def with_causes(latch: Latch, before: Latch | None) -> Latch:
     earlier = [replace(cause, earlier=()) for cause in causes if cause.why != latch.why]
     surplus = [cause for cause in earlier if cause.by][:-MAX_CLIENTS]
     return replace(latch, earlier=tuple([cause for cause in earlier if cause not in surplus]))
+
+
+def _without_values(why: str) -> str:
+    return _VALUES.split(why, maxsplit=1)[0]
 
 
 def number_after_restart(kept: int, now: Instant) -> int:

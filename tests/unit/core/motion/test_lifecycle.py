@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from acsard.core.motion.emergency_stop import CHECK, PRESSED_REASON, RELEASE, SILENT_REASON
-from acsard.core.motion.lifecycle import LATCH_REQUIRED_S, Lifecycle, utc
+from acsard.core.motion.lifecycle import LATCH_REQUIRED_S, MAX_FAULTS, Lifecycle, utc
 from acsard.core.motion.modes import Mode, RefusedError, mode_of
 from acsard.core.values import NS_PER_S, Instant, Latch, Latches
 from tests.each import each
@@ -451,12 +451,32 @@ def both() -> Lifecycle:
     return life
 
 
-def test_the_first_fault_stays() -> None:
+def test_each_cause_of_a_fault_is_latched_once_with_a_new_number() -> None:
+    """The texts of one cause differ in their measured values only."""
     life = ready()
-    assert life.fault("first", at(1.0))
-    assert not life.fault("second", at(2.0))
+    assert life.fault("the left wheel is slow (3 %)", at(1.0))
+    first = life.latches.fault
+    assert not life.fault("the left wheel is slow (4 %)", at(2.0))
+    assert life.latches.fault == first
+    assert life.fault("the driver failed", at(3.0))
+    assert not life.fault("the left wheel is slow (5 %)", at(4.0))
     assert mode(life) is Mode.FAULT
-    assert life.why == f"first, latched at {AT}:01 UTC; call srv/clear"
+    assert life.why == (
+        f"the driver failed, latched at {AT}:03 UTC; also the left wheel is slow (3 %), latched at "
+        f"{AT}:01 UTC; call srv/clear"
+    )
+    assert first is not None
+    with pytest.raises(RefusedError, match="the driver failed; also the left wheel is slow"):
+        life.clear(first.number, 5 * NS_PER_S, at(5.0))
+    assert life.latches.fault is not None
+    life.clear(life.latches.fault.number, 5 * NS_PER_S, at(5.0))
+    assert mode(life) is Mode.READY
+
+
+def test_the_number_of_causes_of_a_fault_is_limited() -> None:
+    life = ready()
+    latched = [life.fault(chr(65 + number), at(1.0 + number)) for number in range(20)]
+    assert latched == [True] * MAX_FAULTS + [False] * (20 - MAX_FAULTS)
 
 
 def test_a_fault_keeps_the_stop_and_each_is_cleared_separately() -> None:
