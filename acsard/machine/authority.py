@@ -262,8 +262,7 @@ def _write(files: Mapping[Path, tuple[bytes, int]]) -> None:
     except OSError as error:
         if isinstance(error, PermissionError):
             raise
-        text = f"cannot write {path}: {error.strerror}; the earlier files are unchanged"
-        raise MendableError(text) from None
+        raise MendableError(f"cannot write {path}: {error.strerror}") from None
     finally:
         for written in new.values():
             with suppress(OSError):

@@ -215,11 +215,16 @@ async def _renew(
     context: ssl.SSLContext, names: set[str], files: CertificateFiles, directory: str, log: Log
 ) -> None:
     renewed, reported = False, ""
+
+    def late(found: bool) -> None:
+        nonlocal renewed
+        renewed |= found
+
     while True:
         await asyncio.sleep(TIDY_S)
         # A hanging disk must not hang the page.
         with suppress(TimeoutError):
-            renewed = await in_thread(files.renewed, READ_TIMEOUT_S) or renewed
+            renewed |= await in_thread(files.renewed, READ_TIMEOUT_S, late)
         if not renewed:
             continue
         try:

@@ -5,10 +5,9 @@ time, and only `activate` releases the latch of a `deactivate`. Neither request 
 or a `deactivate` that its sender has not seen, even if the network delivers the request late:
 
 - A request that names a number releases the latch with exactly this number.
-- A request without a number is refused if less than `LATCH_REQUIRED_S` has passed since the
-last stop
-  or `deactivate`, or since the start of the daemon. A `clear` may release a fault that its sender
-  has not seen, because a fault that persists latches again.
+- A request without a number is refused if less than `LATCH_REQUIRED_S` has passed since the last
+  stop or `deactivate`, or since the start of the daemon. A `clear` without a number may release a
+  fault that its sender has not seen, because a fault that persists latches again.
 - A request that arrived before the latch was set never releases it.
 
 A pressed emergency stop at the robot, a pressed bumper (with `safety.bumper = "stop"`) and an empty

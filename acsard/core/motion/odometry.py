@@ -235,10 +235,10 @@ class Odometry:
         believed = checks.wheels.believed(speeds.as_tuple())
         linear, angular = self._kinematics.moved(believed)
         twist = Twist(linear, angular / self._track.share)
-        self._still = self._still + dt - feedback.bridged if believed == AT_REST else 0.0
+        own = dt - feedback.bridged
+        self._still = self._still + own if believed == AT_REST else 0.0
         at_rest = self._still > REST_S
         after_gap = rolled.bridged > 0.0 or rolled.unknown > 0.0
-        own = dt - feedback.bridged
         self._rounding.add(believed, own, self._still, after_gap, self._largest_step)
         if rolled.unknown > 0.0:
             self._stand(rolled.unknown, before, twist)

@@ -115,7 +115,7 @@ class Witness:
 
     def __init__(self) -> None:
         self.driven = False
-        """True while one of the four wheels is commanded to turn, and then until this wheel is at
+        """True while any of the four wheels is commanded to turn, and then until this wheel is at
         rest."""
         self.ratio = 1.0
         """Angle that the wheel rolled in the last full `RATIO_DRIVE_S` of driving, divided by the

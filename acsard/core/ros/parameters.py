@@ -118,8 +118,8 @@ def kind_of(name: str) -> inspect.Type:
 
 T = TypeVar("T")
 Some = Annotated[list[T], Meta(max_length=128)]
-"""List with at most 128 items, for the parameters that a request sets. A longer
-request is refused, because its decoding would take too much of the time of a control step."""
+"""List with at most 128 items, for the parameters that a request sets. A longer request is refused,
+because its decoding would take too much of the time of a control step."""
 Many = Annotated[list[T], Meta(max_length=256)]
 """List with at most 256 items, for names of parameters. The limit is higher than the limit of
 `Some`, because a name is decoded faster than a parameter with its value."""
