@@ -456,7 +456,7 @@ class Robot:
             self._reject(why, 1, events)
             self._odometry.skip(line)
             if self._sanity.doubtful:
-                self._fault(f"the board reports impossible speeds: {why}", now, events)
+                self._fault(f"the board reports impossible speeds ({why})", now, events)
             return []
         lines, dropped = self._odometry.confirmed(line)
         if dropped:

@@ -124,7 +124,6 @@ class Followed:
         self._before: dict[str, Command] = {}
         """The newest command of each adjusted clock that was followed."""
         self._armed_since_ns = witness.armed_since_ns
-        self._mode = ""
         self._decided_ns = 0
         """Beginning of the step before."""
 
@@ -276,8 +275,9 @@ class Followed:
         """
         witness = self._witness
         armed_since_ns = witness.armed_since_ns
-        disarmed = armed_since_ns != self._armed_since_ns or (mode == "fault" != self._mode)
-        self._armed_since_ns, self._mode = armed_since_ns, mode
+        # Each further cause of a fault makes the daemon forget all commands again.
+        disarmed = armed_since_ns != self._armed_since_ns or mode == "fault"
+        self._armed_since_ns = armed_since_ns
         stood = decided_ns - self._decided_ns > STOOD_NS
         self._decided_ns = decided_ns
         if disarmed or stood or witness.pending or link != "up":

@@ -246,7 +246,7 @@ def test_echoes_that_contradict_the_lines_of_a_stalled_adapter_are_the_cause_of_
     witness.step(NS // 2, "driving", "driving: commanded by app")
     witness.troubles = dict.fromkeys(troubles, NS)
     with pytest.raises(BrokenError, match="without a cause") if finding else nullcontext():
-        witness.step(NS, "fault", "the board reports impossible speeds: front_right is too fast")
+        witness.step(NS, "fault", "the board reports impossible speeds (front_right is too fast)")
 
 
 def test_a_pressed_input_is_a_stop_until_its_release_and_a_clear_behind_that() -> None:

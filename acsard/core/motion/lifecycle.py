@@ -31,17 +31,18 @@ from acsard.core.motion.modes import SHUTDOWN_REASON, Mode, RefusedError, mode_o
 from acsard.core.values import NS_PER_S, Instant, Latch, Latches
 
 LATCH_REQUIRED_S = 2.0
-"""Time after a stop, a `deactivate` or the start of the daemon in which a call `clear` or
-`activate` must name the number of the latch, s. A `clear` that can only release a fault need not
-name it. The network seldom takes longer to deliver a packet."""
+"""Time after a stop, a fault, a `deactivate` or the start of the daemon in which a call `clear` or
+`activate` must name the number of the latch, s. The network seldom takes longer to deliver a
+packet."""
 
 MAX_CLIENTS = 4
 """Largest number of clients among the earlier causes of a stop. If more clients stop the robot, the
 first ones are kept, so that a flood of stops neither fills the reason in `state` nor hides the
 first client. The causes from the board need no limit, because there are only a few."""
 
-MAX_FAULTS = 8
-"""Largest number of causes of a fault that are kept. Further causes are ignored until `clear`."""
+MAX_FAULTS = 32
+"""Largest number of causes of a fault that are kept. There are fewer different causes, so that none
+is lost. Further ones would be ignored until `clear`."""
 
 LONG_AGO_NS = -(2**62)
 """Monotonic time that stands for "never", ns. It is earlier than every real time."""
@@ -74,7 +75,7 @@ class Lifecycle:
         self._stopped_ns = self._faulted_ns = LONG_AGO_NS
         """Monotonic times at which the last stop and the last fault were latched, ns."""
         self._cleared_ns = LONG_AGO_NS
-        """Monotonic time at which a fault was last cleared, ns (see `_require_seen_stop`)."""
+        """Monotonic time at which a fault was last cleared, ns."""
         self._stop_asked_ns = LONG_AGO_NS
         """Latest monotonic time at which a client's request for a stop arrived, ns."""
         self._off_ns = LONG_AGO_NS
@@ -211,13 +212,22 @@ class Lifecycle:
                 "again"
             )
         if number is None:
-            self._require_seen_stop(asked_ns)
             set_ns = max(self._stopped_ns, self._faulted_ns)
+            if asked_ns - self._cleared_ns < LATCH_REQUIRED_S * NS_PER_S:
+                # The network may have delivered one call twice.
+                raise RefusedError(
+                    f"a latch was cleared less than {LATCH_REQUIRED_S:g} s ago; the robot is still "
+                    f"{_in_force(latches)}: look at the robot, then call srv/clear again"
+                )
+            stop = latches.stop
+            if latches.fault is None or (stop and self._stopped_ns > self._faulted_ns):
+                was = f"the robot was {_stopped(stop or latch)}"
+            else:
+                was = f"the robot went into fault ({latches.fault.why})"
+            self._require_seen(was, _in_force(latches), set_ns, asked_ns, "srv/clear")
         else:
             if number != latch.number:
-                faults = "; also ".join(cause.why for cause in latch.causes)
-                still = f"in fault ({faults})" if latches.fault else _still(latch)
-                raise RefusedError(_not_in_force(number, still, "srv/clear"))
+                raise RefusedError(_not_in_force(number, _in_force(latches), "srv/clear"))
             set_ns = self._stopped_ns if latches.fault is None else self._faulted_ns
         if asked_ns <= set_ns or now.mono_ns == set_ns:
             raise RefusedError(
@@ -256,7 +266,13 @@ class Lifecycle:
             raise RefusedError(_not_in_force(number, still, "srv/activate"))
         if latch is not None:
             if number is None:
-                self._require_seen(latch, self._off_ns, asked_ns, "srv/activate")
+                self._require_seen(
+                    f"the robot was {_stopped(latch)}",
+                    _still(latch),
+                    self._off_ns,
+                    asked_ns,
+                    "srv/activate",
+                )
             if asked_ns <= self._off_ns or now.mono_ns == self._off_ns:
                 raise RefusedError(
                     f"{latch.why} at the same time as this call or after it: call srv/activate "
@@ -334,33 +350,22 @@ class Lifecycle:
             commanded=self._commanded,
         )
 
-    def _require_seen_stop(self, asked_ns: int) -> None:
-        stop = self.latches.stop
-        if stop is None:
-            return
-        if asked_ns - self._cleared_ns < LATCH_REQUIRED_S * NS_PER_S:
-            # The network may have delivered one call twice.
-            raise RefusedError(
-                f"a latch was cleared less than {LATCH_REQUIRED_S:g} s ago; the robot is still "
-                f"{_still(stop)}: look at the robot, then call srv/clear again"
-            )
-        self._require_seen(stop, self._stopped_ns, asked_ns, "srv/clear")
+    def _require_seen(self, was: str, still: str, set_ns: int, asked_ns: int, call: str) -> None:
+        """Raise `RefusedError` if the sender of the request may not know the latch yet.
 
-    def _require_seen(self, latch: Latch, set_ns: int, asked_ns: int, call: str) -> None:
-        """Raise `RefusedError` if the sender of the request may not know `latch` yet.
-
-        `set_ns` is `LONG_AGO_NS` if an earlier run set the latch.
+        `was` names the newest cause, and `still` names all causes, as text. `set_ns` is the time of
+        the newest cause, or `LONG_AGO_NS` if an earlier run set the latch.
         """
         began_ns = LONG_AGO_NS if self._began_ns is None else self._began_ns
         since = asked_ns - max(set_ns, began_ns)
         if since >= LATCH_REQUIRED_S * NS_PER_S:
             return
         age_s = max(0.1, math.floor(since / NS_PER_S * 10) / 10)
-        came = f"the robot was {_stopped(latch)} {age_s:.1f} s ago"
+        came = f"{was} {age_s:.1f} s ago"
         if set_ns < began_ns:
             # An earlier run set the latch. Its age is unknown, because the monotonic clock may have
             # restarted and the wall clock may have been set since.
-            came = f"the daemon started {age_s:.1f} s ago and the robot is still {_still(latch)}"
+            came = f"the daemon started {age_s:.1f} s ago and the robot is still {still}"
         raise RefusedError(
             f"{came}: look at the robot, then call {call} again when {LATCH_REQUIRED_S:g} s have "
             "passed since then, or name the number of the latch that you have seen"
@@ -405,6 +410,12 @@ def _not_in_force(number: int, still: str, call: str) -> str:
     )
 
 
+def _in_force(latches: Latches) -> str:
+    if latches.fault is not None:
+        return f"in fault ({'; also '.join([cause.why for cause in latches.fault.causes])})"
+    return _still(latches.stop) if latches.stop else ""
+
+
 def _still(latch: Latch) -> str:
     return " and ".join([_stopped(cause) for cause in latch.causes])
 
@@ -429,7 +440,7 @@ def _said(latch: Latch) -> str:
 
 
 # The daemon publishes the time of a latch in every step, so the text is cached.
-@lru_cache(8)
+@lru_cache(MAX_FAULTS + MAX_CLIENTS + 8)
 def utc(wall_ns: int) -> str:
     """Return a time, ns since 1970, in the form `2026-11-22 13:05:07 UTC` (Gregorian calendar)."""
     days, seconds = divmod(wall_ns // NS_PER_S, 86_400)

@@ -1591,13 +1591,34 @@ def impossible(bench: Bench, lines: int) -> Bench:
     return bench
 
 
+def test_impossible_speeds_of_any_wheel_are_one_cause_and_hide_no_later_cause() -> None:
+    bench = impossible(Bench().driving(), 3)
+    for wheel in range(4):
+        for speed in (99.0, -99.0):
+            speeds = [0.0, 0.0, 0.0, 0.0]
+            speeds[wheel] = speed
+            bench.reply = bench.codec.encode(WheelSpeeds(*speeds))
+            bench.step(GO)
+    latch = bench.robot.latches.fault
+    assert latch is not None
+    assert len(latch.causes) == 1
+    bench.step(GO, guard_trip="a wheel is too fast")
+    newest = bench.robot.latches.fault
+    assert newest is not None
+    assert newest.number != latch.number
+    assert [cause.why.split(" (")[0] for cause in newest.causes] == [
+        "the daemon's guard replaced a line for the board with zeros: a wheel is too fast",
+        "the board reports impossible speeds",
+    ]
+
+
 def test_a_third_impossible_line_is_a_fault_that_brakes_by_the_stop_deceleration() -> None:
     bench = impossible(Bench().driving(), 2)
     assert (bench.mode(), bench.out.applied) == ("driving", GO)
     impossible(bench, 1)
     assert bench.mode() == "fault"
     assert bench.out.reason.startswith(
-        "the board reports impossible speeds: front_right at 99.00 rad/s"
+        "the board reports impossible speeds (front_right at 99.00 rad/s"
     )
     # Each step removes 3 m/s2 x 10 ms.
     assert bench.out.applied.linear == pytest.approx(0.47)

@@ -293,7 +293,7 @@ def test_a_failed_query_of_the_daemon_has_advice_that_fits_its_error(
 @pytest.mark.parametrize(
     ("reason", "mend", "unfit"),
     [
-        ("the board reports impossible speeds: 900 rad/s", "acsard mcu check", "defect of acsard"),
+        ("the board reports impossible speeds (900 rad/s)", "acsard mcu check", "defect of acsard"),
         (
             "the daemon's guard replaced a line for the board with zeros: too fast",
             "defect of acsard",

@@ -475,8 +475,8 @@ def test_each_cause_of_a_fault_is_latched_once_with_a_new_number() -> None:
 
 def test_the_number_of_causes_of_a_fault_is_limited() -> None:
     life = ready()
-    latched = [life.fault(chr(65 + number), at(1.0 + number)) for number in range(20)]
-    assert latched == [True] * MAX_FAULTS + [False] * (20 - MAX_FAULTS)
+    latched = [life.fault(chr(65 + number), at(1.0 + number)) for number in range(MAX_FAULTS + 2)]
+    assert latched == [True] * MAX_FAULTS + [False] * 2
 
 
 def test_a_fault_keeps_the_stop_and_each_is_cleared_separately() -> None:
@@ -523,13 +523,48 @@ def test_a_clear_named_for_a_stop_is_refused_when_a_fault_has_come() -> None:
     assert life.latches.stop is not None
 
 
-def test_a_clear_that_arrived_after_the_beginning_of_a_lasting_fault_releases_the_fault() -> None:
+def test_a_clear_without_a_number_releases_a_fault_only_when_the_client_may_have_seen_it() -> None:
     life = ready()
     life.fault("a wheel is dead", at(3.0))
-    assert not life.fault("a wheel is dead", at(5.0))
-    with pytest.raises(RefusedError, match="call srv/clear again"):
-        life.clear(None, ns(2.0), at(5.0))
-    life.clear(None, ns(4.0), at(5.0))
+    with pytest.raises(RefusedError, match=r"went into fault \(a wheel is dead\) 1\.5 s ago"):
+        clear(life, 4.5)
+    life.fault("the driver failed", at(5.0))
+    with pytest.raises(RefusedError, match=r"went into fault \(the driver failed\) 1\.9 s ago"):
+        clear(life, 4.9 + LATCH_REQUIRED_S)
+    clear(life, 5.0 + LATCH_REQUIRED_S)
+    assert mode(life) is Mode.READY
+
+
+def test_the_second_delivery_of_a_clear_does_not_release_a_fault_that_came_between_the_two() -> None:
+    life = ready()
+    life.fault("a wheel is dead", at(1.0))
+    clear(life, 5.0)
+    life.fault("a wheel is dead", at(5.05))
+    with pytest.raises(RefusedError, match="a latch was cleared less than 2 s ago"):
+        clear(life, 5.1)
+    clear(life, 5.1, number(life))
+    assert mode(life) is Mode.READY
+
+
+def test_a_clear_without_a_number_is_refused_while_the_newest_of_fault_and_stop_is_young() -> None:
+    life = both()
+    with pytest.raises(RefusedError, match="went into fault"):
+        clear(life, 3.0)
+    stop(life, 5.0, "bob")
+    with pytest.raises(RefusedError, match=r"was stopped by bob 1\.0 s ago"):
+        clear(life, 6.0)
+    assert "fault cleared" in clear(life, 5.0 + LATCH_REQUIRED_S)
+
+
+def test_a_fault_from_before_a_restart_needs_a_number_in_the_first_two_seconds() -> None:
+    before = ready()
+    before.fault("a wheel is dead", at(1.0))
+    life = Lifecycle(True, before.latches)
+    life.begin(at(10.0))
+    life.link(up=True)
+    with pytest.raises(RefusedError, match="daemon started 1.0 s ago and the robot is still in fa"):
+        clear(life, 11.0)
+    clear(life, 10.0 + LATCH_REQUIRED_S)
     assert mode(life) is Mode.READY
 
 
