@@ -535,7 +535,7 @@ def test_a_clear_without_a_number_releases_a_fault_only_when_the_client_may_have
     assert mode(life) is Mode.READY
 
 
-def test_the_second_delivery_of_a_clear_does_not_release_a_fault_that_came_between_the_two() -> None:
+def test_the_second_delivery_of_a_clear_does_not_release_a_fault_that_came_between() -> None:
     life = ready()
     life.fault("a wheel is dead", at(1.0))
     clear(life, 5.0)
@@ -562,7 +562,7 @@ def test_a_fault_from_before_a_restart_needs_a_number_in_the_first_two_seconds()
     life = Lifecycle(True, before.latches)
     life.begin(at(10.0))
     life.link(up=True)
-    with pytest.raises(RefusedError, match="daemon started 1.0 s ago and the robot is still in fa"):
+    with pytest.raises(RefusedError, match="and the robot is still in fault"):
         clear(life, 11.0)
     clear(life, 10.0 + LATCH_REQUIRED_S)
     assert mode(life) is Mode.READY
