@@ -711,6 +711,8 @@ class Run:
             self.followed.forget()
             self.liveness.event()
         self.followed.step(true_ns, seen.decided_ns, seen.followed_ns, seen.mode, seen.link)
+        if any(name == "fault" for name, _, _ in seen.events):
+            witness.faults.append(seen.decided_ns + offset)
         witness.step(seen.decided_ns + offset, seen.mode, seen.reason, self._fed_ns)
         if seen.link == "up" and self._link not in ("up", "stale"):
             # Commands that came before the link do not count.

@@ -276,7 +276,7 @@ class Followed:
         witness = self._witness
         armed_since_ns = witness.armed_since_ns
         # Each further cause of a fault makes the daemon forget all commands again.
-        disarmed = armed_since_ns != self._armed_since_ns or mode == "fault"
+        disarmed = armed_since_ns != self._armed_since_ns or mode in ("fault", "shutdown")
         self._armed_since_ns = armed_since_ns
         stood = decided_ns - self._decided_ns > STOOD_NS
         self._decided_ns = decided_ns

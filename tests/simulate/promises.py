@@ -151,6 +151,8 @@ class Witness:
         self.ending_ns: int | None = None
         """When the daemon got SIGTERM."""
         self.fault_ns: int | None = None
+        self.faults: list[int] = []
+        """Times of the causes of the fault that no clear has released, as the log names them."""
         self.mode_ns = 0
         """Time of the last change of the mode."""
         self.away = False
@@ -211,7 +213,7 @@ class Witness:
         if self.blocked_ns is not None:
             self.blocked_ns = at_ns  # this daemon has not yet had the time to find that out
         self.unfaulted_ns = -LOOK_NS
-        """When a clear last released a fault and left the stop."""
+        """When a clear last released a fault."""
         self.timeout = dict(self.file_timeout)
         self.pause_ns = self.file_pause_ns
         for name, value in self.file.items():
@@ -335,10 +337,13 @@ class Witness:
             return
         self.counts["clear"] += 1
         self.arming(asked_ns)
+        faulty = self.fault_ns is not None or bool(self.faults)
+        self._release(self.faults, "a clear releases no later fault", asked_ns, read_ns, name)
         if self.fault_ns is not None and self.fault_ns <= asked_ns:
-            self.fault_ns = None
-        if "still" in text:
+            self.fault_ns = min(self.faults, default=None)
+        if faulty:
             self.unfaulted_ns = asked_ns
+        if "still" in text:
             return
         self.perhaps_latched.discard("clear")
         self._release(self.stops, "a clear releases no later stop", asked_ns, read_ns, name)
@@ -357,7 +362,7 @@ class Witness:
         # A stop that arrived behind the call stays latched. The answer may be later than both.
         later = [at_ns for at_ns in latched if at_ns > asked_ns]
         # The network may deliver one clear twice, and its sender may not know of a start.
-        last_ns = max(self.born_ns, self.unfaulted_ns if latched is self.stops else 0)
+        last_ns = max(self.born_ns, self.unfaulted_ns if latched is not self.offs else 0)
         for at_ns in latched[: len(latched) - len(later)]:
             seen = read_ns is not None and read_ns >= at_ns
             late = read_ns is None and asked_ns >= max(at_ns, last_ns) + LOOK_NS - MARGIN_NS
@@ -401,6 +406,7 @@ class Witness:
                 self.stops = [at_ns for at_ns in self.stops if at_ns != arrived_ns]
             case "clear":
                 self.stops = [at_ns for at_ns in self.stops if at_ns > arrived_ns]
+                self.faults = [at_ns for at_ns in self.faults if at_ns > arrived_ns]
                 if self.fault_ns is not None and self.fault_ns <= arrived_ns:
                     self.fault_ns = None
             case "activate":
@@ -417,6 +423,7 @@ class Witness:
         self.perhaps_latched |= {"clear", "activate"}
         self.stops.clear()
         self.offs.clear()
+        self.faults.clear()
         self.fault_ns = None
         self.limits, self.unsure = dict(self.file), set(self.file)
 

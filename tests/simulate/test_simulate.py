@@ -906,6 +906,22 @@ def test_a_clear_without_a_number_must_wait_behind_a_start_and_behind_the_clear_
         witness.cleared(int(at_s * NS), None, CLEARED, "ann")
 
 
+@pytest.mark.parametrize(
+    ("read_s", "at_s", "finding"),
+    [(2.9, 9.0, True), (3.1, 3.2, False), (None, 4.9, True), (None, 5.0, False)],
+)
+def test_a_clear_releases_no_cause_of_a_fault_that_its_sender_has_not_seen(
+    read_s: float | None, at_s: float, finding: bool
+) -> None:
+    witness = witnessed()
+    witness.fault_ns, witness.faults = 2 * NS, [2 * NS, 3 * NS]
+    promise = "a clear releases no later fault"
+    with pytest.raises(BrokenError, match=promise) if finding else nullcontext():
+        read_ns = None if read_s is None else int(read_s * NS)
+        witness.cleared(int(at_s * NS), read_ns, CLEARED, "ann")
+        assert not (witness.fault_ns or witness.faults)
+
+
 @pytest.mark.parametrize(("junk", "armed"), [("not a number", False), ("stranger", True)])
 def test_a_zero_before_what_may_be_a_speed_of_the_same_identity_arms_nobody(
     junk: str, armed: bool

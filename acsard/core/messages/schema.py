@@ -520,9 +520,9 @@ class Release(Message, frozen=True):
     """Number of the latch to release, as in `RobotState.latch`.
 
     For `activate`, 0 means that the robot is off without a latch. If the number is null, the
-    client may not know of the latch yet. Such a call is refused for 2 s after a stop, after a
-    `deactivate` and after the start of the daemon. If a fault is cleared while a stop is latched,
-    a `clear` without a number is also refused for the next 2 s.
+    client may not know of the latch yet. A `clear` without a number is refused for 2 s
+    after a stop, a fault, the `clear` of a fault and the start of the daemon; an `activate` without
+    a number for 2 s after a `deactivate` and the start of the daemon.
     """
 
 

@@ -1,13 +1,13 @@
 """Keeps the latches and the other facts that determine the mode, and derives the mode from them.
 
 A latch is set by a stop, a fault or `deactivate`. Only `clear` releases a stop or a fault, one at a
-time, and only `activate` releases the latch of a `deactivate`. Neither request may release a stop
-or a `deactivate` that its sender has not seen, even if the network delivers the request late:
+time, and only `activate` releases the latch of a `deactivate`. Neither request may release a latch
+that its sender has not seen, even if the network delivers the request late:
 
 - A request that names a number releases the latch with exactly this number.
 - A request without a number is refused if less than `LATCH_REQUIRED_S` has passed since the last
-  stop or `deactivate`, or since the start of the daemon. A `clear` without a number may release a
-  fault that its sender has not seen, because a fault that persists latches again.
+  stop, the last fault, the last `clear` of a fault or the start of the daemon. For `activate`, the
+  time runs from the last `deactivate` or the start of the daemon.
 - A request that arrived before the latch was set never releases it.
 
 A pressed emergency stop at the robot, a pressed bumper (with `safety.bumper = "stop"`) and an empty
@@ -213,7 +213,8 @@ class Lifecycle:
             )
         if number is None:
             set_ns = max(self._stopped_ns, self._faulted_ns)
-            if asked_ns - self._cleared_ns < LATCH_REQUIRED_S * NS_PER_S:
+            last_ns = self._cleared_ns
+            if set_ns <= last_ns and asked_ns - last_ns < LATCH_REQUIRED_S * NS_PER_S:
                 # The network may have delivered one call twice.
                 raise RefusedError(
                     f"a latch was cleared less than {LATCH_REQUIRED_S:g} s ago; the robot is still "
