@@ -99,7 +99,7 @@ class Report(Struct, frozen=True):
     if no better settings were found.
     """
     effective_track: float
-    """Effective track, m."""
+    """Effective track, m: the distance between left and right wheels that explains the turns."""
     effective_track_std: float | None
     effective_track_growth: float
     """Fraction by which the effective track grows for each rad/s of turn rate."""
@@ -150,7 +150,7 @@ class Report(Struct, frozen=True):
     A delay is positive if the sensor records the same event with a later time than the wheels.
     """
     gyro_bias: float
-    """Gyro bias, rad/s."""
+    """Gyro bias, rad/s; 0 without a gyro."""
     runs: int
     seconds: float
     distance: float
@@ -161,7 +161,7 @@ class Report(Struct, frozen=True):
     """Names of the quantities that stay as configured, because the log does not improve them."""
     notes: Sequence[str]
     written: str | None
-    """Name of the file to which the tool wrote the new settings; None if it wrote none."""
+    """Name of the file to which the tool wrote the new settings; None if the tool wrote no file."""
     refused: None = None
 
 
@@ -169,8 +169,8 @@ def report(log: str, calibration: Calibration, drive: DriveConfig, written: str)
     """Return the object that `--json` prints for a calibration.
 
     `log` is the path of the log file, or "the drive" for a guided drive. `drive` is the configured
-    geometry. `written` is the name of the file to which the new settings were written, or "" if
-    none was written.
+    geometry. `written` is the name of the file to which the tool wrote the new settings, or ""
+    if the tool wrote no file.
     """
     multipliers = calibration.multipliers
     track, left, right = multipliers.values.tolist()
@@ -205,7 +205,10 @@ def report(log: str, calibration: Calibration, drive: DriveConfig, written: str)
 
 
 def _noise(calibration: Calibration) -> tuple[BeforeAfter, BeforeAfter]:
-    """Return the uncertainty of heading, deg, and distance, m, after `REPORT_DISTANCE_M`."""
+    """Return the random errors of heading, deg, and of distance, m, after `REPORT_DISTANCE_M`.
+
+    Each of the two is computed from the configured and from the new noise settings.
+    """
     noise = calibration.noise
     if noise is None or not noise.better:
         return NOT_COMPARED, NOT_COMPARED

@@ -98,8 +98,9 @@ class Base(Struct, frozen=True):
 class Evidence(Struct, frozen=True):
     """The contribution of one sensor to the normal equations of the fit, block by block.
 
-    J is the Jacobian of the predictions with respect to the parameters, r the residuals and W
-    their weights. `fit()` divides J^T W J and J^T W r by the noise variance of the sensor.
+    A block is a few seconds of driving. J is the Jacobian of the predictions with respect to the
+    parameters, r the residuals and W their weights. `fit()` divides J^T W J and J^T W r by the
+    noise variance of the sensor.
     """
 
     normal: Floats
@@ -117,6 +118,8 @@ def of_rows(
     jacobian: Floats, residual: Floats, weight: Floats, block: npt.NDArray[np.int64], blocks: int
 ) -> Evidence:
     """Return the evidence of one sensor from its measurements, summed by block.
+
+    A block is a few seconds of driving.
 
     Args:
         jacobian: derivatives of each prediction with respect to the parameters, shape
@@ -191,12 +194,16 @@ The weighted sum of the parameters must be equal to the value.
 """
 
 MIN_PAIR_BLOCKS = 16
-"""Minimum number of blocks at which the jackknife also leaves out pairs of neighboring blocks."""
+"""Minimum number of blocks at which the jackknife also leaves out pairs of neighboring blocks.
+
+A block is a few seconds of driving. The jackknife computes standard deviations.
+"""
 
 MIN_BLOCKS = 5
-"""Minimum number of blocks that a log must have.
+"""Minimum number of blocks (a few seconds of driving each) that a log must have.
 
-It is also the minimum number of runs at which the jackknife also leaves out whole runs.
+If a log has at least this number of runs, the jackknife that computes standard deviations also
+leaves out whole runs.
 """
 
 
@@ -225,6 +232,8 @@ class Fit(Struct, frozen=True):
 
     def without(self, blocks: Mask) -> Floats:
         """Return the parameters that fit the log without the blocks in the mask `blocks`.
+
+        A block is a few seconds of driving.
 
         The result is an approximation: one linear step from `parameters`, without another fit.
         """
@@ -276,12 +285,12 @@ class Fit(Struct, frozen=True):
         return np.asarray(chance + pull @ np.diag(1 / np.where(usual, usual, np.inf)) @ pull.T)
 
     def _changes(self, group: npt.NDArray[np.int64]) -> tuple[Floats, Floats]:
-        """Return the changes of the parameters without each group of blocks, and variances.
+        """Leave out each group of blocks in turn, and return the changes of the parameters.
 
-        The variances are those of the parameters, from a jackknife over the groups. They are
-        widened to those of Student's t, with the degrees of freedom of Satterthwaite (An
-        approximate distribution of estimates of variance components, 1946). `group` contains the
-        number of the group of each block.
+        The second result contains the variances of the parameters, from a jackknife over the
+        groups. They are widened to those of Student's t, with the degrees of freedom of
+        Satterthwaite (An approximate distribution of estimates of variance components, 1946).
+        `group` contains the number of the group of each block.
         """
         change = np.array(
             [self.without(group == number) - self.parameters for number in np.unique(group)]

@@ -5,8 +5,8 @@ of mobile robots based on the least-squares technique, 2005):
 
     turn = g_r phi_r - g_l phi_l,    g_r = R_r / L,    g_l = R_l / L
 
-phi_r and phi_l are the angles by which the right and the left wheels rolled, R_r and R_l their
-radii, and L is the effective track. The equation is linear in g_r and g_l.
+Here, phi_r and phi_l are the angles by which the right and the left wheels rolled, R_r and R_l are
+their radii, and L is the effective track. The equation is linear in g_r and g_l.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from acsard.calibration.runs import Block, Run, cumulative, gaps, inside, rests
 REST_S, EDGE_S = 0.6, 0.3
 """Limits for a standstill of the robot from which the gyro's bias is measured, s.
 
-The time `EDGE_S` is cut off at both ends of the standstill, because the robot may shake there. The
-remaining time must be at least `REST_S`.
+The time `EDGE_S` is cut off at both ends of the standstill, because the robot may shake when it
+stops or starts. The remaining time must be at least `REST_S`.
 """
 
 MAX_RATE_AT_REST = 0.05
@@ -48,9 +48,9 @@ MIN_RANDOM_WALK = 5e-5
 """Smallest random walk assumed for the gyro bias, rad/s per square root of a second."""
 
 ASSUMED_RANDOM_WALK = 2e-4
-"""Random walk assumed for the gyro bias if the robot does not stand still twice in any run.
+"""Random walk assumed for the gyro bias, rad/s per square root of a second.
 
-The unit is rad/s per square root of a second.
+The value is used if no run contains two standstills of the robot, whose biases could be compared.
 """
 
 INTERVAL_S = 1.0
@@ -60,9 +60,9 @@ GRID_S, FURTHEST_S = 0.02, 2.0
 """Step of the search for the heading sensor's delay, and the largest delay that is tried, s."""
 
 DEGREES_RATIO = 10.0
-"""Limit for the turns in the column yaw, divided by the turns of the wheels.
+"""Limit for the ratio of the turns in the column yaw to the turns of the wheels.
 
-Above this limit, the yaw must be in degrees.
+A column yaw with a larger ratio is refused, because its values are in degrees.
 """
 
 
@@ -86,6 +86,7 @@ class Headings(Struct, frozen=True):
     source: str
     """Column of the log from which the headings come: "yaw_rate" or "yaw"."""
     of: tuple[Heading, ...]
+    """Heading of each run."""
     delay: float
     """Delay of the sensor's recorded times relative to those of the wheels, s.
 
@@ -131,7 +132,8 @@ class Rows(Struct, frozen=True):
     fast: Floats
     """Integral of |w| w over each interval, rad2/s.
 
-    w is the speed of the right wheels minus the speed of the left wheels, rad/s.
+    w is the speed of the right wheels minus the speed of the left wheels, rad/s. The effect of
+    `P.TRACK_GROWTH` on the turn is proportional to this integral.
     """
     seconds: Floats
     """Length of each interval, s."""
@@ -241,7 +243,10 @@ def _mean(samples: Floats) -> tuple[float, float]:
 
 
 def _bias_std(rested: Sequence[Rests], seconds: Sequence[float]) -> float:
-    """Return the standard deviation of the mean bias error over all runs, rad/s."""
+    """Return the standard deviation of the mean bias error over all runs, rad/s.
+
+    `rested` contains the standstills of each run, and `seconds` the length of each run, s.
+    """
     count = sum(len(t) for t, _, _ in rested)
     noise = sum(float(variance.sum()) for _, _, variance in rested) / max(1, count) ** 2
     walked = [np.column_stack((np.diff(v) ** 2 - n[1:] - n[:-1], np.diff(t))) for t, v, n in rested]
@@ -308,8 +313,8 @@ def _correlation(later: Floats, earlier: Floats, reach: int) -> Floats:
 def rows(headings: Headings | None, driven: Sequence[Run], parts: Sequence[Block]) -> Rows:
     """Return the motion of the robot in intervals of about `INTERVAL_S` s.
 
-    The intervals are parts of the blocks `parts`. An interval without samples of the heading
-    sensor is left out. If `headings` is None, no interval is left out.
+    The intervals are parts of the blocks `parts`. An interval is left out unless the samples of the
+    heading sensor cover it without a gap. If `headings` is None, no interval is left out.
     """
     fast = [_fast(run) for run in driven]
     found: list[tuple[Floats, ...]] = []
@@ -395,9 +400,10 @@ def _by_growth(rows: Rows, base: Base, parameters: Floats) -> Floats:
 
 
 def evidence(rows: Rows, base: Base, parameters: Floats, blocks: int) -> Evidence:
-    """Return the evidence of a heading sensor for the fit, linearized at `parameters`.
+    """Return the evidence of a heading sensor: its contribution to the normal equations of the fit.
 
-    `rows` contains the turns of the sensor and of the wheels. `blocks` is the number of blocks.
+    The predictions are linearized at `parameters`. `rows` contains the turns of the sensor and of
+    the wheels. `blocks` is the number of blocks (a few seconds of driving each).
     """
     turn = parameters[P.INVERSE_TRACK]
     by_wheels = turned(rows, base, parameters)

@@ -51,13 +51,17 @@ class BeforeAfter(Struct, frozen=True):
 NOT_COMPARED = BeforeAfter(None, None)
 
 SURE_DEVIATIONS = 2.0
-"""Smallest ratio of a gain to its standard deviation at which the gain counts as sure (95 %)."""
+"""Smallest ratio of a gain to its standard deviation at which the gain counts as sure (95 %).
+
+A gain is a measure of the improvement that new settings bring, such as `Improvement.gain`.
+"""
 
 SURE_GAIN = float(np.log(2.0))
 """Value of `Improvement.gain` if the calibration halves one error.
 
-A larger gain always counts as sure. In a guided drive, one leg may show nearly all of the error.
-The standard deviation of the gain is then large although the gain is real.
+A larger gain counts as sure even if its standard deviation is large. In a guided drive, one leg may
+show nearly all of the error. The standard deviation of the gain is then large although the gain is
+real.
 """
 
 NEAR, FAR = 2.0, 3.0
@@ -90,10 +94,11 @@ class Improvement(Struct, frozen=True):
     The path of each drive is first shifted and rotated so that it fits the positions best.
     """
     gain: float = np.inf
-    """Natural logarithm of (error before / error after); inf if it was not computed.
+    """Size of the improvement, as a sum of logarithms; inf if it was not computed.
 
-    It is the sum of two such logarithms: one for the RMS error of the heading over whole drives,
-    and one for that of the position. The log may show only one of them.
+    Each term is ln(RMS error before / RMS error after) over whole drives. One term is for the
+    heading, and one for the position. If the log shows only one of these errors, the sum has only
+    this term.
     """
     chance: float = 0.0
     """Standard deviation of `gain`, from the differences between drives; inf for a single drive."""
@@ -148,9 +153,9 @@ def positions_of(drive: Block, driven: Sequence[Run]) -> list[Segment]:
 def folds(fit: Fit, parts: Sequence[Block], left_out: Sequence[Block], rate: Rates) -> list[Fold]:
     """Return a fold for each drive in `left_out`, with the parameters that fit all other drives.
 
-    `parts` are the blocks of data of the fit. A fold leaves out each block that overlaps its drive
-    in time. A drive gets no fold if no block overlaps it, or if all blocks do. The parameters of a
-    fold have the same track for all turn rates (`with_constant_track`).
+    `parts` are the blocks (a few seconds each) of the fit. A fold leaves out each block that
+    overlaps its drive in time. A drive gets no fold if no block overlaps it, or if all blocks do.
+    The parameters of a fold have one track for all turn rates (`with_constant_track`).
     """
     run, begin, end = (
         np.array(column) for column in zip(*((p.run, p.begin, p.end) for p in parts), strict=True)
@@ -248,7 +253,8 @@ def per_amount(sums: Floats, unit: float) -> BeforeAfter:
 def _gain(kinds: Sequence[Floats]) -> tuple[float, float]:
     """Return `Improvement.gain` and `Improvement.chance`.
 
-    Each array in `kinds` is of one kind of error, and has for each fold a row that `rms()` takes.
+    `kinds` has one array for each kind of error: heading or position. Each array has one row for
+    each fold, in the form that `rms()` takes.
     """
     drives = np.any([squares[:, 2] > 0.0 for squares in kinds], axis=0)
     if not np.any(drives):
@@ -279,7 +285,11 @@ def with_chance(gain: Callable[[Mask], float], drives: Mask) -> tuple[float, flo
 def _by_group(
     before: Floats, after: Floats, group: npt.NDArray[np.int64], among: Mask, amount: float
 ) -> Floats:
-    """Return the numbers for `per_amount()`. The errors in a group are added with their signs."""
+    """Return the three numbers that `per_amount()` takes.
+
+    In each group, the errors are added with their signs. The absolute values of these sums are
+    then added. The mask `among` selects the intervals to use.
+    """
     sums = (np.abs(np.bincount(group[among], errors[among])).sum() for errors in (before, after))
     return np.array([*sums, amount])
 

@@ -2,8 +2,8 @@
 
 The header names the columns in any order, and may give units, such as "t [ms]" and "yaw_rate
 (deg/s)". A cell may be empty, so that sensors of different rates share a file. Rows that cannot be
-read and impossible values are left out, counted and reported. A file with more than a few such rows
-is refused.
+read and impossible values are left out, counted and reported. A file with more than a few
+unreadable rows is refused.
 """
 
 from __future__ import annotations
@@ -113,6 +113,8 @@ def bounded(columns: dict[str, Floats]) -> Iterator[str]:
 def spikes(values: Floats, order: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
     """Return a mask of the values that are spikes. `order` contains the indices sorted by time.
 
+    If fewer than 1 / `FEW_VALUES` values are above `SLOW`, no value counts as a spike.
+
     A spike differs from its neighbors both in the order of the file and in the order of time. A
     correct value may differ from its neighbors in one of these orders, for example if the rows of
     the file are shuffled.
@@ -128,7 +130,7 @@ def spikes(values: Floats, order: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_
 
 
 def _alone(sizes: Floats, usual: float) -> npt.NDArray[np.bool_]:
-    """Return a mask of the values above `SPIKE` times `usual` and times both their neighbors."""
+    """Return a mask of the values that exceed `SPIKE` * `usual`, and `SPIKE` * each neighbor."""
     held = np.flatnonzero(np.isfinite(sizes))
     seen = np.concatenate([[0.0], sizes[held], [0.0]])
     around = np.maximum(np.maximum(seen[:-2], seen[2:]), usual)

@@ -89,7 +89,7 @@ class Multipliers(Struct, frozen=True):
 
 
 def configured(base: Base) -> Multipliers:
-    """Return the configured multipliers, with a covariance of zeros because it is unknown."""
+    """Return the configured multipliers, with zeros for their unknown covariance."""
     return Multipliers(np.array([base.track, base.left, base.right]), np.zeros((3, 3)))
 
 
@@ -101,7 +101,7 @@ def multipliers(parameters: Floats, covariance: Floats, rate: Rates) -> Multipli
     cover skidding that differs from turn to turn, because that is noise of the odometry.
 
     Args:
-        parameters: the fitted parameters, shape (COUNT,).
+        parameters: the fitted parameters, shape (PARAMETER_COUNT,).
         covariance: the covariance of the parameters.
         rate: the turn rates of the log.
     """

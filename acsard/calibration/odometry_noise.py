@@ -5,8 +5,9 @@ measured heading or position and the heading or position that the wheels give fo
 `Windows.search` finds the noise for which the residuals of all windows have the greatest
 likelihood. The comment above `Windows` has the equations.
 
-The residuals of a window are seconds apart. Some errors last for a whole turn, for example if the
-track changes with the turn rate. Each residual then contains the whole of such an error.
+Some errors last for a whole turn, for example if the track changes with the turn rate. The
+residuals of a window are therefore seconds apart, so that most of an error of this kind falls
+between two residuals.
 """
 
 from __future__ import annotations
@@ -76,9 +77,9 @@ INITIAL_NOISE = np.array([1e-4, 1e-4, 1e-3, 1e-4, 1e-6, 1e-4, 1e-5, 1e-6, 1e-4])
 """Noise of each `Source` from which the search starts. The numbers only have to be positive."""
 
 WINDOW_S, APART_S = 32.0, 4.0
-"""Length of a window, and time between the residuals in a window, s.
+"""Length of the windows into which a drive is divided, and time between residuals in a window, s.
 
-A drive that is shorter than a window has one window of its own length.
+A drive that is shorter than `WINDOW_S` has one window, which covers this drive.
 """
 
 MIN_INTERVALS = 4
@@ -88,7 +89,7 @@ If the window is short, these intervals are shorter than `APART_S`.
 """
 
 MAX_WINDOWS = 80
-"""Maximum number of windows that are used.
+"""Maximum number of windows (half a minute of driving each) that are used.
 
 If a log has more windows, only every n-th window is used.
 """
@@ -119,7 +120,7 @@ MIN_VARIANCE = 1e-12
 """Variance added to each residual, so that even a perfect sensor's covariance can be inverted."""
 
 MIN_NOISE_RATIO = 0.25
-"""Minimum for the noise of `DISTANCE`, `YAW` and `SKID`, in standard deviations of its estimate.
+"""Minimum for the noise of `DISTANCE`, `YAW` and `SKID`, in standard deviations of the estimate.
 
 In a short log, the fit often finds a noise of 0. Without the minimum, the odometry would then state
 that the pose is exact.
@@ -148,8 +149,7 @@ The configuration accepts this value.
 """
 
 REPORT_DISTANCE_M = 10.0
-"""Distance, m, after which the report states how uncertain heading and distance are due to noise.
-"""
+"""Distance of driving, m, for which the report states the random errors of heading and distance."""
 
 
 # The residuals of a window are modelled as normal with mean 0. Their covariance V is linear in the
@@ -318,8 +318,8 @@ def settings(
     Args:
         known: the standard deviations of the new geometry.
         track: the new multiplier of the wheel separation.
-        kept: the quantities that stay as configured: `TRACK` or `RATIO` of `plausibility`, or
-            both.
+        kept: the names of the quantities that stay as configured. The possible names are
+            `plausibility.TRACK` and `plausibility.RATIO`.
         odometry: the configured settings.
         shown: the noise that the log shows, or None if the noise settings stay as configured.
         scaled: whether the size of the wheels was measured.
@@ -369,7 +369,7 @@ def noise(
     Args:
         held: the drives, each with parameters that were fitted without this drive.
         seen: the sensors of the log.
-        known: the standard deviations of track and wheel radii in these parameters.
+        known: the standard deviations of the fitted track and wheel radii.
         odometry: the configured settings.
     """
     motions: list[_Motion] = []
@@ -451,8 +451,9 @@ class _Window(Struct, frozen=True):
     def projected(self, known: Deviations) -> tuple[Floats, Floats, Floats]:
         """Return three arrays, from which the unknown start pose is projected out.
 
-        The arrays are the residuals, their covariance for each `Source` if its noise is 1, and
-        their covariance due to the uncertainty `known` and the uncertain bias of the gyro.
+        - the residuals
+        - their covariance for each `Source` if the noise of this source is 1
+        - their covariance due to the uncertainty `known` and the uncertain bias of the gyro
         """
         distance, turn, track = self.motion.distance, self.motion.turn, self.motion.track
         sides = np.maximum(np.abs(distance), track / 2 * np.abs(turn))
@@ -560,8 +561,9 @@ def _by_places(
 ) -> Iterator[_Window]:
     """Yield a window of position residuals, unless one of the times `t` has no position.
 
-    A residual is the median over the positions that are nearer to one of the times `t` than to the
-    others. `place` contains the positions (x + iy, m), and `at` their times, s.
+    Each position belongs to the nearest of the times `t`. A residual is the median of (position
+    minus aligned path) over the positions of one time. `place` contains the positions (x + iy, m),
+    and `at` their times, s.
     """
     group = np.searchsorted((t[1:] + t[:-1]) / 2, at)
     numbers = range(len(t))

@@ -88,9 +88,9 @@ LARGE_BIAS = 0.05
 """Gyro bias, rad/s, above which the bias is reported."""
 
 ONE_SIDED_RATIO = 0.1
-"""Limit for the ratio of the turns to one side to the turns to the other side.
+"""Limit for the turns to the rarer side, as a fraction of the turns to the more frequent side.
 
-If the ratio is smaller, a remark says that nearly all turns are to one side.
+Below this limit, a remark says that nearly all turns are to one side.
 """
 
 REPORTED_SIZE_RATIO = 1.25
@@ -120,8 +120,8 @@ def rolls_enough(rows: Rows, *, spins: bool = False) -> None:
 
     Two angles are computed in each interval of `rows`: the mean of the left and the right angle,
     and half of their difference. Each angle must add up to `MIN_ROLL`. The two angles must not
-    be proportional to each other (`MAX_CORRELATION`). If `spins` is true, a log with only turns in
-    place, in which the mean is nearly 0, is accepted too.
+    be proportional to each other (`MAX_CORRELATION`). If `spins` is true, the mean may add up to
+    less than `MIN_ROLL`, as in a log with only turns in place.
     """
     together, against = (rows.right + rows.left) / 2, (rows.right - rows.left) / 2
     for rolled, what in ((together, "ahead or back"), (against, "in opposite directions")):
@@ -202,7 +202,10 @@ def heading_follows(source: str, rows: Rows, base: Base, sides: Floats) -> None:
 
 
 def positions_follow(begun: StartingPoint) -> None:
-    """Raise `RefusedError` if the positions do not follow the path of the wheels."""
+    """Raise `RefusedError` if the positions do not follow the path of the wheels.
+
+    `begun` is the result of `positions.search()`.
+    """
     if begun.unexplained > MAX_CONTRADICTION:
         raise RefusedError(
             "the positions do not match the motion of the wheels: check that x is ahead and y to "
@@ -298,7 +301,7 @@ def turn_rates(source: str, rows: Rows) -> None:
 
 
 def turn_units(source: str, turn: float, bare: float, base: Base) -> None:
-    """Raise `RefusedError` if sensor and wheels show so different turns that a unit must be wrong.
+    """Raise `RefusedError` if the turns of sensor and wheels differ so much that a unit is wrong.
 
     Args:
         source: the name of the heading sensor, or "" if positions show the turns.

@@ -4,7 +4,7 @@ The path of each block (a few seconds) is first shifted and rotated so that it f
 best. The remaining differences are the evidence for the fit. The start pose, the frame and the yaw
 are therefore not needed. Places are complex numbers x + iy in m.
 
-The fit needs a track that is nearly right. `search` finds parameters from which it can start.
+The fit needs a track that is nearly right. `search` finds parameters from which the fit can start.
 """
 
 from __future__ import annotations
@@ -22,7 +22,10 @@ from acsard.calibration.log_table import Floats
 from acsard.calibration.runs import Block, Complexes, Run, cumulative
 
 MIN_POINTS = 5
-"""Minimum number of positions in a segment. The alignment has three unknowns (x, y, angle)."""
+"""Minimum number of positions in a segment.
+
+The path of the wheels is aligned with each segment. The alignment has three unknowns (x, y, angle).
+"""
 
 STEP_S = 0.02
 """Time step for integrating the path, s. Finer steps cost time and add no accuracy."""
@@ -39,12 +42,12 @@ SPEED_HALF_INTERVAL_S = 0.05
 
 
 def extent(places: Complexes) -> float:
-    """Return the width plus the height of the box around these places (x + iy), m."""
+    """Return the width plus the height of the bounding box of `places` (x + iy), m."""
     return float(np.ptp(places.real) + np.ptp(places.imag))
 
 
 class Segment(Struct, frozen=True):
-    """Measured positions in one block of a run, without a jump between them."""
+    """Measured positions in one block (a few seconds) of a run, without a jump between them."""
 
     block: int
     run: int
@@ -191,14 +194,20 @@ def path(steps: WheelSteps, base: Base, parameters: Floats) -> Path:
 
 
 def place(steps: WheelSteps, base: Base, parameters: Floats) -> Complexes:
-    """Return only the places of `path()`, which takes less time. TRACK_GROWTH must be 0."""
+    """Return the places (x + iy, m) of `path()`, without its other results, to save time.
+
+    The parameter TRACK_GROWTH must be 0.
+    """
     left, right = parameters[P.LEFT] * steps.left, parameters[P.RIGHT] * steps.right
     _, ahead = _directions(base.gain * parameters[P.INVERSE_TRACK] * (right - left))
     return _sums(ahead * base.radius * (left + right) / 2)
 
 
 def _directions(turns: Floats) -> tuple[Floats, Complexes]:
-    """Return the headings around the steps, and the chord of each step for an arc of length 1."""
+    """Return the headings before and after the steps, and the chord of each step.
+
+    A chord is a complex number x + iy, for a step whose arc has the length 1.
+    """
     heading = cumulative(turns)
     return heading, np.exp(1j * (heading[:-1] + turns / 2)) * np.sinc(turns / (2 * np.pi))
 
@@ -257,9 +266,10 @@ def aligned(segments: Sequence[Segment], paths: Paths, parameters: Floats) -> It
 def evidence(
     segments: Sequence[Segment], paths: Paths, parameters: Floats, blocks: int
 ) -> Evidence:
-    """Return the evidence of the positions for the fit, linearized at `parameters`.
+    """Return the evidence of the positions: their contribution to the normal equations of the fit.
 
-    `paths` must be computed with the same parameters. `blocks` is the number of blocks.
+    The path is linearized at `parameters`, with which `paths` must have been computed. `blocks` is
+    the number of blocks.
     """
     normal, score = (
         np.zeros((blocks, PARAMETER_COUNT, PARAMETER_COUNT)),
@@ -288,29 +298,30 @@ def spread(segments: Sequence[Segment], paths: Paths, parameters: Floats) -> flo
 TRACK_RATIOS = np.unique(
     np.concatenate((np.geomspace(0.03, 10.0, 60), np.geomspace(0.28, 1.4, 40)))
 )
-"""Ratios of configured to true track that the search tries.
+"""Ratios of configured to true track that `search` tries.
 
-The ratios in the usual range are closer together than the others.
+In the usual range, the ratios are closer together.
 """
 
 DELAYS_S = np.arange(-1.5, 1.55, 0.1)
-"""Delays of the positions that the search tries, s."""
+"""Delays of the positions that `search` tries, s."""
 
 MOST_SEGMENTS, REFINED_SEGMENTS = 60, 20
-"""Maximum numbers of segments that the search uses.
+"""Maximum numbers of segments that `search` uses.
 
 `MOST_SEGMENTS` applies while starting points are tried, and `REFINED_SEGMENTS` while they are
 refined. If there are more segments, those with the largest extent are used.
 """
 
 MAX_POINTS = 80
-"""Largest number of positions of a segment that the search uses. They are evenly spaced."""
+"""Largest number of positions of a segment that `search` uses. They are evenly spaced."""
 
 MOST_REFINED, FAR_WORSE = 4, 20.0
-"""Limits for the starting points that the search refines.
+"""Limits for the starting points that `search` refines.
 
-At most `MOST_REFINED` points are refined. A point is not refined if its badness (see `search`) is
-more than `FAR_WORSE` times that of the best point.
+`search` refines at most `MOST_REFINED` points, and no point whose badness is more than `FAR_WORSE`
+times that of the best point. The badness is the unexplained variance, increased if the point
+describes an unusual robot.
 """
 
 USUAL_TURN_RANGE = 0.31, 1.25
@@ -337,13 +348,13 @@ hardly matter.
 """
 
 MAX_REFINEMENT = 1.3
-"""Largest factor by which a refinement may change the robot's turn.
+"""Largest factor by which `search` may change the robot's turn while it refines a starting point.
 
-After a larger change, the refinement is discarded.
+After a larger change, `search` discards the refinement.
 """
 
 SEARCH_STEP_S = 0.1
-"""Time step for integrating paths during the search, s."""
+"""Time step for integrating paths in `search`, s."""
 
 
 class StartingPoint(Struct, frozen=True):
@@ -448,8 +459,9 @@ def _tried(
 ) -> StartingPoint:
     """Return the starting point for a shape of the path, with the wheel size that fits best.
 
-    `shape` contains the sign of the left wheels' rolling, the ratio of configured to true track
-    (negative if the robot turns opposite to its wheels), and the delay of the positions, s.
+    `shape` contains three numbers: the sign of the left wheels' rolling, the ratio of configured to
+    true track, and the delay of the positions, s. The ratio is negative if the robot turns opposite
+    to its wheels.
     """
     parameters = base.start()
     parameters[[P.LEFT, P.RIGHT, P.INVERSE_TRACK, P.DELAY]] = shape[0], 1.0, shape[1], shape[2]

@@ -36,9 +36,9 @@ MAX_LOG_TIME_NS = (1 << 63) - 1
 """Largest time of a message that the table can contain, ns."""
 
 BAG_DAMAGE = (*DAMAGE_ERRORS, RuntimeError, KeyError)
-"""Exceptions that the MCAP reader and LZ4 raise for a damaged bag.
+"""Exceptions of the MCAP reader, of LZ4 and of `_messages` that mean that a bag is damaged.
 
-A `KeyError` means that a schema is missing.
+A `KeyError` means that a schema is missing, or that a message has a time above `MAX_LOG_TIME_NS`.
 """
 
 OTHER_BAGS = {
@@ -48,7 +48,7 @@ OTHER_BAGS = {
 }
 """The kinds of bags that this module cannot read, by file suffix.
 
-A value contains the first bytes of such a file, and words for the error message.
+A value is a pair: the first bytes of the file, and words for the error message.
 """
 
 

@@ -44,7 +44,7 @@ AXES = ("z", "-z", "x", "-x", "y", "-y")
 """Axes of an IMU that may point up. `-x` means that x points down."""
 
 MIN_MESSAGES = 20
-"""Minimum number of messages with a value in a topic that is used."""
+"""Minimum number of messages with a value in a topic. A topic with fewer of them is not used."""
 
 MAX_DELAY_DIFFERENCE_S = 1.0
 """Largest difference between the delays of two topics whose stamps come from the same clock, s.
@@ -144,7 +144,8 @@ class _Topic:
         return pose.position.x, pose.position.y, _yaw(pose.orientation)
 
     def _joints(self, message: JointState, joints: Sequence[str]) -> Sequence[float]:
-        """Return the angles, then the speeds; () if the wheels differ from the first message."""
+        """Return the wheels' angles, then their speeds; () unless the wheels are those of the
+        first message."""
         columns = wheel_joints(tuple(message.name), tuple(joints))
         self.joints.update(message.name[:8])
         self.wheels = self.wheels or tuple(columns)

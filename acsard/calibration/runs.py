@@ -423,7 +423,7 @@ def _remove_repeats(drives: Iterable[tuple[str, Streams]], notes: Notes) -> None
 
 
 def _repeats(streams: Streams, what: str) -> tuple[Mask, Mask]:
-    """Return masks of the samples that repeat the one before, and of those with rolling wheels."""
+    """Return two masks: samples that repeat the previous one, and samples with rolling wheels."""
     t, *values = streams[what]
     if not len(t):
         return np.zeros(0, dtype=bool), np.zeros(0, dtype=bool)
@@ -536,7 +536,7 @@ def blocks(driven: Sequence[Run], shortest_s: float) -> list[Block]:
 
 
 def _turned(run: Run, begin: float, end: float, left: Floats, right: Floats) -> bool:
-    """Return whether a side rolled by `MIN_BLOCK_ROLL`. Back and ahead do not cancel out."""
+    """Return whether the wheels of one side rolled by `MIN_BLOCK_ROLL`, ahead plus backwards."""
     if max(abs(left[1] - left[0]), abs(right[1] - right[0])) >= MIN_BLOCK_ROLL:
         return True
     a, b = np.searchsorted(run.t, (begin, end))

@@ -46,7 +46,9 @@ from acsard.core.config.settings import DriveConfig, FeedbackConfig, OdometryCon
 from acsard.core.values import AcsardError
 
 BLOCK_LENGTHS_S = (4.0, 8.0, 16.0, 32.0, 64.0)
-"""Block lengths to try, s. The tool uses the length that improves the odometry most.
+"""Lengths of the blocks into which the tool divides a log for the fit, s.
+
+The tool tries several lengths, and uses the one that improves the odometry most.
 
 Short blocks suit accurate positions. Long blocks suit coarse positions, and wheels whose errors
 hide small turns. Without positions, the tool tries only the shortest length. With positions but no
@@ -196,6 +198,7 @@ class Prepared(Struct, frozen=True):
     """Headings that a sensor measured, or None if the log has no heading sensor."""
     base: Base
     parts: list[Block]
+    """Blocks into which the runs were divided."""
     rows: Rows
     """Motion in intervals of about 1 s.
 
@@ -209,6 +212,7 @@ class Prepared(Struct, frozen=True):
     sources: list[Source]
     """One function for each sensor, which returns the sensor's evidence for given parameters."""
     start: Floats
+    """Parameters from which the fit starts, shape (PARAMETER_COUNT,)."""
 
 
 def prepared(
@@ -343,7 +347,10 @@ def _known(best: Candidate, odometry: OdometryConfig) -> Deviations:
 def _noise(
     best: Candidate, known: Deviations, odometry: OdometryConfig, *, present: bool
 ) -> Noise | None:
-    """Measure the odometry noise, with the configured geometry if `present`, or else the fitted."""
+    """Return the odometry noise of the log.
+
+    The geometry is the configured one if `present` is true, and otherwise the fitted one.
+    """
     made, fitted = best.made, best.fitted
     held = folds(fitted, made.parts, drives(made.runs), best.rate)
     if present:
@@ -359,9 +366,10 @@ def _noise(
 
 
 def _candidates(made: Prepared) -> list[Candidate]:
-    """Return one fit, or two if the log does not determine both the track and the radius ratio.
+    """Return the fit of both track and radius ratio if the log determines both accurately enough.
 
-    The first of two fits keeps the ratio as configured, and the second fit keeps the track.
+    Otherwise return one or two other fits: one that keeps the ratio as configured, and one that
+    keeps the track as configured. Raises `RefusedError` if no fit is accurate enough.
     """
     found: list[Candidate] = []
     deviations: dict[str, float] = {}

@@ -64,7 +64,8 @@ class WheelResponse(Struct, frozen=True):
 
     There is a proposal only if `false_fault` is true. The proposal is the smallest time in
     `RESPONSE_TIMES_S`, not below `seconds`, with which no wheel looks faulty for longer than
-    `MAX_FAULTY_FRACTION` permits. If no time fulfils this, the value is None.
+    `MAX_FAULTY_FRACTION` permits, rounded to two digits. If no time meets this condition, the value
+    is None.
     """
     present: float
     """Configured response time, s."""
@@ -215,7 +216,10 @@ def _evidence(
 
 
 def _fastest(parts: Sequence[tuple[Floats, Floats, Floats]]) -> float:
-    """Return the highest steady speed of a wheel that stays below its command, rad/s."""
+    """Return the highest steady speed of a wheel that stays below its command, rad/s.
+
+    Return infinity if no wheel stays below its command at a steady speed.
+    """
     found: list[float] = []
     for steps, wanted, seen in parts:
         for told, speed in zip(wanted.T, np.abs(seen.T), strict=True):

@@ -77,8 +77,8 @@ try:  acsard run                (start the robot on the built-in simulator)
 
 class _Parser(argparse.ArgumentParser):
     _intermixed = False
-    """Whether `parse_known_intermixed_args` is running. It may call `parse_known_args`, which must
-    then not call it again."""
+    """Whether `parse_known_intermixed_args` is running. That method may call `parse_known_args`.
+    `parse_known_args` must then not call `parse_known_intermixed_args` again."""
 
     def parse_known_args(  # type: ignore[override]
         self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None
@@ -152,8 +152,8 @@ def main(argv: list[str] | None = None) -> int:
     except OSError as error:
         if not isinstance(error, BrokenPipeError) and error.errno != errno.ENOSPC:
             raise
-        # The program that reads this output (head, less) has ended, or a disk is full: that of the
-        # output, or that of a file.
+        # The program that reads this output (head, less) has ended, or the disk of the output or of
+        # another file is full.
         if not isinstance(error, BrokenPipeError):
             with suppress(OSError):
                 print(f"acsard: {error}", file=sys.stderr)

@@ -110,8 +110,8 @@ def whole(units: str, most: int, hint: str = "") -> Callable[[str], int]:
 def by_environment() -> dict[str, dict[str, object]]:
     """Return the configuration values that environment variables set, as nested dictionaries.
 
-    The only such variable is `ACSARD_TLS`, which sets `bus.tls`. The result is empty without it. A
-    systemd unit sets this variable to the directory of its credentials.
+    The only such variable is `ACSARD_TLS`, which sets `bus.tls`. If the variable is not set, the
+    result is empty. A systemd unit sets the variable to the directory of its credentials.
     """
     return {"bus": {"tls": os.environ["ACSARD_TLS"]}} if "ACSARD_TLS" in os.environ else {}
 

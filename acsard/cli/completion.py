@@ -108,7 +108,7 @@ def _words() -> Mapping[tuple[str, str], list[str]]:
 def _actions(
     parser: argparse.ArgumentParser, verb: str = ""
 ) -> Iterator[tuple[str, argparse.Action]]:
-    """Yield each option with its subcommand.
+    """Yield pairs: the name of a subcommand, and one of its options or arguments.
 
     An option of an action, such as `recording show`, belongs to the subcommand `recording`.
     """

@@ -61,9 +61,10 @@ def connected(args: argparse.Namespace, source: str = "app") -> Iterator[Client]
 
 
 def robot_address(args: argparse.Namespace) -> Address:
-    """Return the address of the one robot that the options name, or else of the configured robot.
+    """Return the address of the robot that the options name.
 
-    Raises `UsageError` if `--id` names several robots.
+    Without these options, return the address of the configured robot. Raises `UsageError` if
+    `--id` names several robots.
     """
     require_one(args)
     _, config = load(args.config)
@@ -123,8 +124,9 @@ def require_followed(key: str) -> None:
 def require_asked(key: str) -> None:
     """Raise `UsageError` if `acsard get` cannot query this key.
 
-    Some keys do not answer queries, and a query on the key of a service would call the service. A
-    key with a wildcard is refused too, because `get` prints only one answer.
+    `get` refuses a key that does not answer queries, and a key with a wildcard, because it prints
+    only one answer. It also refuses the key of a service, because a query on this key would call
+    the service.
     """
     if set(key.partition("?")[0]) & set("*$"):
         raise UsageError(
@@ -207,8 +209,8 @@ def silence_explained(
 
     The context yields a function, which the caller must call for each message. Texts go to standard
     error. If `key` is "", only a lost connection is reported. `timeout_s` is the time without a
-    message after which the caller leaves the context, s, or None without such a limit. If no
-    message has arrived by then, the reason is printed before the context ends.
+    message after which the caller leaves the context, s; None means no time limit. If no message
+    has arrived by then, the reason is printed before the context ends.
     """
     return explained(
         lambda: _none_yet(robot, key) if key else "",
@@ -238,6 +240,9 @@ def _ceased(robot: Client) -> str:
 
 
 def _of_link(where: Address) -> str:
-    """Return the fault of a TLS connection, such as an expired certificate, or ""."""
+    """Return the fault of a TLS connection, such as an expired certificate.
+
+    Return "" if no fault is found, or if the connection does not use TLS.
+    """
     secured = where.tls and where.endpoint.startswith(TLS_PREFIX)
     return trouble(where.endpoint, where.tls) if secured else ""

@@ -106,7 +106,7 @@ class Quota:
         """Allow `most` messages of each robot, or any number if `most` is None.
 
         `robots` contains the ids of the robots that must reach this number before `used_up` is
-        true. If it is empty, these are the robots of which a message has been printed.
+        true. If `robots` is empty, each robot that has sent a printed message must reach it.
         """
         self._most, self._robots, self._counts = most, robots, dict[str, int]()
 

@@ -87,7 +87,11 @@ def main(args: argparse.Namespace) -> int:
 def _checked(
     args: argparse.Namespace, config: Config, configured: Config, where: str, prompt: Prompt
 ) -> int:
-    """Check the board with `config`. Suggest changes to `configured`, the file's own values."""
+    """Check the board with the configuration `config`, and return the exit code.
+
+    Suggest changes to the configuration file `where`. `configured` contains the values of this
+    file, without the values of options.
+    """
     port, simulated = config.mcu.port, config.mcu.simulated
     findings: list[Finding] = []
 
@@ -132,7 +136,10 @@ def _checked(
 
 
 def _prompt(args: argparse.Namespace, port: str) -> TerminalPrompt | NoPrompt | JsonPrompt:
-    """Return a prompt. Refuse a port at which wheels could turn without a person's consent."""
+    """Return the prompt that the options choose.
+
+    Raises `UsageError` if the wheels of a board at `port` could turn without a person's consent.
+    """
     if port == SIMULATOR and args.port != SIMULATOR:
         raise UsageError(
             "no port is configured, so there is no board to check (mcu.port is the simulator, "

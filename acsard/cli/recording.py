@@ -297,7 +297,7 @@ def main_show(args: argparse.Namespace) -> int:
 def _is_being_recorded(recording: Recording) -> bool:
     """Return whether a daemon is still writing to this recording.
 
-    Read all steps of the recording first, because its ending is not known before.
+    The caller must read all steps of the recording first. Before that, its ending is not known.
     """
     if recording.ending != UNFINISHED:
         return False
@@ -308,7 +308,7 @@ def _is_being_recorded(recording: Recording) -> bool:
 
 
 def _show(recording: Recording, part: Span, as_json: bool) -> bool:
-    """Print the events in the time span `part`. Return whether it contains steps."""
+    """Print the events in the time span `part`, and return whether `part` contains steps."""
     story = TimelineWriter(_config_of(recording))
     found, over = False, False
     for step in steps(recording):
@@ -352,10 +352,10 @@ def _tell(one: TimelineEntry, as_json: bool) -> None:
 
 
 def main_replay(args: argparse.Namespace) -> int:
-    """Replay a recording, print the differences to the recorded results, and return the exit code.
+    """Replay a recording, print how the results differ, and return the exit code.
 
-    The exit code is 0 if all results are equal. It is 1 if results differ, unless --config was
-    given. Otherwise it is 65 if a part was not compared.
+    The exit code is 1 if results differ and --config was not given. Otherwise it is 65 if a part of
+    the recording was not compared, and 0 if every part was compared.
     """
     _refuse_times(args, "replay")
     recording = _recording(args)
@@ -482,7 +482,7 @@ def _parts(args: argparse.Namespace) -> list[tuple[Recording, Span]]:
 
 
 def _range(args: argparse.Namespace) -> tuple[float, float]:
-    """Return the times of --from and --to, s since 1970; infinite without the option."""
+    """Return the times of --from and --to, s since 1970; -inf and inf without these options."""
     if any(isinstance(when, Offset) for when in (args.begin, args.end)):
         raise UsageError(
             "--from and --to in seconds count from the beginning of one recording, but "
@@ -589,7 +589,11 @@ def _written(new: Path) -> Iterator[None]:
 
 
 def _percent(recording: Recording) -> Callable[[int], None]:
-    """Return a function that prints percentages, which the server of the web page reads."""
+    """Return a function that prints how much of the recording has been read, in percent.
+
+    The function takes the time of the last step that was read, ns since 1970. The server of the web
+    page reads the printed numbers.
+    """
     last, began = read_end(recording.path), recording.about.wall_ns / 1e9
     end = last.last_ns / 1e9 if last else recording.path.stat().st_mtime
     told = 0

@@ -74,7 +74,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def options(args: argparse.Namespace) -> dict[str, object]:
     """Return the values of the options, by dotted configuration key such as "mcu.port".
 
-    The value is None if the option was not typed.
+    The value of an option that was not typed is None.
     """
     return {
         "mcu.port": args.port,
@@ -145,7 +145,7 @@ def main(args: argparse.Namespace) -> int:
 def settings_file(where: str, config: Config, given: dict[str, object]) -> SettingsFile:
     """Return the `SettingsFile` with which the daemon changes its own configuration file.
 
-    It parses the file as the daemon would after a restart.
+    The `SettingsFile` parses the file as the daemon would after a restart.
 
     Args:
         where: the path of the configuration file, or another text if there is no file.

@@ -137,7 +137,10 @@ def _lasting(message: str) -> str:
 
 
 def _until(message: str) -> str:
-    """Return how long the changes in a text like "KEY = NEW (was OLD)" stay in force, or ""."""
+    """Return a text that says how long the changes stay in force, or "" if there is no change.
+
+    `message` is the daemon's answer, with text such as "KEY = NEW (was OLD)" for each change.
+    """
     changes = {key: (new, old) for key, new, old in _CHANGE.findall(message)}
     if not changes:
         return ""
@@ -157,7 +160,11 @@ def _until(message: str) -> str:
 
 
 def _limits(pairs: Mapping[str, Sequence[str]], at: int) -> LimitsConfig:
-    """Return default limits with the new values of `pairs` if `at` is 0, or the old ones if 1."""
+    """Return the default limits with the changes in `pairs`.
+
+    `pairs` maps the key of each changed limit to the pair (new value, old value). `at` is 0 for
+    limits with the new values, and 1 for limits with the old values.
+    """
     return LimitsConfig(
         **{key.removeprefix(LIMITS_PREFIX): float(pair[at]) for key, pair in pairs.items()}
     )

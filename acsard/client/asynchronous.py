@@ -1,4 +1,8 @@
-"""The client for asyncio programs. Calls that would block the event loop run in threads."""
+"""The client for asyncio programs.
+
+Calls that wait for a reply run in threads. Commands are sent in the event loop. A command blocks
+the loop for up to 3 ms (`MIN_SPACING_S`) if another command was sent just before it.
+"""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """The rules for a sender of commands: what it sends and when, and why a command has no effect.
 
 This module is pure: times and commands come in as arguments. Every program that commands the robot
-uses its time limits. A program that forwards the commands of a person, for example from a panel in
-a browser, passes each command as a `Wish` to a `Commander`.
+uses the time limits of this module. A program that forwards the commands of a person, for example
+from a panel in a browser, passes each command as a `Wish` to a `Commander`.
 
 A `Commander` never repeats a command, so the robot stops when the person, the panel or the network
 falls silent. A new command replaces a command that still waits to be sent. A zero is sent even if
@@ -54,9 +54,9 @@ a source's default timeout of 0.25 s."""
 
 RELEASED_NS = 3 * NS_PER_S // 2
 """Time without input after which a button or a key that was held counts as released, ns. A shorter
-silence may be a pause of the network. A panel that publishes once a second, as a panel of Foxglove
-does by default, must not seem released between its messages. But the daemon forgets the zero of a
-new sender that is then silent for 2 s, so this time must be shorter."""
+silence may be a pause of the network. A panel of Foxglove publishes once a second by default, and
+must not seem released between its messages. The time must be shorter than 2 s, because the daemon
+forgets the zero of a new sender that is silent for 2 s after the zero."""
 
 BURST_WINDOW_NS = NS_PER_S // 25
 """Time for which the first command after a silence waits to be sent, ns. The wait shows whether a
@@ -65,7 +65,7 @@ more than `MAX_BURST_COMMANDS` commands, the next command waits too."""
 
 MAX_BURST_COMMANDS = 5
 """Largest number of commands that a panel is assumed to send within `BURST_WINDOW_NS` (125 Hz). If
-more commands arrive, these commands have waited in a queue, which may contain further commands."""
+more commands arrive, they have waited in a queue. This queue may contain further commands."""
 
 STALE_NS = NS_PER_S // 10
 """Largest age of a nonzero command that is still sent, ns. An older one is dropped, because the
@@ -101,14 +101,14 @@ class Commander:
     At most one command waits to be sent. A newer command replaces the waiting command.
 
     Args:
-        leads: whether to send a zero before the first command, and before the first command after
-            each silence longer than `RELEASED_NS`. Set this for a sender that sends no zeros of its
-            own. There is no zero after a shorter silence: with such a zero, a button that was held
-            through a stop and a `clear` could drive the robot.
-        since_ns: the monotonic time at which the sender began to be able to send, ns. Set this for
-            a sender that may connect while a button is held. There is no zero before its first
-            command if this command arrives within `RELEASED_NS` of that time. None means that no
-            button was held.
+        leads: whether to send a zero (a command with the speed 0) before the first command, and
+            before the first command after each silence longer than `RELEASED_NS`. The daemon
+            requires a zero before a sender may move the robot, so set `leads` for a sender that
+            never sends zeros itself. No zero is sent after a shorter silence: a button may still be
+            held, and after a stop and a `clear`, a zero would let this button drive the robot.
+        since_ns: the monotonic time of the sender's connection, ns. Set this for a sender that may
+            connect while a button is held. If its first command arrives within `RELEASED_NS` after
+            this time, no zero is sent before that command. None means that no button was held.
         gathers: whether the first command after a silence waits for `BURST_WINDOW_NS`. If several
             commands arrive in this time, a congested link or a stalled process has delayed these
             commands. In this case they are dropped, except the last one if it is a zero. Set this
@@ -128,7 +128,7 @@ class Commander:
         """The newest command, sent or not."""
         self._came_ns = 0
         self._since_ns = since_ns
-        """Monotonic time since which the sender can send, ns; None if it does not matter."""
+        """Monotonic time of the sender's connection, ns; None if no button was held then."""
         self._heard_ns: int | None = None
         """Monotonic time of the newest command, ns; None before the first command."""
         self._lead = False
@@ -179,11 +179,11 @@ class Commander:
     def send(self, now_ns: int) -> Wish | None:
         """Return the command that the caller must send at the monotonic time `now_ns`, or None.
 
-        A nonzero command that is too old, or that came in a burst, is dropped.
+        A nonzero command is dropped if it is older than `STALE_NS`, or if it came in a burst.
         """
         if self._lead:
             self._lead = False
-            # If the zero had a later stamp than the command behind it, the daemon would refuse the
+            # If the zero had a later stamp than the command after it, the daemon would refuse the
             # command. The command leaves `_gather_ns` after the zero. With this stamp both have the
             # same delay, so the daemon need not test the delays of a new sender for longer.
             return self._zero(self._came_ns - max(1, self._gather_ns))
@@ -203,9 +203,10 @@ class Commander:
         """End the drive of this sender, and return a zero to send, or None.
 
         The command that waits to be sent is discarded. The result is a zero if the robot may still
-        follow a nonzero command of this sender. It is None if the timeout has passed since the last
-        nonzero command, because a zero would then only stop the next sender. `timeout_s` is the
-        timeout of this sender's source, s, and `now_ns` is the monotonic time, ns.
+        follow a nonzero command of this sender. The result is None if the last command was a zero,
+        or if the timeout has passed since the last nonzero command. A zero would then only stop the
+        next sender. `timeout_s` is the timeout of this sender's source, s, and `now_ns` is the
+        monotonic time, ns.
         """
         moved_ns, self._moved_ns = self._moved_ns, None
         self._wish = self._asked_ns = None
@@ -229,10 +230,10 @@ class Commander:
         return self._asked_ns is not None
 
     def drives(self, now_ns: int) -> bool:
-        """Return whether the last command was not zero and arrived within the last
-        `DRIVING_TIMEOUT_NS`.
+        """Return whether this sender counts as driving at the monotonic time `now_ns`, ns.
 
-        `now_ns` is the monotonic time, ns.
+        A sender counts as driving if its last command was not zero, and arrived within the last
+        `DRIVING_TIMEOUT_NS`.
         """
         return self._asked_ns is not None and now_ns - self._asked_ns <= DRIVING_TIMEOUT_NS
 
@@ -246,8 +247,8 @@ class Sender:
     def sign(self, stamp_ns: int | None, *, steady: bool, zero: bool = False) -> Signature:
         """Return the signature of the next command, with its sequence number.
 
-        The stamp of a zero is raised to the newest stamp of this sender, if that is later. So the
-        daemon never refuses the zero because of an older stamp.
+        If this sender has already used a later stamp, a zero gets that later stamp. So the daemon
+        never refuses the zero because of an older stamp.
 
         Args:
             stamp_ns: the time of the command on the sender's clock, ns; None if the sender has no
@@ -299,7 +300,7 @@ def objection(state: RobotState, source: str, sender: str) -> str:
 
 
 def no_command(source: str) -> str:
-    """Return the text which says that the daemon receives no command of `source`."""
+    """Return the text that says that the daemon receives no command of the source `source`."""
     return (
         f"the daemon receives no command of source {source}; `acsard top` shows whether the daemon "
         "refuses commands"
@@ -309,9 +310,9 @@ def no_command(source: str) -> str:
 def ends_hold(state: RobotState, source: str) -> bool:
     """Return whether the operator must release a held key and press it again to drive.
 
-    This is so if the robot cannot drive in its present mode (a mode in `NEVER_DRIVING_MODES`, or
-    "waiting"), or if `source` must first send a zero. When the robot can drive again, an operator
-    who still holds the key may not expect it to move.
+    The operator must do so if the robot cannot drive in its present mode (a mode in
+    `NEVER_DRIVING_MODES`, or "waiting"), or if `source` must first send a zero. When the robot can
+    drive again, an operator who still holds the key may not expect the robot to move.
     """
     ours = next((one for one in state.sources if one.name == source), None)
     zero_first = ours is not None and "must send a zero" in ours.waits_for

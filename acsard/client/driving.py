@@ -31,23 +31,22 @@ from acsard.host import clock
 from acsard.host.errors import NoAnswerError, NotDrivenError, UsageError
 
 SETTLED_S = 0.2
-"""Longest time that a message on `state` takes to arrive, s. If a state arrives later than this
-after an action, the daemon sent it after the action."""
+"""Longest time that a message on `state` takes to arrive, s. So a state that arrives later than
+this after an action shows the robot after the action."""
 
 STANDSTILL = 0.01, 0.02
-"""Linear speed, m/s, and turn rate, rad/s. The robot counts as standing still if both of its speeds
-are below these values."""
+"""Linear speed, m/s, and turn rate, rad/s, below which the robot counts as standing still."""
 
 SLOWER, SLOWS_S = 0.97, 1.0
-"""The robot counts as slowing down if its speed falls enough within `SLOWS_S` s: below `SLOWER`
-times the lowest speed since the end of the drive."""
+"""A factor, and a time, s. After a drive, the robot counts as slowing down while its speed falls
+to less than `SLOWER` times its former value within each `SLOWS_S` s."""
 
 
 CONNECTION_CLOSED = "the connection to the daemon was closed while the robot was driving"
 
 
 class UnheardError(NotDrivenError):
-    """Error of a drive because the daemon receives no commands from the source of this client."""
+    """The daemon receives no commands from this client's command source, so the drive has ended."""
 
 
 class Driven(Followed, Protocol):
@@ -66,8 +65,8 @@ def drive(
 ) -> Generator[float, None, None]:
     """Drive for `seconds`, then send zeros until the robot stands still.
 
-    This is a generator. It yields the time, s, for which the caller must wait before it resumes the
-    generator. Before the drive, it sends zeros until the daemon accepts the commands.
+    This generator yields the time, s, for which the caller must wait before resuming the generator.
+    Before the drive, the generator sends zeros until the daemon accepts the commands.
 
     Args:
         robot: the client that sends the commands.
@@ -76,9 +75,9 @@ def drive(
         seconds: duration of the drive, s.
 
     Raises:
-        NotDrivenError: The robot does not follow the commands; the text is the daemon's reason. It
-            is also raised if this program pauses for more than `GRACE_S` s between two commands,
-            unless it already sends the zeros at the end.
+        NotDrivenError: The robot does not follow the commands; the text is the daemon's reason. Or
+            this program paused for more than `GRACE_S` s between two commands. A pause between the
+            zeros at the end is not an error.
         NoAnswerError: The daemon is silent, or the connection to it was closed.
         UsageError: An argument is not a finite number, or `seconds` is not above 0.
     """
@@ -130,11 +129,11 @@ def _opening(checks: _Drive) -> Iterator[float]:
 
 
 def _stopping(checks: _Drive) -> Iterator[float]:
-    """Send zeros until the robot stands still, and yield the time to wait after each, s.
+    """Send zeros until the robot stands still, and yield the time to wait after each zero, s.
 
-    End too if the robot has not become slower for `SLOWS_S` s: then something else moves the robot,
-    or the board sends no feedback. Raises `NotDrivenError` if the daemon will keep refusing the
-    commands, and `NoAnswerError` if the daemon is silent.
+    Also end if the robot has not become slower for `SLOWS_S` s. In this case, something else moves
+    the robot, or the board sends no feedback. Raises `NotDrivenError` if the daemon will keep
+    refusing the commands, and `NoAnswerError` if the daemon is silent.
     """
     begun = since = clock.steady_s()
     watch, slowest = checks.watch, math.inf
@@ -214,9 +213,10 @@ class _Drive:
             )
 
     def require(self, grace: float) -> None:
-        """Raise `NotDrivenError` if the robot has not followed for `grace` s, or never will.
+        """Raise `NotDrivenError` if the robot has not followed the commands for `grace` s.
 
-        If the daemon receives no commands, the error is the subclass `UnheardError`.
+        Raise it immediately if the daemon will keep refusing the commands. If the daemon receives
+        no commands of this client's source, the error is an `UnheardError`.
         """
         self.look()
         if not self.objection:

@@ -26,7 +26,7 @@ from acsard.host import clock
 from acsard.host.mailbox import Mailbox
 
 MAX_ROBOTS = 1000
-"""Default of the maximum number of robots. It is limited because any client of the bus can invent
+"""Default maximum number of robots. There is a maximum because any client of the bus can invent
 robot ids."""
 
 
@@ -42,7 +42,7 @@ class Row(Struct, frozen=True):
     """Age of `state`, s; infinite until a state has proved that the daemon runs."""
     version: str
     silent: bool = False
-    """Whether the robot counts as silent, because no state has arrived for too long a time."""
+    """Whether the robot counts as silent, because no new state has arrived (see `Follower`)."""
 
 
 class _Known:
@@ -71,9 +71,11 @@ class Fleet:
 
         Args:
             robot: A client of any robot on the same bus.
-            ids: The ids of the robots, or "*" for all robots. A robot that is named here is never
-                dropped.
-            most: Maximum number of robots.
+            ids: The ids of the robots. The id "*" stands for all robots. A robot that is named here
+                is never dropped.
+            most: Maximum number of robots. When it is reached, a new robot replaces a robot without
+                a liveliness token that `ids` does not name. If there is none, the new robot is left
+                out.
             forget_s: Time without a state, s, after which a robot is dropped. A robot that `ids`
                 names, or whose liveliness token is present, is never dropped.
         """
@@ -145,7 +147,8 @@ class Fleet:
         follower, state = one.follower, one.follower.state
         silent = follower.silent(now)
         if one.here and not follower.heard and not silent:
-            state = None  # it may be an old one from a storage: wait for the daemon's own answer
+            # A storage on a router may have sent this old state. Wait for the daemon's own answer.
+            state = None
         age = follower.age(now) if follower.heard else math.inf
         return Row(name, one.here, state, age, one.version, silent)
 
@@ -154,7 +157,7 @@ class Fleet:
             try:
                 one.follower.published(self._states.decode(*encoded(sample)), at)
             except DecodeError:
-                pass  # another version: the robot is shown as silent
+                pass  # a daemon of another version: the robot is shown as silent
 
     # Zenoh's threads call the methods below.
 

@@ -3,9 +3,10 @@
 `Follower` is pure, and `Watch` connects it to the bus. All programs use the time limits of this
 module, so all programs report a silent robot after the same time.
 
-A storage on a router answers queries too. If the robot is off, the storage sends the last state of
-this robot. A published state never comes from a storage, so it always proves that the daemon runs.
-An answer to a query proves this only if it is newer than an earlier state.
+A Zenoh router may have a storage, which keeps the last messages and answers queries too. If the
+robot is off, the storage sends the last state of this robot. A published state never comes from a
+storage, so it always proves that the daemon runs. An answer to a query proves this only if it is
+newer than an earlier state.
 """
 
 from __future__ import annotations
@@ -52,7 +53,9 @@ STEADY_COUNTERS = ("lines", "lines_sent", "commands")
 class Follower:
     """The newest state of one robot, with its age. All times are in s on the same monotonic clock.
 
-    This clock must also advance while the computer is suspended, as `clock.steady_s` does.
+    This clock must also advance while the computer is suspended, as `clock.steady_s` does. `now` is
+    the present time, s. `ask_s` is the time without a new state after which the caller must query
+    `state`, s.
     """
 
     def __init__(self, now: float, ask_s: float = QUERY_PERIOD_S) -> None:
@@ -79,9 +82,9 @@ class Follower:
     def answered(self, state: RobotState, now: float) -> bool:
         """Process an answer to a query of `state`. Return whether it proves that the daemon runs.
 
-        `state` is the answer, which arrived at the time `now`, s. It may be an old state from a
-        storage. Therefore it is a proof only if its stamp is newer than that of `self.state` or of
-        the previous answer.
+        `state` is the answer, which arrived at the time `now`, s. The answer may be an old state
+        from the storage of a router. So it is a proof only if its stamp is newer than the stamp of
+        `self.state` or of the previous answer.
         """
         # The previous answer is compared too, because the robot's clock may have been set back
         # since `self.state`.

@@ -17,11 +17,11 @@ from acsard.core.values import NS_PER_S
 from acsard.host import clock
 
 Put = Callable[[Wish], object]
-"""A function that sends one command on the bus. It may block."""
+"""Function that sends one command on the bus. It may block."""
 
 
 class Outbox:
-    """Sends the commands of several senders to the robot from a thread of its own."""
+    """Sends the commands of several senders to the robot from a separate thread."""
 
     def __init__(self, dropped: Callable[[], object] = lambda: None) -> None:
         """Start the thread. It calls `dropped` for each command that `Commander.send` drops."""
@@ -31,13 +31,13 @@ class Outbox:
         self._news = Condition()
         self._busy = self._ended = False
         self.dead: Future[Never] = Future()
-        """Future that receives the exception that ended the thread. After that, no command is sent.
-        It stays pending while the thread runs, and if `end` ends the thread."""
+        """Future that gets the exception that ended the thread. No command is sent after that. The
+        future stays pending while the thread runs, and also if `end` ends the thread."""
         self._thread = Thread(target=self._live, name="outbox", daemon=True)
         self._thread.start()
 
     def take(self, commander: Commander, put: Put, wish: Wish) -> int | None:
-        """Queue a command of the sender `commander`. The thread sends it by a call of `put`.
+        """Queue the command `wish` of the sender `commander`. The thread calls `put` to send it.
 
         Returns the time since the sender's previous command, ns, or None (see `Commander.take`).
         """

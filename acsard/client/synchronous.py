@@ -83,8 +83,8 @@ def connect(
         robot_id: the id of the robot. Without a configuration file, it is "acsar".
         source: the command source as which the client sends its commands, a name in
             `[[commands.sources]]`.
-        tls: the directory with your certificate, for an endpoint that begins with "tls/". Without
-            the two variables, the client uses no certificate.
+        tls: the directory with your certificate, for an endpoint that begins with "tls/". If it is
+            None, and neither ACSARD_TLS nor ACSARD_CONFIG is set, the client uses no certificate.
     """
     where = address_by_environment(endpoint, robot_id, tls)
     session = client_session(where.endpoint, where.tls)
@@ -106,8 +106,8 @@ def close(session: zenoh.Session) -> None:
 class _Puts:
     """Keeps a minimum pause between the commands of all clients on one connection.
 
-    The daemon accepts at most 1000 commands a second per connection and key. It would drop a zero
-    that is sent directly after another command.
+    The daemon accepts at most 1000 commands a second per connection and key. Without the pause, the
+    daemon would drop a zero that is sent directly after another command.
     """
 
     def __init__(self) -> None:
@@ -206,8 +206,8 @@ class Client:
     def send(self, linear: float, angular: float = 0.0) -> None:
         """Send one command: `linear` m/s, `angular` rad/s (left is +).
 
-        Repeat the call to keep the robot moving. The first call sends a zero instead, because the
-        daemon requires a zero before it follows a sender.
+        Repeat the call to keep the robot moving. The first call sends a zero (a command with the
+        speed 0) instead, because the daemon requires a zero before it follows a sender.
         """
         with self._puts.turn():
             if self._opened:
@@ -253,8 +253,8 @@ class Client:
 
         Raises:
             NotDrivenError: The robot does not follow the commands; the text is the daemon's reason.
-                It is also raised if this program sent no command for more than 0.5 s during the
-                drive, because the program was suspended or the network failed.
+                Or this program sent no command for more than 0.5 s during the drive, because the
+                program was suspended or the network failed.
             NotPermittedError: The role of this client may not drive the robot.
             NoAnswerError: The daemon is silent.
             UsageError: An argument is not valid.
@@ -391,7 +391,7 @@ class Client:
     def put(
         self, twist: schema.Twist | schema.TwistStamped, signature: Signature, source: str = ""
     ) -> None:
-        """Forward a command that another sender has given, for example a viewer of a web page.
+        """Forward a command of another sender, for example of a person who uses a web page.
 
         Args:
             twist: the command.

@@ -1,11 +1,11 @@
 """Starts child processes, limits them, watches their signs of life, and ends them.
 
-Each child gets a session of its own, so that a Ctrl-C at the terminal reaches only the parent,
-which then ends its children. A child does not outlive its parent.
+Each child runs in a separate session, so a Ctrl-C at the terminal reaches only the parent. The
+parent then ends its children. A child does not outlive its parent.
 
-The parent uses `Child`, and the child uses `Parent`. A socket connects the two processes. The child
-uses it as its standard input, writes signs of life to it, and ends when the parent closes it. The
-parent kills a child that falls silent.
+The parent uses the class `Child`, and the child uses the class `Parent`. A socket connects the two
+processes, and is the child's standard input. The child writes signs of life to the socket, and ends
+when the parent closes the socket. The parent kills a child that falls silent.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ SYSTEMD_VARIABLES = ("NOTIFY_SOCKET", "INVOCATION_ID")
 could send notifications to systemd in its parent's name."""
 
 HEARTBEAT_S = 0.5
-"""Longest interval, s, at which a child sends a sign of life and its parent looks for one."""
+"""Longest pause, s, between two signs of life of a child, and between two checks by its parent."""
 
 SILENCE_TIMEOUT_NS = 3 * NS_PER_S
-"""If a child gives no sign of life for this time, ns, its parent kills it. The TLS gateway already
+"""Time without a sign of life after which a parent kills its child, ns. The TLS gateway already
 ends itself after 1 s without progress, so this limit is for a process that cannot even end
 itself."""
 
@@ -48,7 +48,9 @@ slowly on a busy machine."""
 
 
 class Silence:
-    """Detector that another process has given no sign of life for longer than `most_ns`, ns.
+    """Measures how long another process has been silent, which means without a sign of life.
+
+    The silence is too long if it exceeds `most_ns`, ns.
 
     If more than 0.5 s passes between two calls of `too_long`, only 0.5 s of this time counts as
     silence, because the computer may have stopped both processes meanwhile.
@@ -79,7 +81,7 @@ def acsard(*words: str) -> list[str]:
 def environment(hidden: Collection[str] = ()) -> dict[str, str]:
     """Return the environment variables for a child.
 
-    They are those of this process, without the variables that `hidden` and `SYSTEMD_VARIABLES`
+    The child gets the variables of this process, except those that `hidden` and `SYSTEMD_VARIABLES`
     name.
     """
     return {
@@ -88,7 +90,10 @@ def environment(hidden: Collection[str] = ()) -> dict[str, str]:
 
 
 class Limits(Struct, frozen=True):
-    """Limits of a child whose work is less important than the daemon's."""
+    """Limits of a child whose work is less important than the daemon's.
+
+    `nice` is the nice value, and `memory_bytes` is the limit of `RLIMIT_DATA`, bytes.
+    """
 
     nice: int
     memory_bytes: int
@@ -139,7 +144,7 @@ async def running(
     """Start a child process for the duration of an `async with` block, and yield it.
 
     If the child still runs at the end of the block, it is killed. `stdin`, `stdout` and `stderr`
-    are those of `subprocess`. Raises `OSError` if the child cannot be started.
+    have the same meaning as in `subprocess`. Raises `OSError` if the child cannot be started.
     """
     child = await asyncio.create_subprocess_exec(
         *command,
@@ -166,7 +171,10 @@ async def running(
 
 
 class Child:
-    """The parent's connection to a child. It kills a child that sends no more signs of life."""
+    """A child process, as its parent sees it. `run` kills the child if it sends no signs of life.
+
+    `command` is the program and its arguments. The program must use the class `Parent`.
+    """
 
     def __init__(self, command: Sequence[str]) -> None:
         self._command = command
@@ -178,8 +186,8 @@ class Child:
     def run(self) -> int:
         """Start the child, wait until it ends, and return its exit code.
 
-        If a signal ended the child, return the negative number of the signal. Raises `OSError` if
-        the child cannot be started.
+        If the child falls silent meanwhile, kill it and set `silent`. If a signal ended the child,
+        return the negative number of the signal. Raises `OSError` if the child cannot be started.
         """
         ours, its = socket.socketpair()
         with ours:
@@ -192,14 +200,18 @@ class Child:
                     env=environment(),
                 )
             self._ours = ours
-            if self._over:  # released while it was being started
+            if self._over:  # `release` was called while the child was being started
                 self.release()
             if self._falls_silent(ours):
                 process.kill()
             return process.wait()
 
     def _falls_silent(self, ours: socket.socket) -> bool:
-        """Return False if the child ends, or after `release` was called."""
+        """Wait until the child falls silent, and return True.
+
+        Return False if the child ends first, or if `release` is called first. `ours` is the
+        parent's end of the socket.
+        """
         silence, before_ns, alive = Silence(START_TIMEOUT_NS), clock.mono_ns(), False
         while True:
             beat = ours.recv(4096) if select.select([ours], [], [], HEARTBEAT_S)[0] else None
@@ -229,8 +241,8 @@ class Child:
 class Parent:
     """The connection of a child process to the parent process that started it as a `Child`.
 
-    `fd` is the child's standard input. If no such parent has started the process, it sends no signs
-    of life. This is so if a person has started it at a terminal.
+    `fd` is the child's standard input. If the process has no such parent, for example because a
+    person started it at a terminal, the method `beat` does nothing.
     """
 
     def __init__(self, fd: int) -> None:

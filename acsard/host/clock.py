@@ -75,8 +75,8 @@ class Asleep:
     def was(self) -> bool:
         """Return whether this computer has been suspended since the last call.
 
-        A suspend of less than 0.1 s (`MIN_SUSPEND_NS`) is added to the time that the next call
-        examines.
+        A suspend of less than 0.1 s (`MIN_SUSPEND_NS`) does not count yet. The next call adds its
+        duration to any later suspend.
         """
         if self._read() - self._known_ns < MIN_SUSPEND_NS:
             return False

@@ -87,7 +87,7 @@ class Edit(Struct, frozen=True):
 
     file: Path
     keys: Keys
-    """The new values."""
+    """Maps the changed keys to their new values."""
     before: bytes
     """The content of the file from which `after` was computed."""
     after: str
@@ -152,7 +152,10 @@ def keep(edit: Edit) -> None:
 
 
 def _require_writable(place: Path) -> None:
-    """`place` is a path without symbolic links."""
+    """Raise `ValueError` if the daemon may not replace the file at `place`.
+
+    `place` is a path without symbolic links.
+    """
     if not place.is_file():
         raise ValueError("it is not a regular file")
     # Check the mode bits too, because root may write every file. Without these checks the daemon
@@ -167,8 +170,8 @@ def is_tracked(place: Path) -> bool:
     """Return whether git tracks the file at `place`, a path without symbolic links.
 
     The `acsard.toml` of a clone of acsard always counts as tracked. If git is missing or does not
-    answer, all other files count as not tracked. The same holds for files in a repository of
-    another user, because git refuses to read it.
+    answer, all other files count as not tracked. Files in a repository of another user count as not
+    tracked too, because git refuses to read that repository.
     """
     if not any((parent / ".git").exists() for parent in place.parents):
         return False

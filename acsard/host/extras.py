@@ -44,9 +44,9 @@ def missing(library: str, extra: Extra) -> MendableError:
 def wanted_by(installed: Distribution, extra: Extra) -> list[str]:
     """Return the arguments of `pip install` that install an extra.
 
-    They are like ["DIRECTORY[EXTRA]"], with the directory from which acsard was installed. If this
-    directory no longer exists, they are the names of the extra's libraries. `installed` is the
-    metadata of the installed acsard.
+    The result is like ["DIRECTORY[EXTRA]"], with the directory from which acsard was installed. If
+    this directory no longer exists, the result contains the names of the extra's libraries.
+    `installed` is the metadata of the installed acsard.
     """
     told = json.loads(installed.read_text("direct_url.json") or "{}")
     url = urlsplit(told.get("url", ""))

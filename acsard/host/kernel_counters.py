@@ -27,7 +27,7 @@ SELF_SCALING_DRIVERS = ("intel_pstate", "amd-pstate", "amd-pstate-epp")
 driver, the governor `powersave` keeps the lowest frequency."""
 
 COOLING_TYPES = ("Processor", "cpufreq", "thermal-cpufreq", "thermal-idle", "intel_powerclamp")
-"""A cooling device slows a processor down if its type (in sysfs) begins with one of these texts."""
+"""Beginnings of the types (in sysfs) of those cooling devices that slow a processor down."""
 
 
 class SlowClock(Struct, frozen=True):
@@ -118,7 +118,7 @@ def steal(text: str, tick_ns: int) -> tuple[int, ...]:
 def iowait(text: str, tick_ns: int) -> int:
     """Return the time for which a processor was idle while a program waited for I/O, ns.
 
-    Each processor has its own counter, and the result is the largest of these counters. `text` is
+    Each processor has its own counter. Return the largest of these counters. `text` is
     the content of `/proc/stat`, which counts clock ticks. `tick_ns` is the duration of a clock
     tick, ns.
     """
@@ -132,9 +132,9 @@ def _processors(text: str) -> list[list[str]]:
 
 
 def stalled(text: str) -> int:
-    """Return the total time in which at least one task waited for the resource, ns.
+    """Return the total time in which at least one task waited for a resource, such as a disk, ns.
 
-    `text` is the content of a file such as `/proc/pressure/io`, which names the resource.
+    `text` is the content of the resource's pressure file, such as `/proc/pressure/io`.
     """
     for line in text.splitlines():
         if line.startswith("some "):
@@ -261,8 +261,8 @@ class Kernel:
     def read(self, conditions: Conditions | None = None) -> Reading:
         """Read all counters.
 
-        The result contains `conditions`. If it is None, read the present conditions of the
-        processors too.
+        The result contains `conditions`. If `conditions` is None, read the present conditions of
+        the processors too.
         """
         stat = _text(self._proc / "stat")
         own = fields(_text(self._proc / "self/stat"))

@@ -208,7 +208,10 @@ class Log:
         self._logger.log(_LEVELS[event.level], event.name, **fields)
 
     def info(self, name: EventName, **fields: object) -> None:
-        """Log a message of the daemon itself."""
+        """Log the event `name` of the daemon itself, at the level "info".
+
+        `fields` are the values in the log entry, by name.
+        """
         self._logger.info(name, **fields)
 
     def close(self) -> None:
@@ -227,7 +230,7 @@ def _in_order(logger: object, method: str, line: MutableMapping[str, Any]) -> di
 def _printable(
     logger: object, method: str, line: MutableMapping[str, Any]
 ) -> MutableMapping[str, Any]:
-    """Replace characters that would move the cursor or begin a new line."""
+    """Replace characters that would move the cursor or begin a new line, and cut long values."""
     for key, value in line.items():
         if isinstance(value, str) and not (value.isprintable() and len(value) <= MAX_VALUE_LENGTH):
             line[key] = printable(value[:MAX_VALUE_LENGTH])

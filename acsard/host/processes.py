@@ -17,8 +17,8 @@ from msgspec import Struct
 PROC = Path("/proc")
 
 PTY_MAJORS = range(136, 144)
-"""Major device numbers of ptys. Each number stands for 256 ptys, and no serial port has one of
-them."""
+"""Major device numbers of ptys. Each number stands for 256 ptys. No serial port has any of these
+numbers."""
 
 
 class Holder(Struct, frozen=True):
@@ -163,7 +163,10 @@ def _holder(process: Path) -> Holder:
 
 
 def _name(process: Path) -> str:
-    """`process` is the directory in /proc. "acsard" is also the name of `python -m acsard`."""
+    """Return the program name of a process, whose directory in /proc is `process`.
+
+    The name of `python -m acsard` is "acsard", not "python".
+    """
     words = (process / "cmdline").read_bytes().split(b"\0")
     if any(Path(os.fsdecode(word)).name == "acsard" for word in words[:4]):
         return "acsard"

@@ -77,7 +77,7 @@ class Buckets:
         own = self._buckets.setdefault(name, Bucket(self._of_one))
         if self._shared is None:
             return own.take(now_ns)
-        # A name without units of its own must not consume units of the shared bucket.
+        # A name whose bucket is empty must not consume units of the shared bucket.
         return own.room(now_ns) and self._shared.take(now_ns) and own.take(now_ns)
 
 

@@ -16,10 +16,10 @@ PRIORITY = 10
 50."""
 
 MAX_SPIN_S = 1
-"""If the control loop runs for longer than this without a pause, s, the kernel ends the process.
-Otherwise a loop that hangs would block all ordinary programs, because the loop has priority over
-them. A step takes a thousandth of this time. The systemd service has no such limit: systemd's
-watchdog ends a daemon that hangs."""
+"""Longest time for which the control loop may run without a pause, s. After this time, the kernel
+ends the process. Otherwise a loop that hangs would block all ordinary programs, because the loop
+has priority over them. A step takes a thousandth of this time. The systemd service has no such
+limit: systemd's watchdog ends a daemon that hangs."""
 
 WAKE_UP_LATENCY = "/dev/cpu_dma_latency"
 """Device file with which a process limits the time that a processor takes to wake up."""
@@ -66,8 +66,8 @@ def has(pid: int) -> bool | None:
 def allowed() -> bool:
     """Return whether a daemon started by this user would get real-time scheduling.
 
-    It would if the process has the capability CAP_SYS_NICE, or if the limit RLIMIT_RTPRIO is high
-    enough. In a container, even root may lack this capability.
+    It would if this process has the capability CAP_SYS_NICE, or if its limit RLIMIT_RTPRIO is at
+    least `PRIORITY`. In a container, even root may lack this capability.
     """
     limit = resource.getrlimit(resource.RLIMIT_RTPRIO)[0]
     return _capable(_CAP_SYS_NICE) or limit == resource.RLIM_INFINITY or limit >= PRIORITY
@@ -92,7 +92,10 @@ def _schedule() -> bool:
 
 
 def _stay_awake() -> bool:
-    """From deep sleep, a processor wakes late and with cold caches. Return False if refused."""
+    """Keep the processors out of deep sleep until this process ends. Return False if refused.
+
+    A processor in deep sleep wakes late and with cold caches.
+    """
     try:
         wish = os.open(WAKE_UP_LATENCY, os.O_WRONLY | os.O_CLOEXEC)
     except FileNotFoundError:

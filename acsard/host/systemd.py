@@ -12,8 +12,7 @@ from collections.abc import Mapping
 from acsard.core.values import NS_PER_S, Outputs
 
 FEEDS_PER_WATCHDOG = 4
-"""Number of times that the control loop feeds systemd's watchdog in each timeout of the
-watchdog."""
+"""Number of times that the control loop feeds systemd's watchdog within the watchdog's timeout."""
 
 START_EXTENSION_S = 30
 """Time that each call of `waiting` adds before systemd ends a process that is still starting, s."""

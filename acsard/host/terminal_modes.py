@@ -14,8 +14,8 @@ from typing import TextIO
 def coloured(stream: TextIO) -> bool:
     """Return whether output to a stream may contain colors.
 
-    It may if the stream is a terminal that can show colors, unless the environment variable
-    NO_COLOR is set.
+    The output may contain colors if the stream is a terminal, TERM is not "dumb", and the
+    environment variable NO_COLOR is not set.
     """
     wanted = not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb"
     return wanted and stream.isatty()
@@ -25,8 +25,8 @@ def coloured(stream: TextIO) -> bool:
 def one_by_one() -> Iterator[None]:
     """Make the terminal deliver each key press immediately, without Enter, during a `with` block.
 
-    In the block, Ctrl-S is an ordinary key. Otherwise it would stop the output of the terminal, and
-    so block a program that drives the robot.
+    In the block, Ctrl-S is an ordinary key. Otherwise Ctrl-S would stop the output of the terminal,
+    and so block a program that drives the robot.
     """
     before = termios.tcgetattr(sys.stdin)
     tty.setcbreak(sys.stdin)

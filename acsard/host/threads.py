@@ -1,7 +1,7 @@
 """Runs blocking calls outside the event loop, with a time limit.
 
-The calls run in daemon threads of their own and not in the default executor. A call that never
-returns, such as a close that hangs in a driver, must not keep the process from ending.
+Each call runs in a new daemon thread and not in the default executor. A call that never returns,
+such as a close that hangs in a driver, must not keep the process from ending.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Finds the version of this program and the commit of its source.
 
-`deploy/build_hook.py` imports this module, which therefore uses only the standard library.
+This module uses only the standard library, because `deploy/build_hook.py` imports it.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ COMMIT_FILE = "commit"
 """Name of a file that `deploy/build_hook.py` adds to the package. It contains the git commit."""
 
 HASH_DIGITS = 9
-"""The version contains this number of hexadecimal digits of the commit's hash."""
+"""Number of hexadecimal digits of the commit's hash that the version contains."""
 
 
 @lru_cache(1)
@@ -30,7 +30,7 @@ def version() -> str:
 
 
 def commit_of(clone: Path) -> str:
-    """Return the commit that is checked out in the git clone `clone`; "" if it is not a clone.
+    """Return the commit that is checked out in `clone`; "" if `clone` is not a git clone.
 
     This function reads git's files itself, because a computer that runs the daemon may have no git.
     The files do not show whether the source has changed since the commit.

@@ -2,8 +2,8 @@
 
 All certificates and keys are files. The keys are P-256 keys, in files that only their owner can
 read. Users make their phones trust the authority, so the authority's certificate limits the hosts
-for which it may sign. Somebody who has stolen the authority's key can pose as a robot or as a host
-of a private network, but not as a web site on the Internet.
+for which it may sign. So a thief of the authority's key can pose as a robot or as a host of a
+private network, but not as a web site on the Internet.
 """
 
 from __future__ import annotations
@@ -98,9 +98,10 @@ class Authority:
     def permits(self, address: str) -> bool:
         """Return whether this authority may sign a certificate for a host name or IP address.
 
-        An authority that acsard has made lists the permitted names and the permitted networks. The
-        certificate of another authority may list only one kind, and then it does not restrict the
-        other kind. It may also list excluded names and networks.
+        The certificate of an authority that acsard has made lists the permitted names and the
+        permitted networks. The certificate of an authority from another program may list only names
+        or only networks. It then permits all addresses of the kind that it does not list. It may
+        also list excluded names and networks.
         """
         try:
             constraints = self._certificate.extensions.get_extension_for_class(x509.NameConstraints)
@@ -208,7 +209,7 @@ def _constraints(addresses: Sequence[str]) -> x509.NameConstraints:
             hosts.append(address.lower())
         elif not any(named.value in one for one in networks):
             networks.append(_network_of(address))
-    # A host name below another permitted name needs no entry of its own.
+    # A host name below another permitted name needs no separate entry.
     own = [one for one in dict.fromkeys(hosts) if not any(one.endswith(f".{h}") for h in hosts)]
     return x509.NameConstraints([*map(x509.DNSName, own), *map(x509.IPAddress, networks)], None)
 
@@ -227,7 +228,10 @@ def _general_name(address: str) -> x509.GeneralName:
 
 
 def _within(address: str, subtree: x509.GeneralName) -> bool:
-    """Decide like OpenSSL whether the name constraint `subtree`, of the same kind, matches."""
+    """Return whether the name constraint `subtree` includes `address`, by the rules of OpenSSL.
+
+    Both must be IP addresses, or both must be host names.
+    """
     if isinstance(subtree, x509.IPAddress):
         return ipaddress.ip_address(address) in ipaddress.ip_network(str(subtree.value))
     name, base = address.lower(), str(subtree.value).lower()

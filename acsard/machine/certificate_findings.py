@@ -132,8 +132,10 @@ def _command(action: str, directory: Path) -> str:
 
 
 def router_certificates(config: Config) -> Iterator[Finding]:
-    """Yield a finding about the certificate of each configured router that answers over
-    TLS."""
+    """Yield a finding about the certificate of each router in `bus.connect` that uses TLS.
+
+    Yield nothing about a router that does not answer.
+    """
     tls = config.bus.tls
     routers = [endpoint for endpoint in config.bus.connect if endpoint.startswith(TLS_PREFIX)]
     for whose, ends_ns in ends_of(routers, tls).items():

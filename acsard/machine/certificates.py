@@ -169,9 +169,9 @@ def _robot_names(more: Sequence[str]) -> list[str]:
 def keys(config: Config, directory: Path) -> dict[str, object]:
     """Return values of `bus.listen` and `bus.tls` with which other machines can connect over TLS.
 
-    The new `bus.listen` contains the endpoints of `config`, the present configuration. If no
-    endpoint uses TLS, it also contains a TLS endpoint at port `PORT`. The new `bus.tls` is
-    `directory`, which contains the robot's certificate.
+    The new `bus.listen` contains the endpoints of `config`, the present configuration. If none of
+    them uses TLS, the new `bus.listen` also contains a TLS endpoint at port `PORT`. The new
+    `bus.tls` is `directory`, which contains the robot's certificate.
     """
     listen = list(config.bus.listen)
     if not any(endpoint.startswith("tls/") for endpoint in listen):

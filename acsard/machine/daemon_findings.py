@@ -92,8 +92,8 @@ DIFFERENCE_REASONS: tuple[tuple[Callable[[str], bool], Level, str, str], ...] = 
 """Reasons why the daemon's value of a configuration key may differ from the value in the file.
 
 Each row has four items: a function that returns whether the reason can apply to a key, the level of
-the finding, the reason in words, and the advice to the user. `{which}` and `{lines}` in the advice
-are replaced.
+the finding, the reason in words, and the advice to the user. In the advice, `{which}` stands for
+"this value" or "these values", and `{lines}` stands for lines of a configuration file.
 """
 
 
@@ -108,8 +108,8 @@ class Running(Struct, frozen=True):
     before: RobotState
     state: RobotState
     looked_ns: int
-    """Time in the middle between sending the query of `state` and receiving its answer: this
-    machine's wall clock, ns."""
+    """Time halfway between sending the query of `state` and receiving its answer, by this machine's
+    wall clock, ns."""
     trip_ns: int = 0
     """Time from sending the query of `state` to receiving its answer, ns."""
     rows: tuple[DiagnosticStatus, ...] = ()
@@ -140,7 +140,11 @@ def asked(config: Config, address: Address) -> Running:
 
 
 def _configuration(robot: Client, info: Info, file: Config) -> Config:
-    """Return the daemon's configuration, or the nearest one that `info` and the local file give."""
+    """Return the daemon's configuration.
+
+    If the daemon does not return it, return `file`, the configuration in the local file, with the
+    values that `info` contains.
+    """
     try:
         return from_builtins(robot.get("config"))
     except (AcsardError, msgspec.ValidationError):  # not permitted, or a daemon of another version
@@ -202,7 +206,10 @@ def answers(endpoint: str) -> bool:
 
 
 def link(running: Running) -> Iterator[Finding]:
-    """Yield findings about the serial link, and about the board's inputs and battery."""
+    """Yield findings about the serial link, and about the board's inputs and battery.
+
+    If the link is not up, yield only a finding about the link.
+    """
     config, state = running.config, running.state
     mend = check(running)
     if state.link != "up":
@@ -330,9 +337,9 @@ def refused(counters: Mapping[str, int]) -> list[str]:
 
 
 def gone(counters: Mapping[str, int]) -> list[tuple[int, str]]:
-    """Return a list with the pair (number of times that the link was lost, sentence about this).
+    """Return [(number of times that the link was lost, sentence about these losses)].
 
-    Losses do not count if they occurred because the computer did not run the daemon in time. Return
+    A loss does not count if it occurred because the computer did not run the daemon in time. Return
     [] if no loss counts. `counters` are the daemon's counters.
     """
     times = counters.get("link_lost", 0) - counters.get("link_lost_host_stall", 0)

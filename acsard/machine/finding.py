@@ -8,7 +8,7 @@ from msgspec import Struct
 
 Level = Literal["ok", "warning", "failure"]
 LEVELS: tuple[Level, ...] = ("ok", "warning", "failure")
-"""The levels of findings, the mildest level first. The index of a level is also its number in ROS
+"""The levels of findings, from mild to severe. The index of a level is also its number in ROS
 diagnostics."""
 
 

@@ -1,7 +1,7 @@
 """Installs acsard as a systemd service, or removes the service.
 
 The files of the service come from `deploy/`, with the path of this installation in the units. A
-file that somebody has changed is replaced or removed only with `force` or `purge`. The installation
+file that a user has changed is replaced or removed only with `force` or `purge`. The installation
 and the removal are lists of steps, so that the user can read all steps before they are carried out.
 """
 
@@ -304,7 +304,7 @@ RELOAD_COMMANDS = (
     Run(("udevadm", "control", "--reload"), may_fail=True),
 )
 TRIGGERED_SUBSYSTEMS = ("tty", "usb-serial", "misc")
-"""Kernel subsystems. `udevadm trigger` applies the new udev rules to the devices in them."""
+"""Kernel subsystems with the devices to which `udevadm trigger` applies the new udev rules."""
 
 INSTALL_COMMANDS = (
     *RELOAD_COMMANDS,
@@ -350,7 +350,8 @@ def _unit(name: str) -> File:
 def lan_drop_in(unit: str) -> File:
     """Return the drop-in file `lan.conf` of a unit.
 
-    It lets the unit use the local network and the certificates. `unit` is the unit's file name.
+    The drop-in file lets the unit use the local network and the certificates. `unit` is the unit's
+    file name.
     """
     return File(
         UNIT_DIRECTORY / f"{unit}.d" / LAN_DROP_IN,
@@ -359,8 +360,7 @@ def lan_drop_in(unit: str) -> File:
 
 
 def admitting(directory: Path) -> Write | Keep | None:
-    """Return the step that lets the service's TLS gateway use the certificates in
-    `directory`.
+    """Return the step that lets the service's TLS gateway use the certificates in `directory`.
 
     The step writes a drop-in file for the gateway's unit. Without this file, the gateway may use
     only loopback, and cannot read root's files. If the drop-in file exists, the step changes only
@@ -556,9 +556,10 @@ def source() -> Path:
 
 
 def _reference() -> Path:
-    """Return the path of `acsard.toml`.
+    """Return the path of the reference configuration `acsard.toml`.
 
-    An installed package has it in `deploy/`, a git clone beside it.
+    In an installed package, this file is inside the directory `deploy/`. In a git clone, it is
+    beside this directory.
     """
     inside = source() / "acsard.toml"
     return inside if inside.is_file() else source().parent / "acsard.toml"

@@ -55,8 +55,11 @@ If there are fewer lines, the robot is assumed to stand still.
 """
 
 LEAST_SHARE = 0.2
-"""Smallest part of the distance and of the turns that must remain in the steps. Otherwise the robot
-only moved to and fro within steps, and the drive gives no errors."""
+"""Smallest fraction of the distance and of the turns that must remain in the steps of the drive.
+
+Motion to and fro within a step cancels. If too little distance remains, the drive gives no position
+errors. If too little of the turns remains, the drive gives no heading errors.
+"""
 
 STEP_S = 0.1
 """Minimum duration of the steps into which a measured drive is divided, s."""
@@ -280,7 +283,8 @@ class _Model:
     def __init__(self, config: Config, metres: float) -> None:
         self.odometry, self.kinematics = config.odometry, Kinematics(config.drive)
         self.rolls = self.turns = True
-        """Whether the drive is long enough to extrapolate the position and the heading error."""
+        """Whether the drive is long enough to extrapolate the position error (`rolls`) and the
+        heading error (`turns`)."""
         self._metres = metres
 
     @property
@@ -294,9 +298,10 @@ class _Model:
         """Return the errors that one cause makes. They are None if `basis` is "unknown".
 
         The position error comes from repeating the steps `ahead`. The heading error comes from
-        repeating the steps `left`, in which all turns are to the left. `only` sets the errors of
-        all other causes to 0. `counts` (encoder counts per wheel turn) and `scale` (relative
-        standard deviation of the gyro's scale) are 0 if they are not the cause.
+        repeating the steps `left`, in which all turns are to the left. `only` contains the settings
+        of `[odometry]`, in which the errors of all other causes are 0. `counts` (encoder counts per
+        wheel turn) and `scale` (relative standard deviation of the gyro's scale) are 0 if they are
+        not the cause.
         """
         if basis == "unknown":
             return Share(cause, None, None, basis)
@@ -313,7 +318,10 @@ class _Model:
         self, steps: Steps, only: OdometryConfig, counts: int, scale: float, metres: float,
         angle: float,
     ) -> PoseCovariance:  # fmt: skip
-        """Repeat `steps` until `metres` m are driven, or until the turns add up to `angle` rad."""
+        """Return the covariance of the pose after a drive that repeats `steps`.
+
+        The drive ends when `metres` m are driven, or when the turns add up to `angle` rad.
+        """
         pose, path = PoseUncertainty(ErrorModel(only, self.kinematics), counts), Path()
         rolled = turned = 0.0
         for distance, turn, along, yaw, *missed, by_gyro in cycle(steps.rows.tolist()):

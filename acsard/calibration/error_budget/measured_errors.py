@@ -27,12 +27,14 @@ Counts = npt.NDArray[np.int64]
 UNDELAYED_LINES = 30
 """Number of consecutive feedback lines, of which at least one is assumed not to be delayed.
 
-At 100 Hz, these lines take 0.3 s. A busy host does not keep the daemon from running for longer.
+At 100 Hz, these lines take 0.3 s. A busy host delays the daemon for less than this time.
 """
 
 LOST_LINE_PERIODS = 0.6
-"""Growth of the smallest delay among `UNDELAYED_LINES` lines, in periods, that shows a lost
-line."""
+"""Limit for the growth of the smallest delay among `UNDELAYED_LINES` lines, in line periods.
+
+From this limit on, a line counts as lost.
+"""
 
 DELAY_GAIN = 0.05
 """Gain of the low-pass filter that follows the smallest delay among `UNDELAYED_LINES` lines.
@@ -57,7 +59,7 @@ class LineTimes(Struct, frozen=True):
     missing: Counts
     """Number of feedback lines that were lost just before each line."""
     period: float
-    """Mean interval between two lines, s."""
+    """Mean interval at which the board sends lines, s. Lost lines count as sent."""
 
 
 # The board makes its lines at a fixed period, or as answers to the lines of the daemon, so the
@@ -187,7 +189,7 @@ class Motion(Struct, frozen=True):
 
     seconds: float
     period: float
-    """Mean interval between two lines, s."""
+    """Mean interval at which the board sends lines, s. Lost lines count as sent."""
     distance: Floats
     """Distance from each line to the next, m, negative backwards."""
     turn: Floats
@@ -490,10 +492,10 @@ class Driving:
         return self._steps(np.column_stack(variances))
 
     def contradicted(self) -> Steps:
-        """Return the steps, each with the error that its front and rear wheels show.
+        """Return the steps with the errors that differences of front and rear wheels show.
 
-        On each side, one wheel is assumed to be right. The mean of both wheels is then wrong by
-        half of the difference between the two wheels.
+        On each side of the robot, one of the two wheels is assumed to have no error. The mean of
+        both wheels is then wrong by half of the difference between them.
         """
         turned = np.diff([line.positions for line in self._lines], axis=0)
         front_right, front_left, rear_left, rear_right = turned.T
@@ -501,7 +503,10 @@ class Driving:
         return self._steps(missed=self._of_wheels(np.column_stack([right, left, left, right])))
 
     def _of_wheels(self, off: Floats) -> Floats:
-        """Return the missed motion, rows of (m, rad, 0, 0), for wrong rolled angles, rad."""
+        """Return the motion that the pose missed: rows of (m, rad, 0, 0).
+
+        `off` contains the errors of the angles that the wheels rolled, rad.
+        """
         moved = off @ self._weights.T
         return np.hstack([moved, np.zeros_like(moved)])
 

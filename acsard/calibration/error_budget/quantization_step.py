@@ -58,7 +58,10 @@ def quantization_step(speeds: Floats) -> float:
 
 
 def _strays(speeds: Floats, step: float, doubt: float) -> int:
-    """Return how many speeds are not multiples of `step`. `doubt` is its largest relative error."""
+    """Return how many speeds are not multiples of `step`.
+
+    `doubt` is the largest relative error of `step`.
+    """
     off = np.abs(speeds - step * np.round(speeds / step))
     return int(np.count_nonzero(off > ROUNDING + doubt * speeds))
 

@@ -64,7 +64,7 @@ class Phase(StrEnum):
 
 
 class LegDriver:
-    """Decides the commands of one leg.
+    """Decides the commands of one leg, which is one drive of a guided calibration.
 
     Every argument `now` is the present time, s. All these times come from one monotonic clock,
     which also advances while the computer is suspended.
@@ -152,7 +152,10 @@ class LegDriver:
             self._tolerate_briefly(why or deviation, now, disturbed=disturbed)
 
     def wheels(self, fastest: float, now: float) -> None:
-        """Process wheel speeds from the daemon. `fastest` is that of the fastest wheel, rad/s."""
+        """Process wheel speeds from the daemon.
+
+        `fastest` is the absolute speed of the fastest wheel, rad/s.
+        """
         self._received = now
         if fastest > STANDSTILL_SPEED:
             self._still_since = None

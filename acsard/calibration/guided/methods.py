@@ -424,7 +424,7 @@ def _positions(setup: Setup, track: float) -> tuple[Leg, ...]:
 
 
 def _there_and_back(setup: Setup, rate: float) -> tuple[Move, ...]:
-    """Return a curve there and back, which stays on the floor whatever the robot's heading is."""
+    """Return a curve there and back that stays on the floor at any heading of the robot."""
     metres = min(CURVE_M, FLOOR_M / 2 - setup.from_edge)
     return setup.arc(rate, metres), SHORT, setup.arc(-rate, -metres), SHORT
 

@@ -47,7 +47,7 @@ RECONNECT_TIMEOUT_S = 3.0
 """Time within which a silent daemon must send its state again, s, so that the leg is repeated."""
 
 POSITION_TYPES = (Odometry, PoseStamped)
-"""Types of a position message, in the order in which a sample is decoded as one of them.
+"""Message types with positions, in the order in which `Sensor` tries to decode the first message.
 
 A CDR payload does not name its type. `Odometry` comes first because a pose is too short to be
 decoded as `Odometry`.
@@ -130,7 +130,7 @@ class Sample(Struct, frozen=True):
 
 
 class Recorder:
-    """Collects the samples of one leg.
+    """Collects the samples of one leg, which is one drive of a guided calibration.
 
     Every argument `came` is the time of arrival of the message, s. `joints` contains the names of
     the wheel joints: front right, front left, rear left, rear right.
@@ -293,5 +293,5 @@ class RobotOnBus:
         self._watch.look(clock.steady_s())
 
     def _full(self, key: str) -> str:
-        """Put the id of this robot in front of a key of acsard, such as "imu"."""
+        """Return `key`, with this robot's id in front if acsard itself defines the key ("imu")."""
         return self._client.key(key) if by_key(key) is not None else key

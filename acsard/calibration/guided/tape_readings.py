@@ -404,7 +404,10 @@ def calibrated(
 
 
 def _improvement(readings: Sequence[Reading], base: Base, fit: TapeFit, rate: Rates) -> Improvement:
-    """Compare the present and the new parameters: predict each reading by a fit to the others."""
+    """Return the errors of the configured and of the new parameters.
+
+    The error of the new parameters in a reading comes from a fit to all other readings.
+    """
     sums = {name: np.zeros(3) for name in ("turn", "straight", "place")}
     present = fit.parameters.copy()
     present[: P.DELAY] = base.start()[: P.DELAY]
