@@ -2,7 +2,7 @@
 
 Successive commands have different speeds, and so have successive feedback lines. Each output of the
 measured daemon is therefore matched with its input by the speed, not by the time. All times are
-monotonic, in ns.
+monotonic, in ns, except the stamps of odometry samples, which are wall-clock times.
 """
 
 from __future__ import annotations

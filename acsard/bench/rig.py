@@ -283,7 +283,7 @@ class Rig:
         return self._share(began_ns, used_ns)
 
     def _neutral(self, phases: random.Random) -> None:
-        """Send zeros until one is accepted: the daemon first ignores a new sender."""
+        """Send zeros until the daemon accepts one. At first it ignores a new sender."""
         before = self._counted()
 
         def look() -> bool | None:
@@ -329,7 +329,7 @@ class Rig:
         end(self.process, END_TIMEOUT_S)
 
     def end(self) -> Record:
-        """End the measured program and return the record. Do not use the rig after this."""
+        """End the measured program and return the record. Do not use the rig afterward."""
         window_ns = (self._settled_ns, clock.mono_ns())
         # Wait for messages that have not arrived yet.
         time.sleep(0.1)

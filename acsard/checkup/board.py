@@ -3,9 +3,9 @@
 A step of the check sends lines through a `Board` for some time, and then evaluates the stored
 `replies`. Speeds are given for the motors a to d and not for wheels, because the check must find
 out which wheel a motor turns. A step ends immediately if a motor runs away, if the board falls
-silent, or if the board restarts. After a restart the step can be repeated; otherwise the check
-ends. The caller implements the interfaces `Wire` (the serial line) and `Operator` (the person at
-the robot).
+silent, or if the board restarts. After a restart the step can be repeated. After a runaway or a
+silence the check ends. The caller implements the interfaces `Wire` (the serial line) and `Operator`
+(the person at the robot).
 """
 
 from __future__ import annotations
@@ -91,11 +91,11 @@ BEAT_NS = int(motion.LINE_PERIOD_S * NS_PER_S)
 much this computer runs the check too late."""
 
 FINAL_ZEROS = 5
-"""Number of times that the check sends zeros at its end."""
+"""Number of times that the check sends zero speeds at its end."""
 
 
 RESULT_FIELDS = ("comma", "latched", "sealed", "sampled", "own_clock", "gap_s", "paced", "lost")
-"""Names of the attributes of `Board` that are set back before a step is repeated.
+"""Names of the attributes of `Board` that are restored before a step is repeated.
 
 They contain results of earlier steps, which later steps use.
 """
@@ -104,8 +104,8 @@ They contain results of earlier steps, which later steps use.
 class Board:
     """The board that is checked, with its replies and the results of the steps.
 
-    It is a context manager, which opens the wire at the beginning and closes it at the end. Before
-    it closes the wire, it sends zeros, unless a motor runs away (`fled`).
+    It is a context manager, which opens the serial line (`wire`) at the beginning and closes it at
+    the end. Before it closes the line, it sends zero speeds, unless a motor runs away (`fled`).
     """
 
     def __init__(
@@ -126,7 +126,7 @@ class Board:
         self.comma = mcu.trailing_comma
         """Whether the lines to the board end with a comma."""
         self.latched = False
-        """Whether motor d stops only if a line of zeros has the ending that `comma` selects."""
+        """Whether motor d stops only at lines with the ending that `comma` selects."""
         self.sealed = self.sampled = False
         """`sealed`: whether each line has a checksum. `sampled`: whether each line to the board
         requests a sample, that is the board's clock and encoder counts."""
@@ -163,7 +163,7 @@ class Board:
         self._commanded = ZERO
         self._unanswered_s = 0.0
         """Time for which `drive` has sent lines since the last reply, s. A delay of this computer
-        counts for the time between two lines at most."""
+        adds at most the time between two lines."""
         self._listened_s = 0.0
         self._sequence = 0
         self._lines = LineReader()
@@ -220,7 +220,7 @@ class Board:
     def known(self) -> dict[str, object]:
         """Mapping from each name in `RESULT_FIELDS` to the value of that attribute.
 
-        Assign an earlier mapping to set the attributes back, before a step is repeated.
+        Assign an earlier mapping to restore the attributes before a step is repeated.
         """
         return {name: getattr(self, name) for name in RESULT_FIELDS}
 
@@ -243,7 +243,7 @@ class Board:
     # Sending
 
     def line(self, motors: Motors, comma: bool | None = None) -> bytes:
-        """Return the line that commands these speeds, rad/s.
+        """Return the line that commands the speeds `motors`, rad/s.
 
         The line ends with a comma if `comma` is true. None means the value of `self.comma`. The
         line has a sequence number and a checksum if `self.sealed` is true.
@@ -270,7 +270,7 @@ class Board:
         self.restarts.sent(motors, self.sent_s)
 
     def zeros(self) -> None:
-        """Send zeros as a line with a final comma, and again as a line without a final comma.
+        """Send zero speeds as a line with a final comma, and again as a line without one.
 
         If `sealed` is true, also send them as a line with a checksum.
         """
@@ -280,7 +280,7 @@ class Board:
         self.restarts.sent(ZERO, self.now_s)
 
     def wakes(self, seconds: float) -> bool:
-        """Send zeros until the board answers. Return whether a reply arrives within `seconds` s."""
+        """Send zero speeds until the board answers. Return False if it does not in `seconds` s."""
         before, end_s = len(self.replies), self.now_s + seconds
         while len(self.replies) == before:
             if self.now_s >= end_s:
@@ -290,7 +290,7 @@ class Board:
         return True
 
     def ask(self, wait_s: float = 0.0, comma: bool | None = None) -> None:
-        """Send one line of zeros, then listen for `wait_s` s, but at least for `period_s`.
+        """Send one line of zero speeds, then listen for `wait_s` s, but at least for `period_s`.
 
         The line ends with a comma if `comma` is true. None means the value of `self.comma`.
         """
@@ -300,7 +300,7 @@ class Board:
     def answers(
         self, lines: int, wait_s: float, comma: bool | None = None
     ) -> list[tuple[float, Reply]]:
-        """Send lines of zeros, and return the first reply to each line together with its delay.
+        """Send lines of zero speeds, and return the first reply to each line with its delay.
 
         Each entry of the result is a pair: the time from the line to its reply, s, and the reply. A
         line without a reply has no entry.
@@ -343,7 +343,10 @@ class Board:
         return got
 
     def let_go(self, silent_s: float) -> None:
-        """Send zeros once, then send nothing for `silent_s` s, so that the watchdog can act."""
+        """Send zero speeds once, then send nothing for `silent_s` s.
+
+        In this time the board's watchdog can stop the motors.
+        """
         self.zeros()
         self.listen(silent_s)
 
@@ -449,11 +452,14 @@ class Board:
         return motion.moving(last, motion.STANDING_SPEED)
 
     def rest(self) -> None:
-        """Send zeros until all motors stand still. Raises `StoppedError` if a motor keeps turning.
+        """Send zero speeds until all motors stand still.
 
-        If motor d does not stop, try lines with the other ending: a comma or none. Some firmware
-        stops motor d only at lines with one of the two endings. If motor d stops now, change
-        `comma`, so that all later lines have this ending.
+        Raises `StoppedError` if a motor keeps turning.
+
+        If a motor does not stop in time, try lines with the other ending: a comma or none. Some
+        firmware stops motor d only at lines with one of the two endings. If only motor d kept
+        turning without slowing down, and it stops now, change `comma`, so that all later lines have
+        this ending.
         """
         began_s = self.now_s
         if self.settles(self.comma):
@@ -470,7 +476,7 @@ class Board:
         raise StoppedError(outcomes.find("stop: turns", motors=motors, seconds=seconds))
 
     def settles(self, comma: bool) -> bool:
-        """Send zeros until all motors stand still, and return whether this happens in time.
+        """Send zero speeds until all motors stand still, and return whether they do so in time.
 
         The time limit is `motion.MOTOR_TIMEOUT_S`, or `motion.SLOWING_TIMEOUT_S` while a motor
         slows down. `comma` says whether the lines of zeros end with a comma.

@@ -22,8 +22,8 @@ Changes = dict[str, object]
 OPTIONAL_KEYS = ("mcu.encoder_counts", "mcu.link_check")
 """Keys of settings that improve the link but make its lines longer.
 
-If the wire is too slow for the longer lines, `changes` leaves out the first key. If that is not
-enough, it leaves out the second key too.
+If the wire is too slow for the longer lines, `changes` leaves out the suggestion to switch on the
+first setting. If that is not enough, it also leaves out the one for the second setting.
 """
 
 
@@ -37,8 +37,9 @@ def changes(findings: Sequence[Finding], config: Config, port: str = "") -> Chan
 
     They come from the findings. If a board answered, `mcu.port` gets the value `port`, unless
     `port` is "". If the suggested values contradict each other, for example because the lines
-    would be too long for the control rate, suggestions for `OPTIONAL_KEYS` keys are left out. If
-    that is not enough, `control.rate` gets the value "auto", provided that this helps.
+    would be too long for the control rate, the result leaves out suggestions that switch on a
+    setting in `OPTIONAL_KEYS`. If that is not enough, `control.rate` gets the value "auto",
+    provided that this helps.
     """
     wanted: Changes = {"mcu.port": port} if port and answered(findings) else {}
     for finding in findings:
@@ -129,9 +130,10 @@ def report(
 
 
 def summary(found: Report, where: str) -> str:
-    """Return the text that the check prints last: the number of each verdict, and the changes.
+    """Return the text that the check prints last, for the report `found`.
 
-    `where` is the path of the configuration file.
+    It contains the number of findings with each verdict, and the suggested changes. `where` is the
+    path of the configuration file.
     """
     verdicts = [finding.verdict for finding in found.findings]
     counts = ", ".join(f"{verdicts.count(v)} {v}" for v in get_args(Verdict) if v in verdicts)

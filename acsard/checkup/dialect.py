@@ -1,8 +1,8 @@
 """Steps of the check that find out how the board communicates.
 
-The steps measure the baud rate, the form of the lines, the checked link, the rate of the replies
-and their delay. They send only zeros and questions, so no motor turns. They store their results in
-the `Board`, for the later steps.
+The steps find out the baud rate, the form of the lines, whether the board supports the checked
+link, and the rate and the delay of the replies. They send only zeros and questions, so no motor
+turns. They store their results in the `Board`, for the later steps.
 """
 
 from __future__ import annotations
@@ -207,7 +207,9 @@ def rate(board: Board) -> Finding:
 def trip(board: Board) -> Finding:
     """Measure the time from the sending of a line to the arrival of the board's reply.
 
-    Boards that report by their own clock do not reply to single lines, so the step is skipped.
+    Boards that report by their own clock do not reply to single lines. For such a board, the
+    finding says that the step was skipped. It says that the step was not judged if an earlier step
+    could not measure the rate of the replies.
     """
     if not board.paced:
         return lateness.finding("round trip", board.lateness.since(0.0))

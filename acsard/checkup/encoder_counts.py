@@ -25,9 +25,10 @@ The limit is low, because a coarse encoder allows only a rough measurement.
 """
 
 COARSE_ANGLE = 0.015
-"""Smallest mean variation of the angles between replies that shows a coarse encoder, rad.
+"""Mean variation of the angle by which a wheel turns between two replies, rad.
 
-The daemon must know the counts per turn of a coarse encoder.
+From this value on, the encoders are considered coarse. The daemon must know the counts per turn of
+a coarse encoder.
 """
 
 MAX_REPLY_GAP_S = 0.05

@@ -1,4 +1,4 @@
-"""Records when this computer ran the check too late, and decides which findings are doubtful then.
+"""Records when this computer ran the check too late, and decides which findings are then doubtful.
 
 An overloaded computer sends and receives late. The check would then find faults that the board does
 not have. `procedure.py` therefore repeats a step with a doubtful finding. If every attempt is
@@ -35,7 +35,7 @@ NOT_JUDGED = "late: not judged"
 
 
 class Lateness:
-    """Record of the delays of this computer: the times by which it returned too late from waits."""
+    """Record of the delays of this computer: the times by which it ran the check too late."""
 
     def __init__(self) -> None:
         self._seen: list[tuple[float, float]] = []
@@ -78,7 +78,7 @@ def finding(name: str, late_s: float) -> Finding:
 
 
 def judged(found: Finding) -> bool:
-    """Return whether the step was judged: False if this computer was too late for a judgment."""
+    """Return whether a finding judges its step: False if this computer ran the step too late."""
     return found.figure != outcomes.MANUAL[NOT_JUDGED].figure
 
 

@@ -30,10 +30,10 @@ MIN_LOST_LINES = 2
 """Smallest number of lost lines that shows a fault. A single lost line may be a coincidence."""
 
 LINES, LEAST_S, MOST_S = 300, 3.0, 10.0
-"""Limits of the count of lost lines: a number of lines, and a shortest and a longest time, s.
+"""Limits of the step that counts lost lines: a number of lines, and two durations, s.
 
-The count takes `LEAST_S` if no line is lost. Otherwise it ends after `LINES` lines, which are
-enough to show a loss of 2 %, or after `MOST_S`.
+The step takes `LEAST_S` if no line is lost. Otherwise it ends after `LINES` lines, which are enough
+to show a loss of 2 %, or after `MOST_S`.
 """
 
 SILENCE_FACTOR = 2.0
@@ -161,16 +161,16 @@ were equal, a link that loses every n-th line might never lose a pulse.
 """
 
 OBEYED_FRACTION = 0.5
-"""Smallest angle of the motors that shows that they obeyed a pulse.
+"""Smallest angle that shows that the motors obeyed a pulse (a single line that turns them).
 
 It is a fraction of the median angle by which all pulses turned the motors.
 """
 
 SEEN, GRAINS = 0.02, 4
-"""Smallest median angle of the pulses from which the check can tell which pulses arrived.
+"""Limits for the median angle by which pulses (single lines) turn the motors.
 
-The median must be at least `SEEN` rad, and at least `GRAINS` times the smallest angle that the
-encoders showed between two replies.
+The check can tell which pulses arrived if the median is at least `SEEN` rad, and at least `GRAINS`
+times the smallest angle that the encoders showed between two replies.
 """
 
 
@@ -191,8 +191,8 @@ def direction(board: Board, operator: Operator, motors: Sequence[int]) -> Findin
     """Find out whether lines are lost on the way to the board, or replies on the way back.
 
     The motors turn briefly, several times. `motors` are the numbers of the motors that turn as
-    commanded: their encoders show which lines arrived. If the board replies to lines and loses at
-    most `MAX_LOSS` of them, return None, and do not turn the motors.
+    commanded: their encoders show which lines arrived. If the board replies to lines, and at most
+    `MAX_LOSS` of them are lost, return None, and do not turn the motors.
     """
     if not (board.own_clock or board.lost > MAX_LOSS):
         return None

@@ -80,10 +80,10 @@ class Reply(Struct, frozen=True):
 class Step(Struct, frozen=True):
     """The interval from one reply to the next.
 
-    `seconds` is its duration on this computer's clock. `speeds` are the speeds in the later reply,
-    rad/s. `mcu_s` is the duration on the board's clock, s. `counts` are the counts by which each
-    encoder moved, -32768 to 32767. If a reply lacks the board's clock and encoder counts, `mcu_s`
-    is 0 and `counts` is None.
+    `seconds` is its duration on this computer's clock, s. `mcu_s` is its duration on the board's
+    clock, s. `speeds` are the speeds in the later reply, rad/s. `counts` are the counts by which
+    each encoder moved, -32768 to 32767. If a reply lacks the board's clock and encoder counts,
+    `mcu_s` is 0 and `counts` is None.
     """
 
     seconds: float
@@ -152,7 +152,7 @@ def turning(replies: Sequence[Reply], now_s: float) -> list[int]:
     A coarse encoder reports a speed of 0 in most replies, even while its motor turns. After a reply
     that reports a movement, the motor therefore counts as turning for some time.
     """
-    # That time is the time in which the motor would turn by the same angle at the speed
+    # The motor counts as turning for the time in which it would turn by the same angle at the speed
     # `STANDING_SPEED`.
     found: set[int] = set()
     for reply, earlier in pairwise(reversed([Reply(-math.inf, ZERO, b""), *replies])):

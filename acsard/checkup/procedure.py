@@ -2,7 +2,7 @@
 
 A step is repeated if the board restarts, or if this computer ran the step too late. The check ends
 early if the operator quits, after a danger such as a motor that runs away, if the serial port is
-lost, or if this program stalls. The check sends zeros before it ends.
+lost, or if this program stalls. The check sends zero speeds before it ends.
 """
 
 from __future__ import annotations
@@ -50,7 +50,8 @@ STEPS = (
     "damaged lines", "inputs",
 )  # fmt: skip
 """Names of all steps. After an early end of the check, the finding `SKIPPED_STEPS` lists the steps
-without a result. If some motors have a result, it lists each of the other motors."""
+without a result. If some motors have a result, the finding lists each motor without one instead of
+"motors"."""
 
 SILENT_STEPS: tuple[tuple[str, Callable[[Board], Finding | None]], ...] = (
     ("listening for 3 s at the configured baud rate, then at other baud rates", dialect.baud),
@@ -65,7 +66,7 @@ SILENT_STEPS: tuple[tuple[str, Callable[[Board], Finding | None]], ...] = (
 )
 """The first steps of the check, in order, each with a message for the operator.
 
-They send only zeros and questions.
+They send only zero speeds and questions.
 """
 
 Tell = Callable[[Finding], None]
@@ -121,7 +122,11 @@ def run(
     unjudged: set[str] = set()
 
     def once(finding: Finding | None) -> None:
-        """Pass on the first finding of a name, and also its first judgment if that comes later."""
+        """Call `tell` with a finding if it is the first with its name.
+
+        If the first finding does not judge its step, also call `tell` with the first later finding
+        of this name that does.
+        """
         if finding is None:
             return
         judged = lateness.judged(finding)
@@ -159,7 +164,10 @@ def run(
 
 
 class _Watched:
-    """Ends the check if the operator quits, or after a stall, when the operator may have left."""
+    """Passes questions to the operator, and ends the check if the operator quits.
+
+    It also ends the check if this program stalls, because the operator may have left meanwhile.
+    """
 
     def __init__(self, operator: Operator, board: Board, asleep_ns: Callable[[], int]) -> None:
         self.doing, self.keys = operator.doing, operator.keys
@@ -191,7 +199,7 @@ class _Watched:
 
 
 class _Steps:
-    """Runs the steps. It repeats a step that a restart or a delay of this computer has spoilt."""
+    """Runs the steps. It repeats a step if the board restarts or if this computer is too late."""
 
     def __init__(
         self,
@@ -230,7 +238,7 @@ class _Steps:
         self._board.armed = True
 
     def _turn(self, motor: int) -> Finding:
-        """Test one motor. Ask the operator only if this computer was in time for the test."""
+        """Test one motor. Ask the operator only if this computer did not run the test too late."""
         board, operator, channels = self._board, self._operator, self._channels
         operator.doing(f"{motor_name(board.mcu, motor)} turns: briefly, then forward and back")
 
@@ -302,7 +310,7 @@ class _Steps:
                 board.known = known
 
     def _tried(self, step: Step) -> Finding | None:
-        """Run a step. Raise `RestartedError` if a restart of the board spoilt the step.
+        """Run a step. Raise `RestartedError` if the board restarted during the step.
 
         A restart may be the cause of a bad finding, so wait until a silent board answers.
         """

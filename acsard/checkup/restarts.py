@@ -28,7 +28,8 @@ If an identification arrives later, the board sent it without a request, because
 """
 
 RESTART_UNANSWERED_LINES = 5
-"""Smallest number of successive lines without a reply after which a text shows a restart.
+"""Smallest number of successive lines without a reply after which a text from the board shows a
+restart.
 
 If the board has left fewer lines without a reply, the text may be a debug print of the firmware.
 """
@@ -54,7 +55,8 @@ The value is the part of the outcome's name after "restarts: ".
 """
 
 _WORD = re.compile(rb"[a-z]{3}|[G-Z]{3}")
-"""Pattern of a word, as texts contain it. A reply does not contain such a word, even if damaged."""
+"""Pattern of three letters in a row, by which a text is recognized. A reply does not contain them,
+even if it is damaged."""
 
 _CAUSE = re.compile(rb" reset=([a-z-]{1,20})")
 
@@ -67,7 +69,7 @@ class Restart(Struct, frozen=True):
     turned: Motors = ZERO
     """Speeds that were commanded shortly before the restart, rad/s; zeros if no motor turned."""
     silent_s: float = 0.0
-    """Longest time in which no line was sent, from the board's last reply to the restart, s."""
+    """Longest time without a line to the board, between its last reply and the restart, s."""
     cause: str = ""
     """Cause of the restart as the board reports it, or "" if the board does not report a cause."""
 
@@ -91,7 +93,7 @@ class Restarts:
         """The last commanded speeds, rad/s, that were not all zero."""
         self._sent_s: float | None = None
         self._silent_s = 0.0
-        """Longest time from one line to the next since the board's last reply, s."""
+        """Longest time between two sent lines since the board's last reply, s."""
         self._unanswered = 0
         self._replied_s: float | None = None
         """Time of the board's last reply, s, or None before the first reply.

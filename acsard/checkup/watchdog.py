@@ -53,7 +53,8 @@ class Run(Struct, frozen=True):
     ran_s: float
     """Largest distance by which a motor ran on until it stood still.
 
-    It is given as the time in which a motor at full speed covers this distance, s.
+    It is given as a time, s: the time in which the motor would cover this distance at full speed.
+    Full speed is its speed before the silence.
     """
     slow_s: float
     """Time from the last line that turned the motors until all motors are slower than `STOPPED`, s.
@@ -78,7 +79,7 @@ class Run(Struct, frozen=True):
 def finding(board: Board, motors: Sequence[int]) -> Finding:
     """Measure the time after which the watchdog stops the motors, and return the finding.
 
-    Unless its verdict is FAIL, also test whether damaged lines keep the watchdog from acting.
+    If its verdict is not FAIL, also test whether damaged lines keep the watchdog from acting.
     `motors` are the numbers of the motors that turned as commanded. At the end, all motors stand
     still. Raises `StoppedError` if no motor reaches half of the commanded speed when all of
     `motors` turn together.
@@ -149,7 +150,10 @@ def measured(board: Board, motors: Sequence[int], stop: Run) -> Between:
 
 
 def _asked(board: Board, motors: Sequence[int], stop: Run, between: Between) -> Between:
-    """Narrow the bounds `between` by bisection. `stop` is an ordinary stop of the motors."""
+    """Narrow the bounds of the time for which motors run on, by bisection.
+
+    `between` are the first bounds. `stop` is the behavior of the motors in an ordinary stop.
+    """
     least_s, most_s = between
     # Each run halves the interval between the bounds, unless this computer is late.
     for _ in range(8):
@@ -160,9 +164,9 @@ def _asked(board: Board, motors: Sequence[int], stop: Run, between: Between) -> 
             least_s = max(least_s, answer.silent_s)
         else:
             most_s = min(most_s, answer.silent_s)
-    # The replies with the speeds `first` and `second` describe moments after the end of the
-    # silence. In the same way, the reply that shows the end of the ordinary stop arrives after that
-    # end.
+    # The motors need `stop.slow_s` to slow down after the watchdog acts, but `second` is the speed
+    # about one period after the silence. `stop.slow_s` is too large by up to one line period,
+    # because it ends with a reply.
     least_s -= stop.slow_s - board.period_s + 2 * stop.grain_s
     most_s -= stop.slow_s - board.period_s - motion.LINE_PERIOD_S - 2 * stop.grain_s
     return max(0.0, least_s), max(0.0, most_s)

@@ -163,9 +163,9 @@ def _whose(mcu: McuConfig, channel: Channel) -> str:
 def wheel_map(mcu: McuConfig, found: Sequence[Channel]) -> Finding:
     """Return the finding that compares `[mcu.wheels]` with the wheels that the operator saw turn.
 
-    The finding suggests an entry for each wheel. It is the configured entry if the motor does not
-    work correctly, or if the operator saw no wheel turn. If no operator answered, the finding has
-    no entries.
+    The finding suggests an entry (sign and motor, such as "-d") for each wheel. If the motor does
+    not work correctly, or if the operator saw no wheel turn, this is the configured entry. If no
+    operator answered, the finding has no entries.
     """
     if any(channel.wheel is None for channel in found):
         return outcomes.find("wheel map: not seen")
@@ -239,9 +239,9 @@ def _look_s(board: Board) -> float:
 def run_up(board: Board, motors: Motors) -> Motors:
     """Ramp up to the speeds `motors`, rad/s, and return each encoder's mean speed, rad/s.
 
-    The function returns when the speeds are steady, when they are not steady after
-    `motion.MOTOR_TIMEOUT_S` (`motion.SLOWING_TIMEOUT_S` while a motor speeds up), or earlier if no
-    encoder moves.
+    The function returns when the speeds are steady, but at the latest after
+    `motion.MOTOR_TIMEOUT_S`, or after `motion.SLOWING_TIMEOUT_S` if a motor still speeds up. It
+    returns earlier if no encoder moves.
     """
     steps = max(1, int(motion.SHORT_MEASUREMENT_S / board.period_s))
     for step in range(1, steps + 1):

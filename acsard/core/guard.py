@@ -6,13 +6,14 @@ bytes in the same way as the MCU, and passes a line only if all of these conditi
 - The line has the complete format, no wheel exceeds `limits.wheel_speed`, and the checksum is
   correct if the line has a checksum. With `link_check = "require"`, a line that moves a wheel must
   have a checksum.
-- No wheel is faster than in the last line sent, and no wheel turns the other way, unless there is a
-  fresh command, the link is up and the mode is `driving` (rule 2 of `acsard/README.md`).
+- No wheel is faster than in the last line sent, and no wheel turns the other way. This does not
+  apply if there is a fresh command, the link is up and the mode is `driving` (rule 2 of
+  `acsard/README.md`).
 - Without a link, all wheel speeds are zero.
-- All wheel speeds are zero if the robot has had enough time to brake to rest. This is the case if
-  the last fresh command is older than the longest ramp to rest, or if a stop, a fault or a shutdown
-  began longer ago than the longest stop takes. `RAMP_MARGIN_NS` is added to each of these two
-  durations.
+- All wheel speeds are zero before the first fresh command, and when the last fresh command is older
+  than the longest ramp to rest plus `RAMP_MARGIN_NS`.
+- All wheel speeds are zero when a stop, a fault or a shutdown began longer ago than the duration of
+  the longest stop plus `RAMP_MARGIN_NS`.
 
 If a condition does not hold, the guard replaces the line with the stop line, and the robot latches
 a fault. The guard keeps the times of the last fresh command and of the last stop in its `Memory`. A
@@ -169,7 +170,7 @@ class Guard:
         return abs(outputs.now.mono_ns - arrived) <= timeout
 
     def _sealed(self, line: bytes) -> bool:
-        """Return whether a line has a correct end for a link on which each line has a checksum.
+        """Return whether a line ends with a sequence number and a correct checksum.
 
         After the four speeds (the first 31 characters), the line must consist of these parts, in
         this order:
@@ -189,7 +190,10 @@ class Guard:
 
 
 def _ramp_ns(config: Config, *, stop: bool) -> int:
-    """Return the time to brake from the highest speed, ns. Jerk limits do not affect braking."""
+    """Return the time to brake from the highest speed to rest, ns.
+
+    If `stop` is true, the robot brakes at the stop deceleration. Jerk limits do not affect braking.
+    """
     limits, drive = config.limits, config.drive
     sides = drive.left_wheel_radius_multiplier + drive.right_wheel_radius_multiplier
     rim = limits.wheel_speed * drive.wheel_radius * sides / 2

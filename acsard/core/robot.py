@@ -1,10 +1,10 @@
 """The robot as one pure object. `Robot.step(Inputs) -> Outputs` calls all its parts in order.
 
-A step updates the odometry with the feedback, chooses one command, checks that the mode allows it,
-limits it, converts it to wheel speeds and reports. A step does no I/O: its inputs are time, bytes
-and commands, and its outputs are decisions. Only `step` changes the state of a `Robot`, with one
-exception: the control loop also adds to `counters`. The control loop reads and writes the port,
-and `core/guard.py` checks each line before it is written.
+A step updates the odometry with the feedback from the board, and chooses one command. It checks
+that the mode allows this command, limits the command, and converts it to wheel speeds. A step does
+no I/O: its inputs are time, bytes and commands, and its outputs are decisions. Only `step` changes
+the state of a `Robot`, with one exception: the control loop also adds to `counters`. The control
+loop reads and writes the port, and `core/guard.py` checks each line before it is written.
 """
 
 from __future__ import annotations
@@ -64,9 +64,9 @@ from acsard.core.values import (
 )
 
 MAX_DT = 0.05
-"""Longest time between two lines for which the robot accelerates, s. If the process stalls for
-longer, the rest of the time is ignored, so that the speed does not jump. If 1.5 control periods
-are longer than this constant, they are the limit."""
+"""Longest time between two lines to the board for which the robot accelerates, s. If the process
+stalls for longer, the rest of the time is ignored, so that the speed does not jump. If 1.5 control
+periods are longer than this constant, they are the limit instead."""
 
 WRITE_PAUSE_S = WATCHDOG_S - 0.05
 """Time without a line written to the port, s, after which the next acceleration starts from rest.
@@ -90,7 +90,7 @@ CANNOT_MOVE = (
     ", but the robot cannot move: limits.linear_speed and limits.angular_speed are 0; set a "
     "higher limit"
 )
-"""Part of the reason while a source drives and both speed limits are 0."""
+"""Text that the reason in `state` contains while a source drives and both speed limits are 0."""
 
 MAX_REFUSAL_LENGTH = 200
 """Largest number of characters of the text in `state` about a refused message. The text may quote
@@ -154,8 +154,8 @@ class Robot:
         self.counters: Counter[str] = Counter()
         """Counters since the start of the daemon. `commands` counts accepted commands, and
         `command_<reason>` counts refused commands. `commands_of_new_senders` counts the commands of
-        senders whose delays are not proved yet. Other counters count events. The control loop adds
-        the counters of the port and of the bus."""
+        senders that still have to prove that their delays are steady. Other counters count events.
+        The control loop adds the counters of the port and of the bus."""
         self._refused = ""
         self._refused_ns: int | None = None
         self._sanity = Sanity(config.feedback)
@@ -270,7 +270,7 @@ class Robot:
         level = battery.level if battery else ""
         another = status != self._status or level != self._battery_level
         self._status, self._battery_level = status, level
-        # If both are false, neither the mode nor the sender that drives can have changed.
+        # If `another` and `news` are false, the mode and the sender that drives are unchanged.
         if another or news:
             events += self._told.changes(self._life.mode, self._choice, status[1])
         # Pass the arguments by position: seventeen keyword arguments take three times as long.
@@ -296,7 +296,7 @@ class Robot:
     def _settle(self, inputs: Inputs) -> None:
         """Undo the effect of the last line on the limiter if the line was not written."""
         if inputs.guard_trip:
-            # The guard has replaced the line with STOP.
+            # The guard has replaced the line with the stop line, which contains zeros.
             self._limiter.cut()
             self._made = (self._limiter.state, self._made_ns)
             self._computed = STILL
@@ -363,7 +363,11 @@ class Robot:
         self._odometry.checks.wheels.forget()
 
     def _watch_inputs(self, now: Instant, events: list[Event]) -> None:
-        """A press stops the robot even if it began and ended between two steps."""
+        """Process the board's reports on emergency stop, bumpers, motor drivers and battery.
+
+        A press of the emergency stop or of a bumper stops the robot even if the press began and
+        ended between two steps.
+        """
         estop, bumpers, statuses = self._estop, self._bumpers, self.session.statuses
         events += estop.look(statuses, now.mono_ns)
         if estop.pressed_now:
@@ -404,10 +408,10 @@ class Robot:
         self._life.hold(*held, now.mono_ns)
 
     def _awaited_report(self) -> tuple[str, str]:
-        """Return the cause of a latch that cannot be cleared yet, and what a person must do.
+        """Return the cause of a latch from an earlier run of the daemon, and advice about it.
 
-        An input of the board may have caused it in an earlier run. The latch stays until the board
-        has reported this input again.
+        An input of the board caused this latch, and the board has not reported the input since.
+        Until it does, `clear` is refused. If there is no such latch, both texts are "".
         """
         reported = {
             "estop": self._estop.use == "off" or bool(self._estop.state),
@@ -423,8 +427,8 @@ class Robot:
     def _keep_away(self, now_ns: int) -> None:
         """Reduce the command to motion that leads away from the pressed bumpers.
 
-        If none is left, require a zero of each sender. Otherwise the robot would drive against the
-        obstacle as soon as the bumper is released.
+        If no motion remains, each sender must send a zero before it drives again. Without this
+        rule, the robot would drive against the obstacle as soon as the bumper is released.
         """
         twist = self._choice.twist
         if twist is None:

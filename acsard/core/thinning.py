@@ -83,7 +83,10 @@ class Curve:
 
 
 def _merged(one: _Bin, other: _Bin) -> _Bin:
-    """A gap between these bins would be too short to see, so it is dropped."""
+    """Return one bin with the lowest and the highest value of two neighboring bins.
+
+    A gap between the two bins is dropped, because it would be too short to see.
+    """
     low = other.low if other.low.value < one.low.value else one.low
     high = other.high if other.high.value > one.high.value else one.high
     return _Bin(one.number, low, high, other.breaks)
@@ -131,7 +134,7 @@ class Band:
         self._spans: list[Span] = []
 
     def add(self, t: float, kind: str, words: str = "") -> None:
-        """Record that the state is `kind` from the time `t` on, s.
+        """Record that the state is `kind` from the time `t` s on.
 
         If `kind` is "", there is no state from this time on. `words` is the reason of the state.
         """

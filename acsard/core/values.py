@@ -141,8 +141,8 @@ class Command(Struct, frozen=True):
     sender id nor a GID. Then `sender` is only the name of the Zenoh session that stamped the
     command, or only the key. The session may belong to a router or a bridge."""
     ros: bool = False
-    """True if the command came from ROS. Some ROS tools never send a zero. If such a tool must
-    send a zero first, the text about this condition says so."""
+    """True if the command came from ROS. Some ROS tools never send a zero, so a text that asks a
+    ROS sender for a zero mentions this fact."""
     stamp_replaced: bool = False
     """True if Zenoh replaced the stamp, because the sender's clock is ahead of the daemon's
     clock."""
@@ -262,8 +262,8 @@ class Estimate(Struct, frozen=True, gc=False):
     angle is not wrapped: each full turn forward adds 2 pi."""
     speeds: WheelSpeeds
     asked_ns: int | None = None
-    """Monotonic time at which the daemon wrote the command line that the board answered with the
-    feedback line, ns. None if the daemon cannot tell which command line that is."""
+    """Monotonic time at which the daemon wrote the line that the board answered with the feedback
+    line, ns. None if the daemon cannot tell which of its lines the board answered."""
     heard_ns: int = 0
     """Monotonic time at which the daemon had received the complete feedback line, ns."""
 
@@ -286,6 +286,12 @@ class Wait(Struct, frozen=True):
         "equal",
         "senders",
     ]
+    """Kind of the condition. `source` explains most kinds. The other kinds are:
+
+    - nothing: The source need not wait.
+    - command: The source must send a command.
+    - senders: The source need not wait, but some of its senders must wait for another sender.
+    """
     source: str = ""
     """The source that the condition `what` is about; "" if `what` is not in this list.
 
@@ -370,8 +376,9 @@ class RoutersStatus(Struct, frozen=True):
 class GyroSample(Struct, frozen=True, omit_defaults=True):
     """A turn rate about the z axis of base_link, measured by a gyro.
 
-    `rate` is in rad/s and positive to the left. `variance` is in rad2/s2, or 0 if the gyro does
-    not report it. `anew` is True for the first sample after a change to another gyro.
+    `rate` is in rad/s and positive to the left. `variance` is the variance of `rate`, rad2/s2, or 0
+    if the gyro does not report it. `anew` is True for the first sample after a change to another
+    gyro.
     """
 
     at_ns: int
@@ -388,12 +395,13 @@ GyroDoes = Literal[
     "reversed", "in degrees", "dead", "not believed",
 ]  # fmt: skip
 """State of the gyro. The odometry takes the heading from the gyro only in the states `used` and
-`disagrees`. In the state `disagrees`, the wheels slip."""
+`disagrees`. In the state `disagrees`, the wheels slip. Even in the state `used`, the wheels provide
+the turns until the gyro has agreed with the wheels in one turn."""
 
 TrackUse = Literal["shown", "uncertain", "too far off", "used"]
-"""`used` if the odometry uses the effective track that it has learned with a gyro. Any other value
-is the reason why it does not. `shown` means that `odometry.learned_track` is false. The effective
-track is the distance between left and right wheels with which the computed turns are correct."""
+"""Whether the odometry uses the effective track that it has learned with a gyro: `used`, or the
+reason why the odometry does not use it. `shown` means that `odometry.learned_track` is false. The
+effective track is the distance between left and right wheels that makes computed turns correct."""
 
 
 class GyroStatus(Struct, frozen=True):
@@ -577,8 +585,9 @@ class Outputs(Struct, frozen=True):
     events: tuple[Event, ...] = ()
     answers: tuple[Answer, ...] = ()
     news: bool = False
-    """True if an extra line is useful: the command or the mode has changed since the last computed
-    line, or the emergency stop or a bumper was pressed."""
+    """True if the board should get a new line without delay. This is the case if the command or the
+    mode has changed since the previously computed line, or if the emergency stop or a bumper was
+    pressed. The value is true even if this step has computed the new line."""
     latches: Latches = Latches()
     """The latches and lowered limits after the step. A latch or a lowered limit has changed if
     this is not the same object as in the previous step."""

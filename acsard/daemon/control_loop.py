@@ -61,8 +61,8 @@ FEEDBACK_TOPICS = ("odom", "tf", "wheel_states")
 """Topics whose messages are made from the feedback lines of the board."""
 
 QUERIES_PER_STEP = 8
-"""Largest number of queries that one control step takes from the bus. One slow query may exceed
-this limit. Further queries wait for the next step, so that a flood of queries does not make the
+"""Largest number of queries that one control step takes from the bus. One slow query may be taken
+in addition. Further queries wait for the next step, so that a flood of queries does not make the
 control loop miss a period."""
 
 MIN_WRITE_DELAY_NS = 1_000_000
@@ -125,7 +125,7 @@ class ControlLoop:
             adopted: function that is called with each new configuration that comes into force after
                 the start.
             recorder: the black box, which records each step. With None nothing is recorded.
-            latches: the latches with which the robot starts.
+            latches: the latches (stop, fault, "inactive") with which the robot starts.
             keeper: stores the latches, so that they survive a restart of the daemon. With None the
                 latches are not stored.
             settings_file: writes settings to the configuration file. With None, a `set` request
@@ -207,7 +207,8 @@ class ControlLoop:
     def listens(self) -> bool:
         """Whether the next command gets an extra step immediately.
 
-        If this is False, the next command waits for the next step that another event runs.
+        If this is False, the command waits for a step that another event runs, such as the end of
+        the control period.
         """
         return self._pace.listens
 
@@ -310,11 +311,11 @@ class ControlLoop:
         return outputs, went is not None
 
     def _to_keep(self, latches: Latches) -> Latches:
-        """Return the latches that the next start of the daemon needs.
+        """Return the latches, and the lowered limits, that the next start of the daemon needs.
 
-        A limit that a `set` request lowered stays lowered, unless it is a deceleration. A limit
-        from the key `speed_limit` does not, because the program that would lift it may have ended
-        by then.
+        The result includes the limits that `set` requests have lowered, except decelerations. It
+        does not include the limit from the key `speed_limit`: the program that sent this limit may
+        have ended before the next start, so no program would lift it.
         """
         now, file = self._speed.settings.limits, self._settings_file
         if file is not None:
@@ -454,9 +455,10 @@ class ControlLoop:
             self._settings_file.keep(request, now.mono_ns)
 
     def _keepable(self, now: Instant) -> tuple[Request, ...]:
-        """Return the `set` requests whose settings the robot must use now.
+        """Return the `set` requests with the field `keep` that the robot must process now.
 
-        Also queue the answers to the earlier requests that have ended.
+        The thread of the settings file has checked that it can write their settings to the file.
+        Also queue the answers to the requests that have ended.
         """
         if self._settings_file is None:
             return ()
@@ -469,7 +471,10 @@ class ControlLoop:
         return tuple(requests)
 
     def _send(self, outputs: Outputs, now: Instant, tick: bool) -> bytes | None:
-        """Return the line if the port wrote it. `tick` is false for a line between two periods."""
+        """Write the line of a step to the port. Return the line, or None if it was not written.
+
+        `tick` is false for a line between two control periods.
+        """
         line, self._trip = self._guard.check(outputs)
         self._superseded, self._late_ns = False, 0
         if line is None:
@@ -512,7 +517,8 @@ class ControlLoop:
     def _answer(self, now: Instant, *, last: bool = False) -> None:
         """Send the queued answers.
 
-        Unless `last` is true, they wait until the latches are stored.
+        Unless `last` is true, an answer waits until the latches are stored, but at most for
+        `MAX_ANSWER_DELAY_NS`.
         """
         held, before_ns = self._handover.held, now.mono_ns - MAX_ANSWER_DELAY_NS
         trouble = "" if held else self._handover.trouble or NOT_STORED

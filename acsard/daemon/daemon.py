@@ -43,8 +43,8 @@ from acsard.host.version import version
 from acsard.recording.recorder import Recorder
 
 MAX_EXIT_RAMP_S = 0.6
-"""Longest time for the ramp to zero speed at the shutdown, s. After this time the daemon sends STOP
-even if the robot still moves."""
+"""Longest time for the ramp to zero speed at the shutdown, s. After this time the daemon sends
+STOP, the line of zero speeds, even if the robot still moves."""
 
 
 class Departure:
@@ -136,7 +136,7 @@ async def run(
         log: the daemon's log.
         announce: function that is called once, when the start is complete.
         gateway: command-line arguments with which the daemon starts `acsard gateway` if
-            `bus.outside` names endpoints. None if the gateway runs as a service of its own.
+            `bus.outside` names endpoints. None if the gateway runs as a separate service.
         page: command-line arguments with which the daemon starts `acsard web`. None for no web
             page.
         settings_file: the configuration file. The daemon compares the file with the settings in
@@ -254,9 +254,11 @@ async def _beside(helpers: Iterable[Coroutine[Any, Any, object]]) -> AsyncIterat
 
 
 def _certificates(config: Config, ours: bool) -> dict[str, int]:
-    """Return the expiry times from `ends_of`. Raises `MendableError` if a file cannot be used.
+    """Return the expiry time of each TLS certificate of this robot, ns since 1970.
 
-    `ours` is true if this daemon itself starts the TLS gateway.
+    The keys of the returned dict are those of `tls.ends`. Return {} if neither the daemon nor its
+    gateway uses TLS. Raises `MendableError` if a certificate file cannot be used. `ours` is true if
+    this daemon itself starts the TLS gateway.
     """
     bus = config.bus
     if not (any(e.startswith(TLS_PREFIX) for e in bus.connect) or (ours and bus.outside)):

@@ -98,9 +98,10 @@ def place(config: Config, environ: Mapping[str, str]) -> Path:
 
 
 class LatchFile:
-    """The latch file of one robot.
+    """The file that stores a robot's latches: a stop, a fault or "inactive".
 
-    Call `start()` once, and then `keep()` after every change of the latches.
+    The latches then survive a restart of the daemon. Call `start()` once, and then `keep()` after
+    every change of the latches.
     """
 
     def __init__(self, config: Config, environ: Mapping[str, str]) -> None:
@@ -419,10 +420,11 @@ class LatchFile:
         return ""
 
     def _with_missed(self, latches: Latches) -> Latches:
-        """Add the missed latches. A newer fault or "inactive" drops the missed one for good.
+        """Return `latches` with the latches in `_missed` added.
 
-        A missed stop is never added, because `start()` has set a stop when it could not read the
-        file.
+        `_missed` contains latches of the file that `start()` could not read in time. If `latches`
+        has a fault or "inactive", the one in `_missed` is dropped permanently. A missed stop is
+        never added, because `start()` has set a stop when it could not read the file.
         """
         missed = self._missed
         if latches.fault is not None:

@@ -1,8 +1,9 @@
 """The rules of the latch file: its content, and the latches with which the robot starts.
 
-If the latch file cannot be read or written, the robot starts stopped, until a `clear` releases the
-stop. Each latch is written when it is set, so it does not matter how the process ends. This module
-is pure; `latch_file.py` reads and writes the file.
+A latch is a stop, a fault or "inactive", which lasts until a person releases it. If the latch file
+cannot be read or written, the robot starts stopped, until a `clear` releases the stop. The daemon
+writes each latch to the file when the latch is set, so it does not matter how the process ends.
+This module is pure; `latch_file.py` reads and writes the file.
 """
 
 from __future__ import annotations
@@ -165,7 +166,7 @@ def doubted(latches: Latches, why: str, now: Instant) -> Latches:
 
 
 class LatchKeeper(Protocol):
-    """The storage that keeps the latches over a restart of the daemon.
+    """The storage that keeps the latches (stop, fault, "inactive") over a restart of the daemon.
 
     Only the method `wait` waits for the disk.
     """

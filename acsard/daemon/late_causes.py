@@ -29,13 +29,13 @@ the lateness. Some causes have another limit, such as `DISK_FRACTION`."""
 
 SLEPT_FRACTION = 0.3
 """Limit for the disk as a cause: it counts only if the control loop's thread slept for at least
-this share of the lateness. The limit is low, because in a test with a fast virtual disk, a thread
+this share of the lateness. The limit is low because of a test with a fast virtual disk: a thread
 that read pages from the disk ran on the processor for as long as it slept."""
 
 DISK_FRACTION = 0.25
 """Limit for the time in which any program waited for a disk: it counts as a cause only if it is at
-least this share of the lateness. The limit is low, because in a test a thread wrote to a disk all
-the time, and the kernel counted only 0.28 to 0.45 of this time as waiting."""
+least this share of the lateness. The limit is low because of a test in which a thread wrote to a
+disk all the time: the kernel counted only 0.28 to 0.45 of this time as waiting."""
 
 MIN_STOLEN_NS = 3 * NS_PER_S // 100
 """Shortest steal time that counts as a cause, ns: three of the kernel's ticks. Steal time is time
@@ -83,7 +83,7 @@ class Cause(Struct, frozen=True):
 
     name: str
     rule: Callable[[Lateness], str]
-    """Function that returns the cause in words, or "" if it did not cause the lateness."""
+    """Function that returns the cause in words, or "" if the counters do not show this cause."""
     advice: str
 
 
@@ -131,8 +131,8 @@ def governor(late: Lateness) -> str:
 
     The rule compares the frequency limit (`scaling_max_freq`) with the processor's full frequency
     (`cpuinfo_max_freq`). With a governor that keeps the lowest frequency, the limit is
-    `scaling_min_freq` instead. If `heat` applies, return "", because heat also limits the
-    frequency.
+    `scaling_min_freq` instead. If the function `heat` returns a cause, return "", because heat also
+    limits the frequency.
     """
     return slow(late.after.conditions) if late.computed and not heat(late) else ""
 
@@ -203,7 +203,7 @@ def disk(late: Lateness) -> str:
 def other_program(late: Lateness) -> str:
     """Return the cause in words if other programs used the daemon's processor time, else "".
 
-    If `cgroup_quota` or `stolen` applies, return "".
+    If the function `cgroup_quota` or `stolen` returns a cause, return "".
     """
     if cgroup_quota(late) or stolen(late) or not late.explains(late.loop.waited_ns):
         return ""
@@ -274,8 +274,9 @@ def cause_in(text: str) -> str:
 
 
 STOLEN_FRACTION = 0.02
-"""Limit for the steal time in `present`, which reports it only if it exceeds this share of the time
-between the two readings."""
+"""Limit for the steal time in `present`. The function reports steal time only if it exceeds this
+share of the time between the two readings. Steal time is time in which the host of a virtual
+machine took the processor away."""
 
 
 def present(before: Reading, after: Reading, within_ns: int) -> list[tuple[str, str]]:

@@ -70,11 +70,11 @@ Name = Literal[
     "feedback_to_bus",
     "mcu_round_trip",
 ]
-"""The latencies that the daemon measures.
+"""The latencies that the daemon measures. A line is a line of text to or from the board.
 
-- period_lateness: from the due time of a period to the start of its step. If periods were missed,
-  from the due time of the first missed period.
-- step_time: from the start of a step to the end of its work.
+- period_lateness: from the due time of a control period to the start of its step. If periods were
+  missed, from the due time of the first missed period.
+- step_time: from the start of a control step to the end of its work.
 - command_age: from a command's arrival to the write of each line that carries it.
 - command_to_wire: from a command's arrival to the write of the first line that carries it. A
   command that had to wait until its source was chosen is not counted.
@@ -91,8 +91,8 @@ SLOT_NS = 10 * NS_PER_S
 SLOTS = 6
 
 FRESH_NS = NS_PER_S
-"""Age up to which `Stopwatch.measured` returns cached values, ns. Computing them takes longer than
-a control step, because all time slots of the last minute are added up."""
+"""Age up to which `Stopwatch.measured` returns cached statistics, ns. The computation of new ones
+takes longer than a control step, because it adds up all time slots of the last minute."""
 
 
 class Figure:
@@ -156,9 +156,9 @@ class Stopwatch:
         self._cached_ns = -FRESH_NS
 
     def measured(self, now_ns: int) -> dict[str, Measured]:
-        """Return the values of each latency, by the name of the latency. They are at most 1 s old.
+        """Return the statistics of each latency, us, by the name of the latency.
 
-        `now_ns` is the present monotonic time, ns.
+        They are at most 1 s old. `now_ns` is the present monotonic time, ns.
         """
         if now_ns - self._cached_ns >= FRESH_NS:
             self._cached_ns = now_ns
@@ -166,7 +166,7 @@ class Stopwatch:
         return self._cached
 
     def missed(self, now_ns: int) -> int:
-        """Return how many periods got no step in the last minute.
+        """Return how many control periods got no control step in the last minute.
 
         `now_ns` is the present monotonic time, ns.
         """

@@ -27,13 +27,13 @@ NO_PERIOD = Period(0, 0)
 
 
 REPLY_TIME_NS = 1_000_000
-"""Shortest time from the end of a line on the wire to an early line after it, ns. The board can
-reply in this time."""
+"""Shortest time from the end of a line on the wire to an early line after it, ns. An early line is
+a line between two control periods. The board can reply in this time."""
 
 MAX_IDLE_WAKES = 3
-"""Limit on the steps in one period in which the bus had input, but the input brought no new command
-or mode. After more than this number of such steps, further input waits for the next period, so that
-a flood of messages takes little processor time."""
+"""Number of idle steps that one control period tolerates. A step is idle if it had input from the
+bus, but the input brought no new command or mode. After more idle steps, further input waits for
+the next period, so that a flood of messages takes little processor time."""
 
 
 class Pace:
@@ -70,7 +70,11 @@ class Pace:
         return missed > 0 or not ahead
 
     def at_once(self, now_ns: int, sent_ns: int) -> bool:
-        """Return whether an early line may be written at the monotonic time `now_ns`, ns."""
+        """Return whether a line between two control periods may be written now.
+
+        `now_ns` is the present monotonic time, ns. `sent_ns` is the monotonic time at which the
+        last line was written, ns.
+        """
         return self._possible and not self._tried and now_ns - sent_ns >= self._gap_ns
 
     def note(self, tick: bool, due: bool, went: bool, news: bool, heard: bool) -> None:
@@ -94,7 +98,8 @@ class Pace:
     def listens(self) -> bool:
         """Whether the next command gets an extra step immediately.
 
-        If this is False, the next command waits for the next step that another event runs.
+        If this is False, the command waits for a step that another event runs, such as the end of
+        the control period.
         """
         return self._possible and not (self._tried or self._waiting or self._idle > MAX_IDLE_WAKES)
 
@@ -106,6 +111,7 @@ class Pace:
     def retry_ns(self, sent_ns: int) -> int | None:
         """Return the monotonic time at which the waiting command may be sent, ns.
 
-        Return None if no command waits.
+        Return None if no command waits. `sent_ns` is the monotonic time at which the last line was
+        written, ns.
         """
         return sent_ns + self._gap_ns if self.waits else None

@@ -23,9 +23,8 @@ MAX_JSON_BYTES = MAX_MESSAGE_BYTES - 1024
 `MAX_MESSAGE_BYTES` are for the Zenoh key and Zenoh's headers."""
 
 XACRO_TAG = "/xacro}"
-"""Text that shows that an element is a xacro element, if the tag of the element contains it.
-ElementTree writes the tag as "{NAMESPACE}NAME", with a namespace such as
-http://www.ros.org/wiki/xacro."""
+"""Text that the tag of each xacro element contains. ElementTree writes the tag as
+"{NAMESPACE}NAME", with a namespace such as http://www.ros.org/wiki/xacro."""
 
 DOCUMENT_TYPE = "<!DOCTYPE"
 """Beginning of an XML document type. A URDF file with a document type is refused, because the

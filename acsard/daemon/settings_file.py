@@ -88,9 +88,10 @@ class _Pending(Struct):
 
 
 class SettingsFile:
-    """The configuration file of the daemon, as it is compared with the settings and changed.
+    """The daemon's configuration file, and the thread that reads and changes it.
 
-    Call `use` whenever the settings in force change.
+    The thread compares the file with the settings in force, and writes settings to the file if a
+    client requests that. Call `use` whenever the settings in force change.
     """
 
     def __init__(
@@ -193,8 +194,9 @@ class SettingsFile:
     def results(self, now_ns: int, events: list[Event]) -> list[Request | Answer]:
         """Return the requests whose settings the robot must use now, and the answers for clients.
 
-        Append an event to `events` for each request whose settings were written to the file, and
-        for each one that failed after its answer. `now_ns` is the present monotonic time, ns.
+        Append an event to `events` for each request whose settings were written to the file. Also
+        append an event if the file could not be changed for a request that was overdue, because its
+        client already has an answer. `now_ns` is the present monotonic time, ns.
         """
         if not self._pending:
             return []
@@ -248,10 +250,10 @@ class SettingsFile:
     def latches(self, latches: Latches, now: LimitsConfig) -> Latches:
         """Return the robot's latches as the latch file must store them for the next start.
 
-        The next start reads the limits from the configuration file. So if the daemon has written
-        limits to that file, the field `lowered` of the result contains the limits that are lower in
-        `now` than in the file, except decelerations. For the same arguments, the result is the same
-        object.
+        The next start reads the limits from the configuration file. If the daemon has not written
+        limits to that file, the result is `latches`. Otherwise the field `lowered` of the result
+        contains each limit, except decelerations, that is lower in `now` than in the file. For the
+        same arguments, the result is the same object.
 
         Args:
             latches: the robot's latches.
@@ -348,7 +350,7 @@ class SettingsFile:
 
 
 def _overdue(pending: _Pending) -> Answer:
-    """Answer a request that took too long, or that exceeded the limit `MAX_JOBS`."""
+    """Return the answer to a request that took too long, or that exceeded the limit `MAX_JOBS`."""
     answer = pending.answer
     if pending.too_many:
         why = f"more than {MAX_JOBS} changes of the file wait for the disk"

@@ -1,12 +1,12 @@
 """Runs a control step for each of these events, directly in the event loop's callback.
 
-- period: a period has ended. Missed periods are counted, but get no steps of their own.
+- period: a control period has ended. Missed periods are counted, but get no separate steps.
 - bytes: the serial port has received data or was lost.
 - retry: the line with a waiting command may be written now (`pacing.py`).
 - command: the bus has a sample that may be a command, and `pacing.py` permits an early line.
   Otherwise the sample waits for the next step.
 - stop: the bus has a stop, which gets a step even if `pacing.py` permits no early line. In a flood
-  of stops, not every stop gets a step of its own.
+  of stops, not every stop gets a separate step.
 - signal: the shutdown begins.
 
 The step does not run in a task, because waking a task would cost another round of the event loop.
@@ -114,8 +114,8 @@ class Next(Struct, frozen=True):
     """Result of a step: the events that may run another step before the present period ends."""
 
     listens: bool
-    """Whether the next command gets an extra step immediately. If this is False, the next command
-    waits for the next step that another event runs."""
+    """Whether the next command gets an extra step immediately. If this is False, the command waits
+    for a step that another event runs, such as the end of the control period."""
     retry_ns: int | None
     """Monotonic time at which a step can send the waiting command, ns; None if no command waits."""
     period_ended: bool = True
@@ -158,8 +158,8 @@ class Wakeup:
     def stop(self) -> None:
         """Report that the bus has a stop. Any thread may call this method.
 
-        The first stop runs a step. A further stop runs no step of its own until a step has run at
-        the end of a period, or has returned a `Next` in which `listens` is True.
+        The first stop runs a step. Further stops then wait for the next step. This ends when a step
+        has run at the end of a period, or has returned a `Next` in which `listens` is True.
         """
         if not self._stop_told:
             self._stop_told = True

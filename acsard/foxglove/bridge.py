@@ -198,7 +198,8 @@ class Bridge:
     def _object(self, driving: dict[int, Client]) -> None:
         """Tell all viewers why the robot does not follow the commands of a viewer.
 
-        `driving` maps the id of each viewer that requests a speed to its bus client.
+        `driving` contains the viewers that request a speed now. It maps the id of a viewer to the
+        bus client of this viewer.
         """
         now_ns = clock.steady_ns()
         for client in driving.keys() - self._objections.keys():

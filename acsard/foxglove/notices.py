@@ -80,8 +80,8 @@ class Notices:
         Args:
             server: the server to which the viewers are connected.
             log: function that publishes a message on the topic `log`.
-            newcomers: whether new viewers have come. If so, first send the messages that remain
-                visible again.
+            newcomers: whether new viewers have come. If so, first repeat the messages that remain
+                visible.
         """
         if newcomers:
             for one in self._staying.values():

@@ -118,7 +118,7 @@ class Reader:
 
 
 class Commanders:
-    """Receives the commands that programs send to the robot, for one topic per command source.
+    """Receives the commands that programs send to the robot. Each command source has one topic.
 
     Only one thread may use this class. Zenoh's threads call `wake`.
     """
@@ -149,8 +149,8 @@ class Commanders:
     def follow(self, topics: Collection[str]) -> None:
         """Subscribe to the commands of `topics` only.
 
-        A program that is connected over TLS may not receive the commands of other clients. In this
-        case, do not subscribe at all.
+        If this program is connected over TLS, do not subscribe at all, because it is not permitted
+        to receive the commands of other clients.
         """
         wanted = set() if self._deaf else self._ways.keys() & set(topics)
         for topic in self._heard.keys() - wanted:
@@ -304,7 +304,7 @@ class Relay:
                     out.log(message)
 
     def log(self, line: Log) -> None:
-        """Publish a message on the topic `log`, unless this topic was not offered yet."""
+        """Publish a message on the topic `log`. Do nothing before this topic has been offered."""
         out = self._outs.get(self.log_topic)
         if out is not None:
             out.log(line)

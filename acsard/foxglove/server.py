@@ -144,10 +144,11 @@ class Settings:
             return asked(self._known, wishes.keys()) if wishes else {}
 
     def _change(self, wishes: dict[str, Any]) -> dict[str, Any]:
-        """Change all settings in `wishes`, or none. Return settings with their present values.
+        """Change all settings in `wishes`, or none.
 
-        The result contains `wishes` even after a failure, because viewers may already show the new
-        values.
+        Return the settings that have changed and the settings in `wishes`, with their present
+        values. The settings in `wishes` are returned even after a failure, because viewers may
+        already show the new values.
         """
         news = dict[str, Any]()
         try:

@@ -52,7 +52,7 @@ class CommandSources:
 
         Args:
             sources: the sources in the configuration.
-            reader: the reader of the robots that replay the steps.
+            reader: reads the values of the robot that replays the steps.
         """
         self._reader = reader
         self._timeouts = {
@@ -84,7 +84,7 @@ class CommandSources:
 
         Args:
             step: the recorded step.
-            t: the time of the step in the report, s.
+            t: the time of the step, s since the first step of the report.
             robot: the robot, which has just replayed the step.
         """
         commands, before = step.inputs.commands, dict(self._refused)
@@ -135,7 +135,7 @@ class CommandSources:
 
         Args:
             step: the recorded step.
-            t: the time of the step in the report, s.
+            t: the time of the step, s since the first step of the report.
             robot: the robot, which has just replayed the step.
         """
         for name, state, words in self._states(step, t, robot):

@@ -74,7 +74,7 @@ class Clip(NamedTuple):
     """
 
     t: float
-    """Time in the report at which the excursion begins, s."""
+    """Time at which the excursion begins, s since the first step of the report."""
     edge: float
     """Value at the edge of the diagram."""
     value: float
@@ -147,7 +147,7 @@ DRIVES_STATE = "drives"
 class BandStyle(NamedTuple):
     """Appearance of the bands for one state, in the picture of the command sources.
 
-    The state "drives" has a style of its own for each source that drove the robot.
+    The state "drives" has a separate style for each source that drove the robot.
     """
 
     kind: str
@@ -488,7 +488,10 @@ class TimeFigures:
         return layout() | {"xaxis": axis, "margin": {"l": 44, "r": 12, "t": 8, "b": 44}}
 
     def _stack(self, name: str, title: str, caption: str, parts: list[Part], px: int) -> Figure:
-        """Return diagrams below each other with one time axis. Each is `px` high."""
+        """Return a picture of diagrams below each other with one time axis.
+
+        Each diagram is `px` px high.
+        """
         traces, notes = list[Trace](), list[dict[str, Any]]()
         axes = self._timed()
         axes["margin"] |= {"t": GAP_PX}

@@ -61,11 +61,11 @@ class Mark(Struct, frozen=True):
     by: str
     """The client that caused the event, or the sources that commanded a drive; "" if unknown."""
     count: int
-    """Number of equal events that the log combined to this event."""
+    """Number of equal events that the log combined into this event."""
     place: Place | None
     """Pose of the robot according to odometry; None before the first pose."""
     seconds: float
-    """Wall-clock time of the event, s since 1970. A later change of the clock has no effect."""
+    """Wall-clock time of the event, s since 1970. Later changes of the clock do not change it."""
 
     @property
     def words(self) -> str:
@@ -156,7 +156,7 @@ class Lateness:
         """Process the step of a control period.
 
         Args:
-            t: the time of the step in the report, s.
+            t: the time of the step, s since the first step of the report.
             now_ns: the monotonic time of the step, ns.
             missed: the number of control periods without a step since the last call.
             known: false if the recording lacks the steps just before this step. The number of the
@@ -181,7 +181,7 @@ class Lateness:
         self._curve.add(t, (behind_ns + missed * period_ns) / NS_PER_MS)
 
     def points(self) -> list[Point]:
-        """Return the curve of the delays: time in the report, s, and delay, ms.
+        """Return the curve of the delays, ms, over the time since the first step of the report, s.
 
         The smallest delay is 0.
         """
@@ -202,9 +202,9 @@ class LineCount:
         """`curve` contains the number of lines in each second. `total` is the sum of them."""
 
     def add(self, t: float, count: int) -> None:
-        """Add the number of lines in one second.
+        """Add `count`, the number of lines in one second.
 
-        `t` is the time in the middle of this second, s.
+        `t` is the middle of this second, s since the first step of the report.
         """
         self.curve.add(t, count)
         self.total += count
@@ -248,7 +248,7 @@ class SerialCounts:
         """Process a step.
 
         Args:
-            t: the time of the step in the report, s.
+            t: the time of the step, s since the first step of the report.
             sent: true if the daemon sent a line in this step.
             counters: the robot's counters after the step. `lines` counts the readable lines from
                 the board, and each `line_...` counts the lines that were dropped for one reason.
@@ -265,7 +265,10 @@ class SerialCounts:
         self._sent += sent
 
     def _end(self, received: tuple[int, int]) -> None:
-        """Add the counts of the present second. `received` counts since the daemon's start."""
+        """Add the counts of the present second to the curves and totals.
+
+        `received` is a pair: the numbers of accepted and of dropped lines since the daemon's start.
+        """
         t = float(self._second or 0) + 0.5
         good, dropped = (now - then for now, then in zip(received, self._before, strict=True))
         outstanding = self._outstanding or 0
@@ -307,7 +310,8 @@ class ReportData:
             config: the configuration at the beginning of the recording.
             begin: wall-clock time at which the report begins, s since 1970; None for no limit.
             end: wall-clock time at which the report ends, s since 1970; None for no limit.
-            robot_errors: function that returns the context manager for each use of the robot.
+            robot_errors: function that returns a context manager, in which each use of the replayed
+                robot runs (see `RobotErrors`).
         """
         self._window = (-math.inf if begin is None else begin, math.inf if end is None else end)
         self.config = config
@@ -372,7 +376,10 @@ class ReportData:
         return self._wall > self._window[1]
 
     def step(self, step: Step, outputs: Outputs, robot: Robot) -> None:
-        """Add a step of the recording. A step outside of the report's range changes only the state.
+        """Add a step of the recording.
+
+        A step outside of the report's range of time adds no data to the report. It changes only the
+        state that later steps need, such as the last pose.
 
         Args:
             step: the recorded step.

@@ -33,8 +33,7 @@ NUMBER = re.compile(r"\d+(\.\d+)?")
 """Pattern for a number in a reason. Reasons that differ only in numbers share a row."""
 
 MAX_POINT_S = 0.05
-"""Resolution of the pictures, s. If one point of a picture covers more time, the report has a note
-about this."""
+"""Longest time that one point of a picture may cover without a note in the report, s."""
 
 MAX_NAMES = 5
 """Maximum number of names or texts that are listed in one sentence."""

@@ -1,4 +1,4 @@
-"""Reads the values of the replayed robot that a report needs.
+"""Reads the values that a report needs from the replayed robot, an object of the class `Robot`.
 
 The robot may come from a forged or damaged recorded state, so each of its parts may be wrong. Every
 use of the robot is in this module, in a `with` block that reports the errors of such a robot. Each

@@ -95,7 +95,8 @@ class Prompt(Protocol):
     def start(self, text: str, by_key: bool = False) -> None:
         """Show a text, and wait until the person starts a drive.
 
-        Any key press stops the drive. `by_key` says whether a key press is its intended end.
+        After the start, any key press stops the drive. `by_key` says whether this is the intended
+        end of the drive.
         """
 
     def number(self, ask: Ask) -> float:

@@ -196,7 +196,7 @@ def _line() -> str:
     try:
         return sys.stdin.readline()
     except UnicodeDecodeError:
-        return "?\n"  # no answer to any question
+        return "?\n"  # not an answer to any question
 
 
 def _end_if_closed(call: Callable[[], T]) -> T:
@@ -217,7 +217,7 @@ def _lines() -> Iterator[None]:
     """Let the terminal deliver and echo whole lines of input in the `with` block."""
     before = _end_if_closed(lambda: termios.tcgetattr(sys.stdin))
     cooked = list(before)
-    # Python 3.12.0 and 3.12.1 clear ICRNL in `tty.setcbreak`. Without it, Enter ends no line.
+    # Python 3.12.0 and 3.12.1 clear ICRNL in `tty.setcbreak`. Then Enter would not end a line.
     cooked[0] |= termios.ICRNL
     cooked[3] |= termios.ICANON | termios.ECHO
     _end_if_closed(lambda: termios.tcsetattr(sys.stdin, termios.TCSANOW, cooked))

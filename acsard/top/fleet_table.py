@@ -31,10 +31,9 @@ The table has this column only if any robot reports a battery.
 """
 
 URGENT = ("fault", "stopped", "GONE", "SILENT")
-"""Modes and kinds of absence that need attention.
+"""Modes and kinds of absence that need attention, the most urgent first.
 
-The table lists the robots with these in this order. The other robots follow, those with a warning
-first.
+The table lists the robots in this order, and then all remaining robots, those with a warning first.
 """
 
 
@@ -132,7 +131,10 @@ def _absence(row: Row) -> str:
 
 
 def _order(row: Row) -> tuple[int, str]:
-    """Sort urgent robots first. The mode of a robot that is gone or silent does not count."""
+    """Return the sort key of a robot: urgent robots come first (see `URGENT`).
+
+    The mode of a robot that is gone or silent does not count.
+    """
     what = _absence(row) or ("" if row.state is None else row.state.mode)
     if what in URGENT:
         return URGENT.index(what), row.robot_id

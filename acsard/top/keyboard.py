@@ -1,7 +1,7 @@
 """Drives the robot from the keyboard with the keys of teleop_twist_keyboard.
 
 A terminal reports a key press but never its release. Each press therefore drives the robot for
-`KEY_HOLD_S`. After the first `REPEATS` repeats of a held key, each further repeat drives the robot
+`KEY_HOLD_S`. From the third repeat (`REPEATS`) of a held key on, each repeat drives the robot
 for `REPEAT_S` only. When this time is over, `acsard drive` sends three zero commands and then
 nothing. If this program was not running for more than 0.5 s, the keys that the operator typed in
 that time do not drive the robot.
@@ -139,8 +139,9 @@ class Keyboard:
 
         Call this when a state arrives that shows that the robot does not follow. If the operator
         has begun to hold the key less than `SETTLED_S` ago, do nothing, because the state may be
-        older. If no key seems to be held, a network may be delaying the repeats of a held key.
-        Repeats that then arrive together do not drive the robot either.
+        older. If no key seems to be held, a network may be delaying the repeats of a held key. If
+        more than `MAX_BURST_KEYS` of them then arrive together, the key does not drive the robot
+        either.
         """
         held = self._held(now)
         if self._over or (held and now - self._begun <= SETTLED_S):

@@ -146,10 +146,10 @@ def _screen(console: Console) -> Live:
 
 
 def _hold(shows: Callable[[list[bool]], bool]) -> None:
-    """Call `shows` until a signal arrives or `shows` returns False.
+    """Call `shows` repeatedly until it returns False or a signal arrives.
 
-    Ctrl-Z adds an element to the list that `shows` gets. Then `shows` must close the screen and
-    return True.
+    The argument of `shows` is a list, to which Ctrl-Z adds an element. Then `shows` must close the
+    screen and return True, and this program is suspended. The next call follows when it resumes.
     """
     _be_lenient()
     suspend: list[bool] = []
@@ -161,7 +161,10 @@ def _hold(shows: Callable[[list[bool]], bool]) -> None:
 
 
 def _steer(ride: Ride, console: Console, suspend: list[bool]) -> bool:
-    """Return True if the user pressed Ctrl-Z, and False at the end of the input."""
+    """Drive the robot with the typed keys, and show the screen.
+
+    Return True if the user pressed Ctrl-Z, and False at the end of the input.
+    """
     with keys() as read, _screen(console) as shown:
         due = 0.0
         while not suspend:
@@ -186,7 +189,8 @@ def _be_lenient() -> None:
 def until_told() -> Iterator[None]:
     """End the `with` block at the first signal in `END_SIGNALS`, or when the terminal closes.
 
-    Further signals are ignored, because two signals arrive when a terminal with a shell closes.
+    Further signals are ignored, even after the block, because two signals arrive when a terminal
+    with a shell closes.
     """
 
     def deaf() -> None:

@@ -126,7 +126,8 @@ def rule(width: int, titles: Sequence[tuple[int, str | Text]]) -> Text:
 def flow(parts: Sequence[Text], width: int, inset: int = 0) -> list[Text]:
     """Return lines of at most `width` cells, each with as many of the parts as fit.
 
-    A longer part gets a longer line of its own. Lines after the first begin with `inset` blanks.
+    A part of more than `width` cells is alone on a longer line. Lines after the first begin with
+    `inset` blanks.
     """
     lines: list[Text] = []
     for part in parts:

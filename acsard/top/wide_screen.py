@@ -224,7 +224,8 @@ def rates(seen: ScreenData, state: RobotState, before: RobotState) -> Callable[[
 def board(state: RobotState) -> str:
     """Return the emergency stop, the bumpers and the battery in words, as the board reports them.
 
-    Leave out what the board does not report. If it reports nothing, return "".
+    The text leaves out everything that the board does not report. It is "" if the board reports
+    nothing.
     """
     told = [f"emergency stop {clean(state.emergency_stop)}"] if state.emergency_stop else []
     if state.bumpers is not None:

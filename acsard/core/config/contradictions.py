@@ -29,17 +29,17 @@ from acsard.core.config.wire_time import (
 from acsard.core.values import ROOT_KEY, WHEELS
 
 MIN_WRAP_PERIODS = 2
-"""Smallest number of control periods in which a wheel at full speed may change its encoder count
-by half of the count's range. A larger change between two lines would look like a turn in the other
-direction. The value 2 allows for one lost line."""
+"""Shortest time in which the encoder count of a wheel at full speed may change by half of the
+count's range, in control periods. A larger change between two lines would look like a turn in the
+other direction. The value 2 allows for one lost line."""
 
 FEW_COUNTS, FASTEST_HZ = 200, 100.0
 """Limits for a warning about coarse encoders: encoder counts per wheel turn, and the control rate
 in Hz. The warning appears if there are fewer counts, the control rate is higher, and the board
 reports speeds but no counts. Such a board repeats its last speeds if it is asked again too soon,
-and the daemon cannot always tell repeated speeds from new ones. With 16 to 96 counts, the
-simulated robot measured distances that were up to 20 % too short at 200 Hz and up to 29 % too long
-at 300 Hz."""
+and the daemon cannot always tell repeated speeds from new ones. The
+simulated robot with 16 to 96 counts measured wrong distances: up to 20 % too short at 200 Hz, and
+up to 29 % too long at 300 Hz."""
 
 MIN_RATE_HZ = 0.001
 """Lowest publishing rate that is not 0, Hz. It means one message in 17 min."""
@@ -162,7 +162,10 @@ def _shorter_lines(mcu: McuConfig, rate: float) -> str:
 
 
 def _count_problems(config: Config) -> list[str]:
-    """Report counts so large that forward motion could look like backward motion."""
+    """Return an error if forward motion could look like backward motion.
+
+    This is possible if `mcu.encoder_counts` is too large, because an encoder count wraps round.
+    """
     counts, fastest = config.mcu.encoder_counts, config.feedback.wheel_speed / math.tau
     lasts = MIN_WRAP_PERIODS / config.rate_hz
     if fastest * counts * lasts <= FIELD_VALUES / 2:
@@ -339,7 +342,10 @@ def _listen_twice_problems(config: Config) -> list[str]:
 
 
 def _page_problems(config: Config) -> list[str]:
-    """`acsard/web/listen.py` applies the same rules when the page starts."""
+    """Return an error for each address of the robot's web page that cannot be used.
+
+    `acsard/web/listen.py` applies the same rules when the page starts.
+    """
     addresses, found = config.web.address, []
     for address in addresses:
         where = f"web.address = {show(address)}"

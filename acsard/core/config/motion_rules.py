@@ -130,7 +130,7 @@ def longest_reply(fault_s: float) -> float:
 
 
 def _rounded_up(value: float) -> float:
-    """The value is the least allowed one in a message, so do not round it down."""
+    """Round up to three decimals, because a message names the result as the least allowed value."""
     return math.ceil(round(value * 1000, 6)) / 1000
 
 

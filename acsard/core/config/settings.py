@@ -457,7 +457,7 @@ class Config(Struct, frozen=True):
         """Control rate, Hz.
 
         For `"auto"`, it is the highest whole number of Hz at which the lines use at most 80 % of
-        the capacity of the serial wire, but at most 100 Hz.
+        the serial wire's capacity. This number is limited to 100 Hz.
         """
         if self.control.rate != "auto":
             return float(self.control.rate)

@@ -61,9 +61,10 @@ def _changed(text: str, keys: Mapping[str, object]) -> str:
 
 
 def _adjusted(array: object, value: object) -> bool:
-    """Change the TOML list `array` to `value` and keep its comments.
+    """Change the TOML list `array` to `value`, keep its comments, and return True.
 
-    If this returns False, the list may be partly changed, so the caller must replace it.
+    Return False if this is not possible. The list may then be partly changed, so the caller must
+    replace it.
     """
     from tomlkit.items import Array
 
@@ -80,9 +81,11 @@ def _adjusted(array: object, value: object) -> bool:
 
 
 def _dotted(text: str, keys: Mapping[str, object]) -> tuple[str, dict[str, object]]:
-    """Insert each new key whose table is written as dotted keys, such as `mcu.port = ...`.
+    """Insert the keys that belong to a table that `text` writes as dotted keys.
 
-    Return the new text, and the entries that the caller must still put into the text.
+    A dotted key is a line such as `mcu.port = ...`, without a header `[mcu]`. Only keys that `text`
+    lacks are inserted. Return the new text, and the entries of `keys` that the caller must still
+    put into the text.
     """
     import tomlkit
 

@@ -80,18 +80,18 @@ _decoder = Decoder(GatewayState)
 
 
 class GatewayFollower:
-    """Counts the starts of the TLS gateway, and the checks that found all its connections in use.
+    """Counts the starts of the TLS gateway, and how often all its connections were in use.
 
-    The gateway makes these checks four times a second, and reports their number since its own
-    start. A gateway that already runs when the daemon starts counts as one start, and its earlier
-    checks are counted too.
+    The gateway checks its connections four times a second, and reports the number of checks since
+    its own start in which all of them were in use. A gateway that already runs when the daemon
+    starts counts as one start, and its earlier checks are counted too.
     """
 
     def __init__(self) -> None:
         self._last = GatewayState(0, 0, 0)
 
     def receive(self, arrival: Arrival, counters: MutableMapping[str, int]) -> int | None:
-        """Decode a report of the TLS gateway, and add the increase of both numbers to `counters`.
+        """Decode a report of the TLS gateway, and update the two gateway counters in `counters`.
 
         `arrival` is the sample with the report. Return the time at which the first of the TLS
         certificates expires, wall-clock ns since 1970. Return None if this time is unknown, or if
@@ -129,9 +129,9 @@ class RouterFollower:
     ) -> None:
         """Store the present status, and compare it with the previous status.
 
-        If connections were lost or made, or if connected endpoints are not routers, one event for
-        each of these changes is added to `events`. The lost connections are also counted in
-        `counters`.
+        Append up to three events to `events`: for the connections that were lost, for those that
+        were made, and for the connected endpoints that are not routers. Also count the lost
+        connections in `counters`.
         """
         before, self.status = self.status, status
         lost = [endpoint for endpoint in status.missing if endpoint not in before.missing]

@@ -52,9 +52,9 @@ class Bindings:
 
     A sender id is bound to the certificate with which the daemon first received it. If one id
     arrives with two certificates, it was copied by mistake, or its secret was stolen. The daemon
-    then refuses the commands with the second certificate for as long as commands with the first
-    certificate keep arriving. Senders on ROS keys are not bound, because such keys do not contain
-    the name of a certificate. Such a sender cannot have the public name of a native sender.
+    then refuses the commands with the second certificate, until no command with the first one has
+    arrived for `BINDING_NS`. Senders on ROS keys are not bound, because ROS keys do not contain the
+    name of a certificate. A sender on a ROS key cannot have the public name of a native sender.
     """
 
     def __init__(self) -> None:
@@ -68,7 +68,8 @@ class Bindings:
 
         If the id is still bound to another certificate, change nothing and return the name of the
         other certificate. `sender` is the public name of the id. `certificate` is the common name
-        of the certificate, or "" for a program on the robot itself. `now_ns` is monotonic.
+        of the certificate, or "" for a program on the robot itself. `now_ns` is the present
+        monotonic time, ns.
         """
         bound, seen_ns = self._seen.get(sender, (certificate, now_ns))
         if bound != certificate and now_ns - seen_ns <= BINDING_NS:
@@ -85,7 +86,8 @@ MAX_COMMAND_BYTES = 4096
 300 bytes."""
 
 MAX_TIMESTAMP_LEAD_NS = NS_PER_S // 2
-"""Zenoh replaces a timestamp that is ahead of the daemon's clock by more than this, ns."""
+"""Largest time by which a timestamp may be ahead of the daemon's clock, ns. Zenoh replaces a
+timestamp that is further ahead."""
 
 Via = Literal["native"] | Transport
 """The kind of key on which a sample or query arrived: "native" for acsard's own keys, otherwise the
@@ -320,10 +322,10 @@ def identify(arrival: Arrival) -> Identity:
     - on a key of a bridge: the session that stamped the sample, the key
 
     Raises `DecodeError` if a sample on a key of rmw_zenoh has no valid attachment. A sender id or a
-    GID belongs to one program. A session or a key may stand for several programs: a router or a
-    bridge stamps the samples of all programs behind it, and the daemon cannot tell the session of a
-    router from the session of a program. A GID does not prove the identity: ROS discovery publishes
-    the GIDs, so a program that may put on a key of rmw_zenoh can claim any GID.
+    GID belongs to one program. A session or a key may stand for several programs. A router or a
+    bridge stamps the samples of all programs that connect through it. The daemon cannot tell the
+    session of a router from the session of a program. A GID does not prove the identity: ROS
+    discovery publishes the GIDs, so a program that may put on a key of rmw_zenoh can claim any GID.
     """
     if arrival.via == "rmw":
         rmw = unpack(arrival.attachment)
@@ -390,14 +392,14 @@ def _twist_payload(arrival: Arrival) -> _TwistPayload:
 
 
 def caller_name(via: Via, attachment: bytes, stamped_by: str = "") -> str:
-    """Return a name for the log: that of the program that called a service or sent a stop.
+    """Return the name that the log shows for a program that called a service or sent a stop.
 
-    The name depends on the transport `via`, which follows it in brackets:
+    The name has a suffix in brackets, which begins with the transport `via`:
 
     - native: the public name of the sender id in `attachment`, or "unnamed". The brackets also
       contain the public name of the Zenoh session `stamped_by`, which stamped the sample, unless
       `stamped_by` is "".
-    - rmw_zenoh: "unnamed" with the GID of the client in brackets.
+    - rmw: "unnamed". The brackets also contain the GID of the client.
     - bridge: "unnamed".
 
     The name is only a claim of the program: Zenoh does not say on which connection a query arrived.

@@ -52,7 +52,10 @@ _readings = Decoder(_Reading)
 
 
 class GyroFollower:
-    """Decoder for the samples of one gyro on the bus. It refuses the samples of all other gyros."""
+    """Decoder for the samples of one gyro on the bus.
+
+    While this gyro sends, the samples of all other gyros are refused.
+    """
 
     def __init__(self, own: bool = False) -> None:
         """Start without a gyro in use.

@@ -241,7 +241,7 @@ class Queries:
         return [] if value is None else [(topic, type(value).__name__, value)]
 
     def _matches(self, query: Query, key: str) -> bool:
-        """`key` is a key without the prefix `acsard/<id>/`."""
+        """Return whether a query asks for `key`, which lacks the prefix `acsard/<id>/`."""
         if "*" not in query.asked:
             return query.asked == key
         if len(query.asked) > MAX_WILDCARD_LENGTH:
@@ -268,7 +268,11 @@ def includes(expression: str, key: str) -> bool:
 
 
 def _fits(pattern: str, chunk: str) -> bool:
-    """Match a chunk of a key with a chunk of a key expression, in which `$*` is any text."""
+    """Return whether `pattern` matches `chunk`.
+
+    `chunk` is a part of a key between two slashes. `pattern` is a part of a key expression between
+    two slashes, in which `$*` stands for any text.
+    """
     if pattern == "*":
         return True
     first, *middle = pattern.split("$*")

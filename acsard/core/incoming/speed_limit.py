@@ -166,7 +166,7 @@ class SpeedLimiter:
         return tuple(found), refused
 
     def _limited(self, request: Request) -> Request:
-        """Lower the highest speed in a client's `set` request to the limit.
+        """Return a client's `set` request, with the highest speed lowered to the limit in force.
 
         Raises `ConfigError` if the requested settings would be invalid when the limit ends.
         """
@@ -199,8 +199,8 @@ class SpeedLimiter:
         """Store the robot's configuration after a step, and return the answers for the clients.
 
         `robot` is the robot's configuration after the step. `answers` are the robot's answers in
-        the step. If a client has set a speed above the limit, the answer to this client and a new
-        event in `events` say that the speed will apply when the limit ends.
+        the step. A client may have set a speed above the limit. The answer to this client and a new
+        event in `events` then say that the speed will apply when the limit ends.
         """
         answers = tuple(answers)
         speed = self.settings.limits.linear_speed

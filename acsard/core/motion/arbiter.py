@@ -61,7 +61,8 @@ class Choice(Struct, frozen=True):
 
 IDLE = Choice()
 """The choice if no source has sent a command within its timeout. If a known sender has sent a
-command that was not accepted because of its stamp, the choice has this reason and is not `IDLE`."""
+command that was not accepted because of its stamp, the arbiter returns another choice, in which
+`Choice.wait` gives this reason."""
 
 
 class _Source:
@@ -81,7 +82,11 @@ class _Source:
             sender.use(self.timeout_ns, self.pause_ns)
 
     def add(self, name: str, now_ns: int) -> Sender | None:
-        """Return None if all `MAX_SENDERS` senders may keep control of the robot."""
+        """Add the sender `name` and return it, or return None if there is no room for it.
+
+        If the source is full, the new sender replaces the sender with the lowest rank (`_account`).
+        There is no room if each of the `MAX_SENDERS` senders may keep control of the robot.
+        """
         if len(self.senders) >= MAX_SENDERS:
             least = min(self.senders, key=lambda other: self._account(other, now_ns))
             if self._account(least, now_ns)[0]:
@@ -97,19 +102,19 @@ class _Source:
         return holds, holds or sender.armed(now_ns), sender.noticed_ns
 
     def cancel_zeros(self, at_ns: int) -> None:
-        """Process a message that may be a speed of any sender with a shared identity.
+        """Cancel the zeros of all senders with a shared identity: one may have sent a speed.
 
-        Their zeros do not arm them any more, unless `commands.neutral_pause` was already over.
+        A canceled zero does not arm its sender. A zero stays valid if `commands.neutral_pause` was
+        already over at the monotonic time `at_ns`, ns.
         """
         for sender in self.senders.values():
             sender.cancel_zero(at_ns)
 
     def doubt(self, command: Command, was_set: bool) -> None:
-        """Undo the effect of a sender's zeros on this source, because `command` raised a doubt.
+        """Undo the effect of zeros of the sender of `command`, because its clock is in doubt.
 
-        If `was_set`, the clock of the sender was set, and the sender must send a zero again.
-        Otherwise the clock is unproven. A zero then arms the sender only if it was accepted before
-        the doubt or arrives later.
+        If `was_set` is true, the clock was set, and the sender must send a zero again. Otherwise
+        the clock is unproven, and only the earlier zeros that were not accepted lose their effect.
         """
         sender = self.senders.get(command.sender)
         # Behind a bridge, several programs with clocks of their own share one identity. Therefore a
@@ -136,7 +141,10 @@ class _Source:
         )
 
     def latest_ns(self) -> int | None:
-        """Return None if no command was accepted since the last `require_neutral`."""
+        """Return the monotonic time at which the last accepted command arrived, ns.
+
+        Return None if no command was accepted since the last call of `require_neutral`.
+        """
         times = [s.arrived_ns for s in self.senders.values() if s.arrived_ns is not None]
         return max(times, default=None)
 
@@ -145,19 +153,26 @@ class _Source:
             sender.require_neutral()
 
     def neutral(self, sender: Sender, lasts: float = 0.0) -> Wait:
-        """`lasts` is the time for which the sender has sent speeds without a zero before, s."""
+        """Return the condition that `sender` must send a zero.
+
+        `lasts` is the time for which the sender has sent only speeds, s, rounded down to one of
+        `REPORTED_DURATIONS_S`; 0 leaves it out.
+        """
         pause = self.pause_ns / NS_PER_S
         return Wait("neutral", self.name, pause, lasts=lasts, ros=sender.ros, shared=sender.shared)
 
     def doubted(self, now_ns: int) -> Wait | None:
-        """Return why commands were not accepted because of their stamps, or None."""
+        """Return the condition for a sender whose recent commands have doubtful stamps, or None.
+
+        If the source has several of these senders, use the one that sent the newest message.
+        """
         doubtful = [sender for sender in self.senders.values() if sender.doubtful(now_ns)]
         if not doubtful:
             return None
         return self.why(max(doubtful, key=lambda sender: sender.noticed_ns), now_ns)
 
     def why(self, sender: Sender, now_ns: int) -> Wait:
-        """Call this only if `sender` is not live."""
+        """Return the condition that `sender`, which is not live, waits for."""
         if not sender.doubtful(now_ns):
             return self.stalled
         if sender.doubt == "stale":
@@ -165,7 +180,10 @@ class _Source:
         return self.proof if sender.armed(now_ns) else self.neutral(sender)
 
     def obstacle(self, sender: Sender, now_ns: int, lasting: bool = True) -> Wait:
-        """If `lasting`, the result says for how long an unarmed sender has sent speeds."""
+        """Return the condition that keeps `sender` from driving.
+
+        If `lasting` is true, the result says for how long an unarmed sender has sent speeds.
+        """
         if not sender.live(now_ns):
             return self.why(sender, now_ns)
         since_ns = sender.speeds_ns if lasting else None
@@ -198,10 +216,10 @@ class Arbiter:
     def require_neutral(self, since_ns: int = 0) -> None:
         """Forget all commands. Each sender must send a zero command before it drives again.
 
-        Only a zero command that arrives at the monotonic time `since_ns` or later arms a sender. An
-        older zero command, for example from before a stop was cleared, does not show that the
-        sender wants the robot to rest now. After several calls, the latest `since_ns` counts. If
-        `commands.neutral_first` is false, senders need not send a zero command.
+        Only a zero command that arrives at the monotonic time `since_ns`, ns, or later arms a
+        sender. An older zero command, for example from before a stop was cleared, does not show
+        that the sender wants the robot to rest now. After several calls, the latest `since_ns`
+        counts. If `commands.neutral_first` is false, senders need not send a zero command.
         """
         self._since_ns = max(self._since_ns, since_ns)
         for source in self._ranking:
@@ -254,9 +272,9 @@ class Arbiter:
 
         If `shared` is true or `sender` is "" (unknown), any sender with a shared identity may have
         sent the message. The zero command of such a sender does not arm it any more, unless
-        `commands.neutral_pause` was already over at the monotonic time `arrived_ns`. The time of a
-        lost message is unknown: pass "" as `sender` and 0 as `arrived_ns`. Then no zero command
-        arms such a sender, unless it has already done so.
+        `commands.neutral_pause` was already over at the monotonic time `arrived_ns`, ns. The time
+        of a lost message is unknown: pass "" as `sender` and 0 as `arrived_ns`. This cancels each
+        zero command that has not armed its sender yet.
         """
         known = self._sources.get(source)
         if known is None:

@@ -106,7 +106,7 @@ class CommandEvents:
         self._mode, self._commander = mode, ("", "")
         self._kept = ""
         """The source whose speeds have no effect, according to the last log event about such
-        speeds; "" if this is over."""
+        speeds. It is "" before the first event, and when the condition of the event has ended."""
 
     def changes(self, mode: Mode, choice: Choice, why: str) -> list[Event]:
         """Return the log events for the changes since the last call.

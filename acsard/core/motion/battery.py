@@ -5,7 +5,7 @@ apply to single values, because starting motors make the voltage drop for some t
 An empty battery latches a stop, which `lifecycle.py` keeps. The call `clear` does not release the
 stop until the mean has risen above the threshold by `battery.hysteresis`.
 
-If the board stops reporting its battery, the level becomes "unknown" and the robot does not stop: a
+If the board stops reporting its battery, the level becomes "unknown" and the robot does not stop. A
 robot that blocks the way is the greater danger, and the voltage falls slowly.
 """
 
@@ -196,7 +196,10 @@ class Battery:
             self._mean_ns = at_ns
 
     def _level(self, now_ns: int) -> BatteryLevel | None:
-        """Return None while the level is undecided: until the reports cover `SETTLE_S`."""
+        """Return the battery level, or None until the reports cover `SETTLE_S`.
+
+        The method also updates `stopped_now`.
+        """
         measure, values = self._config.measure, self._values
         if measure not in values:
             self._mean = None

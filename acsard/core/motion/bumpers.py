@@ -85,8 +85,8 @@ class Bumpers(BoardInput):
         """Whether a pressed bumper latches a stop, until a client calls `clear`.
 
         If the configuration allows driving away from an obstacle (`bumper = "away"`), a real press
-        latches no stop. Bumpers that count as pressed because the board no longer reports them
-        still latch a stop.
+        does not latch a stop. Bumpers that count as pressed because the board no longer reports
+        them still latch a stop.
         """
         return not self._away or self.state == "silent"
 

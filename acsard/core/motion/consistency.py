@@ -56,7 +56,8 @@ class ConsistencyChecks:
         If it is None, the odometry must use the turn according to the wheels.
         """
         self.on_trial = False
-        """Whether the wheels provided the turn of the last line because the gyro is not proven."""
+        """Whether the wheels provided the turn of the last line because the gyro is not proven: it
+        has not agreed with the wheels in a turn yet."""
         self.slips = False
         """Whether the wheels slip, which means that they contradict each other or the gyro."""
         self.events: list[Event] = []
@@ -104,9 +105,9 @@ class ConsistencyChecks:
         """Return the angle that the caller must subtract from the heading, rad.
 
         Call this after the pose was recomputed over earlier feedback lines without a faulty wheel.
-        `turn` is the sum of the changes of the turns, rad, in the lines for which `on_trial` was
-        true. If the gyro is proven by now, the result is `turn`, because the heading was already
-        corrected to the gyro's turn. Otherwise the result is 0.
+        `turn` is the angle, rad, by which the recomputation changed the robot's turn in the lines
+        for which `on_trial` was true. If the gyro is proven by now, the result is `turn`, because
+        the heading was already corrected to the gyro's turn. Otherwise the result is 0.
         """
         return 0.0 if self.gyro is None else self.gyro.taken_back(turn)
 

@@ -94,7 +94,7 @@ class Noise:
 
 
 class ErrorModel:
-    """The noise of an odometry step and the effects of parameter errors on it.
+    """The noise of an odometry step, and the effects of parameter errors on this step.
 
     The results are for the effective track in use, which may change (`turn_by`).
     """
@@ -108,12 +108,15 @@ class ErrorModel:
         self.turn_by(CONFIGURED if odometry.learned_track else None)
 
     def use(self, odometry: OdometryConfig) -> None:
-        """Use the noise in `odometry` from now on. The errors of parameters do not change."""
+        """Use the noise settings in `odometry` from now on. Errors of parameters do not change."""
         self.settings = odometry
         self.noise = Noise(odometry, self.track)
 
     def turn_by(self, learned: Track | None) -> None:
-        """Use the effective track `learned` from now on. None means the configured track."""
+        """Use the effective track `learned` from now on.
+
+        None means the configured track, without a column for the error of a learned track.
+        """
         self.track = self._kinematics.track * (learned or CONFIGURED).share
         """Effective track in use, m."""
         self.columns = columns(self._declared, self._kinematics, learned)

@@ -59,8 +59,9 @@ class EventThrottle:
         self._number = 0
         """Number of events of all names so far."""
         self._free_ns: dict[EventName, int] = {}
-        """For each event name, the monotonic time at which the schedule has the next line, ns. Each
-        written line moves this time on by one second, so a burst moves it into the future."""
+        """For each event name, the monotonic time at which the next line is due, ns, at one line
+        per second. Each written line adds one second, so a burst moves this time into the
+        future."""
 
     def lines(self, events: list[Event], now_ns: int) -> tuple[Event, ...]:
         """Return the events to log now.
@@ -85,10 +86,10 @@ class EventThrottle:
         return tuple([self._held.pop(name).line() for name in told])
 
     def _may(self, name: EventName, news: bool, now_ns: int) -> bool:
-        """Return whether a line may be written now. If so, count it as written.
+        """Return whether a line may be written now. If it may, count it as written.
 
-        Each name has one line per second. Up to `BURST` lines may come earlier if `news` is true.
-        The same holds for the lines of a stop, because the time of each stop matters.
+        Each name gets one line per second. Up to `BURST` lines may be written without a delay if
+        `news` is true, or if `name` is "stop", because the time of each stop matters.
         """
         free_ns, at_once = self._free_ns.get(name, now_ns), news or name == "stop"
         if free_ns > now_ns + (BURST - 1 if at_once else 0) * NS_PER_S:

@@ -86,11 +86,10 @@ delay. If both stamps and arrival times show the pause, a foreign clock (one tha
 may have been set by any amount during the pause."""
 
 MAX_STOPPED_STAMP_NS = 10_000
-"""Largest step of the stamps, ns, at which a clock seems to have been set back: the stamp of a
-command is later than that of the previous command by at most this, although the commands arrived
-more than `SEPARATE_NS` apart. Zenoh's own clock never goes back. If the wall clock was set back,
-Zenoh's clock advances by a fraction of a microsecond for each message until the wall clock has
-caught up."""
+"""Largest difference between the stamps of two successive commands, ns, that shows that the clock
+was set back. It shows this only if the commands arrived more than `SEPARATE_NS` apart. The limit is
+not 0, because Zenoh's own clock never goes back. If the wall clock was set back, Zenoh's clock
+advances by a fraction of a microsecond for each message until the wall clock has caught up."""
 
 SEPARATE_NS = NS_PER_S // 500
 """Commands that arrive within this time of each other, ns, may have been sent together."""
@@ -145,7 +144,16 @@ class _Proof:
         """Monotonic start, ns, and minimum delay, ns, of each of the latest halves."""
 
     def add(self, delay: int, at_ns: int, timeout_ns: int) -> Literal["proven", "open", "failed"]:
-        """Return "failed" if a new test must begin with this command."""
+        """Add a command of the clock, and return the state of the test.
+
+        The test is "proven" if the delays are constant, and "open" if it needs more commands. It is
+        "failed" if the delay has changed so much that a new test must begin with this command.
+
+        Args:
+            delay: the delay of the command, ns.
+            at_ns: the monotonic time at which the command arrived, ns.
+            timeout_ns: the timeout of the command's source, ns.
+        """
         if not -MAX_JITTER_NS <= delay - self._first <= WAVER_NS:
             return "failed"
         proven = False
@@ -262,9 +270,10 @@ class _Clock:
         return verdict
 
     def _superseded(self, mark: tuple[int, int]) -> bool:
-        """`mark` is the stamp of this command, ns, and its sequence number, or -1 if it has none.
+        """Return whether the last accepted command is newer than this one, or is the same command.
 
-        A repetition of an accepted command is recognized only if the command is numbered.
+        `mark` contains the stamp of this command, ns, and its sequence number, or -1 if it has no
+        number. A repetition of the last accepted command is recognized only by its number.
         """
         last = self._accepted
         return last is not None and (mark < last or (mark == last and mark[1] >= 0))
@@ -291,7 +300,8 @@ class _Clock:
         """Record a pause of the sender, or an adjustment of its clock.
 
         A stamp that goes back or stands still shows an adjustment. The next command must confirm
-        it: the stamp of that command must do the same, or not be later than before the adjustment.
+        the adjustment: its stamp must also go back or stand still, or must not be later than the
+        last stamp before the adjustment.
 
         If commands were lost, the network may have caused the silence, so no pause is recorded. The
         adjustment is then measured from the stamp of the last accepted command.
@@ -359,10 +369,11 @@ class _Clock:
         return "stale"
 
     def _forgive(self, proof: _Proof, at_ns: int) -> bool:
-        """Trust the new constant delay that `proof` has found, if it is plausible.
+        """Trust the new constant delay that `proof` has found, and return True, if it is plausible.
 
         A larger delay is plausible after a pause of the sender. It is also plausible if visible
-        adjustments of the clock, the budget for invisible ones (`FORGIVE_NS`), or both explain it.
+        adjustments of the clock, the budget for invisible adjustments (`FORGIVE_NS`), or both
+        explain it.
         """
         self._accrue(at_ns, FORGET_NS)
         hidden = proof.least - self._least

@@ -5,8 +5,8 @@ is implausible if `sanity.py` or `Confirmation` rejects it. `Rolling` uses the f
 sources that exists: the encoder counts in the line, whole counts that are recovered from the speeds
 in the line, or these speeds times the time. It uses each time and each count exactly once.
 
-In a gap that no line covers, `Rolling` assumes the speed before the gap for the first half of the
-gap, and the speed after the gap for the second half. If the motors were commanded to rest in the
+In a gap that no line covers, `Rolling` assumes two speeds: the speed before the gap for the first
+half, and the speed after the gap for the second half. If the motors were commanded to rest in the
 gap, the speed before the gap is assumed only until that command.
 """
 
@@ -201,7 +201,11 @@ def _some(*pieces: Motors) -> tuple[Motors, ...]:
 
 
 def _until_rest(before: Motors, driven: float, after: Motors, bridged: float) -> Motors:
-    """Return the wheel angles, rad, in a gap with a command to rest after `driven` s."""
+    """Return the wheel angles, rad, in a gap with a command to rest after `driven` s.
+
+    `before` and `after` are the wheel speeds before and after the gap, rad/s. `bridged` is the
+    duration of the gap, s.
+    """
     # A board that computes its speeds since its last reply reports the means over the gap. These
     # means are large enough for the motion until the command to rest. A smaller speed is the speed
     # at the end of the gap.
@@ -239,7 +243,7 @@ class Confirmation:
     - If the next line agrees with the held line, both are used, because one wheel really changed
       its speed alone.
     - If the next line agrees with the last line that was used, the held line is dropped.
-    - If the next line agrees with neither, both are held, and the third line decides: a line is
+    - If the next line agrees with neither, both are held, and the third line decides. A line is
       dropped if it differs from the other two much more than these differ from each other.
 
     The time of a dropped line counts as a gap.
@@ -302,7 +306,11 @@ class Confirmation:
 
 
 def _alone(a: Motors, b: Motors, steps: Motors) -> float:
-    """Return the largest speed change that the other wheel of its side did not make, rad/s."""
+    """Return the largest speed change that one wheel of a side made without the other, rad/s.
+
+    `a` and `b` are the wheel speeds in two lines. A change does not count as far as the wheel's
+    quantization step in `steps`, rad/s, explains it.
+    """
     changes, largest = tuple(map(sub, a, b)), 0.0
     # The wheels i and 3 - i in `WHEELS` order are those of one side.
     for own, other, step in zip(changes, reversed(changes), steps, strict=True):
@@ -321,9 +329,9 @@ class Gaps:
 
     `follow` measures s while lines arrive without gaps. The configured acceleration limits are not
     used, because robots seldom accelerate that much. The deviation is limited to the motion at the
-    highest of three speeds: the speeds before and after the gap, and the highest speed that was
-    commanded in it (for `MAX_COMMANDED_S` at most). Therefore a robot that stood still before and
-    after a gap, and had no command to move, is assumed not to have moved in it.
+    highest of three speeds: the speed before the gap, the speed after the gap, and the highest
+    speed commanded in the gap (for `MAX_COMMANDED_S` at most). Therefore a robot that stood still
+    before and after a gap, and had no command to move, is assumed not to have moved in the gap.
     """
 
     def __init__(self) -> None:
@@ -426,9 +434,11 @@ class Rounding:
         self._last: Motors | None = None
         """Speeds in the last line, rad/s; None before the first line."""
         self._older: Motors | None = None
-        """Speeds in the line before it, rad/s; None if a gap lies between the two lines."""
+        """Speeds in the line before the last line, rad/s; None if a gap lies between the two
+        lines."""
         self._step = 0.0
-        """The largest recent quantization step, rad/s, less `STEP_DECAY` for each line since."""
+        """Estimated quantization step, rad/s: the largest recent step, reduced by the fraction
+        `STEP_DECAY` with each line since."""
         self._before = self._after = 0.0
         """Quantization steps of the line before the last one, and of the last one, rad/s. While the
         wheels stand still, they become smaller from line to line."""
@@ -463,12 +473,13 @@ class Rounding:
 
     @property
     def square(self) -> float:
-        """Sum of the squares of the steps before and after the gap, rad2/s2.
+        """Sum of the squares of the quantization steps before and after the gap, rad2/s2.
 
-        Let e be the variance of a speed that is rounded to one step, which is step^2 / 12. In a gap
-        of t s, the speed before it is assumed for t / 2, and then the speed after it. So the
-        variance is (t / 2)^2 times the sum of both variances. But both wheels of a side turn alike,
-        so their errors are equal. In addition, a single line can contain an edge too many or too
-        few. Each fact doubles e. Therefore the variance is t^2 times that of independent wheels.
+        A speed that is rounded to one step has the variance step^2 / 12. In a gap of t s, the speed
+        before the gap is assumed for t / 2 s, and the speed after the gap for another t / 2 s. So
+        the variance of the motion is (t / 2)^2 times the sum of the variances of both speeds. Two
+        facts double each of these variances. Both wheels of a side turn alike, so their errors are
+        equal. A single line can contain an encoder edge too many or too few. Therefore the variance
+        of the motion is t^2 times the sum of the variances of both speeds for independent wheels.
         """
         return self._before**2 + self._after**2

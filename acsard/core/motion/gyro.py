@@ -69,13 +69,14 @@ samples per second, it is a change of 20 rad/s2, which is more than the motors o
 cause."""
 
 LOST_NS = NS_PER_S
-"""Age of the gyro's last sample from which nobody can tell any more whether gyro or wheels were
-right in a contradiction before it, ns."""
+"""Age of the gyro's last sample, ns, from which a contradiction between gyro and wheels remains
+unresolved. The daemon can then no longer find out whether gyro or wheels were right."""
 
 MAX_BIAS_STEP = 0.06
-"""Largest change of the bias that is learned from a rate that repeats exactly, rad/s, if the gyro
-also repeats its rates without a defect, as a coarse gyro or a simulated one without noise does.
-Such a gyro that hangs at a lower rate looks like a gyro whose bias has changed."""
+"""Largest change of the bias that is learned while a gyro at rest repeats one rate exactly, rad/s.
+The limit applies to gyros that also repeat rates without a defect: coarse gyros, and simulated
+gyros without noise. If such a gyro hangs at a rate that differs less from the bias, it looks like a
+gyro whose bias has changed."""
 
 MAX_REPEATING, MIN_CHANCE = 0.6, 1e-6
 """A gyro certainly hangs if it usually repeats a smaller fraction of its samples at rest than
@@ -89,9 +90,9 @@ remains."""
 FROZEN_S = 0.8
 """Time at rest after which a gyro that repeats one rate exactly is assumed to hang, s. The noise of
 a gyro, and a hand that turns the robot, change the last digits of the rate within a few samples.
-The time is shorter than `NEW_BIAS_TIME_S`, so that no such rate becomes the bias before. A coarse
-gyro that rotates evenly with a robot at rest, for example on a turntable, looks like a gyro that
-hangs."""
+The time is shorter than `NEW_BIAS_TIME_S`, so that the rate of a gyro that hangs does not become
+the bias first. A coarse gyro that rotates evenly with a robot at rest, for example on a turntable,
+looks like a gyro that hangs."""
 
 TRUSTED_BLOCKS = 20.0
 """Number of blocks of 0.1 s in which the robot must turn before the measured ratio of the gyro's
@@ -147,9 +148,9 @@ class Gyro:
         self._learned: Track | None = None
         """The effective track that was learned with an earlier gyro, or None."""
         self.owes = False
-        """Whether the wheels provided the turn of the last line because the gyro is not proven. If
-        the gyro is proven later, the heading is corrected by the gyro's turn minus the wheels'
-        turn."""
+        """Whether the wheels provided the turn of the last line because the gyro is not proven: it
+        has not agreed with the wheels in a turn yet. When it is proven, the heading is corrected by
+        the gyro's turn minus the wheels' turn."""
         self._does: GyroDoes = "silent"
         self.events: list[Event] = []
         """Log events of the last call of `turn`."""
@@ -198,8 +199,8 @@ class Gyro:
         """Whether samples are missing since the last feedback line, or the gyro was silent at that
         line."""
         self._contradicted = 0.0
-        """The gyro's turn minus the wheels' turn since they contradict each other, rad. It contains
-        only turns that `turn` has returned, and it is 0 without a contradiction."""
+        """The gyro's turn minus the wheels' turn since their contradiction began, rad. The value
+        contains only turns that `turn` has returned, and it is 0 without a contradiction."""
         self._forget_owed()
         self._forget_repeated()
 
@@ -221,8 +222,8 @@ class Gyro:
     def hear(self, samples: tuple[GyroSample, ...]) -> None:
         """Store the `samples` that arrived since the last control step, in the order of arrival.
 
-        A sample with `anew` begins the data of another gyro. Everything except the learned
-        effective track is then forgotten.
+        A sample with `anew` is the first one of another gyro. Everything that was learned from the
+        earlier gyro is then forgotten, except the effective track and the doubt about the heading.
         """
         for sample in samples:
             if sample.anew:
@@ -303,19 +304,22 @@ class Gyro:
 
     def _forget_repeated(self) -> None:
         self._repeated = self._repeated_wheels = self._repeated_gaps = 0.0
-        """Sums over the feedback lines since the rate of the gyro changed: the gyro's turn minus
-        the wheels' turn, rad (`_repeated`), the wheels' turn, rad (`_repeated_wheels`), and the
-        squares of the gyro's turns in gaps of the feedback, rad2 (`_repeated_gaps`). They contain
-        only lines for which `turn` has returned the gyro's turn."""
+        """Sums over the feedback lines since the rate of the gyro changed. The sums contain only
+        lines for which `turn` has returned the gyro's turn.
+
+        - `_repeated`: the gyro's turn minus the wheels' turn, rad.
+        - `_repeated_wheels`: the wheels' turn, rad.
+        - `_repeated_gaps`: the squares of the gyro's turns in gaps of the feedback, rad2.
+        """
 
     def taken_back(self, turn: float) -> float:
         """Return the angle that the caller must subtract from the heading, rad.
 
         Call this after the pose was recomputed over feedback lines for which `owes` was true.
-        `turn` is the sum of the changes of the turns in these lines, rad. If the gyro is proven by
-        now, the heading has already been corrected to the gyro's turn, so the changes must be
-        undone: the result is `turn`. Otherwise the result is 0, and a pending correction of the
-        heading changes by -`turn`.
+        `turn` is the angle by which the recomputation changed the robot's turn in these lines, rad.
+        If the gyro is proven by now, the heading has already been corrected to the gyro's turn, so
+        the change must be undone: the result is `turn`. Otherwise the result is 0, and a pending
+        correction of the heading changes by -`turn`.
         """
         verdict = self._trial.verdict
         if verdict == "none yet":
@@ -387,7 +391,7 @@ class Gyro:
         return share < MAX_REPEATING and share**self._repeats < MIN_CHANCE
 
     def _end_repetition(self) -> None:
-        """Call this if the rate of the gyro changes."""
+        """End the repetition of one rate, because the rate of the gyro has changed."""
         # The gyro may have hung while it contradicted the wheels. But a gyro without noise also
         # repeats its rate in an even turn with slipping wheels. Then the repetition begins with the
         # slip, and the wheels turn more than the robot.
@@ -410,7 +414,7 @@ class Gyro:
     def _try(self, wheels: float, angle: float, variance: float, dt: float, resting: bool) -> bool:
         """Test a gyro that is not proven yet. Return whether the wheels must provide this turn.
 
-        While the wheels rest, the gyro provides it, because a person may turn the robot.
+        While the wheels rest, the gyro provides the turn, because a person may turn the robot.
         """
         trial, known = self._trial, self._bias.known
         if not trial.open or resting:
@@ -451,8 +455,8 @@ class Gyro:
     def _end_contradiction(self) -> None:
         """Add the turns that gyro and wheels contradicted to the doubt of the heading.
 
-        Call this if nobody can tell any more whether the gyro or the wheels were right, for example
-        because the gyro has been silent for `LOST_NS`.
+        Call this if the daemon can no longer find out whether the gyro or the wheels were right,
+        for example because the gyro has been silent for `LOST_NS`.
         """
         self._doubt += self._contradicted * self._contradicted
         self._contradicted = 0.0
@@ -467,7 +471,7 @@ class Gyro:
         """
         angle = 0.0
         if self._frozen:
-            # The wheels give the turn since the gyro hangs, but in a gap nobody knows it.
+            # The wheels give the turn since the gyro hangs, except in a gap of the feedback.
             angle, self._contradicted = -self._repeated, 0.0
             deviation = self._match.deviation * self._repeated_wheels
             self._doubt += deviation * deviation + self._repeated_gaps
@@ -480,7 +484,10 @@ class Gyro:
         return Turn(wheels + angle, variance, wheels / dt, noise)
 
     def _shift(self) -> None:
-        """Call this only while the robot is at rest. Otherwise the heading would jump."""
+        """Correct the assumed delay of the gyro by the measured error.
+
+        Call this only while the robot is at rest. Otherwise the heading would jump.
+        """
         delay = self._match.delay()
         if delay is not None and abs(delay) >= MIN_DELAY_CORRECTION_S:
             earliest, latest = DELAY_RANGE_NS

@@ -32,8 +32,8 @@ MIN_NOISE = 1e-5
 its measured standard deviation may be 0."""
 
 NEW_BIAS_TIME_S = 1.0
-"""Time for which the reading at rest must stay constant before it becomes the new bias, s, if it
-differs from the known bias. The gyro may have restarted or warmed up, or the robot may have turned
+"""Time for which a reading at rest that differs from the known bias must stay constant before it
+becomes the new bias, s. The gyro may have restarted or warmed up, or the robot may have turned
 while the first bias was learned."""
 
 NOISE_GAIN = 0.02

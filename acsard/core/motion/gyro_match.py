@@ -70,7 +70,7 @@ ASSUMED_DELAY_STD_S = 0.05
 s."""
 
 MAX_DELAY_STD_S = 0.004
-"""`Match.delay` returns a delay only if its standard deviation is below this, s."""
+"""Upper limit for the standard deviation of a delay that `Match.delay` returns, s."""
 
 WINDOW_S = 0.2
 """Time over which the turns of gyro and wheels are compared to find a contradiction, s."""
@@ -80,12 +80,12 @@ WINDOW_STD = 0.015
 without slip. Encoder counts and vibration cause it."""
 
 MAX_DEVIATIONS = 3.0
-"""If the turns of gyro and wheels over `WINDOW_S` differ by more than this number of standard
-deviations, gyro and wheels contradict each other."""
+"""Number of standard deviations by which the turns of gyro and wheels over `WINDOW_S` may differ.
+If they differ by more, gyro and wheels contradict each other."""
 
 
 class Block(Struct, frozen=True, gc=False):
-    """Turns of the robot in one block, rad: according to the wheels, and according to the gyro.
+    """Turns of the robot in a block of about `BLOCK_S`, rad: by the wheels, and by the gyro.
 
     `change` is the change of the turn rate according to the wheels, rad/s2.
     """

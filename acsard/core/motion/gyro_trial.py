@@ -112,7 +112,7 @@ class Trial:
 
 
 def _named(ratio: float) -> Verdict:
-    """`ratio` is the gyro's turn divided by the wheels' turn."""
+    """Return the verdict on a gyro whose turn is `ratio` times the wheels' turn."""
     least, most = TURN_RATIO_RANGE
     if DEGREES_RATIO_RANGE[0] <= abs(ratio) <= DEGREES_RATIO_RANGE[1]:
         return "in degrees"

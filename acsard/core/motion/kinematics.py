@@ -1,9 +1,9 @@
 """Converts between the twist and the wheel speeds of a four-wheel differential-drive base.
 
-Let v be the linear velocity of base_link in m/s, w its angular velocity in rad/s, r_l and r_r the
-wheel radii of both sides, and L the effective track, all in m. L is the wheel separation times its
-multiplier: wheels that skid turn the robot as if they were further apart. left and right are the
-mean wheel speeds of the sides, rad/s.
+Let v be the linear velocity of base_link, m/s, and w its angular velocity, rad/s. Let r_l and r_r
+be the wheel radii of the left and the right side, m, and L the effective track, m. L is the wheel
+separation times its multiplier: wheels that skid turn the robot as if they were further apart. The
+mean wheel speeds of the two sides are called left and right, rad/s.
 
     (1)  left = (front_left + rear_left) / 2      right = (front_right + rear_right) / 2
     (2)  v = (r_r right + r_l left) / 2

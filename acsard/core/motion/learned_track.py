@@ -28,9 +28,9 @@ track is not used. The effective track is 1.4 to 1.9 times the wheel separation 
 2.5 times on slippery ones."""
 
 RANGE_HYSTERESIS = 1.05
-"""Factor that narrows `TRACK_RATIO_RANGE` for a learned track that is not in use: such a track
-comes into use only above the lower bound times this factor and below the upper bound divided by
-this factor. Without this margin, a track near a bound could alternate between use and non-use."""
+"""Factor that narrows `TRACK_RATIO_RANGE` for a learned track that is not in use. The lower bound
+is multiplied by this factor, and the upper bound is divided by it. Without this margin, a track
+near a bound could alternate between use and non-use."""
 
 STATUS_TEXTS: dict[TrackUse, str] = {
     "shown": "(only reported)",

@@ -11,8 +11,8 @@ that its sender has not seen, even if the network delivers the request late:
 - A request that arrived before the latch was set never releases it.
 
 A pressed emergency stop at the robot, a pressed bumper (with `safety.bumper = "stop"`) and an empty
-battery latch a stop too, and a fault of a motor driver latches a fault. `clear` releases nothing
-while one of these causes lasts.
+battery also latch a stop. A fault of a motor driver latches a fault. `clear` releases nothing while
+one of these causes lasts.
 
 There is one latch for all causes of a stop, and one for all causes of a fault. Each new cause gives
 its latch a new number. The latch keeps the earlier causes, so that the operator reads all of them
@@ -31,9 +31,9 @@ from acsard.core.motion.modes import SHUTDOWN_REASON, Mode, RefusedError, mode_o
 from acsard.core.values import NS_PER_S, Instant, Latch, Latches
 
 LATCH_REQUIRED_S = 2.0
-"""Time after a stop, a fault, a `deactivate` or the start of the daemon in which a call `clear` or
-`activate` must name the number of the latch, s. The network seldom takes longer to deliver a
-packet."""
+"""Time in which a call `clear` or `activate` must name the number of the latch, s. The time begins
+with a stop, a fault, the `clear` of a fault, a `deactivate`, and the start of the daemon. The
+network seldom takes longer to deliver a packet."""
 
 MAX_CLIENTS = 4
 """Largest number of clients among the earlier causes of a stop. If more clients stop the robot, the
@@ -41,14 +41,14 @@ first ones are kept, so that a flood of stops neither fills the reason in `state
 first client. The causes from the board need no limit, because there are only a few."""
 
 MAX_FAULTS = 32
-"""Largest number of causes of a fault that are kept. There are fewer different causes, so that none
-is lost. Further ones would be ignored until `clear`."""
+"""Largest number of causes of a fault that are kept. The daemon knows fewer different causes, so no
+cause is lost. Further causes would be ignored until `clear`."""
 
 LONG_AGO_NS = -(2**62)
 """Monotonic time that stands for "never", ns. It is earlier than every real time."""
 
 _VALUES = re.compile(r"[(\d]")
-"""The beginning of the measured values in the text of a fault."""
+"""Pattern for the digit or bracket with which the measured values in the text of a fault begin."""
 
 _DAYS_TO_1970 = 719_468
 """Days from 0000-03-01 to 1970-01-01. `utc` counts years from March, so that the leap day is the
@@ -142,8 +142,9 @@ class Lifecycle:
     def fault(self, why: str, now: Instant) -> bool:
         """Latch a fault and return True. If this cause is already latched, only return False.
 
-        `why` is the cause of the fault, as text. Two texts that differ only from their first number
-        or bracket on name the same cause, because the rest contains measured values.
+        `why` is the cause of the fault, as text. Two texts name the same cause if they are equal up
+        to the first digit or bracket, where the measured values begin. If `MAX_FAULTS` causes are
+        latched, further causes are ignored, and the method returns False.
         """
         latch = self.latches.fault
         if latch is not None:
@@ -160,8 +161,8 @@ class Lifecycle:
         """Latch a stop with a new number, and return a text for the client.
 
         A repeated request does not change the latch. A request counts as repeated if the latch
-        already names this client, and if the daemon has already processed a request for a stop with
-        the same or a later time of arrival.
+        already names this client, and if `asked_ns` is not later than the arrival of the latest
+        request for a stop so far.
 
         Args:
             by: the name of the client; "" if it is unknown.
@@ -354,8 +355,13 @@ class Lifecycle:
     def _require_seen(self, was: str, still: str, set_ns: int, asked_ns: int, call: str) -> None:
         """Raise `RefusedError` if the sender of the request may not know the latch yet.
 
-        `was` names the newest cause, and `still` names all causes, as text. `set_ns` is the time of
-        the newest cause, or `LONG_AGO_NS` if an earlier run set the latch.
+        Args:
+            was: the newest cause, as text.
+            still: all causes, as text.
+            set_ns: the monotonic time of the newest cause, ns; `LONG_AGO_NS` if an earlier run of
+                the daemon set the latch.
+            asked_ns: the monotonic time at which the request arrived, ns.
+            call: the name of the service that was called.
         """
         began_ns = LONG_AGO_NS if self._began_ns is None else self._began_ns
         since = asked_ns - max(set_ns, began_ns)
@@ -377,7 +383,7 @@ def with_causes(latch: Latch, before: Latch | None) -> Latch:
     """Return `latch`, the new latch of a stop or a fault, with the earlier causes added to it.
 
     `before` is the latch that `latch` replaces, or None. Its causes become the earlier causes,
-    except a cause that equals the new one. Of the earlier causes that came from clients, at most
+    except a cause that equals the new one. Of the earlier causes that came from clients, the oldest
     `MAX_CLIENTS` are kept.
     """
     causes = () if before is None else before.causes

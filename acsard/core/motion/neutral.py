@@ -6,10 +6,10 @@ several programs may share the sender's identity. A shared identity becomes arme
 of any shared identity of the source follows for `commands.neutral_pause`.
 
 A sender is live while its last accepted command is not older than the timeout of its source. A
-sender is present while it takes part in the choice of the arbiter: while it is live, and after a
-stall of the daemon or doubtful stamps for at most `CANDIDATE_NS` after its last accepted command.
-Without this extra time, a sender that holds the robot still would lose the robot to a sender of
-speeds.
+sender is present while it takes part in the choice of the arbiter. A live sender is present. After
+a stall of the daemon, or while its stamps are doubtful, a sender stays present for at most
+`CANDIDATE_NS` after its last accepted command. Without this extra time, a sender that keeps the
+robot at rest would lose control to a sender of speeds.
 """
 
 from __future__ import annotations
@@ -106,10 +106,12 @@ class Sender:
     def present(self, now_ns: int) -> bool:
         """Return whether the sender takes part in the choice of the arbiter at the time `now_ns`.
 
-        A live sender takes part. For at most `CANDIDATE_NS` after its last accepted command, a
-        sender also takes part in two other cases: while it goes on sending commands with doubtful
-        stamps, without a silence longer than the timeout, and for one timeout after a stall of the
-        daemon.
+        `now_ns` is a monotonic time, ns. A live sender takes part. For at most `CANDIDATE_NS` after
+        its last accepted command, a sender also takes part in two other cases:
+
+        - The sender goes on sending commands with doubtful stamps, without a silence longer than
+          the timeout.
+        - A stall of the daemon has ended at most one timeout ago.
         """
         arrived_ns, timeout_ns = self.arrived_ns, self._timeout_ns
         return arrived_ns is not None and (
@@ -175,7 +177,7 @@ class Sender:
         return self.present(now_ns) and (waits or self.armed(now_ns))
 
     def unlearn(self) -> None:
-        """Undo the effect of zeros with unproven stamps, which the network may have delayed."""
+        """Undo the effect of zeros whose stamps are unproven: the network may have delayed them."""
         self._armed, self._zero_ns = self._proven_armed, self._proven_zero_ns
 
     def resume(self, before_ns: int, now_ns: int) -> None:
@@ -260,11 +262,16 @@ class Sender:
             else:
                 self._ended = None
         if zero and self._ended is None:
-            # `Freshness` compares its stamp with those of the same clock.
+            # `Freshness` already compares the stamps of commands of one clock with each other, so
+            # leave out the stamp of this accepted zero.
             self._ended = replace(command, stamp_ns=None)
 
     def _tell_apart(self, zero: bool, now_ns: int, present: bool) -> None:
-        """`present` is false if this command ends a silence of the sender."""
+        """Update `zeros_ns` and `speeds_ns` with a command that arrived at `now_ns`.
+
+        `zero` says whether the command is a zero. `present` is false if this command ends a silence
+        of the sender.
+        """
         since_ns = self.zeros_ns if zero else self.speeds_ns
         if since_ns is None or not present:
             since_ns = now_ns
@@ -272,9 +279,10 @@ class Sender:
 
     def _overtaken(self, command: Command, zero: Command) -> bool:
         """Return whether this command was sent before `zero` but arrived after it."""
-        # The network delays an accepted command by at most about the timeout. If the stamp or the
-        # number of `zero` is later for longer than that, it was wrong, or the sender has restarted
-        # its numbers. Then it must not keep the robot at rest.
+        # The network delays an accepted command by at most about the timeout. Therefore the stamp
+        # of `zero` is wrong if it is later by more than the timeout. If a command with a lower
+        # number arrives more than the timeout after `zero`, the sender has restarted its numbers.
+        # In both cases, `zero` must not keep the robot at rest.
         if command.clock != zero.clock:
             # Stamps of two clocks cannot be compared, but a sender numbers all its commands.
             passed_ns = command.arrived_ns - zero.arrived_ns

@@ -71,7 +71,8 @@ class Step(Struct, frozen=True, gc=False):
     turn: float
     """Change of the heading that this line caused, rad."""
     on_trial: bool
-    """Whether the turn was computed from the wheels because the gyro was still on trial."""
+    """Whether the turn was computed from the wheels because the gyro was not proven: it had not
+    agreed with the wheels in a turn yet."""
     share: float = 1.0
     """Effective track that was used for this feedback line, divided by the configured track."""
 
@@ -101,8 +102,8 @@ class Odometry:
         pose when they exceed two encoder counts (`_unsettled`) or when the robot drives."""
         self._steps_of, self._coarsest, self._largest_step = AT_REST, 0.0, 0.0
         """`_steps_of` contains the quantization step of each wheel's speed in the last line, rad/s.
-        `_coarsest` is the largest known step of these, rad/s, and 0 if none is known.
-        `_largest_step` is the same, but infinite if none is known."""
+        `_coarsest` and `_largest_step` are the largest of these steps that is known, rad/s. If no
+        step is known, `_coarsest` is 0 and `_largest_step` is infinite."""
         self._path = Path()
         self._errors = ErrorModel(odometry, kinematics)
         self._uncertainty = PoseUncertainty(self._errors, encoder_counts)
@@ -126,8 +127,8 @@ class Odometry:
         """Whether a feedback line was used since the last command."""
         self.gaps, self.unseen, self.bridged = 0, 0.0, 0.0
         """Statistics of the gaps in the feedback. `gaps` and `unseen` are the number and the total
-        duration, s, of the gaps in which the robot moved but the pose could not follow. `bridged`
-        is the total duration of the gaps that were filled, s."""
+        duration, s, of the gaps in which the robot may have moved but the pose could not follow.
+        `bridged` is the total duration of the gaps that were filled, s."""
         self.travelled = 0.0
         """Distance driven since the start of the daemon, forwards plus backwards, m."""
 
@@ -150,7 +151,8 @@ class Odometry:
         """Set the pose of base_link in odom, with the uncertainty of an initial pose.
 
         The angles of the wheels do not change. Motion in feedback lines that are held back or
-        implausible is not in the pose yet. It is dropped, because it happened before this call.
+        implausible is not in the pose yet. This motion is dropped, because it happened before this
+        call.
         """
         self._confirmation.forget()
         self._rolling.forget()
@@ -167,9 +169,9 @@ class Odometry:
     def missed(self) -> dict[str, int]:
         """Return counters of the gaps in the feedback by name, without counters that are 0.
 
-        `gaps` is the number of gaps in which the robot moved but the pose could not follow, and
-        `gap_ms` is their total duration, ms. `gaps_filled_ms` is the total duration of filled gaps,
-        ms.
+        `gaps` is the number of gaps in which the robot may have moved but the pose could not
+        follow, and `gap_ms` is their total duration, ms. `gaps_filled_ms` is the total duration of
+        filled gaps, ms.
         """
         ms = {"gap_ms": round(1e3 * self.unseen), "gaps_filled_ms": round(1e3 * self.bridged)}
         return {name: count for name, count in ({"gaps": self.gaps} | ms).items() if count}

@@ -2,7 +2,7 @@
 
 `Sanity` rejects a feedback line in which a wheel turns, or changes its speed, faster than any wheel
 can. The daemon does not use such a line, and several in a row are a fault. If more than one line in
-a hundred is impossible, the daemon logs a warning: either the wire damages lines, or a bound is too
+a hundred is impossible, the daemon logs a warning. Either the wire damages lines, or a bound is too
 low and true lines are rejected. `wheel_faults.py` checks whether the wheels follow their commands.
 
 A plain line has no checksum, so a damaged line may look possible, and then the true lines after it
@@ -43,15 +43,17 @@ COUNT_MARGIN = 2
 may be wrong by one count."""
 
 COARSEST_COUNT = math.tau / 16
-"""Angle of one count of the coarsest encoder that is expected, rad. Before the steps are learned,
-only a speed of up to one such count in the time of the line may be over `feedback.wheel_speed`."""
+"""Angle of one count of the coarsest encoder that is expected, rad. Until the quantization steps
+are learned, a speed over `feedback.wheel_speed` counts as possible only if one count of this size
+in the time that the line covers can cause it."""
 
 MIN_COUNT_S = 0.005
-"""Shortest time of a line for `COARSEST_COUNT`, s. Firmware rarely counts for a shorter time."""
+"""Shortest time that is used to convert one `COARSEST_COUNT` to a speed, s. Firmware rarely counts
+for a shorter time."""
 
 MAX_STEP = COARSEST_COUNT / MIN_COUNT_S
-"""Highest speed that a learned quantization step may excuse: 78.5 rad/s. Steps that are not proven
-never widen the default bound of 80 rad/s."""
+"""Highest speed that a learned quantization step may excuse: 78.5 rad/s. This is below the default
+bound of 80 rad/s, so steps that encoder counts do not prove never widen the default bound."""
 
 MAX_REPORTS = 2
 """Largest number of successive lines that report the same encoder count. Firmware that is asked
@@ -78,9 +80,8 @@ class Sanity:
         self._settings = feedback
         self._last: WheelSpeeds | None = None
         self._trusted = False
-        """Whether the line `_last` is trusted. It is trusted if it differs so little from the
-        possible line before it that the next line may have the speeds of that earlier line
-        again."""
+        """Whether the line `_last` is trusted. It is trusted if it differs from the possible line
+        before it by so little that the wheels can change back by the next line."""
         self._rejected: list[tuple[WheelSpeeds, float]] = []
         """The newest impossible lines since `_last`: pairs of the speeds and the time since
         `_last`, s. Lines with a speed over `feedback.wheel_speed` are not included."""
@@ -93,9 +94,9 @@ class Sanity:
         """For each wheel, the number of successive lines, up to the last line, in which the wheel
         was over `feedback.wheel_speed`."""
         self._totals = AT_REST
-        """For each wheel, the sum of the sizes of its speeds in the lines of `_fast`, rad/s. If a
-        speed is over the bound by more than one quantization step, the line is damaged, and only
-        one step counts."""
+        """For each wheel, the sum of the magnitudes of its speeds in the lines of `_fast`, rad/s. A
+        speed that exceeds the bound by more than one quantization step comes from a damaged line.
+        It counts as the bound plus one step."""
         self._lines = self._dropped = 0
         """Numbers of feedback lines in the present window: all lines (`_lines`), and impossible
         lines (`_dropped`)."""
@@ -136,7 +137,7 @@ class Sanity:
         most = self._most(self._since, longest)
         why = ""
         if max(map(abs, wheels)) > self._settings.wheel_speed or change > most:
-            # Few lines come here, and only for them do the quantization steps matter.
+            # Only a few lines get here. The quantization steps matter only for these lines.
             why = self._too_fast(feedback)
             if not why and last is not None:
                 why = self._jump(feedback, last, most)
@@ -171,7 +172,10 @@ class Sanity:
         )
 
     def _count(self, why: str) -> None:
-        """`why` is the reason why a line is impossible; "" for a possible line."""
+        """Count a feedback line in the present window, and update `warning`.
+
+        `why` is the reason why the line is impossible; "" for a possible line.
+        """
         self._lines += 1
         self.warning = None
         if why:

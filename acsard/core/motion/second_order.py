@@ -2,7 +2,7 @@
 
 If the true heading deviates from the estimated one and returns, the robot does not get as far as
 the estimated position, and never farther. This is an effect of second order. On a straight drive,
-it causes nearly the whole error along the path: after 60 m with k = 1e-5 (`error_model.py`) the
+it causes nearly all of the error along the path. After 60 m with k = 1e-5 (`error_model.py`), the
 first-order error is 17 mm, but the true error is 0.12 m.
 
 The path is divided into stretches. Each stretch composes the error e of the path before it with its

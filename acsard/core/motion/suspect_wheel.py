@@ -18,17 +18,19 @@ from typing import Literal
 from acsard.core.motion.wheel_witness import Expected
 
 FAULT_S, FAULT_LINES = 0.025, 2
-"""A sign of a faulty encoder must last for at least `FAULT_S` s and for at least `FAULT_LINES`
-feedback lines. At 100 Hz, `FAULT_S` takes three lines, so one bad reading is not enough."""
+"""Shortest time, s (`FAULT_S`), and smallest number of feedback lines (`FAULT_LINES`) for which a
+sign of a faulty encoder must last. At 100 Hz, `FAULT_S` takes three lines, so one bad reading is
+not enough."""
 
 FAULT_COUNTS, FAULT_ANGLE = 3.5, 0.05
 """Smallest difference between the angles of the two wheels of a side at which one wheel can be
 called faulty: `FAULT_COUNTS` encoder counts plus `FAULT_ANGLE` rad."""
 
 FOLLOWED_COUNTS, FOLLOWED_ANGLE = 2.5, 0.01
-"""After a new command, a wheel that repeats its old speed is called stuck only when a healthy wheel
-would have rolled a clearly different angle. The difference must be at least `FOLLOWED_COUNTS`
-encoder counts plus `FOLLOWED_ANGLE` rad."""
+"""Smallest effect of a new command on the angle of a healthy wheel, after which a wheel that still
+repeats its old speed can be called stuck. The effect is the angle that a healthy wheel would have
+rolled minus the angle at the old speed. It must be at least `FOLLOWED_COUNTS` encoder counts plus
+`FOLLOWED_ANGLE` rad."""
 
 MIN_COMMAND_CHANGE = 0.05
 """Smallest change of the command, rad/s, after which a healthy wheel must report a different

@@ -45,7 +45,7 @@ from acsard.core.motion.second_order import SecondOrder
 from acsard.core.values import PoseCovariance
 
 MAX_VARIANCE = 1e9
-"""Largest variance of the pose, m2 or rad2. A variance of this size means that it is unknown."""
+"""Largest variance of the pose, m2 or rad2. It means "unknown"."""
 
 ASSUMED_COUNTS = 400
 """Number of encoder counts per revolution of a wheel that is assumed if this number is not
@@ -93,7 +93,7 @@ class PoseUncertainty:
         self._stand_within(self._count)
 
     def _stand_within(self, angle: float) -> None:
-        """Set the angle of a count, rad. The wheel positions between two counts are unknown."""
+        """Set the angle of an encoder count, rad, within which a wheel's position is unknown."""
         self._count, count, track = angle, self._model.radius * angle, self._model.track
         self._play = count / track
         self._phase = (count**2 / 24 / 2, count**2 / 24 * 2 / track**2, 0.0)
@@ -204,7 +204,11 @@ class PoseUncertainty:
         return len(self._columns) - 1
 
     def _forget_where(self, distance: float, turn: float) -> None:
-        """Call this only if the position or the heading is already unknown."""
+        """Set all variances to "unknown" after a motion of `distance` m and `turn` rad.
+
+        Without a motion, nothing changes. Call this only if the position or the heading is already
+        unknown.
+        """
         if distance or turn:
             self.covariance = UNKNOWN_POSE
 

@@ -39,9 +39,9 @@ COARSEST, FINEST = math.tau / 16, math.tau / 2000
 not configured, rad."""
 
 RECUR, SOUGHT = 3, 1000
-"""If the number of counts is not configured, the daemon learns the angle of one encoder count. This
-is the `RECUR`-th smallest angle that a front wheel rolled in a feedback line, within `SOUGHT`
-lines. The smallest angle alone may come from a damaged line."""
+"""Parameters for learning the angle of one encoder count, if the number of counts is not
+configured. The angle is the `RECUR`-th smallest angle that a front wheel rolled in a feedback line,
+within `SOUGHT` lines. The smallest angle alone may come from a damaged line."""
 
 MIN_COMMANDED_SPEED = 0.005
 """Smallest commanded wheel speed that does not count as zero, rad/s. The line to the board has two
@@ -122,7 +122,11 @@ class _Side:
             part.forget()
 
     def watch(self, seen: Motors, dt: float, most: float, count: float, still: bool) -> bool:
-        """Return whether a wheel may be faulty. The arguments are as in `Witness.look`."""
+        """Check both wheels of this side, and return whether one of them may be faulty.
+
+        `seen` contains the reported speeds of all four wheels, rad/s. The other arguments are as in
+        `Witness.look`.
+        """
         i, j = self.wheels
         front, rear = self.witnesses
         bad = front.look(seen[i], self.expected, dt, most, count, still)
@@ -348,7 +352,7 @@ class WheelFaults:
             abs(commanded.front_left) < MIN_COMMANDED_SPEED
             and abs(commanded.front_right) < MIN_COMMANDED_SPEED
         )
-        # After this computer did not run the daemon for a while, one line covers that whole time.
+        # If this computer did not run the daemon for a while, one line covers all of that time.
         # This line alone must not prove a fault.
         most, count = limit / MIN_EVIDENCE_LINES, self._count
         bad_left = left.watch(speeds, dt, most, count, still)
@@ -465,9 +469,11 @@ class WheelFaults:
                 self._seeking = self._count > FINEST
 
     def _by_gyro(self, i: int, turned: Motors, turn: float) -> float:
-        """Return the angle of the left (0) or right (1) side by the gyro and the other side, rad.
+        """Return the angle that one side rolled, rad, computed from the gyro and the other side.
 
-        The wheels of the other side must agree with each other.
+        `i` is 0 for the left side and 1 for the right side. `turned` contains the angles that the
+        wheels rolled, and `turn` is the turn of the robot according to the gyro, both in rad. The
+        wheels of the other side must agree with each other.
         """
         front_right, front_left, rear_left, rear_right = turned
         return self._kinematics.opposite(

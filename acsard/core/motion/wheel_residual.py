@@ -13,12 +13,16 @@ harmless effects explains the difference:
 The comparison uses sums of the angles that the wheels rolled recently. Older angles have less
 weight (`TIME_CONSTANT_S`). The wheels contradict each other if
 
-    |D - r A| > ALLOWED_FRACTION A + ALLOWED_COUNTS c + ALLOWED_ANGLE
+    |D - r A| > ALLOWED_FRACTION B + ALLOWED_COUNTS c + ALLOWED_ANGLE
 
-where D is the sum of the front wheel's angles minus the sum of the rear wheel's angles, rad, A is
-the sum over the lines of the mean angle of both wheels, rad, r is the learned fraction, and c is
-the angle of an encoder count, rad. The wheels slip if |D - r A| exceeds this limit by more than
-ALLOWED_DELAY_S |v - mean of v|, where v is the speed of the side, rad/s.
+- D is the sum of the front wheel's angles minus the sum of the rear wheel's angles, rad.
+- A is the sum over the lines of the mean angle of both wheels, rad.
+- B is the sum over the lines of the mean magnitude of both angles, rad.
+- r is the learned fraction.
+- c is the angle of an encoder count, rad.
+
+The wheels slip if |D - r A| exceeds this limit by more than ALLOWED_DELAY_S |v - mean of v|, where
+v is the speed of the side, rad/s.
 """
 
 from __future__ import annotations

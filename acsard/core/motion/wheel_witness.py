@@ -8,8 +8,8 @@ proves a fault only if it lasts.
 
 A wheel that stands still, turns against its command or turns too fast is not evidence of a fault
 while its speed approaches the command. If a wheel turns in the right direction but too slowly, the
-daemon logs a warning with the ratio of the speeds: the load, the battery or
-`feedback.response_time` may be the cause.
+daemon logs a warning with the ratio of the speeds. The cause may be the load, the battery or
+`feedback.response_time`.
 """
 
 from __future__ import annotations
@@ -32,8 +32,9 @@ SMOOTHING_SPEED = 1.0
 smoothing is the time in which a wheel with this speed turns by one encoder count."""
 
 MIN_APPROACH = 1.0
-"""If a wheel is too fast, stands still or turns against its command, but its speed comes closer to
-the command by more than this, rad/s, its behavior is not evidence of a fault."""
+"""Approach of a wheel's speed to its command, rad/s, that excuses the wheel. A wheel may be too
+fast, stand still or turn against its command. This is not evidence of a fault if its speed has come
+closer to the command by more than this limit."""
 
 RATIO_DRIVE_S = 2.0
 """Time of driving, s, after which the angle that a wheel rolled is compared with the expected

@@ -138,7 +138,7 @@ def left_out(config: Config) -> frozenset[str]:
     messages.
     """
     silent = set() if config.odometry.publish_tf else {"tf"}
-    # The simulated robot has a gyro of its own, so the daemon does not subscribe to one.
+    # The simulated robot has its own gyro, so the daemon does not subscribe to another one.
     if not config.odometry.gyro or config.mcu.simulated:
         silent.add(IMU)
     if not (config.lidar.publish_tf or config.footprint.publish_tf):

@@ -12,7 +12,7 @@ Zenoh denies every message that no rule allows.
 - The daemon checks the exact key, the kind (PUT) and the source of each command again.
 
 Zenoh does not tell the daemon the certificate of a sample's sender. Therefore each certificate that
-may command has command keys of its own, which end with the name of the certificate. The rules let
+may command has its own command keys, which end with the name of the certificate. The rules let
 only a client with that certificate put on these keys.
 """
 
@@ -53,8 +53,8 @@ DECLARATIONS = (
     "declare_liveliness_subscriber",
     "liveliness_query",
 )
-"""Zenoh's names of the message types that a daemon sends. The type `put` (data) has rules of its
-own."""
+"""Zenoh's names of the message types that a daemon sends, except `put` (data). Separate access
+rules allow `put`."""
 
 ALL_MESSAGES = (*DECLARATIONS, "put", "delete", "query")
 
@@ -93,10 +93,10 @@ LOCAL_RULES = (
 )
 """The names of the access rules for a client on the robot's own machine.
 
-They are the rules of a maintainer, and more. Such a client may also subscribe with any wildcard,
+They are the rules of a maintainer, and more. A local client may also subscribe with any wildcard,
 and receive the commands of other clients. It may put on any key except those on which the robot
-publishes. If the key does not exist, the daemon counts and refuses the sample, and gives the
-reason.
+publishes. A command for an unknown source, or on a key with a wildcard, therefore reaches the
+daemon. The daemon counts and refuses this command, and gives the reason.
 """
 
 Flow = Literal["ingress", "egress"]
@@ -172,8 +172,8 @@ class _Keys:
     def commands_by(self, certificate: str) -> list[str]:
         """Return the command keys of all sources for one certificate.
 
-        For "*", return key expressions that match every certificate: a router forwards the commands
-        of every client.
+        For "*", return key expressions that match every certificate. A router needs them, because
+        it forwards the commands of every client.
         """
         return [full_key(self._robot, key) for key in source_keys(self._sources, certificate)]
 

@@ -56,10 +56,10 @@ def address_of(
 def address_by_environment(endpoint: str | None, robot_id: str | None, tls: str | None) -> Address:
     """Return a robot's address for a program that uses the client library.
 
-    An argument that is None is taken from the configuration file that $ACSARD_CONFIG names. Without
-    such a file, it has its default value. $ACSARD_TLS has priority over the certificate directory
-    in the file. Raises `UsageError` if `robot_id` does not have the form of a robot's id, or if the
-    file is unusable.
+    An argument that is None is taken from the configuration file that $ACSARD_CONFIG names. If
+    $ACSARD_CONFIG is not set, this argument has its default value. $ACSARD_TLS has priority over
+    the certificate directory in the file. Raises `UsageError` if `robot_id` does not have the form
+    of a robot's id, or if the file is unusable.
     """
     complete = endpoint is not None and robot_id is not None
     if complete and (tls is not None or not _is_tls(endpoint or "")):

@@ -73,10 +73,11 @@ class ZenohBus:
         return self._outlets.wanted
 
     def take(self, queries: int) -> BusInput:
-        """Return the samples and queries that have arrived since the last call, and other changes.
+        """Return the samples and queries that have arrived since the last call.
 
-        The result contains at most `queries` queries, plus one slow query (see `Inbox.take`).
-        Further queries wait for the next call.
+        The result also contains changes of the connections to routers, the number of messages that
+        were dropped, and whether the bus has begun to block. It contains at most `queries` queries,
+        plus one slow query (see `Inbox.take`). Further queries wait for the next call.
         """
         taken = self._inbox.take(queries)
         routers = self._links.changed()
@@ -88,7 +89,7 @@ class ZenohBus:
         return replace(taken, dropped=dropped, stuck=stuck) if dropped or stuck else taken
 
     def publish(self, key: str, message: Message) -> None:
-        """Queue a message for the subscribers of a topic. `flush` lets the message be sent.
+        """Queue a message for the subscribers of a topic. `flush` wakes the thread that sends it.
 
         `key` is the native key of the topic, without the robot's id.
         """
@@ -152,9 +153,9 @@ class ZenohBus:
         return session
 
     def _conflict(self, tokens: set[str]) -> str:
-        """Return an error message, or "".
+        """Return an error message if another daemon uses this robot's id or ROS names, or "".
 
-        `tokens` are the tokens of this robot from other sessions.
+        `tokens` are those of this robot's liveliness tokens that other sessions have declared.
         """
         if self._alive in tokens:
             return (
@@ -249,8 +250,8 @@ def _others(session: zenoh.Session, alive: str, claims: tuple[str, ...]) -> set[
     }
     deadline_ns = clock.now().mono_ns + int(TWIN_TIMEOUT_S * NS_PER_S)
     held: set[str] = set()
-    # A daemon with this robot's id also has its ROS names. The message about the id is clearer, so
-    # go on until the token of the id or the deadline arrives.
+    # Another daemon with this robot's id usually also has this robot's ROS names. The message about
+    # the id is clearer, so wait for the token of the id until the deadline.
     while alive not in held and clock.now().mono_ns < deadline_ns:
         time.sleep(0.01)
         held |= {token for token, other in subscribers.items() if other.try_recv() is not None}

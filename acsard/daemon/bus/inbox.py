@@ -55,7 +55,8 @@ class Replies:
         """Store a query, and return its ticket, which is a number.
 
         Return None if `MAX_OPEN_QUERIES` queries are stored already. The replies are sent on the
-        full key `key`. If `key` is "", each reply is sent on its own key below the robot's id.
+        full key `key`. If `key` is "", each reply is sent on the key in `Reply.key`, below the
+        robot's id.
         """
         if len(self._queries) >= MAX_OPEN_QUERIES:
             return None
@@ -132,7 +133,7 @@ ANY_CERTIFICATE = "*"
 """Placeholder in a command key for the name of any certificate."""
 
 STOP_BUFFER = 16
-"""Size of the buffer for stops. Stops have a buffer of their own, so that no flood of commands
+"""Size of the buffer for stops. Stops have a separate buffer, so that no flood of commands
 displaces a stop."""
 
 QUERY_QUEUE = 256

@@ -33,13 +33,13 @@ PUBLISHER_OPTIONS: dict[str, Any] = {
 }
 
 SLOT_MESSAGES = 16
-"""Largest number of messages of a topic that wait in its slot for the thread. A newer message
-displaces the oldest one. With odometry at 100 Hz, a slot covers 0.16 s. A busy machine, or a client
-that connects, usually blocks the thread for a shorter time."""
+"""Largest number of messages in the slot of a topic, which is the queue to the sending thread. A
+newer message displaces the oldest one. With odometry at 100 Hz, a slot covers 0.16 s. A busy
+machine, or a client that connects, usually blocks the thread for a shorter time."""
 
 BLOCKED_AFTER_NS = NS_PER_S // 4
-"""Time after which the bus counts as blocked, ns, if the thread has not sent all waiting messages.
-Usually the thread needs 0.1 ms."""
+"""Time after which the bus counts as blocked, ns, if the sending thread has not sent all waiting
+messages. Usually this thread needs 0.1 ms."""
 
 HEARTBEAT = zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=0.5)
 """Heartbeat of the publishers of latched ROS topics. The settings are those of rmw_zenoh."""
@@ -86,8 +86,8 @@ class Outlets:
         self._dropped = 0
         """Number of messages that newer messages have displaced since the last call of `losses`."""
         self._began_ns: int | None = None
-        """Monotonic time at which the thread began to send the waiting messages, ns; None while it
-        waits."""
+        """Monotonic time at which the sending thread began to send the waiting messages, ns. None
+        while this thread waits for messages."""
         self._thread = BusThread("outlets", self._run)
 
     def _count(self, outlet: _Outlet, wanted: bool) -> None:
@@ -104,7 +104,7 @@ class Outlets:
     # The control loop calls the methods below. None of them waits or calls Zenoh.
 
     def publish(self, topic: str, message: Message) -> None:
-        """Put a message into the slot of its topic. `flush` lets the thread send the message.
+        """Put a message into the slot of its topic. `flush` wakes the thread that sends it.
 
         `topic` is the native key of the topic.
         """

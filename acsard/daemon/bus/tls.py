@@ -255,8 +255,8 @@ def trouble(endpoint: str, directory: str) -> str:
     """Return the reason why this machine cannot connect to a TLS endpoint, and how to fix
     that.
 
-    Return "" if the connection succeeds. `directory` is the TLS directory of the client.
-    Blocks for a few seconds at most.
+    Return "" if the connection succeeds. `directory` is the TLS directory of this machine. Blocks
+    for a few seconds, or longer if the lookup of the host name is slow.
     """
     host, port = _place(endpoint)
     try:
@@ -291,7 +291,8 @@ def _tls_trouble(plain: socket.socket, host: str, directory: str) -> str:
     context.load_verify_locations(f"{directory}/{CA}")
     _load(context, directory)
     # Zenoh ignores the dates of an authority, but OpenSSL rejects each certificate of an expired
-    # authority before it looks at the rest. Such a connection fails for another reason.
+    # authority before it looks at the rest. So ignore the dates, to find the reason for which Zenoh
+    # cannot connect.
     outdated = any(map(_wrong_date, context.get_ca_certs()))
     if outdated:
         context.verify_flags |= NO_CHECK_TIME
@@ -329,7 +330,10 @@ def _wrong_date(certificate: Mapping[str, Any]) -> int:
 
 
 def _server_rejected(code: int, reason: str, host: str, directory: str) -> str:
-    """Return an error message; `code` and `reason` are OpenSSL's error code and its text."""
+    """Return the error message for a certificate of the server that this client rejects.
+
+    `code` and `reason` are OpenSSL's error code and its text.
+    """
     now = time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime())
     match code:
         case _ if code == EXPIRED:
@@ -368,7 +372,10 @@ def _server_rejected(code: int, reason: str, host: str, directory: str) -> str:
 
 
 def _client_rejected(reason: str, host: str, directory: str) -> str:
-    """Return an error message; `reason` is OpenSSL's name of the alert that the server sent."""
+    """Return the error message for a TLS handshake that the server ends.
+
+    `reason` is OpenSSL's name of the error, usually of an alert that the server sent.
+    """
     certificate = f"{directory}/{CERTIFICATE}"
     if "CERTIFICATE_EXPIRED" in reason:
         return (

@@ -159,7 +159,10 @@ RETRY_SETTINGS = {"connect/timeout_ms": -1, "connect/exit_on_failure": False}
 
 
 def _listening() -> dict[str, object]:
-    """Protect a listening session from clients that send nothing, send too much, or do not read."""
+    """Return the settings that protect a session that listens.
+
+    They protect it from clients that send nothing, send too much, or do not read.
+    """
     return {
         "transport/link/rx/max_message_size": MAX_MESSAGE_BYTES,
         "transport/unicast/accept_timeout": 1000,
@@ -276,9 +279,10 @@ def _tls(directory: str) -> dict[str, object]:
 
 
 def _command_limits(config: Config) -> dict[str, object]:
-    """Limit the rate of messages on input keys. Zenoh counts each connection separately.
+    """Return the setting that limits the rate of messages on each input key.
 
-    All certificates of a source share one limit. So do all sources that are not configured.
+    Zenoh counts each connection separately. All certificates of a source share one limit. All
+    sources that are not configured also share one limit.
     """
     names = [*(source.name for source in config.commands.sources), "*"]
     below = [*source_keys(names), *source_keys(names, "*"), IMU, SPEED_LIMIT]

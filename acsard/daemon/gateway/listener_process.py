@@ -1,4 +1,4 @@
-"""Runs a Zenoh session that is open to the network, in a process of its own that can be restarted.
+"""Runs a Zenoh session that is open to the network, in a separate process that can be restarted.
 
 A malicious client can make Zenoh compare key expressions for ever, use all connections, or use much
 memory. This process then suffers, but the daemon does not. During such an attack a call to Zenoh
@@ -35,13 +35,13 @@ STUCK_AFTER_NS = NS_PER_S
 millisecond."""
 
 FIRST_CONNECTION_NS = 5 * NS_PER_S
-"""Time within which the daemon must connect after the session was opened, ns. Otherwise this
-process restarts. The time is longer than `LOST_DAEMON_NS`, because all clients connect at the same
-moment after a restart."""
+"""Longest time from the opening of the Zenoh session to its connection with the daemon, ns. After
+this time, this process restarts. The time is longer than `LOST_DAEMON_NS`, because all clients
+connect at the same moment after a restart."""
 
 LOST_DAEMON_NS = NS_PER_S
-"""Time within which the daemon must connect again after its connection was lost, ns. Otherwise this
-process restarts."""
+"""Longest time for which the Zenoh session may be without its connection to the daemon after this
+connection was lost, ns. After this time, this process restarts."""
 
 REPORT_RATE = Rate(1 / 60)
 """Largest rate of the log event that reports that all connections are in use: one a minute."""
@@ -84,7 +84,7 @@ class Observation(Struct, frozen=True):
 
 
 class SessionHealth:
-    """The health of a session, derived from observations that follow each other."""
+    """The health of a Zenoh session, derived from consecutive observations of the session."""
 
     def __init__(self, most: int, opened_ns: int, events: Events = GATEWAY_EVENTS) -> None:
         """Prepare for the first observation.
@@ -160,7 +160,8 @@ def connection_counts(holders: Sequence[str]) -> str:
 
 
 CHECK_PERIOD_S = 0.25
-"""Interval at which a thread looks at the Zenoh session, and the main thread at that thread, s."""
+"""Interval at which a thread observes the Zenoh session, s. At the same interval, the main thread
+checks that this thread still makes observations."""
 
 MAX_MEMORY_BYTES = 192 << 20
 """Limit of the data memory of this process, bytes. The process needs 35 MB, or 72 MB if all
@@ -204,7 +205,10 @@ class Listener:
 
 
 class ListenerProcess:
-    """The process of one `Listener`, until the process must end or be restarted."""
+    """The main loop of a process that opens and observes the session of one `Listener`.
+
+    The loop ends when the process must end or be restarted.
+    """
 
     def __init__(self, listener: Listener, log: Log, manager: Systemd, parent: int | None) -> None:
         """Prepare the process; `run` runs it.

@@ -1,6 +1,6 @@
 """The TLS gateway between clients on other machines and the daemon on loopback.
 
-The gateway is a Zenoh router in a process of its own. It forwards only the messages that the access
+The gateway is a Zenoh router in a separate process. It forwards only the messages that the access
 rules allow. The worst effect that a client can have is a restart of the gateway
 (`listener_process.py`), after which all clients reconnect.
 """
@@ -82,7 +82,7 @@ class Gateway(Listener):
     def observe(self, session: zenoh.Session) -> Observation:
         """Return the connections from the network, and whether the daemon is connected."""
         links = session.info.links()
-        # Only the daemon connects without TLS.
+        # Only the link to the daemon has no TLS.
         local = [link for link in links if str(link.dst).startswith("tcp/")]
         holders = tuple(link.auth_identifier or "" for link in links if link not in local)
         unanswered = self._probe.unanswered(session, clock.mono_ns()) if local else 0
@@ -91,9 +91,9 @@ class Gateway(Listener):
     def report(self, session: zenoh.Session, observed: Observation, health: SessionHealth) -> None:
         """Publish the state of the gateway, which the daemon includes in the message `state`.
 
-        This state contains the number of connections, the opening time of the gateway, the earliest
-        expiry time of its certificates, and the number of observations in which all connections
-        were in use.
+        This state contains the number of connections, the opening time of the gateway, and the
+        earliest expiry time of its certificates. It also contains the number of observations in
+        which all connections were in use.
         """
         if self._publisher is None:
             self._ends_ns = min(ends(self._config.bus.tls).values(), default=0)
@@ -115,9 +115,9 @@ class DaemonProbe:
         """Prepare the probe. `key` is the full key of the queries, which the daemon must answer."""
         self._key, self._asked_ns, self._unanswered = key, 0, 0
         self._ended = threading.Event()
-        """Set when a query has ended, with or without a reply, since the last query was sent. An
-        earlier query that ends late sets it too. A query that ends within `PROBE_TIMEOUT_NS` has
-        reached the daemon."""
+        """Set whenever a query ends, with or without a reply, and cleared before the next query is
+        sent. A query that ends within `PROBE_TIMEOUT_NS` has reached the daemon. A query that ends
+        later also sets the event. The query that is open at that time then counts as answered."""
 
     def unanswered(self, session: zenoh.Session, now_ns: int) -> int:
         """Send the next query if it is due, and return the number of consecutive failed queries.

@@ -89,7 +89,8 @@ class BlockingPort:
     def send(self, data: bytes) -> None:
         """Write all of `data`.
 
-        Raises `WireLostError` if the port is lost, or if it accepts no byte for `SEND_TIMEOUT_S`.
+        Raises `WireLostError` if the port is lost, or if it has not accepted all bytes after
+        `SEND_TIMEOUT_S`.
         """
         fd = self._fileno()
         deadline_ns = clock.mono_ns() + int(SEND_TIMEOUT_S * NS_PER_S)

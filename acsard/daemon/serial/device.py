@@ -134,7 +134,8 @@ def close(device: serial.Serial, *, lost: bool = False, wait_s: float = 0.0) -> 
 
     The thread is needed because a driver may take 30 s to close. If no thread can be started, the
     next `open_raw` closes the device. After this call, the descriptor of `device` refers to
-    /dev/null, so the caller can close `device` itself without delay.
+    /dev/null, so the caller can close `device` itself without delay. If this process has no free
+    descriptor, the device stays open, and the caller closes it with the driver's delay.
 
     Args:
         device: the open device.

@@ -41,8 +41,8 @@ still has no access after this time, its start fails."""
 DRIVER_HUNG = "the driver of the serial port did not answer"
 
 FINAL_STOP_TIMEOUT_S = 0.15
-"""Longest time for sending the last STOP, s. It is twice the time of a line at the lowest baud
-rate, plus a margin."""
+"""Longest time for sending the last STOP, the line of zero speeds, s. It is twice the time of
+a line at the lowest baud rate, plus a margin."""
 
 
 MAX_READ_BYTES = 4096
@@ -255,7 +255,7 @@ class SerialPort:
     # Closing.
 
     async def __aexit__(self, *_: object) -> None:
-        """Send STOP as the last line, and close the port, even after an exception.
+        """Send STOP (zero speeds) as the last line, and close the port, even after an exception.
 
         Sending takes at most `FINAL_STOP_TIMEOUT_S`.
         """

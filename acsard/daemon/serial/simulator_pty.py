@@ -113,7 +113,10 @@ class SimPty:
         termios.tcsetattr(self._end.slave, termios.TCSANOW, attributes)
 
     def _speed(self) -> int:
-        """Return the baud rate that the host has set on the pty, if acsard supports it."""
+        """Return the baud rate that the host has set on the pty.
+
+        If acsard does not support this rate, return the baud rate of the board.
+        """
         return _RATES.get(termios.tcgetattr(self._end.slave)[5], self.mcu.baud_rate)
 
     def _advance(self) -> None:
