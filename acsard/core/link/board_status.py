@@ -6,15 +6,15 @@ An example of a status line is:
 
 Every field is optional. The fields may come in any order, and each at most once. The board sends
 status lines in addition to its replies, never instead of a reply. A status line contains no wheel
-speeds and does not count as a reply. One invalid field makes the whole line invalid. The format of
-the values makes damage detectable:
+speeds and does not count as a reply. One invalid field makes the line invalid. The format of the
+values makes damage detectable:
 
 - An input has two words, such as `pressed` and `ok`. They differ in many bits, so a few flipped
   bits cannot turn one word into the other.
 - Each number has a fixed number of decimals or ends with `%`, so a truncated number is refused.
 
 `*` and four hexadecimal digits may end the line: the CRC-16/XMODEM of all characters before `*`. On
-a checked link, the line must have this checksum.
+a checked link (a link whose lines have checksums), the line must have this checksum.
 """
 
 from __future__ import annotations

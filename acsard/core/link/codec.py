@@ -2,9 +2,9 @@
 
 An example is `ap12.50,bn08.75,cp15.00,dn10.25`. Each value consists of a motor letter, `p`
 (positive) or `n` (negative) for the direction, and a speed in rad/s. The encoder writes exactly
-this form, with a trailing comma if the configuration asks for a trailing comma. The decoder also
-accepts spaces after commas, a trailing comma, one or two integer digits, and one to three decimals.
-One invalid value makes the whole line invalid. In the daemon, only this module maps motor letters
+this form, with a trailing comma if the configuration asks for one. The decoder also accepts spaces
+after commas, a trailing comma, one or two integer digits, and one to three decimals.
+One invalid value makes the line invalid. In the daemon, only this module maps motor letters
 and signs to wheels. The simulator has its own code for this.
 """
 
@@ -126,7 +126,11 @@ class Codec:
 # A robot at rest repeats the same line, so the last lines are cached.
 @lru_cache(16)
 def _words(line: bytes) -> tuple[tuple[bytes, float], ...] | None:
-    """Return four pairs such as `(b"ap", 12.5)`, the speed in rad/s; None if malformed."""
+    """Return a motor token and a speed, such as `(b"ap", 12.5)`, for each of the four motors.
+
+    The token is the motor letter and the direction. The speed is in rad/s. Return None if `line` is
+    malformed.
+    """
     match = _LINE.fullmatch(line)
     if match is None:
         return None

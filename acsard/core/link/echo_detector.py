@@ -1,8 +1,9 @@
 """Detects echoes: lines that the daemon writes to the serial port and then receives back.
 
 Lines come back if TX and RX are connected to each other, or if a device at the far end sends all
-bytes back. Behind such a device, there may also be a board that answers. This module detects the
-echo of plain lines, and of checked lines that ask for no sample.
+bytes back. A board that answers may be connected behind such a device. This module detects the echo
+of plain lines, and of checked lines (lines with a checksum) that do not ask for a sample of the
+encoders.
 """
 
 from __future__ import annotations
@@ -23,20 +24,20 @@ adapter that echoes, the daemon receives both the echo and the replies of the bo
 reports by its own clock may send two replies in a row."""
 
 MIN_TOTAL_CHANGE = 2.0
-"""Least total change of the wheel speeds in an echo, rad/s. From each line that came back to the
-next, only the largest of the four changes counts, and these changes are added up. With coarse
-encoders, a smaller sum may be a coincidence."""
+"""Least total change of the wheel speeds in an echo, rad/s. The total is a sum over all pairs of
+successive lines that came back. Each pair adds the largest of its four speed changes, one per
+wheel. With coarse encoders, a smaller total may be a coincidence."""
 
 MIN_BEND = 0.025
-"""Least difference between two successive speed changes in an echo, rad/s. At least one such
-difference must occur, as at the start or the end of a ramp. Speeds in lines are rounded to 0.01
-rad/s, so on a straight ramp two speed changes differ by up to 0.02 rad/s. Therefore an echo may
-stay undetected while all ramps are gentler than 0.025 rad/s per line, which is 0.125 m/s2 for a
-wheel radius of 0.05 m at 100 Hz."""
+"""Least bend in an echo, rad/s. A bend is the difference between two successive changes of a
+wheel's speed, as at the start or the end of a ramp. An echo needs at least one bend above this
+limit. Speeds in lines are rounded to 0.01 rad/s, so on a straight ramp two speed changes differ by
+up to 0.02 rad/s. Therefore an echo may stay undetected while all ramps are gentler than 0.025 rad/s
+per line, which is 0.125 m/s2 for a wheel radius of 0.05 m at 100 Hz."""
 
 COMPARED_LINES = 8
-"""Number of sent lines, the newest ones, with which `EchoDetector` compares each received reply. At
-100 Hz, an echo that comes back within 70 ms is detected."""
+"""Number of the newest sent lines with which `EchoDetector` compares each received reply. At 100
+Hz, an echo that comes back within 70 ms is detected."""
 
 _Wheels = tuple[float, float, float, float]
 NO_CHANGE: _Wheels = (0.0, 0.0, 0.0, 0.0)
@@ -60,25 +61,25 @@ class _Run(Struct, gc=False):
     """Sum of the speed changes between successive lines, rad/s, as `MIN_TOTAL_CHANGE` defines
     it."""
     corner: float = 0.0
-    """Largest difference between two successive speed changes in the run, rad/s. See `MIN_BEND`."""
+    """Largest bend in the run, rad/s. A bend is the difference between two successive speed
+    changes."""
 
 
 class EchoDetector:
     """Detector of an echo: received lines that only repeat the daemon's own lines.
 
-    A report is a received reply without a sample, which means without encoder counts. A report has
-    the same form as a command, so an echo looks like a board that reports exactly the commanded
-    speeds. The received lines are an echo if all of these conditions hold:
+    A report is a received reply that contains no encoder counts. A report has the same form as a
+    command, so an echo looks like a board that reports exactly the commanded speeds. The received
+    lines are an echo if all of these conditions hold:
 
     - At least `MIN_REPEATED_LINES` successive sent lines came back in order, byte for byte.
     - Between two successive lines that came back, at most `MAX_OTHER_REPORTS` other reports came.
-    The speeds
-      in these reports do not lie between the speeds in the two lines. A motor that changes from one
-      speed to the other would report speeds between them.
+      The speeds in these reports do not lie between the speeds in the two lines. A motor that
+      changes from one speed to the other would report speeds between them.
     - The speed changes from line to line add up to at least `MIN_TOTAL_CHANGE`, and one of them
-    differs by
-      more than `MIN_BEND` from the speed change before it. A motor that lags by a whole number of
-      lines repeats a steady ramp exactly, but it rounds off the start and the end of the ramp.
+      differs by more than `MIN_BEND` from the speed change before it. A motor that lags by a whole
+      number of lines repeats a steady ramp exactly, but it rounds off the start and the end of the
+      ramp.
 
     At rest every board looks like an echo, so lines without speed changes prove nothing. A device
     that echoes and also passes on replies, such as an RS-485 adapter with a board behind it, is
@@ -111,7 +112,7 @@ class EchoDetector:
         self._runs.append(None)
 
     def report(self, line: bytes, speeds: WheelSpeeds) -> bool:
-        """Process a reply without a sample, and return whether the last such replies are an echo.
+        """Process a reply without encoder counts. Return whether the last replies are an echo.
 
         `line` is the reply without its line end, and `speeds` are the speeds in the reply.
         """
@@ -141,7 +142,10 @@ class EchoDetector:
         return found
 
     def _continued(self, run: _Run | None, wheels: _Wheels) -> _Run:
-        """Return `run` with one more line, or a new run if this line cannot be an echo."""
+        """Return `run` extended by the present reply, or a new run if the reply cannot continue it.
+
+        `wheels` are the wheel speeds in the present reply, rad/s.
+        """
         others = MAX_OTHER_REPORTS + 1 if run is None else self._reports - run.report - 1
         if run is None or others > MAX_OTHER_REPORTS:
             return _Run(self._reports, wheels)

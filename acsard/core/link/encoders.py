@@ -1,11 +1,11 @@
 """Converts encoder counts into the angle that each motor turned since the previous reading.
 
 The counts are cumulative, so no distance is missing after a lost line. The board sends the time of
-its own clock with the counts, so the time between two readings does not depend on the moments at
-which the host read the lines. Counts and milliseconds are modulo 65536. The difference between two
-counts is used only if the counts cannot have wrapped, and if a wheel at its highest speed can make
-that many counts. Otherwise the caller computes the angle as speed times time. The module also
-detects a probable restart of the board.
+its own clock with the counts. The time between two readings therefore does not depend on when the
+host read the lines. Counts and milliseconds are modulo 65536. The difference between two counts is
+used only if the counts cannot have wrapped, and if a wheel at its highest speed can make that many
+counts. Otherwise the caller computes the angle as speed times time. The module also detects a
+probable restart of the board.
 """
 
 from __future__ import annotations
@@ -63,9 +63,9 @@ class Encoders:
         Args:
             counts: encoder counts per wheel turn, 0 if unknown.
             wheel_speed: highest speed of a wheel, rad/s.
-            quiet_ns: time without a line from the board after which the link is stale, ns. The
-                board has probably restarted if, by its clock, a reading arrives more than
-                `quiet_ns` too early.
+            quiet_ns: time without a line from the board after which the link is stale, ns. If a
+                reading seems to come more than `quiet_ns` too early by the board's clock, the board
+                has probably restarted.
         """
         self._angle = math.tau / counts if counts else 0.0
         self._fastest = wheel_speed / math.tau * counts / 1000

@@ -35,37 +35,39 @@ DIFFERENCE_GAIN = 0.05
 the time that `FreeRunningTimes` gives to the same line."""
 
 FULL_READ_BYTES = 1024
-"""If a read of the port contains at least this number of bytes, the kernel may hold more data."""
+"""Least number of bytes in a full read of the port. After a full read, the kernel may hold more
+data."""
 
 EVALUATION_START = 1.5
-"""A read of the port helps `ReplyStyle` to decide if two numbers differ by at least
-`EVALUATION_START`: the reply periods that have passed since the previous read, and the commands
-that were written since then. Scheduling alone causes a smaller difference."""
+"""Least difference between two numbers: the reply periods that have passed since the previous read
+of the port, and the commands that were written since then. At a read that reaches this difference,
+`ReplyStyle` begins to evaluate reads. Scheduling alone causes a smaller difference."""
 
 DECISION_DIFFERENCE = 2.5
-"""`ReplyStyle` adds up two numbers over the reads of the port that it evaluates: the reply periods
-that passed, and the commands that were written. It decides only if the two sums differ by at least
-`DECISION_DIFFERENCE`."""
+"""Least difference between the number of reply periods and the number of commands at which
+`ReplyStyle` decides whether the board reports by its own clock. Both numbers are sums over the
+reads of the port that `ReplyStyle` evaluates."""
 
 MAX_READ_PERIODS = 100.0
-"""`ReplyStyle` ignores a read of the port if more than this number of reply periods have passed
-since the previous read."""
+"""Longest time between two reads of the port after which `ReplyStyle` still evaluates the later
+read, in reply periods."""
 
 CLEAR_FRACTION = 0.5
-"""`ReplyStyle` decides only if the number n of received lines is clearly nearer to one of two sums
-than to the other: the number p of reply periods, and the number c of commands. Therefore |p - n|
-and |c - n| must differ by at least `CLEAR_FRACTION` times |p - c|. All three numbers are sums over
-the reads of the port that `ReplyStyle` evaluates."""
+"""Limit of how clearly the lines must favor one kind of board before `ReplyStyle` decides. Let n be
+the number of received lines, p the number of reply periods, and c the number of commands, summed
+over the reads of the port that `ReplyStyle` evaluates. Then |p - n| and |c - n| must differ by at
+least `CLEAR_FRACTION` times |p - c|. This means that n is clearly nearer to p or to c."""
 
 EXTRA_READS = 3
 """Number of further reads that `ReplyStyle` evaluates after a read of the port that reaches
 `EVALUATION_START`."""
 
 NEAR_FRACTION = 0.35
-"""`ReplyStyle` decides only if the number n of received lines is near to one of two sums: the
-number p of reply periods, or the number c of commands. Therefore |p - n| or |c - n| must be at most
-`NEAR_FRACTION` times n, or at most 1.5 if that is more. The limit is not 0, because some lines get
-lost. All three numbers are sums over the reads of the port that `ReplyStyle` evaluates."""
+"""Largest distance of the number n of received lines from the nearer of two sums at which
+`ReplyStyle` decides, as a fraction of n. The sums are the number of reply periods that passed, and
+the number of commands that were written. A distance of up to 1.5 is always allowed. The limit is
+not 0, because some lines get lost. All numbers cover the reads of the port that `ReplyStyle`
+evaluates."""
 
 
 class Feedback(Struct, frozen=True, gc=False):
@@ -97,7 +99,7 @@ class Feedback(Struct, frozen=True, gc=False):
     if the line contains the time of that clock, else from the arrival times. It is 0 after a
     silence or a gap."""
     heard_ns: int = 0
-    """Monotonic time at which the host had received the whole line, ns."""
+    """Monotonic time at which the host had received the complete line, ns."""
     counted: Motors | None = None
     """Angle that each wheel turned in the last `dt - bridged` seconds, rad, in `WHEELS` order, as
     `whole_counts.py` recovers it from the speeds. None if the counts per turn are not configured,
@@ -107,10 +109,10 @@ class Feedback(Struct, frozen=True, gc=False):
     count: float = 0.0
     """Angle of one encoder count, rad, 0 if the counts per turn are not configured."""
     driven: float = 0.0
-    """Time from the previous sample until the motors had no command to move any more, s. The
-    command to move ends with the first line of zeros. It also ends when the watchdog of the board
-    stops the motors because no line has reached the board. The value is negative if the command
-    ended before the previous sample, and 0 in the first line."""
+    """Time from the previous sample to the end of the last command to move, s. A command to move
+    ends with the first line of zeros. It also ends when the watchdog of the board stops the motors
+    because no line has reached the board. The value is negative if the command ended before the
+    previous sample, and 0 in the first line."""
 
 
 class ReplyStyle:
@@ -143,7 +145,8 @@ class ReplyStyle:
     def read(self, lines: int, periods: float) -> None:
         """Process a read of the port that completed `lines` lines.
 
-        `periods` is the time since the previous such read, in reply periods of the board.
+        `periods` is the time since the previous read that completed a line, in reply periods of the
+        board.
         """
         left, self._left = self._left, 0
         if self._known or periods > MAX_READ_PERIODS:
@@ -199,8 +202,8 @@ class Timeline:
         self._heard_ns = self._end_ns = 0
         self._forgotten = True
         self._rest_ns = 0
-        """Monotonic time at which the motors have no command to move any more, ns: the time of the
-        first line of zeros, or of the stop by the board's watchdog if that is earlier."""
+        """Monotonic time at which the last command to move ends, ns: the time of the first line of
+        zeros, or of the stop by the board's watchdog if that is earlier."""
         self._last_placed = Placed("reads", 0)
         """The time of the last good line, by the clock that was chosen for this line."""
         self._spoilt = False
@@ -354,7 +357,10 @@ class Timeline:
         return Placed("reads", int(self._end_ns - self._share_ns * self._rest))
 
     def _since_last(self, placed: Placed) -> tuple[float, float]:
-        """Return the time since the last good line, s, and its part with lost lines."""
+        """Return the time since the last good line, s, and the part in which lines were lost, s.
+
+        `placed` is the time of the present line.
+        """
         last = self._last_placed
         back = placed.due_ns < last.due_ns
         self._last_placed = replace(placed, due_ns=last.due_ns) if back else placed
@@ -386,7 +392,11 @@ class Timeline:
         self._later += DIFFERENCE_GAIN * (later_ns - self._later)
 
     def _late_ns(self, clock: str) -> float:
-        """Return how much later `clock` usually is than `FreeRunningTimes` for a line, ns."""
+        """Return the mean difference between the times that two clocks give to a line, ns.
+
+        It is the time by `clock` ("reads", "prompts" or "slots") minus the time by
+        `FreeRunningTimes`.
+        """
         if clock == "reads":
             return self._slots.late_ns
         return self._later if clock == "prompts" else 0.0
@@ -396,7 +406,11 @@ class Timeline:
         return self._slots.usual or self._period_ns
 
     def _sampled(self, came_ns: int, placed: Placed, length: int) -> Instant:
-        """Return the time at which the board began to send the line."""
+        """Return the sample time of the line: the time at which the board began to send it.
+
+        `placed` is the time at which the host should have received the line, and `came_ns` the time
+        at which the line came. `length` is the number of bytes of the line.
+        """
         mono_ns = min(came_ns, placed.due_ns) - wire_ns(length, self._baud_rate)
         last, read = self._last, self._at
         wall_ns = read.wall_ns - read.mono_ns + mono_ns

@@ -26,11 +26,11 @@ class LineReader:
         self._discarding = False
 
     def feed(self, data: bytes) -> list[tuple[bytes, int]]:
-        """Return the lines that are complete with the bytes `data`, in order.
+        """Add the received bytes `data`, and return the lines that they complete, in order.
 
-        Each item is a pair: the line without its line end, and the number of bytes in `data` behind
-        the line. The serial port needed a known time for these bytes, so the caller can compute
-        when the line was complete.
+        Each item is a pair: the line without its line end, and the number of bytes in `data` after
+        the line. The wire needs a known time for these bytes, so the caller can compute when the
+        line was complete.
         """
         lines = []
         ends = data.split(b"\n")

@@ -19,10 +19,10 @@ from acsard.core.link.negotiation import ADVICE, Negotiation
 from acsard.core.values import NS_PER_S, Event
 
 LATE_STEP_FRACTION = 0.5
-"""A control step is late if the time since the previous step reaches this share of `Link.quiet_ns`,
-the duration of silence after which the link is stale. The daemon reads the lines of the board only
-in its control steps. So before a late step, this computer has caused a silence by not running the
-daemon, and the board is not to blame."""
+"""Least time between two control steps that makes the second step late, as a share of
+`Link.quiet_ns`, the duration of silence after which the link is stale. The daemon reads the lines
+of the board only in its control steps. So if a silence ends with a late step, this computer has
+caused the silence by not running the daemon, and the board is not to blame."""
 
 BUSY_ADVICE = (
     "the Linux command `top` shows which other program uses the processor; acsard has priority if "
@@ -40,7 +40,7 @@ FIRST_DIAGNOSIS_NS = 3 * NS_PER_S
 this time."""
 
 MAX_SHOWN_BYTES = 64
-"""Largest number of bytes that a diagnosis shows: a whole line and some noise."""
+"""Largest number of bytes that a diagnosis shows: enough for a complete line and some noise."""
 
 Look = Literal["nothing", "statuses", "cut", "foreign", "garbage", "few", "sparse"]
 """The class of the bytes that the board sent while the link was not up.
@@ -118,7 +118,7 @@ class Lateness:
 
         Only a good line from the board ends a silence. The built-in simulator runs on this
         computer, so this computer causes each of the simulator's silences. With the simulator, the
-        result is therefore True for every good line, whether or not a silence was before it.
+        result is therefore True for every good line, even if no silence came before the line.
 
         Args:
             now_ns: the monotonic time of the control step, ns.
@@ -212,7 +212,7 @@ class Heard(Struct):
 
     @property
     def words(self) -> str:
-        """The whole diagnosis as a sentence for the message `state`."""
+        """The complete diagnosis as a sentence for the message `state`."""
         if self.looks == "sparse" and self.late_s:
             return (
                 f"{HOST_STALL} {self.late_s:.2f} s, so it received too little for a link: "
@@ -358,10 +358,11 @@ def _sparse(sparse_s: float, longest_reply: float) -> str:
 
 
 def check_event(check: Negotiation, wants_samples: bool) -> Event:
-    """Return the log event which says whether the lines on the wire are now plain or checked.
+    """Return the log event that says whether the lines on the wire are now plain or checked.
 
-    The event is a warning if the board does not support the check. It is also a warning if
-    `wants_samples` is true and the board does not send its encoder counts.
+    A checked line has a checksum. The event is a warning if the board does not support the
+    checksum. It is also a warning if `wants_samples` is true and the board does not send its
+    encoder counts.
     """
     fallen = check.state == "plain" or (wants_samples and check.state == "checked")
     text = f"the lines on the serial port are now {check.in_force}"

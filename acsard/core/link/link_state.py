@@ -50,22 +50,23 @@ STATE_TEXTS: dict[State, str] = {
 }
 
 WATCHDOG_S = 0.3
-"""If the board receives no valid line from the daemon for this time, s, it stops the motors."""
+"""Time without a valid line from the daemon after which the board stops the motors, s."""
 
 WATCHDOG_NS = int(WATCHDOG_S * NS_PER_S)
 """`WATCHDOG_S` in ns."""
 
 GOOD_LINES = 3
-"""The link comes up only after this number of good lines in a row. Fewer prove little, because a
-board may print anything after a reset."""
+"""Number of good lines in a row after which the link comes up. Fewer good lines prove little,
+because a board may print anything after a reset."""
 
 BAD_LINES = 5
-"""Number of bad lines in a row on a checked link after which the daemon negotiates the check
-again."""
+"""Number of bad lines in a row on a checked link (a link whose lines have checksums) after which
+the daemon negotiates the checksum again."""
 
 SPARSE_SILENCES = 2
-"""The lines of the board count as too sparse after this number of silences in a row, with only one
-good line between two of them. A single silence only means that the link was lost for a moment."""
+"""Number of silences in a row after which the lines of the board count as too sparse. Silences are
+in a row if only one good line comes between two of them. A single silence only means that the link
+was lost for a moment."""
 
 
 class Link:
@@ -138,8 +139,9 @@ class Link:
 
         The caller does this if it sent no line for a while, because the board may have had nothing
         to answer. The call has an effect only while the link is up, and only once after each good
-        line. With it, the link becomes stale at the latest `quiet_ns` plus the duration of the
-        stall plus `quiet_ns` / 3 after the last good line.
+        line. The additional time is limited. Let pause be the time in which the caller sent no
+        line. The link becomes stale at the latest `quiet_ns` + pause + `quiet_ns` / 3 after the
+        last good line. `now_ns` is monotonic.
         """
         if self.state == "up" and not self._waited:
             self._waited = True

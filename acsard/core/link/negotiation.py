@@ -98,7 +98,7 @@ ADVICE: dict[Trouble, str] = {
 }
 
 MAX_UNANSWERED_QUESTIONS = 3
-"""After this number of unanswered questions of one kind, the daemon concludes that the board does
+"""Number of unanswered questions of one kind after which the daemon concludes that the board does
 not support this kind. A question is a stop line with a sequence number and a checksum. Questions of
 the first kind ask for a sample, and those of the second kind have no request letters. If the daemon
 wants no samples, it sends a single question with `ECHO_MARK` instead of the first kind."""
@@ -142,7 +142,7 @@ class Throttle:
         return True
 
     def undo(self) -> None:
-        """Forget the last event, because its line was not written.
+        """Forget the last allowed event, because the line for which it was allowed was not written.
 
         The next event is then allowed immediately.
         """
@@ -150,7 +150,7 @@ class Throttle:
 
 
 class Negotiation:
-    """The negotiation of the check with the board.
+    """The negotiation of the check (a sequence number and a CRC in each line) with the board.
 
     The class also adds the check to commands, and finds the command that a reply answers.
     """
@@ -235,10 +235,11 @@ class Negotiation:
         return self._sealed(line, SAMPLE_REQUEST if self.state == "sampled" else b"", now_ns)
 
     def question(self, now_ns: int) -> bytes | None:
-        """Return the next question or plain stop to send, or None if none is due yet.
+        """Return the next line of the negotiation, or None if no line is due yet.
 
-        The caller calls this method instead of `seal` while the daemon asks for the check. `now_ns`
-        is the monotonic time at which the line is made.
+        The line is a plain stop, or a question: a stop line with a sequence number and a CRC. The
+        caller calls this method instead of `seal` while the daemon asks for the check. `now_ns` is
+        the monotonic time at which the line is made.
         """
         waking = self.state == "waking"
         wait_ns = max(SILENT_BOARD_PERIOD_NS, self._answer_ns) if waking else self._answer_ns
@@ -313,10 +314,10 @@ class Negotiation:
     def answered(self, reply: Checked, at_ns: int) -> int:
         """Process a correct checked reply, and return the time at which its command was written.
 
-        This time is monotonic, in ns. Raises `FrameError` if the command was written more than 0.3
-        s (`ANSWER_TIMEOUT_NS`) before the reply was read, or if the sequence number of the reply
-        belongs to no command that waits for an answer. `at_ns` is the monotonic time at which the
-        reply was read.
+        This time is monotonic, in ns. `at_ns` is the monotonic time at which the reply was read.
+        Raises `FrameError` if the command was written more than 0.3 s (`ANSWER_TIMEOUT_NS`) before
+        `at_ns`. Also raises `FrameError` if the sequence number of the reply belongs to no command
+        that waits for an answer.
         """
         while self._pending and at_ns - self._pending[0][1] > ANSWER_TIMEOUT_NS:
             self._pending.popleft()
@@ -340,7 +341,7 @@ class Negotiation:
     def judge(self, now_ns: int) -> None:
         """Count the last question as unanswered if its answer is overdue.
 
-        After `MAX_UNANSWERED_QUESTIONS` unanswered questions of each kind, accept plain lines if
+        Once all questions with and without request letters are unanswered, accept plain lines if
         `mcu.link_check` is "auto" and the board has never answered with the check. Otherwise set
         `trouble`. `now_ns` is monotonic.
         """

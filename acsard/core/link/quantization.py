@@ -38,8 +38,8 @@ MAX_STEP_RATIO = 3.0
 the four wheels. The bound is needed because random jumps of a speed look like quantization too."""
 
 COARSE, JUMP_GAIN = 0.015, 0.06
-"""If the mean jump of a wheel's speed exceeds `COARSE`, rad per line, its encoder is treated as
-coarse. `Coarseness` defines a jump. An encoder with about 200 counts a turn reaches this value.
+"""`COARSE` is the mean jump of a wheel's speed above which its encoder is treated as coarse, rad
+per line. `Coarseness` defines a jump. An encoder with about 200 counts a turn reaches this value.
 `JUMP_GAIN` is the gain of the filter for the mean jump."""
 
 MAX_INTERVAL_S = 0.03

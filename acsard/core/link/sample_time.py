@@ -26,8 +26,8 @@ Read = tuple[int, int]
 complete, ns, and the number of lines in the read."""
 
 MAX_FILLED_GAP_S = 1.0
-"""If no line came for this time, s, the odometry does not fill the gap, because the board may have
-been reset. The odometry fills only shorter gaps."""
+"""Shortest gap without a line that the odometry does not fill, s, because the board may have been
+reset meanwhile. The odometry fills only shorter gaps."""
 
 
 class Placed(Struct, frozen=True, gc=False):
@@ -35,7 +35,7 @@ class Placed(Struct, frozen=True, gc=False):
 
     `clock` is "slots" for `FreeRunningTimes`, "prompts" for `PromptedTimes`, and "reads" for the
     times at which the host read the port. `due_ns` is the monotonic time at which the host should
-    have received the whole line, ns.
+    have received the complete line, ns.
     """
 
     clock: Literal["slots", "prompts", "reads"]
@@ -54,8 +54,8 @@ class Placed(Struct, frozen=True, gc=False):
 # A free-running board. A slot is one period of its clock, in which the board sends one line.
 
 WINDOW_NS, WINDOW_READS = NS_PER_S // 2, 12
-"""A window is a series of reads of the port from which `FreeRunningTimes` finds or corrects the
-clock of the board. It lasts at least `WINDOW_NS` ns and has at least `WINDOW_READS` reads."""
+"""Least duration of a window, ns, and least number of reads in a window. A window is a series of
+reads of the port from which `FreeRunningTimes` finds or corrects the clock of the board."""
 
 LOOP_GAIN = 0.2
 """Final value of the gain g with which `FreeRunningTimes` corrects its clock. The gain starts at 1
@@ -66,17 +66,20 @@ MAX_CLOCK_ERROR = 0.01
 """Largest relative error of a board's clock. A ceramic resonator reaches half of it."""
 
 MAX_ROUNDING = 0.001
-"""A measured period is rounded to a whole number of ms if the rounding changes it by less than this
-share. The share covers the error of a quartz and of the measurement."""
+"""Largest relative change of a measured period by rounding it to a whole number of ms. If the
+change would be larger, the period is not rounded. The limit covers the error of a quartz and of the
+measurement."""
 
 SINGLE_READ_FRACTION = 0.7
-"""If at least this share of the reads of the port contains a single line, the lines are treated as
-read one by one. Otherwise they are treated as batches of an adapter."""
+"""Least share of the reads of the port with a single line at which `FreeRunningTimes` tries clocks
+for lines that are read one by one. Below this share, it tries only clocks for lines that an adapter
+batches."""
 
 LATE_ALONE, LATE_BATCHED = 0.6, 1.3
-"""`FreeRunningTimes` accepts a clock only if every line comes at most this long after its slot, in
-periods of the board. `LATE_ALONE` is for lines that are read one by one, and `LATE_BATCHED` for
-lines that an adapter batches. `MAX_ADAPTER_DELAY_NS` limits both."""
+"""Largest time by which a line may come after its slot for `FreeRunningTimes` to accept a clock, in
+periods of the board. A slot is the period in which a line is due. `LATE_ALONE` is for lines that
+are read one by one, and `LATE_BATCHED` for lines that an adapter batches. `MAX_ADAPTER_DELAY_NS`
+limits both."""
 
 MAX_ADAPTER_DELAY_NS = 25_000_000
 """Longest time for which an adapter is assumed to hold a line back, ns. An FTDI chip holds a line
@@ -85,27 +88,27 @@ answers a command that was sent between two periods, or comes from a slow board 
 more than this time."""
 
 EARLY_ALONE, ALONE = 0.55, 12
-"""A read confirms a clock if it comes at most `EARLY_ALONE` periods after its slot. The earliest
-read always confirms the clock. `FreeRunningTimes` accepts the clock only if, in addition to the
-earliest read, more than one in `ALONE` reads confirm it. If fewer reads do, these reads probably
-contain answers to commands that were sent between two periods, and the clock is too early for all
-other lines."""
+"""Limits for the reads that confirm a clock. A read confirms a clock if it comes at most
+`EARLY_ALONE` periods after its slot. The earliest read always confirms the clock.
+`FreeRunningTimes` accepts the clock only if, in addition to the earliest read, more than one in
+`ALONE` reads confirm it. If fewer reads do, these reads probably contain answers to commands that
+were sent between two periods, and the clock is too early for all other lines."""
 
 COMPLETE_PERIODS = 1.4
-"""If two reads with a single line each are less than this number of periods apart, no line is
-missing between them."""
+"""Time between two reads with a single line each, in periods of the board, below which no line is
+missing between the two lines."""
 
 LATENESS_MARGIN = 0.15
 """Margin on the lateness of a line, in periods. An adapter delays a line only up to a limit. If the
 lateness exceeds this limit by more than one period plus the margin, an earlier line is missing."""
 
 MAX_EARLY_PERIODS = 0.25
-"""If a line comes before its slot by more than this number of periods, `FreeRunningTimes` gives up
-its clock as wrong."""
+"""Largest time by which a line may come before its slot, in periods of the board. If a line comes
+even earlier, `FreeRunningTimes` gives up its clock as wrong."""
 
 LOSSY_READ_FRACTION = 0.45
-"""If missing lines precede more than this share of the reads in two successive windows, the period
-of the clock is wrong."""
+"""Largest share of the reads that may follow missing lines, as a mean over two successive windows.
+If the share is larger, the period of the clock is wrong."""
 
 
 class FreeRunningTimes:
@@ -216,7 +219,7 @@ class FreeRunningTimes:
         return self._lag * self.usual
 
     def place(self, behind: int) -> Placed | None:
-        """Return the time of a line of the last read, or None if the board has no known rhythm.
+        """Return the time of a line of the last read, or None if no clock of the board is known.
 
         `behind` is the number of lines that follow the line in the read.
         """
@@ -232,11 +235,12 @@ class FreeRunningTimes:
         return Placed("slots", due_ns, passed * period, missing * period)
 
     def _missing(self, ahead: float, since: float, lines: int, drained: bool) -> int:
-        """Return the number of missing lines that this read proves.
+        """Return the number of missing lines that the last read proves.
 
-        Return -1 if the clock is wrong, or an earlier read counted a slot too many as missing.
-        `ahead` is the lateness x of the last line, and `since` the time since the last read, both
-        in slots. `drained` is true if the read took all data from the kernel.
+        Return -1 if the clock is wrong, or an earlier read counted one slot too many as missing.
+        `ahead` is the lateness x of the last line, and `since` the time since the previous read,
+        both in slots. `lines` is the number of lines in the last read. `drained` is true if the
+        read took all data from the kernel.
         """
         lag = self._lag if self._lag < 0.5 else 0.5
         if ahead < -0.5 + 0.6 * lag:
@@ -281,10 +285,11 @@ class FreeRunningTimes:
     def _clocks(
         self, reads: list[Read], gaps: list[int]
     ) -> Iterator[tuple[list[int], float, float]]:
-        """Yield possible rhythms of the board's lines, the likelier ones first.
+        """Yield possible clocks of the board, the likelier ones first.
 
-        Each is a triple: for each read, the number of the period (slot) in which its last line was
-        due; the largest allowed lateness in slots; and the period in ns.
+        Each clock is a triple: for each read, the number of the period (slot) in which its last
+        line was due; the largest allowed lateness in slots; and the period in ns. `gaps` are the
+        times between successive reads in `reads`, ns.
         """
         # The configured periods come before the measured period, because for jittery lines they are
         # more reliable than half a second of data.
@@ -348,7 +353,7 @@ class FreeRunningTimes:
 
 
 def _slots(reads: list[Read], period: float = math.inf) -> list[int]:
-    """Return the slot of the last line of each read. The first read has slot 0.
+    """Return the number of the slot of the last line of each read. The first read has slot 0.
 
     With a finite `period`, ns, missing lines have slots too.
     """
@@ -391,25 +396,25 @@ SLOW_GAIN = 0.0125
 """Gain per read of the filter that decides whether the board itself varies the reply delay."""
 
 LEAST_DELAY_GAIN = 0.002
-"""Gain per reply with which the long-term least delay rises toward the usual delay. With this gain,
-an outdated least delay is forgotten after about 500 replies."""
+"""Gain per reply with which the long-term least reply delay rises toward the usual reply delay.
+With this gain, an outdated least delay is forgotten after about 500 replies."""
 
 CREEP, CREEPS_FOR = 0.05, 3
-"""`PromptedTimes` keeps the least delay of the last replies. With each read of the port, this least
-delay rises by `CREEP` times the time since the previous read, so that older replies are forgotten.
-For this purpose, the time since the previous read counts as at least 1 and at most `CREEPS_FOR`
-times the usual time between two commands. The upper limit is for a board that stalls and then
-answers all lines."""
+"""`CREEP` is the rate at which the least delay of the last replies rises, so that `PromptedTimes`
+forgets older replies. With each read of the port, the least delay rises by `CREEP` times the time
+since the previous read. For this purpose, the time since the previous read counts as at least 1 and
+at most `CREEPS_FOR` times the usual time between two commands. The upper limit is for a board that
+stalls and then answers all lines."""
 
 LOST_REPLY_PERIODS = 1.25
-"""Replies were lost if the least delay of the last replies exceeds the long-term least delay by
-more than `LOST_REPLY_PERIODS` times the usual time between two commands. A factor of 1 is too low,
+"""Largest excess of the least delay of the last replies over the long-term least delay, in usual
+times between two commands. A larger excess means that replies were lost. A limit of 1 is too low,
 because the delay may permanently rise by almost the time between two commands."""
 
 RARE_LOSS_FRACTION = 0.002
-"""While the share of lost replies is below this value, a late reply after a host stall does not
-prove that a reply was lost. After a host stall, two commands are written close together, so the
-reply to the first command is late even if no reply was lost."""
+"""Share of lost replies below which a late reply after a host stall does not prove that a reply was
+lost. After a host stall, two commands are written close together, so the reply to the first command
+is late even if no reply was lost."""
 
 MAX_SUPPORT, MIN_SUPPORT = 200, -8
 """Bounds of the support for the usual reply delay. Each reply with about this delay adds 1. Each
@@ -417,38 +422,37 @@ reply that comes much later, as after a stall, subtracts 1. At `MIN_SUPPORT`, st
 explain the late replies: the usual delay was measured on a reply that came unusually early."""
 
 MAX_USB_JITTER_NS = 350_000
-"""If the mean deviation of the reply delay is at most this, ns, USB and the scheduler explain the
-deviation."""
+"""Largest mean deviation of the reply delay that USB and the scheduler explain, ns."""
 
 MIN_BOARD_JITTER_NS = 800_000
-"""If the mean deviation of the reply delay exceeds this, ns, the board itself varies the delay. USB
-and the scheduler rarely cause such a large deviation."""
+"""Mean deviation of the reply delay above which the board itself varies the delay, ns. USB and the
+scheduler rarely cause a deviation above this limit."""
 
 DELAY_RISE_NS = 20_000
-"""On a batched link, the least reply delay rises by this time with each read, ns, so that an
-outdated value is forgotten. A link is batched if an adapter holds replies back, so that a read
-contains several replies."""
+"""Rise of the least reply delay with each read on a batched link, ns. The rise makes
+`PromptedTimes` forget an outdated value. A link is batched if an adapter holds replies back, so
+that a read contains several replies."""
 
 LOSS_GAIN = 0.005
 """Gain of the filter for the share of lost replies. With a gain of 1/20 instead, two lost replies
 would be enough to reach `LOSSY_FRACTION`."""
 
 LOSSY_FRACTION = 0.03
-"""If more than this share of the replies is lost on a batched link, the link counts as lossy. Then
-the reply to any command may be missing."""
+"""Share of lost replies above which a batched link counts as lossy. On a lossy link, the reply to
+any command may be missing. A link is batched if an adapter holds replies back."""
 
 BATCH_READ_FRACTION = 0.15
-"""If more than this share of the reads of the port contain several lines, an adapter batches lines.
+"""Share of the reads of the port with several lines above which an adapter must be batching lines.
 Host stalls alone cause fewer such reads."""
 
 BOARD_JITTER_FRACTION = 0.6
-"""If the reply delay varies in more than this share of the reads, the board itself varies the
-delay. An adapter whose packets fill line by line also varies the delay, but only for a quarter of a
+"""Share of the reads with a varied reply delay above which the board itself varies the delay. An
+adapter whose packets fill line by line also varies the delay, but only for a quarter of a
 second."""
 
 MIN_ADAPTER_JITTER_NS = 2_000_000
-"""If the mean deviation of the reply delay exceeds this, ns, an adapter and not the board varies
-the delay."""
+"""Mean deviation of the reply delay above which an adapter and not the board varies the delay,
+ns."""
 
 
 class PromptedTimes:
@@ -460,9 +464,9 @@ class PromptedTimes:
     between two samples is the time between the two lines that the board answered, even if the host
     reads the replies late.
 
-    Replies come in the order of the lines. If a reply seems to be later than usual by more than
-    half the time from its line to the next line, it answers the next line, and the reply to the
-    earlier line was lost.
+    Replies come in the order of the lines. A reply may seem to be later than usual by more than
+    half the time from its line to the next line. Then it answers the next line, and the reply to
+    the earlier line was lost.
     """
 
     def __init__(self, soonest_ns: int) -> None:
@@ -501,11 +505,11 @@ class PromptedTimes:
         replies."""
         self._last: int | None = None
         """Time at which the last answered command was written, ns. If the board itself answered
-        later or sooner than usual, about this difference is added."""
+        later or sooner than usual, an estimate of this difference is added."""
         self._passed = self._line = 0
         """Both are times at which the daemon wrote a command, ns. `_line` belongs to the last
-        answered command. `_passed` belongs to the last command for which no reply is expected any
-        more, because the command was answered, skipped or given up."""
+        answered command. `_passed` belongs to the last command that was answered, skipped or given
+        up, so that it waits for no reply."""
         self._lost = False
         """Whether the last read with a single reply showed that an earlier reply was lost."""
         self._given: list[int] = []
@@ -540,7 +544,7 @@ class PromptedTimes:
 
     @property
     def latest_ns(self) -> int:
-        """Latest monotonic time at which a usual reply to the last command comes, ns.
+        """Monotonic time at which the reply to the last command usually comes, ns.
 
         It is 0 before the first command, and while the usual delay is unknown.
         """
@@ -557,10 +561,10 @@ class PromptedTimes:
         self._left.append(at_ns)
 
     def read(self, at_ns: int, lines: int, cut: bool = False) -> None:
-        """Process a read of the port that contains `lines` whole replies.
+        """Process a read of the port that contains `lines` complete replies.
 
-        The last whole reply was complete at the monotonic time `at_ns`. `cut` is true if the read
-        also contains the first part of one more reply.
+        The last complete reply was received at the monotonic time `at_ns`. `cut` is true if the
+        read also contains the first part of one more reply.
         """
         alone, since = lines == 1, at_ns - self._at
         self._at, self._alone, self._since = at_ns, alone, since
@@ -649,7 +653,8 @@ class PromptedTimes:
     def _weigh(self, lines: int, since: int, cut: bool) -> None:
         """Give up the commands whose replies were lost on a batched link.
 
-        `cut` is true if the read also contains the first part of one more reply.
+        `lines` is the number of complete replies in the read. `since` is the time since the
+        previous read, ns. `cut` is true if the read also contains the first part of one more reply.
         """
         # The last reply of a batch shows a loss: it comes too late for the command that it would
         # answer if no reply were lost. If it comes too soon for its command, commands that were
@@ -663,7 +668,7 @@ class PromptedTimes:
         if since < 1.5 * self._batch:
             self._batch += FAST_GAIN * (since - self._batch)
         given, self._given, again = self._given, [], False
-        # The first part of a reply can come sooner than a whole reply.
+        # The first part of a reply can come sooner than a complete reply.
         earliest = self._soonest // 2 if cut else self._soonest
         while given and (len(left) < began or at - left[began - 1] < earliest):
             left.appendleft(given.pop())  # too soon: the replies answer lines that were given up
@@ -725,11 +730,12 @@ class PromptedTimes:
         return at - left[0] - delay <= -max((left[0] - self._passed) / 2, wide)
 
     def _shift(self, line: int) -> int:
-        """Return an estimate of the extra time that the board took for this reply, ns.
+        """Return an estimate of the extra time that the board took for the present reply, ns.
 
-        USB and the scheduler cause a part of the difference from the usual delay. The result is 0
-        if they explain the usual deviation, or if the deviation is so large that an adapter must
-        cause it. The present reply must be the only reply in its read of the port.
+        `line` is the time at which the answered command was written, ns. USB and the scheduler
+        cause a part of the difference from the usual delay. The result is 0 if they explain the
+        usual deviation, or if the deviation is so large that an adapter must cause it. The present
+        reply must be the only reply in its read of the port.
         """
         delay, spread = self._delay, self._spread
         if delay is None or self._batched:

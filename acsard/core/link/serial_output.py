@@ -12,9 +12,9 @@ from acsard.core.config.wire_time import wire_ns
 from acsard.core.values import Instant, Received
 
 Offered = Literal["sent", "superseded", "down"]
-"""The result of `Port.offer`. "sent" means that the whole line was written. "superseded" means that
-the line was dropped, replaced by a stop or only partly written, so that the daemon must send a
-newer line. "down" means that the port is closed."""
+"""The result of `Port.offer`. "sent" means that the port wrote the complete line. "superseded"
+means that the line was dropped, replaced by a stop or only partly written, so that the daemon must
+send a newer line. "down" means that the port is closed."""
 
 
 class Port(Protocol):
@@ -67,9 +67,9 @@ class SerialOutput:
     def prepare(self, line: bytes, made_ns: int, now_ns: int, kernel_bytes: int) -> bytes | None:
         """Return the bytes to pass to the kernel for a line, or None if the line must be dropped.
 
-        The first line after the port was opened is replaced by a plain stop. If the board may have
-        received only a part of the previous line, the bytes begin with an additional line end. A
-        line is dropped in these cases:
+        The first line after the port was opened is replaced by a plain stop, which commands speed
+        zero for all wheels. If the board may have received only a part of the previous line, the
+        bytes begin with an additional line end. A line is dropped in these cases:
 
         - The kernel still has bytes to send.
         - The previous line was still on the wire when this line was made.

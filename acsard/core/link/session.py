@@ -1,13 +1,13 @@
 """Exchanges lines with the board on one serial port, which may close, reopen and fall silent.
 
 The module turns received bytes into feedback, and wheel speeds into lines for the board.
-`negotiation.py` decides whether lines are plain or checked, and `link_state.py` decides whether the
-robot may drive over the link. The link does not come up while the daemon asks the board for checked
-lines.
+`negotiation.py` decides whether lines are plain or checked (with a checksum), and `link_state.py`
+decides whether the robot may drive over the link. The link does not come up while the daemon asks
+the board for checked lines.
 
 When the port is opened again, another board may answer. The daemon then forgets, after `FORGET_NS`,
 each field of the status line that only the previous board reported. If a board restarts while the
-port stays open, the daemon forgets no field: the same board has the same inputs, so a field that it
+port stays open, the daemon forgets no field. The same board has the same inputs, so a field that it
 no longer reports is a fault.
 """
 
@@ -37,15 +37,16 @@ NAMES: dict[LinkState, EventName] = {
 }
 
 LONG_GAP_NS = 1 * NS_PER_S
-"""If the daemon received no line or wrote no line for at least this time, ns, the MCU may have been
-reset meanwhile. After such a gap, every sender must send a zero before it can drive."""
+"""Least duration of a gap after which a new session with the MCU begins, ns. In a gap, the daemon
+receives no good line, or the port accepts no line, so the MCU may have been reset. After such a
+gap, every sender must send a zero before it can drive."""
 
 FORGET_NS = 3 * NS_PER_S
 """Time after the opening of the port in which a board must report each field of its status line,
 ns. The session then forgets the fields that the board did not report, because another board may be
-connected now. Only time in which the link is up without a break counts, without steps in which this
-computer was late. The time is long enough, because a board reports each of its fields at least once
-a second. Until a field is forgotten, it keeps its value. So a pressed emergency stop remains
+connected now. Only uninterrupted time with the link up counts, and steps in which this computer was
+late do not add to it. The time is long enough, because a board reports each of its fields at least
+once a second. Until a field is forgotten, it keeps its value. So a pressed emergency stop remains
 latched while the cable is unplugged and plugged in again."""
 
 IDENTITY = b"!acsard-mcu "
@@ -77,14 +78,16 @@ class McuSession:
         self._rest = self.codec.stop.rstrip(b",\r\n")
         """The first bytes of every line, plain or checked, with speed zero for all wheels."""
         self._answers = not mcu.reply_period
-        """Whether the board answers lines. Such a board is silent if it received no line."""
+        """Whether the board answers lines instead of reporting by its own clock. A board that
+        answers sends no reply while it receives no line."""
         self._lines = LineReader()
         self._needs_check = mcu.link_check == "require"
         self.statuses: list[tuple[int, BoardStatus]] = []
         """The status lines that the last `update` received. Each is a pair of the monotonic time
         of arrival, ns, and the decoded line."""
         self.status = BoardStatus()
-        """The last received value of each field of the status lines, until it is forgotten."""
+        """The last received value of each field of the status lines, until the session forgets the
+        field. A forgotten field is None."""
         self.status_ns: int | None = None
         """Monotonic time of arrival of the last status line that is not forgotten, ns."""
         self._reported: tuple[BoardStatus, int | None] = (BoardStatus(), None)
@@ -234,9 +237,9 @@ class McuSession:
 
     @property
     def note(self) -> str:
-        """The present form of the lines, in parentheses, to append to the reason of a mode.
+        """The present form of the lines, to append to the reason of a mode.
 
-        It is "" if `mcu.link_check` is "off".
+        An example is " (serial lines checked)". The text is "" if `mcu.link_check` is "off".
         """
         check = self.negotiation
         return "" if check.state == "off" else f" (serial lines {check.in_force})"
@@ -279,7 +282,10 @@ class McuSession:
         self.negotiation.begin(fresh=True)
 
     def _restart(self, how: str) -> None:
-        """Start a new session, because the MCU has restarted and its motors stand still."""
+        """Start a new session, because the MCU has restarted and its motors stand still.
+
+        `how` completes the sentence "the microcontroller ..." in the log.
+        """
         if self.link == "up":
             self.events.append(Event("mcu_restarted", f"the microcontroller {how}", "warning"))
         self._link.sign("restarted")
@@ -321,7 +327,10 @@ class McuSession:
             self.events.append(Event(NAMES[self.link], self.words(), "warning"))
 
     def _reject(self, reason: str, line: bytes = b"", more: int = 1) -> None:
-        """`line` is the last of these lines; b"" means that its bytes are unknown."""
+        """Count `more` rejected lines.
+
+        `line` is the last of them; b"" means that its bytes are unknown.
+        """
         self.rejects[reason] += more
         before, _ = self._rejected.get(reason, (0, b""))
         self._rejected[reason] = (before + more, line)
@@ -436,7 +445,10 @@ class McuSession:
         size: tuple[int, int],
         asked_ns: int | None,
     ) -> Feedback:
-        """`size` is the pair of `following` and `length`, the arguments of `Timeline.place`."""
+        """Count a good line, and return its feedback.
+
+        `size` is the pair of `following` and `length`, the arguments of `Timeline.place`.
+        """
         self.good_lines += 1
         before_ns, self._heard_ns = self._heard_ns, read_at.mono_ns
         if before_ns is not None and read_at.mono_ns - before_ns >= LONG_GAP_NS:

@@ -10,8 +10,9 @@ However, n is a whole number, so T can be found from the speeds:
    whose T is nearest to the host's estimate.
 2. The search ends at the first n with which the counts of the other wheels are whole numbers too.
 3. A large part of the difference between the host's estimate and T is added to the host's estimate
-   for the next line: if the board took a sample later than the host estimated, less time is left
-   until the next sample. If n was wrong, this also corrects the error in the next line.
+   for the next line. The reason: if the board took a sample later than the host estimated, less
+   time is left until the next sample. The addition also corrects the error in the next line if n
+   was wrong.
 
 With fine encoders, the host's estimate is too inaccurate to find n. Then the angle of each wheel is
 its speed times the host's estimate, which includes the addition from the previous line. So no time
@@ -57,26 +58,26 @@ WIDE, WIDE_S = 0.6, 0.005
 
 MAX_CARRIED_ERROR = 0.95
 """Largest share of the error of the host's estimate that is added to the estimate for the next
-line. The share must be below 1. If the whole error were added and the two clocks differed by 0.5 %,
-the sum of the errors would grow forever."""
+line. The share must be below 1. If the share were 1 and the clocks of the host and the board
+differed by 0.5 %, the sum of the errors would grow forever."""
 
 REPEATED_FRACTION = 0.65
-"""Firmware that is asked again very soon has no new counts, and repeats the speeds of the previous
-line. A line with unchanged speeds can be such a repetition only if the time since the previous line
-is less than `REPEATED_FRACTION` times the time over which the firmware last counted."""
+"""Longest time after the previous line at which a line with unchanged speeds can be a repetition,
+divided by the time over which the firmware last counted. Firmware that is asked again very soon has
+no new counts, and repeats the speeds of the previous line."""
 
 SOON, OFF = 0.45, 0.25
-"""Let q be the time since the previous line, divided by the time over which the firmware last
-counted. If q is less than `SOON`, a line with unchanged speeds is a repetition of the previous
-line. If q lies between `SOON` and `REPEATED_FRACTION`, the line is a repetition in two cases: its
-speeds are not whole counts, or the host's estimate of the time contradicts its counts by more than
-`OFF` counts of the fastest wheel."""
+"""Limits for a line with unchanged speeds. Let q be the time since the previous line, divided by
+the time over which the firmware last counted. If q is less than `SOON`, the line is a repetition of
+the previous line. If q lies between `SOON` and `REPEATED_FRACTION`, the line is a repetition in two
+cases. Either its speeds are not whole counts, or its counts and the host's estimate of the time
+differ by more than `OFF` counts of the fastest wheel."""
 
 UNSURE, SLOW = 0.2, 0.025
-"""The error of the host's estimate of the time is measured in counts of the fastest wheel. If its
-mean exceeds `UNSURE`, the nearest whole number of counts is often wrong. A random time has a mean
-error of 0.25. An encoder with 96 counts a turn reaches `UNSURE` behind a USB adapter that batches
-lines for 16 ms. `SLOW` is the gain of the filter for the mean."""
+"""`UNSURE` is a limit for the mean error of the host's estimate of the time, in counts of the
+fastest wheel. Above this limit, the nearest whole number of counts is often wrong. A random time
+has a mean error of 0.25. An encoder with 96 counts a turn reaches `UNSURE` behind a USB adapter
+that batches lines for 16 ms. `SLOW` is the gain of the filter for the mean."""
 
 GAIN, DOUBTFUL = 0.1, 0.3
 """`GAIN` is the gain of the filter for the share of lines whose speeds are not whole counts. If
@@ -98,17 +99,18 @@ class WholeCounts:
     def forget(self) -> None:
         """Forget all earlier lines, because they may be those of another board."""
         self._apart = self._period = 0.0
-        """`_apart` is the time, s, that is added to the host's estimate for the next line. It is
-        positive if the board took the last sample earlier than the host estimated. `_period` is the
-        time, s, over which the firmware last counted."""
+        """`_apart` is the time, s, that is added to the host's estimate of the time until the next
+        sample. It is positive if the board took the last sample earlier than the host estimated.
+        `_period` is the time, s, over which the firmware last counted."""
         self._run = 0
         """Number of lines with recovered counts since the last line without recovered counts."""
         self._before: Motors = (0.0, 0.0, 0.0, 0.0)
         self.covers_gap = False
         """Whether the counts of the last line include those of the missing line before it."""
         self._cover = 0.0
-        """Filtered share of the lines after a missing line whose counts include those of the
-        missing line. Lines that do not show whether their counts include them are left out."""
+        """Filtered share of lines that include the counts of the missing line before them, 0 to 1.
+        It is computed only from lines that follow a missing line and show whether they include its
+        counts."""
         self._doubt = self._unsure = 0.0
         """`_doubt` is the filtered share of the lines whose speeds are not whole counts. `_unsure`
         is the filtered error of the host's estimate of the time, in counts of the fastest wheel."""
@@ -135,7 +137,8 @@ class WholeCounts:
 
         `speeds` are in rad/s. `own` is the host's estimate of the time since the previous line, s,
         whether or not the host received that line. If that line is missing, `gap` is the time from
-        the last good line to the missing line, s. Otherwise `gap` is 0.
+        the last good line to the missing line, s. Otherwise `gap` is 0. If the call sets
+        `covers_gap` to True, the angles also include the motion during `gap`.
         """
         self.covers_gap = False
         before, self._before = self._before, speeds
@@ -204,11 +207,12 @@ class WholeCounts:
         return abs(number - want * fastest / self.angle) <= MAX_COUNT_ERROR
 
     def _number(self, speeds: Motors, fastest: float, want: float) -> tuple[int, bool | None]:
-        """Return the number n of counts of the fastest wheel, or 0, and whether n is proved.
+        """Return the count n of the fastest wheel, 0 if unknown, and whether n is proved.
 
-        The second value is True if the speeds prove that they are whole counts, False if they prove
-        the opposite, and None otherwise. `want` is the host's estimate of the time between the two
-        samples plus the addition from the previous line, s.
+        The second value is True if the speeds prove that the wheels made whole counts, False if
+        they prove the opposite, and None otherwise. `fastest` is the largest absolute value in
+        `speeds`, rad/s. `want` is the host's estimate of the time between the two samples plus the
+        addition from the previous line, s.
         """
         count = fastest / self.angle
         exact = want * count  # counts if the host's time were right

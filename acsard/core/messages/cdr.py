@@ -106,7 +106,11 @@ class _Source:
         return layout.unpack_from(self.data, start)
 
     def count(self, least: int) -> int:
-        """`least` is the smallest size of an item, bytes."""
+        """Read the number of items of a sequence.
+
+        `least` is the smallest size of an item, bytes. Raises `CdrError` if the payload cannot
+        contain all items.
+        """
         (count,) = self.take("I")
         if count * least > len(self.data) - self.at:
             raise CdrError(
@@ -138,7 +142,8 @@ def _whole(code: str, value: Any) -> Any:
 def _layout(order: str, codes: str, start: int) -> struct.Struct:
     """Return the layout of neighboring numbers, each aligned to its size.
 
-    `start` is the position of the first number modulo 8, after the CDR header.
+    `order` is the byte order and `codes` are the format characters in Python's `struct`. `start` is
+    the position of the first number modulo 8, counted from the end of the CDR header.
     """
     text, at = order, start
     for code in codes:
@@ -149,7 +154,11 @@ def _layout(order: str, codes: str, start: int) -> struct.Struct:
 
 
 def _packs(codes: str) -> tuple[Callable[..., bytes], ...]:
-    """Return a function for each start position modulo 8, counted from the end of the header."""
+    """Return eight functions that pack numbers, one for each start position modulo 8.
+
+    `codes` are the format characters of the numbers in Python's `struct`. A start position is
+    counted from the end of the CDR header.
+    """
     return tuple(_layout("<", codes, start).pack for start in range(8))
 
 

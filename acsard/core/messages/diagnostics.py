@@ -5,9 +5,9 @@
 - ERROR: a condition keeps the robot from driving.
 
 Each message has the same rows, because rqt_robot_monitor shows a missing row as stale. There are
-two exceptions. The row of the board's inputs and the row of its battery appear when the board first
-reports a value for them, or from the start if the configuration requires such values. They stay
-until another board is connected that does not report the values.
+two exceptions: the row of the board's inputs and the row of its battery. Each appears when the
+board first reports a value for it, or from the start if the configuration requires such values. It
+stays until another board is connected that does not report the values.
 """
 
 from __future__ import annotations
@@ -54,7 +54,8 @@ BOARD = {
     "pressed": (WARN, PRESSED_REASON),
     "silent": (ERROR, SILENT_REASON),
 }
-"""Maps each state of the emergency-stop input to the diagnostic level and the text to show."""
+"""Maps each state of the emergency-stop input to the diagnostic level and the text to show. The
+state "" means that the board has never reported the input."""
 
 WARNING_LEVELS = {"ok": OK, "warning": WARN, "return": WARN, "stop": ERROR, "unknown": WARN}
 """Maps each battery level, such as "return", to the diagnostic level to show for it."""

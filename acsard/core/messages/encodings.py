@@ -39,7 +39,8 @@ class DecodeError(AcsardError):
     """Error for a payload that cannot be decoded.
 
     `reason` is the kind of the error, such as "malformed". The daemon counts these errors by
-    reason: an error with this reason adds 1 to the counter `command_malformed`.
+    reason. For example, an error with the reason "malformed" adds 1 to the counter
+    `command_malformed`.
     """
 
     def __init__(self, reason: str, text: str) -> None:

@@ -1,7 +1,7 @@
 """Derives the permissions of each role from the table of keys in `keys_and_roles.py`.
 
-The access rules of the daemon, of the TLS gateway and of a fleet's router, the permissions of the
-page, and the tables of roles in the documentation come from these functions.
+These functions supply the access rules of the daemon, of the TLS gateway and of a fleet's router.
+They also supply the permissions of the page and the tables of roles in the documentation.
 """
 
 from __future__ import annotations

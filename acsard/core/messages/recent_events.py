@@ -18,8 +18,8 @@ from acsard.core.motion.event_throttle import together
 from acsard.core.values import NS_PER_S, Event, Instant
 
 MAX_ROWS = 20
-"""Number of rows in the message `events`. With this number, even a client that polls slowly seldom
-misses an event."""
+"""Largest number of rows in the message `events`. With this number, even a client that polls slowly
+seldom misses an event."""
 
 NEW_ROW_AFTER_NS = 60 * NS_PER_S
 """Longest time between two events of the same name that share a row, ns. After a longer pause, an

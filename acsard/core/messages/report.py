@@ -1,4 +1,4 @@
-"""Builds the messages that are due after a step, and the present message of any published key.
+"""Builds the messages that are due after a control step, and the present message of a key.
 
 A message is built only if its key has a subscriber or was queried. All messages that come from the
 same feedback line have the stamp of that line.
@@ -226,7 +226,7 @@ class Report:
         return String(self.description) if self.description else None
 
     def _odom(self, estimate: Estimate, live: bool = True) -> Odometry:
-        """`live` is False if the board no longer sends feedback."""
+        """Return the message `odom`. `live` is False if the board no longer sends feedback."""
         frames, pose = self._config.odometry, estimate.pose
         of_pose = self._covariances.of_pose(estimate.covariance)
         of_twist = (
@@ -304,7 +304,11 @@ class Report:
         return round((first(self.certificate_ends)[1] - now.wall_ns) / DAY_NS, 2)
 
     def _battery(self, outputs: Outputs, snapshot: Snapshot) -> Battery | None:
-        """The stamp is the time of the board's last report, or now if the reports have stopped."""
+        """Return the message `battery`, or None if no battery status is known.
+
+        The stamp of the message is the time of the board's last report, or now if the reports have
+        stopped.
+        """
         battery, now = snapshot.battery, outputs.now
         if battery is None:
             return None

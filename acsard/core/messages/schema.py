@@ -2,7 +2,7 @@
 
 If ROS 2 has a corresponding type, the struct has the same name and fields. A field means the same
 in msgpack, JSON and CDR. Decoding refuses unknown fields, so a command with a misspelled axis is
-an error. If the field were ignored, the speed on that axis would be zero without an error.
+an error. If the misspelled field were ignored, the speed on that axis would silently be zero.
 """
 
 from __future__ import annotations
@@ -519,10 +519,10 @@ class Release(Message, frozen=True):
     latch: LatchNumber | None = None
     """Number of the latch to release, as in `RobotState.latch`.
 
-    For `activate`, 0 means that the robot is off without a latch. If the number is null, the
-    client may not know of the latch yet. A `clear` without a number is refused for 2 s
-    after a stop, a fault, the `clear` of a fault and the start of the daemon; an `activate` without
-    a number for 2 s after a `deactivate` and the start of the daemon.
+    For `activate`, 0 means that the robot is off without a latch. If the number is null, the client
+    may not know of the latch yet. Therefore a `clear` without a number is refused for 2 s after a
+    stop, a fault, the `clear` of a fault and the start of the daemon. An `activate` without a
+    number is refused for 2 s after a `deactivate` and the start of the daemon.
     """
 
 

@@ -78,9 +78,11 @@ def unpack(attachment: bytes) -> Signature | None:
 def public_name(sender: str, certificate: str = "") -> str:
     """Return the public name of a sender, such as "joystick/0b5d6c1f22a94e37 [laptop]".
 
-    It has up to three parts: the text of the id before its last "/", the first 16 hexadecimal
-    digits of the SHA-256 of the whole id, and the common name of the certificate in brackets. Parts
-    that do not exist are left out.
+    It has up to three parts, and parts that do not exist are left out:
+
+    - the text of the id before its last "/"
+    - the first 16 hexadecimal digits of the SHA-256 of the complete id
+    - the common name of the certificate, in brackets
 
     Args:
         sender: the sender id. If the message has no sender id, pass the id of the Zenoh session

@@ -30,7 +30,7 @@ RESET_NS = 2 * NS_PER_S
 
 MIN_WINDOW_NS = 4 * MS
 """Shortest time over which the board computes speeds from encoder counts, ns. If the last
-computation is more recent, a reply repeats its speeds."""
+computation is more recent, a reply repeats the speeds of that computation."""
 
 OUTPUT_BYTES = 255
 """Size of the board's output buffer, bytes. If a line does not fit into the buffer, the board drops
@@ -62,7 +62,7 @@ class FakeMcu(Faults):
     """The simulated board.
 
     Pass the bytes that the host sends to `receive()`. Call `advance()` at the times that
-    `next_ns()` returns. It returns the bytes that the host receives.
+    `next_ns()` returns. `advance()` returns the bytes that the host receives.
     """
 
     def __init__(self, config: Config, now_ns: int = 0) -> None:
@@ -294,7 +294,8 @@ class FakeMcu(Faults):
     def _handed_over(self, now_ns: int, what: str, data: bytes) -> bytes:
         """Return the bytes that the USB adapter passes to the host; b"" during a stall.
 
-        `what` is "batch" if its timer has expired, or "sent" if `data` has arrived from the board.
+        `what` is "batch" if the adapter's timer has expired, or "sent" if `data` has arrived from
+        the board.
         """
         until_ns = self._stalled_until(now_ns)
         if until_ns > now_ns:
@@ -494,7 +495,11 @@ class FakeMcu(Faults):
 
 
 def _wiring(wheels: WheelMap) -> list[tuple[int, int]]:
-    """Return the index in `WHEELS` and the sign for each of the motors a to d."""
+    """Return the wheel and the sign of each of the motors a to d.
+
+    The wheel is an index in `WHEELS`. The sign is -1 if a positive speed of the motor turns the
+    wheel backward, else 1.
+    """
     motors = (wheels.front_right, wheels.front_left, wheels.rear_left, wheels.rear_right)
     place = {motor[1]: (index, -1 if motor[0] == "-" else 1) for index, motor in enumerate(motors)}
     return [place[letter] for letter in "abcd"]

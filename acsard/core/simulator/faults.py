@@ -76,7 +76,7 @@ class Faults:
             self._turn(before)
 
     def _turn(self, values: dict[str, object]) -> None:
-        # The old switches were in force until now.
+        # Until now the old switches were in force, so first simulate the vehicle with them.
         self._catch_up()
         for name, value in values.items():
             setattr(self, name, value)

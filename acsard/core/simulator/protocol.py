@@ -36,7 +36,11 @@ class Command(Struct, frozen=True):
 
 
 def whole(line: bytes) -> Command | None:
-    """Decode a plain or checked line like the reference firmware. Return None if it is invalid."""
+    """Decode a line as the reference firmware does.
+
+    The line may be plain or checked (with a sequence number and a checksum). Return None if it is
+    not valid.
+    """
     text = line.removesuffix(b"\n").removesuffix(b"\r")
     if b"#" not in text and b"*" not in text:
         return _plain(text)
@@ -54,12 +58,12 @@ def whole(line: bytes) -> Command | None:
 
 
 def plain_only(line: bytes) -> Command | None:
-    """Decode a line like firmware without checksums. Return None if the line is not plain."""
+    """Decode a line as firmware without checksums does. Return None if the line is not plain."""
     return _plain(line.removesuffix(b"\n").removesuffix(b"\r"))
 
 
 def prefix(line: bytes) -> Command | None:
-    """Decode a line like firmware that ignores all text after the four speeds.
+    """Decode a line, but ignore all text after the four speeds, as some firmware does.
 
     Return None if the four speeds are not valid.
     """
@@ -67,7 +71,7 @@ def prefix(line: bytes) -> Command | None:
 
 
 def latched(line: bytes) -> Command:
-    """Decode a line like old firmware, which obeys each speed that is followed by a comma.
+    """Decode a line as old firmware does: obey each speed that is followed by a comma.
 
     Such firmware obeys these speeds even if the rest of the line is not valid.
     """
