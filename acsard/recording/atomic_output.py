@@ -20,8 +20,8 @@ from acsard.recording.file import Recording
 from acsard.recording.mcap_records import MAGIC
 
 PROFILE, HEADER_BYTES = b"acsard", 64
-"""Profile in the header of a recording, and size of the beginning of a file that contains it,
-bytes."""
+"""`PROFILE` is the MCAP profile of every recording: a name in the header of the file. This name is
+in the first `HEADER_BYTES` bytes of the file."""
 
 METADATA = "metadata.yaml"
 """Name of the file that describes a ROS bag."""
@@ -129,7 +129,8 @@ def _require_bag(directory: Path) -> None:
 
 
 def _recording(path: Path) -> Recording | None:
-    # `Recording` reads the whole file, and a ROS bag may be larger than the memory.
+    # `Recording` reads the complete file, and a ROS bag may be larger than the memory. So check the
+    # beginning of the file first.
     with path.open("rb") as stream:
         begin = stream.read(HEADER_BYTES)
     if not (begin.startswith(MAGIC) and PROFILE in begin):

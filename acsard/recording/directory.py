@@ -62,7 +62,7 @@ MCAP_SUFFIX = ".mcap"
 PART_SUFFIX = ".mcap.part"
 
 MARKER_SUFFIX = ".left"
-"""Suffix of a marker file. It shows that a `.part` file was cut off by the disk, not by a crash."""
+"""Suffix of a marker file, which shows that the disk, and not a crash, cut off a `.part` file."""
 
 SUFFIX_OF_KIND: dict[Kind, str] = {"plain": MCAP_SUFFIX, "near": NEAR_SUFFIX, "kept": KEPT_SUFFIX}
 """Maps each retention class to the end of the name of a finished file."""
@@ -75,8 +75,8 @@ TRIM_ROUNDS = 600
 S_PER_DAY = 86400
 
 BEING_RECORDED_S = 10.0
-"""If a `.part` file was not written for this time, s, it does not count as being recorded. A daemon
-writes once a second."""
+"""Time after the last write to a `.part` file, s. When it has passed, the file no longer counts as
+being recorded. A daemon writes once a second."""
 
 NAME_TIME_FORMAT = "%Y%m%dT%H%M%SZ"
 """Format of the time in a file's name: the time at which the file began, in UTC."""
@@ -153,14 +153,14 @@ def _marked(part: Path) -> tuple[Kind, str] | None:
 class Run(Struct):
     """State of the directory of recordings in one run of the daemon.
 
-    After a disk error, the next `Ring` of the run continues with this object.
+    A disk error ends the `Ring`. The next `Ring` of this run of the daemon gets the same object.
     """
 
     numbers: set[int] = field(default_factory=set)
     """Numbers of the files that ended in this run. The number of a file is in its name."""
     cut: dict[str, Kind] = field(default_factory=dict)
-    """Files that a disk error cut off in this run. Maps the name of each file to its retention
-    class. Any other `.part` file without a marker was cut off by a crash before this run."""
+    """Maps the name of each file that a disk error cut off in this run to its retention class. Any
+    other `.part` file without a marker file was cut off by a crash before this run."""
     freed: int = 0
     """Total size of the recordings that were deleted since the disk first refused to write, bytes.
     It restarts from 0 after each successful write."""
@@ -184,8 +184,8 @@ class Ring:
 
         Args:
             settings: the configuration of the recordings.
-            run: the `Run` of an earlier `Ring` in this run of the daemon, which a disk error ended;
-                None for the first `Ring`.
+            run: the state that the previous `Ring` of this run of the daemon left after a disk
+                error; None for the first `Ring`.
             refused: true if the last write failed because the disk was full.
         """
         self._directory = Path(settings.directory)
@@ -260,7 +260,10 @@ class Ring:
                 self._retain_before(part, found.st_mtime_ns)
 
     def _retain_before(self, part: Path, cut_ns: int) -> None:
-        """Retain the older files that ended within a minute of the crash."""
+        """Give the class `near` to older `plain` files that ended within a minute of a crash.
+
+        The crash cut off the file `part` at the wall-clock time `cut_ns`, ns since 1970.
+        """
         for path in listed(self._directory):
             # Another process may have just removed the file.
             with suppress(FileNotFoundError):
@@ -294,7 +297,7 @@ class Ring:
         stamp = time.strftime(NAME_TIME_FORMAT, time.gmtime(about.wall_ns // 1_000_000_000))
         path = self._directory / f"{number:06}-{stamp}{PART_SUFFIX}"
         writing = Writing(path, about, OPEN_MODE if self._open_to_all else FILE_MODE)
-        # The name of the new file must reach the disk as well as its content.
+        # Not only the content of the new file but also its name must reach the disk.
         sync(self._directory)
         return writing
 
@@ -317,8 +320,8 @@ class Ring:
     def just_ended(self, now: Instant) -> Iterator[tuple[Path, Kind, int]]:
         """Yield the triple (path, retention class, time) of each file that ended recently.
 
-        These are the finished files that ended less than a minute before `now`. The time is that of
-        the file's end, as monotonic time, ns.
+        These are the finished files that ended less than a minute before `now`. The time in the
+        triple is the monotonic time at which the file ended, ns.
         """
         for file in self._ended():
             ago_ns = now.wall_ns - int(file.at_s * NS_PER_S)

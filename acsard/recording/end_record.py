@@ -29,8 +29,8 @@ TAIL_BYTES = 1 << 16
 record typically begins 1960 bytes before the end of the file."""
 
 _NAMED = struct.pack("<I", len(END_RECORD_NAME)) + END_RECORD_NAME.encode()
-"""Bytes that follow the header of the end record in a file: the length of the record's name, and
-this name."""
+"""First bytes after the header of the end record in a file: the length of the record's name, and
+the name."""
 
 _FOOTER = RECORD_HEAD.pack(Opcode.FOOTER, 20)
 """Header of the MCAP footer record, whose content has 20 bytes."""
@@ -66,7 +66,8 @@ class EndRecord(Struct, frozen=True):
     cut: str = ""
     """Cause that cut off the recording, a key of `CUT_TEXTS`; "" if the daemon ended normally."""
     why: str = ""
-    """If `cut` is "bug", text that names the failed step and the exception; otherwise ""."""
+    """Text about the internal error that ended the daemon: the exception, and the number of the
+    control step if a step failed. It is "" if `cut` is not "bug"."""
     earliest_ns: Ns | None = None
     """Earliest wall-clock time of any message, ns since 1970; None if the file does not contain
     this time. It is earlier than `wall_ns` if the clock was set back during the recording."""

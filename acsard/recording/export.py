@@ -228,8 +228,9 @@ class _Writer:
     def skip(self, step: Step, inside: bool) -> None:
         """Process a step whose outputs are not exported.
 
-        If `inside` is true, the step is in the exported part but was not replayed, and its log
-        lines are still written.
+        `inside` is true if the step is in the exported part of the recording, but cannot be
+        replayed. The log lines of the step are then still written. `inside` is false if the step is
+        before the exported part.
         """
 
     def end(self, ending: str = "") -> None:
@@ -394,7 +395,7 @@ def _write_steps(
     began_ns, over = recording.about.mono_ns, False
 
     def is_inside(step: Step) -> bool:
-        """Also end the output at the first step after `span`."""
+        """Return whether a step is in `span`. At the first step after `span`, end the output."""
         nonlocal over
         seconds = (step.inputs.now.mono_ns - began_ns) / NS_PER_S
         if seconds > span.end and not over:

@@ -234,8 +234,9 @@ class Writing:
     def __init__(self, path: Path, about: About, mode: int = FILE_MODE) -> None:
         """Create a file at `path`, and write the metadata `about` to it.
 
-        `mode` is the file mode. Raises `OSError` if a file exists at `path`, or if the disk refuses
-        to write. A new file is then deleted.
+        `mode` is the file mode. Raises `OSError` if a file already exists at `path`; that file
+        stays unchanged. Also raises `OSError` if the disk refuses to write; the new file is then
+        deleted.
         """
         self.path, self._mode = path, mode
         self._end_builder = EndRecordBuilder(about)
@@ -269,7 +270,8 @@ class Writing:
 
     @property
     def size(self) -> int:
-        """Number of bytes that the file has so far. Messages that are not written do not count."""
+        """Number of bytes that were written to the file so far, without the messages that wait for
+        the next `flush`."""
         return self._file.tell()
 
     def add(self, topic: Topic, wall_ns: int, data: bytes) -> None:
@@ -376,7 +378,7 @@ def _about_records(about: About) -> list[McapRecord]:
 
 
 def _checksum(metadata: Mapping[str, str]) -> int:
-    """Return a CRC-32, because MCAP has no checksum for metadata records."""
+    """Return the CRC-32 of a metadata record, for which MCAP defines no checksum."""
     return zlib.crc32(msgspec.json.encode(metadata, order="sorted"))
 
 
@@ -418,7 +420,8 @@ class Recording:
         """Cause that cut off the recording, a key of `CUT_TEXTS`; "" if the daemon ended normally
         or if the file is not finished."""
         self.why = ""
-        """If `cut` is "bug", text that names the failed step and the exception; otherwise ""."""
+        """Text about the internal error that ended the daemon: the exception, and the number of the
+        control step if a step failed. It is "" if `cut` is not "bug"."""
         self.unfinished: bytes | None = None
         """Encoded inputs of the step in which the daemon failed; None if no step failed."""
         self.about = self._about()
@@ -443,7 +446,7 @@ class Recording:
 
     @property
     def missing(self) -> str:
-        """Text with the number of damaged places, and with the text of `ending`.
+        """Text that tells the user about missing data: the number of damaged places, and `ending`.
 
         The text is "" if the file is undamaged and the daemon ended normally. Use this property
         only after `messages()` has yielded the last message.
@@ -530,13 +533,12 @@ def rewrite(recording: Recording, path: Path, cut: str = "open") -> int:
     """Copy all readable messages to a new, finished file at `path`, and return their number.
 
     If the recording is not finished, the end record of the new file names the cause `cut`, a key of
-    `CUT_TEXTS`. Otherwise the new end record has the cause of the recording's own end record.
+    `CUT_TEXTS`. Otherwise the new end record has the cause of the recording's own end record. If an
+    error occurs, the new file is deleted.
 
     Raises:
-        OSError: a file exists at `path`, or the disk refuses to write.
+        OSError: a file already exists at `path`, or the disk refuses to write.
         RecordingError: an event cannot be decoded.
-
-    If an error occurs, the new file is deleted.
     """
     writing = Writing(path, recording.about)
     try:

@@ -62,8 +62,8 @@ class Gap(Struct):
     end_ns: int
     """Monotonic time of the first replayed step after the gap, or of the recording's end, ns."""
     unreadable: int = 0
-    """Number of steps that cannot be read. It follows from the numbers of the readable steps before
-    and after them."""
+    """Number of steps that cannot be read. The replay computes it from the step numbers before and
+    after the unreadable steps."""
     skipped: int = 0
     """Number of steps that can be read, but not replayed. They are between the unreadable steps and
     the next recorded state of the robot."""
@@ -144,7 +144,7 @@ class _Source:
     def __init__(self, recording: Recording) -> None:
         self._recording = recording
         self._state: State | None = None
-        """The robot state from the file with which the replay goes on; None while the replay uses a
+        """The recorded robot state from which the replay last started; None while the replay uses a
         new robot."""
         self._place = "at the start of"
         """Words for the position of `_state` in the recording, for error messages."""
@@ -181,9 +181,11 @@ class _Source:
         number: int,
         tried: Callable[[Config], Config] | None = None,
     ) -> State | None:
-        """Return the state with which the replay can go on at step `number`, or None.
+        """Decode `saved` if it is the robot's state before step `number`, and return the state.
 
-        `tried` gives the configuration that replaces that of the decoded robot.
+        Return None if `saved` is None or another state, or if it cannot be used. `tried` is None,
+        or a function that maps the configuration in the state to the configuration that the replay
+        tries instead.
         """
         if saved is None or saved.number != number:
             return None
@@ -239,8 +241,9 @@ class RecordedRun(_Source):
         """`_next` is the number of the step that `robot` can replay next. `_state` is the recorded
         state from which `robot` was rebuilt, or None for a new robot."""
         self.robot, self.memory = self._state or (Robot(self.config), Memory())
-        """`robot` is the robot that replays the steps, and `memory` is the memory of its guard.
-        After a gap, `steps()` replaces them with those of the next robot state in the file."""
+        """`robot` is the robot that replays the steps. `memory` is the memory of the robot's guard,
+        which checks each line to the board. After a gap, `steps()` replaces both with the next
+        robot and memory in the file."""
         if self._state is not None:
             with self.state_errors():
                 adopt(self.robot, Robot(self._recorded), Robot(self.config))
@@ -314,9 +317,10 @@ class RecordedRun(_Source):
 
 
 def _with_changes(other: Config, recorded: Config, present: Config) -> Config:
-    """Return `other` with the settings that clients changed during the recording, if permitted.
+    """Return `other` with the settings that clients changed during the recording.
 
-    `recorded` is the configuration before these changes, and `present` the one after them.
+    `recorded` is the configuration before these changes, and `present` is the configuration after
+    them. If one of the changes is not permitted in `other`, return `other` unchanged.
     """
     # A robot with the configuration `other` would have refused changes that are not permitted.
     before = dict(flat(effective(recorded)))
@@ -358,7 +362,8 @@ def replay_file(
 def _failed_step(recording: Recording, robot: Robot, last: int | None) -> str:
     """Replay the step in which the recorded daemon failed; return `ReplayResult.failed_step`.
 
-    Call this after `recording.messages()` has yielded the last message.
+    `last` is the number of the step that `robot` has replayed last, or None. Call this function
+    after `recording.messages()` has yielded the last message.
     """
     if recording.unfinished is None:
         return ""
@@ -444,7 +449,11 @@ class DisplayReplay(_Source):
 
 
 def _first_state(recording: Recording) -> tuple[int, State | None]:
-    """Return (number of the next step, state) for the state with which a recording begins."""
+    """Return the robot state at the beginning of a recording, as (number of the next step, state).
+
+    Return (0, None) if the recording does not begin with a state. Raises `RecordingError` if this
+    version of acsard cannot use the state.
+    """
     for topic, _, data in recording.messages():
         if topic == "state":
             try:

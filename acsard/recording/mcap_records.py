@@ -6,7 +6,7 @@ writes each chunk while the chunk grows:
 
 1. First the recorder writes a header whose length field is larger than any file.
 2. Once a second it appends a zstd block with the new messages.
-3. When the chunk is complete, the recorder replaces the header by the true header.
+3. When the chunk is complete, the recorder replaces the header with the true header.
 
 The reader does not need the length and the checksum in the header. Each zstd block contains its own
 length, and each message contains a checksum in the field for its sequence number. After a damaged
@@ -95,11 +95,12 @@ _BLOCK_BYTES = 1 << 17
 """Largest size of a zstd block, compressed or uncompressed, bytes."""
 
 _BLOCK_EFFORT = 1 << 10
-"""Work that each zstd block adds to the work for its data, in unpacked bytes. Even an empty block
-takes about as long as 1 KiB of data."""
+"""Work that the reader counts for each zstd block in addition to the data of the block, in unpacked
+bytes. Even an empty block takes about as long to read as 1 KiB of data."""
 
 _REPEATED = 1
-"""Type of a zstd block that contains a single byte, and the number of repetitions of this byte."""
+"""Type number of a zstd block that repeats one byte. Such a block stores the byte only once, and
+its size field contains the number of repetitions."""
 
 
 class Message(NamedTuple):
@@ -154,7 +155,7 @@ class GrowingChunk:
         self._out += [self._compressor.compress(head), self._compressor.compress(data)]
 
     def take(self) -> bytes:
-        """Return compressed bytes: those of the messages since the last call of `take`."""
+        """Return the compressed bytes of the messages that were added since the last call."""
         self._out.append(self._compressor.flush(COMPRESSOBJ_FLUSH_BLOCK))
         return self._taken()
 
@@ -162,7 +163,7 @@ class GrowingChunk:
         """End the chunk, and return a pair: the last bytes of the chunk, and its true header.
 
         The caller appends the last bytes to the file, and replaces the header at the beginning of
-        the chunk by the true header.
+        the chunk with the true header.
         """
         self._out.append(self._compressor.flush())
         last = self._taken()
@@ -276,9 +277,11 @@ def _blocks(data: bytes, at: int) -> Iterator[tuple[int, bytes, bool]]:
 
 
 def _messages(data: bytearray) -> tuple[list[Message], int, int]:
-    """Return the complete messages, their size, and the number of bytes that the next one needs.
+    """Return the triple (complete messages at the beginning of `data`, their size, `wanted`).
 
-    This number exceeds `MAX_MESSAGE_BYTES` if the next message is damaged.
+    The size and `wanted` are in bytes. `wanted` is the size of the next message, or of its header
+    if the header is not complete yet. It exceeds `MAX_MESSAGE_BYTES` if the next message is
+    damaged.
     """
     messages: list[Message] = []
     at = 0
@@ -308,7 +311,8 @@ MAGIC = b"\x89MCAP0\r\n"
 # In the test recordings, each byte of a chunk unpacks to 5 to 13 bytes. The limit is larger,
 # because a damaged chunk is read up to three times, and a damaged block counts as 128 KiB.
 MAX_EFFORT = 256
-"""Limit on the work for damaged chunks, in unpacked bytes for each byte of the file."""
+"""Limit on the work for damaged chunks, in unpacked bytes for each byte of the file. In addition,
+every file may cost `MAX_CHUNK_BYTES`."""
 
 RECORD_HEAD = struct.Struct("<BQ")
 """Layout of the header of an MCAP record: opcode, and number of bytes that follow the header."""
@@ -340,7 +344,7 @@ class Found(NamedTuple):
     record: McapRecord | None
     """The decoded record; None for a chunk and for a damaged place."""
     chunk: ReadChunk | None
-    """The readable part of a chunk, which may be damaged; None for any other record."""
+    """The readable part of a complete or damaged chunk; None if this is not a chunk."""
     end: int
     """Offset in the file at which the record, chunk or damaged place ends, bytes. The next item
     begins at this offset."""
@@ -392,8 +396,8 @@ def walk(data: bytes) -> Iterator[Found]:
 def _read(stream: io.BytesIO, at: int, opcode: int, claimed: int, size: int) -> Found | None:
     """Decode the record at the offset `at`, or return None if it is damaged or cut off.
 
-    `claimed` is the offset of its end according to its length field. `size` is the size of the
-    file.
+    `claimed` is the offset at which the record ends according to its length field. `size` is the
+    size of the file, bytes.
     """
     read = READ_RECORDS.get(opcode)
     if read is None:
@@ -410,7 +414,10 @@ def _read(stream: io.BytesIO, at: int, opcode: int, claimed: int, size: int) -> 
 
 
 def _is_intact(stream: io.BytesIO, at: int, end: int) -> bool:
-    """Check the checksum of an attachment. A checksum of 0 means that it has none."""
+    """Return whether an attachment has a correct checksum, or 0, which means no checksum.
+
+    `at` and `end` are the offsets at which the attachment begins and ends.
+    """
     stream.seek(at)
     record = stream.read(end - at)
     crc = int.from_bytes(record[-4:], "little")

@@ -94,7 +94,7 @@ class Publisher:
         yield from self.skip(step)
 
     def skip(self, step: Step) -> Iterator[Published]:
-        """Yield only the log lines of a step, which need no replay of the step."""
+        """Yield only the log lines of a step. The step need not have been replayed."""
         self._now = step.inputs.now
         yield from map(self._line, self._timeline.step(step))
 

@@ -26,16 +26,16 @@ MAX_QUEUED_STEPS = 4096
 """Largest number of queued steps. At 400 steps a second, the queue is full after 10 s."""
 
 SLOW_SYNC_NS = 3 * NS_PER_S
-"""If a sync of the file to the disk takes longer than this, ns, the log reports that the disk
+"""Duration of a sync of the file to the disk, ns, above which the log reports that the disk
 hangs."""
 
 SLOW_DISK = "the disk has accepted no data for 3 s"
 
 MAX_DISK_WAIT_NS = NS_PER_S // 4
-"""Largest part of the time between two steps that counts as duration of a sync, ns.
+"""Largest amount by which the time between two steps extends the measured duration of a sync, ns.
 
-If the time between two steps is longer, the whole process was stopped, and the disk is not the
-cause.
+If more time passes between two steps, the process itself was stopped, so the disk is not the cause
+of the rest of that time.
 """
 
 SYNC_PAUSE_S = 0.98
@@ -84,9 +84,9 @@ class Recorder:
         self._waited_ns = self._now_ns = 0
         """Duration of the present sync so far, and monotonic time of the last step, both in ns."""
         self._slow = False
-        """True while the disk hangs, as far as the log has reported it."""
+        """True after the log has reported a slow disk, until it reports a fast disk again."""
         self._lost_before = 0
-        """Number of steps that were already lost when the disk began to hang."""
+        """Value of `_lost` when `_slow` became true."""
         self._failed_inputs: Inputs | None = None
         """Inputs of the step in which the daemon failed, or None."""
         self._wants_state = False
@@ -191,8 +191,8 @@ class Recorder:
     def close(self, error: BaseException | None = None) -> None:
         """Write the last steps and the end of the file, and wait at most `CLOSE_S` for that.
 
-        If the disk is slower, and the daemon has not failed, also try to write a marker file with
-        this reason, for at most `MARK_S`.
+        If the disk is slower, and the daemon has not failed, also try for at most `MARK_S` to
+        create a marker file. The file tells the next start of the daemon that the disk was slow.
 
         Args:
             error: the exception that ends the daemon. An `Exception` is a failure of the daemon.

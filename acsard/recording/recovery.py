@@ -25,9 +25,9 @@ from acsard.recording.mcap_records import LAST_BLOCK, MAGIC, chunk_places, encod
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
 
 MAX_DELETED_BYTES = 64 << 10
-"""Size limit below which a file without readable data is deleted, bytes.
+"""Largest size of a file without any data that recovery deletes, bytes.
 
-A larger file contains more than a header and one second of steps. It is never deleted.
+A larger file contains more than a header and one second of steps. Recovery never deletes it.
 """
 
 
@@ -35,11 +35,13 @@ def recover(part: Path, whole: Path, cut: str, room: bool) -> str:
     """Finish a recording that was cut off, and give it its final name.
 
     Usually this function writes a finished copy at `whole` and deletes `part`. If the disk has no
-    room for a copy, it finishes `part` in place and renames it to `whole`. There are two
+    room for a copy, it finishes `part` in place and renames it to `whole`. There are three
     exceptions:
 
     - A small file without any data is deleted.
     - Any other file that this version cannot read is renamed to `whole`, with unchanged content.
+    - If the disk has no room even for the end record, `part` is renamed to `whole`, with unchanged
+      content.
 
     Args:
         part: path of the file that was cut off.
@@ -95,12 +97,15 @@ def _has_configuration(part: Path) -> bool:
 
 
 def _has_chunks(part: Path) -> bool:
-    """Return whether the file has the header of a chunk, even if its content is unreadable."""
+    """Return whether the file has the header of a chunk, even if the chunk is unreadable."""
     return any(True for _ in chunk_places(part.read_bytes(), 0))
 
 
 def _copy(recording: Recording, part: Path, whole: Path, cut: str) -> bool:
-    """Copy the readable data. Return False, and keep the file `part`, if the disk is full."""
+    """Copy the readable data to `whole`, delete `part`, and return True.
+
+    If the disk is full, keep `part` and return False.
+    """
     written = part.with_name(f".{part.name}.new")
     written.unlink(missing_ok=True)
     try:
@@ -149,9 +154,10 @@ def _finish_in_place(recording: Recording, part: Path, cut: str) -> bool:
 def _writes(before: bytes, last: EndRecord) -> tuple[list[tuple[int, bytes]], int]:
     """Return the writes (offset, data) that finish a file, and the size of the finished file.
 
-    If an earlier recovery has already written the end of the file, there are only chunk headers.
+    `before` is the present content of the file, and `last` is its future end record. If an earlier
+    recovery has already written the end of the file, the writes contain only chunk headers.
     """
-    # The end comes first, because the disk may have no room for it.
+    # The first write is the end of the file, because the disk may have no room for the end.
     heads: list[tuple[int, bytes]] = []
     chunk, index = None, Index()
     for place in walk(before):
@@ -181,7 +187,7 @@ def _writes(before: bytes, last: EndRecord) -> tuple[list[tuple[int, bytes]], in
 
 
 def _put(stream: FileIO, at: int, data: bytes) -> None:
-    """Write and sync `data`. If the disk refuses it, a part of `data` may have been written."""
+    """Write `data` at the offset `at`, and sync it. An `OSError` may leave a part of it written."""
     stream.seek(at)
     while data:
         data = data[stream.write(data) :]

@@ -58,8 +58,7 @@ Output = Literal[
 """
 
 TEXT_OUTPUTS: frozenset[Output] = frozenset({"reason", "event text"})
-"""Outputs that are text for people. Another version of acsard may use other words in such a
-text."""
+"""Outputs that are text for people. Another version of acsard may word such a text differently."""
 
 
 class Difference(Struct, frozen=True):
@@ -73,7 +72,8 @@ class Difference(Struct, frozen=True):
     recorded: RecordedOutputs
     replayed: RecordedOutputs
     trip: str
-    """Why the guard replaced the replayed line by zeros; "" if the guard did not replace it."""
+    """Why the guard, which checks each line to the board, replaced the replayed line with zeros; ""
+    if the guard did not replace it."""
 
 
 class Comparison(Struct):
@@ -96,8 +96,8 @@ class Comparison(Struct):
     links_same: int = 0
     sources_same: int = 0
     events: int = 0
-    """Number of compared events. If a step has more recorded events than replayed events, or the
-    other way round, the larger number counts."""
+    """Number of compared events. If a step has different numbers of recorded and replayed events,
+    the larger number counts."""
     events_same: int = 0
     exact: bool = True
     """True if all poses, twists and wheel angles so far are equal to the last bit. They are
@@ -157,7 +157,8 @@ class Replay:
         Args:
             config: the configuration of a new robot. It is used only if `robot` is None.
             robot: the robot that replays the steps, or None for a new robot.
-            memory: the memory of the robot's guard, or None for a new guard.
+            memory: the memory of the robot's guard, which checks each line to the board; None for a
+                new guard.
         """
         self.outputs: Outputs | None = None
         """Outputs of the last replayed step; None before the first step."""
@@ -169,7 +170,8 @@ class Replay:
     def resume(self, robot: Robot, memory: Memory | None) -> None:
         """Replay the next steps with another robot, for example after missing steps.
 
-        `memory` is the memory of this robot's guard, or None for a new guard.
+        `memory` is the memory of this robot's guard, which checks each line to the board. It is
+        None for a new guard.
         """
         self.robot = robot
         self._config = robot.config

@@ -53,8 +53,8 @@ MAX_SPARE_BYTES = 1_000_000_000
 they leave the fraction `SPARE_FRACTION`, which is less."""
 
 NEEDED_FRACTION = 0.2
-"""Fraction of `Disk.spare`. If less space than this is free, protected recordings are deleted
-too."""
+"""Fraction of `Disk.spare`, the space that recordings leave free. If less than this fraction of
+that space is free, protected recordings are deleted too."""
 
 MAX_CORRECTION_NS = 60 * NS_PER_S
 """Largest change of the wall clock that counts as a correction and not as a jump, ns. The change is
@@ -136,8 +136,7 @@ def to_delete(
 
     - If `freed` is 0, at least one recording is deleted, even if all recordings are protected.
     - If `freed` is less than `MIN_FILE_BYTES`, at least one unprotected recording is deleted, if
-    any
-      exists.
+      any exists.
     - If `freed` is `MIN_FILE_BYTES` or more, the refusal has no effect.
     """
     protected = _protected(ended)
@@ -162,7 +161,12 @@ def to_delete(
 
 
 def _protected(ended: Sequence[Ended]) -> set[str]:
-    """Return the names of the newest `kept` recordings, and of the `near` ones in their groups."""
+    """Return the names of the protected recordings.
+
+    These are the newest `MAX_KEPT_FILES` recordings of the class `kept`, and the `near` recordings
+    in the same group as one of them. A group is a sequence of `kept` and `near` recordings with
+    consecutive numbers.
+    """
     kept = {file.name for file in [file for file in ended if file.kind == "kept"][-MAX_KEPT_FILES:]}
     return {
         file.name
@@ -212,7 +216,7 @@ class ClockWatch(Struct):
         return 0
 
     def trusted(self, now: Instant) -> bool:
-        """Return True if the wall clock has been watched for `STEADY_CLOCK_NS` without a jump."""
+        """Return whether `jump_ns()` has found no jump of the wall clock for `STEADY_CLOCK_NS`."""
         return self._since_ns is not None and now.mono_ns - self._since_ns >= STEADY_CLOCK_NS
 
 

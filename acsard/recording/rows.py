@@ -323,7 +323,10 @@ def _sent(row: Row) -> bytes | None:
 
 
 def _instant(batch: Batch, mono_ns: int, offset: int) -> Instant:
-    """Return an instant; `offset` is a `Row.offset` or a `Read.offset` of the batch."""
+    """Return an instant; `offset` is a `Row.offset` or a `Read.offset` of the batch.
+
+    Raises `ValueError` if a time is out of range.
+    """
     ahead_ns = batch.offset_ns + offset * batch.unit
     if abs(mono_ns) >= 2 * MAX_TIME_NS or abs(ahead_ns) >= MAX_OFFSET_NS:
         raise ValueError("a time is out of range")
@@ -331,7 +334,10 @@ def _instant(batch: Batch, mono_ns: int, offset: int) -> Instant:
 
 
 def _require_finite(rare: Rare) -> None:
-    """Check requests and gyro samples only, because the robot checks the numbers in commands."""
+    """Raise `ValueError` if a pose in a request, or a gyro sample, is not finite.
+
+    The robot itself checks the numbers in commands.
+    """
     for request in rare.requests:
         pose = request.pose
         if pose is not None and not all(map(math.isfinite, (pose.x, pose.y, pose.yaw))):

@@ -32,7 +32,7 @@ TIME_TOLERANCE_S = 60.0
 """
 
 MIN_GAP_S = 2.0
-"""Longest time without a recording that does not count as a gap, s."""
+"""Duration of a time without a recording, s, above which this time counts as a gap."""
 
 
 class Series(Recording):
@@ -112,8 +112,8 @@ class _Piece(NamedTuple):
 def search(files: Sequence[Path], first: float, last: float) -> Search:
     """Find the recordings that have steps in a range of time.
 
-    Files that continue each other are joined to a `Series`. If a file begins during a drive, its
-    series also includes the files with the earlier part of this drive.
+    Successive files without a missing step between them are joined into a `Series`. If a file
+    begins during a drive, its series also includes the files with the earlier part of this drive.
 
     Args:
         files: paths of the files to search, the oldest first.
@@ -164,7 +164,10 @@ def _gaps(pieces: Sequence[_Piece], first: float, last: float) -> list[tuple[flo
 
 
 def _groups(files: Sequence[Path], chosen: dict[int, Contents]) -> list[list[int]]:
-    """Return the indices in `files` of each series. `chosen` maps some indices to contents."""
+    """Return a list of indices in `files` for each recording of one or more successive files.
+
+    `chosen` maps the index of each file with steps in the searched range to its contents.
+    """
     groups: list[list[int]] = []
     for number, contents in sorted(chosen.items()):
         if groups and number - 1 in chosen and _continues(chosen[number - 1], contents):
@@ -177,7 +180,8 @@ def _groups(files: Sequence[Path], chosen: dict[int, Contents]) -> list[list[int
 def _earlier(files: Sequence[Path], number: int, contents: Contents) -> list[int]:
     """Return the indices of the earlier files of a drive, the oldest file first.
 
-    It is the drive during which the file with the index `number` begins.
+    The file with the index `number` and the contents `contents` begins during this drive. If that
+    file does not begin during a drive, the result is empty.
     """
     found: list[int] = []
     while number > 0 and contents.first.recorded.status[0] == "driving":

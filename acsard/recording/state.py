@@ -1,8 +1,8 @@
 """Encodes a `Robot` between two steps as bytes, and decodes such bytes.
 
-It also applies another configuration to a decoded robot. Each file of a run of the daemon, except
-possibly the first file, begins with an encoded robot. About every 20 s the file contains another
-encoded robot, so that a replay can go on after a damaged place.
+The module also applies another configuration to a decoded robot. In each run of the daemon, every
+recording file begins with an encoded robot, but the first file may lack it. About every 20 s a file
+contains another encoded robot, so that a replay can go on after a damaged place.
 
 `freeze` uses pickle, which takes a fraction of a millisecond. `thaw` uses `unpickling.py` instead,
 because a forged file could run code through pickle.
@@ -104,7 +104,10 @@ def checkpoint(data: bytes) -> Checkpoint:
 
 
 def freeze(robot: Robot, memory: Memory) -> bytes:
-    """Encode the present state of a robot and of its guard's memory. `thaw` decodes the result."""
+    """Encode the state of a robot, and the memory of the guard that checks its lines to the board.
+
+    `thaw` decodes the result.
+    """
     written = io.BytesIO()
     pickler = pickle.Pickler(written, PICKLE_PROTOCOL)
     pickler.dispatch_table = DISPATCH_TABLE
@@ -113,7 +116,7 @@ def freeze(robot: Robot, memory: Memory) -> bytes:
 
 
 def thaw(data: bytes) -> State:
-    """Decode a robot and its guard's memory, encoded by `freeze`. The bytes may be forged.
+    """Decode a robot and its guard's memory, which `freeze` has encoded. The bytes may be forged.
 
     Raises `StateError` if the bytes are damaged or forged, or if another version of acsard encoded
     them and this version cannot use them.
@@ -184,7 +187,10 @@ class _Walk:
         so that no other object gets the same `id()`."""
 
     def into(self, now: Any, begun: Any, other: Any) -> None:
-        """Change the attributes of the object `now` as `adopt()` describes."""
+        """Change the attributes of the object `now` as `adopt()` describes.
+
+        `now`, `begun` and `other` are the same part of the three robots of `adopt()`.
+        """
         if id(now) in self._visited:
             return
         self._visited[id(now)] = now
@@ -200,7 +206,10 @@ class _Walk:
                 setattr(now, name, merged)
 
     def merged(self, now: Any, begun: Any, other: Any) -> Any:
-        """Return the new value of an attribute. Parts of `now` may be changed in place."""
+        """Return the new value of an attribute. Parts of `now` may be changed in place.
+
+        `now`, `begun` and `other` are the values of the attribute in the three robots of `adopt()`.
+        """
         if type(now) is not type(other):
             return other if _same(now, begun) else now
         match now:

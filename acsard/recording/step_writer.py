@@ -111,7 +111,7 @@ class StepWriter:
         self._number = self._began_ns = self._state_ns = 0
         self._last = Instant(0, 0)
         self._reported = False
-        """True once the log has an event with the text that the daemon records."""
+        """True once this object has reported an event that says that the daemon records."""
         self._refused = False
         """True if the last write failed because the disk was full."""
         self._looked_back = False
@@ -130,8 +130,8 @@ class StepWriter:
         """Numbers of steps in the present call of `write`.
 
         `_handed` counts the steps that were written to the file or lost so far. `_safe` counts only
-        those that are synced to the disk or already in `lost`. If the disk refuses to write, all
-        steps of the call that `_safe` does not count are lost.
+        the steps that are synced to the disk or already counted in `lost`. If the disk refuses to
+        write, all other steps of the call are lost.
         """
 
     def write(self, items: list[Taken | Start], over: bool) -> None:
@@ -178,7 +178,11 @@ class StepWriter:
         return ring
 
     def _write_group(self, ring: Ring, start: Start | None, steps: list[Taken]) -> None:
-        """Write steps. `start` begins a new file, or becomes a checkpoint in the current one."""
+        """Write `steps` to the current file.
+
+        `start` is the robot's state before these steps, or None. The state begins a new file, or
+        becomes a checkpoint in the current file.
+        """
         if start is not None and self._writing is not None and self._goes_on(ring, start):
             self._add_checkpoint(self._writing, start, self._last)
         elif start is not None:
@@ -247,9 +251,10 @@ class StepWriter:
         self._add_checkpoint(self._writing, start, now)
 
     def _look_back(self, ring: Ring, now: Instant) -> None:
-        """Let an incident at the beginning of this run protect the last files of the previous run.
+        """Register the last files of the previous run of the daemon in `_incidents`.
 
-        An incident at the end of the previous run protects the first file of this run.
+        An incident at the beginning of this run then protects those files. An incident in one of
+        them protects the first file of this run.
         """
         for path, kind, ended_ns in ring.just_ended(now):
             self._incidents.earlier(path, kind, ended_ns)

@@ -23,7 +23,7 @@ from acsard.recording.timeline import MIN_CLOCK_CHANGE_NS
 class Span(NamedTuple):
     """A part of a recording, limited by two times in s after the recording began.
 
-    The times are counted by the monotonic clock.
+    Both times are measured with the monotonic clock.
     """
 
     begin: float = -math.inf
@@ -296,9 +296,9 @@ def stretches(recording: Recording) -> list[Stretch]:
 
 
 def read_contents(recording: Recording) -> Contents | None:
-    """Return the continuous parts of a recording, its first step and its last step.
+    """Return the stretches of a recording, and its first and last readable step.
 
-    Return None if no step is readable.
+    A stretch is a part without an adjustment of the wall clock. Return None if no step is readable.
     """
     found: list[Stretch] = []
     first: Step | None = None

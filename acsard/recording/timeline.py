@@ -31,36 +31,37 @@ must fit in 64 bits."""
 
 
 MIN_REASON_NS = NS_PER_S
-"""Shortest time between two `reason` entries, two `waits` entries or two `board` entries, ns.
+"""Shortest time between two timeline entries with the same name, ns.
 
-Without this limit, two sources that alternate in every step would fill the timeline.
+The limit applies to entries with the names `reason`, `waits` and `board`. Without this limit, two
+sources that alternate in every step would fill the timeline.
 """
 
 MAX_POSE_WAIT_NS = NS_PER_S
-"""Longest delay of the entry `continues`, ns. The entry is delayed until the first pose, because it
-contains this pose. Without a link to the board there is no pose."""
+"""Longest delay of the timeline entry `continues`, ns. The entry is delayed until the first pose,
+because it contains this pose. Without a link to the board there is no pose."""
 
 MIN_CLOCK_CHANGE_NS = 5 * NS_PER_S
-"""Smallest change of the wall clock that gives an entry `clock`, ns. The change is measured against
-the monotonic clock."""
+"""Smallest change of the wall clock that gives a timeline entry `clock`, ns. The change is measured
+against the monotonic clock."""
 
 MIN_WAIT_NS = NS_PER_S
-"""Time for which a sender must send speeds without effect before it gets an entry `waits`, ns.
+"""Time for which a sender must send speeds without effect to get a timeline entry `waits`, ns.
 
 While an operator changes from one sender to another, both senders may send, but for less than this
 time.
 """
 
 MIN_SILENCE_NS = NS_PER_S
-"""If a waiting sender sends nothing for longer than this, ns, its waiting time restarts at 0."""
+"""Silence of a waiting sender, ns, after which the sender's waiting time restarts at 0."""
 
 MAX_IDENTITY_BYTES = 256
 """Largest length, bytes, of the line with which a microcontroller names itself. The line of the
 reference firmware has 150 bytes."""
 
 MAX_WAITING = 16
-"""Largest number of waiting senders that are watched at a time. A hostile client may use many
-names."""
+"""Largest number of senders that are watched at a time because they send speeds that the robot does
+not follow. A hostile client may use many names."""
 
 NUMBER = re.compile(r"\b\d+(\.\d+)?\b")
 """Pattern for a number in a reason, but not for a digit in a name. Reasons that differ only in
@@ -79,7 +80,7 @@ class TimelineEntry(Struct, frozen=True, omit_defaults=True):
     - `continues`: the recording continues an earlier one.
     - `drive`: a drive has ended, or is under way as the recording ends.
     - `link_late`: an event `link_stale` that a delay of the daemon's computer caused.
-    - `link_heard`: another event about a loss of the link that an earlier event has reported.
+    - `link_heard`: an event that repeats an earlier event about the same loss of the link.
     - `reason`: the reason of the robot's mode has changed, but the mode has not.
     - `waits`: a sender must wait while another one drives.
     - `board`: a microcontroller has named itself and its last reset.
@@ -93,7 +94,7 @@ class TimelineEntry(Struct, frozen=True, omit_defaults=True):
     by: str = ""
     """The client that caused the event, or the sources that commanded the drive; "" if unknown."""
     count: int = 1
-    """Number of equal events that the log combined to this entry."""
+    """Number of equal events that the log combined into this entry."""
 
     @property
     def sentence(self) -> str:
@@ -122,7 +123,7 @@ class LinkLosses:
     def repeated(self, name: str) -> bool:
         """Register the name of the next event.
 
-        Return whether this event repeats an earlier event about the same loss of the link.
+        Return whether an earlier event with this name has reported the same loss of the link.
         """
         if name == "link_up":
             self._names.clear()
@@ -138,11 +139,11 @@ class ReasonChanges:
 
     def __init__(self) -> None:
         self._mode = self._reason = ""
-        """The last mode and reason that the timeline shows. Each number in the reason is replaced
-        by `#`."""
+        """The last mode and reason that the timeline shows. A `#` replaces each number in the
+        reason."""
         self._reported_ns = -MIN_REASON_NS
-        """Monotonic time of the last entry, ns. An event that reports the mode `waiting` counts
-        like an entry."""
+        """Monotonic time of the last entry `reason`, ns. An event that reports the mode `waiting`
+        counts like an entry."""
         self._sender = ("", "")
         """Pair: the source that the robot followed last, and the sender of that source's last
         command."""
@@ -189,7 +190,7 @@ class BoardIdentity:
         """The last received bytes, if they may be the beginning of the line with the board's name;
         otherwise empty."""
         self._reported_ns = -MIN_REASON_NS
-        """Monotonic time of the last entry, ns."""
+        """Monotonic time of the last entry `board`, ns."""
 
     def step(self, step: Step) -> Iterator[TimelineEntry]:
         """Yield an entry if the board has named itself in a step, but at most one each second."""
@@ -241,7 +242,7 @@ class WaitingSenders:
         self._waiting: dict[tuple[str, str], _Waiting] = {}
         """Maps the pair (source, sender) to each waiting sender."""
         self._reported_ns = -MIN_REASON_NS
-        """Monotonic time of the last entry, ns."""
+        """Monotonic time of the last entry `waits`, ns."""
 
     def step(self, step: Step) -> Iterator[TimelineEntry]:
         """Yield an entry for each sender that has waited for `MIN_WAIT_NS` and has no entry yet."""
@@ -286,13 +287,14 @@ class WaitingSenders:
         return len(self._waiting) < MAX_WAITING
 
     def _known(self, source: str) -> bool:
-        """Return whether `_commander` names exactly one sender, and it is a sender of `source`."""
+        """Return whether `_commander` names exactly one sender, which uses the source `source`."""
         return self._commander.startswith(f"{source} (") and ", " not in self._commander
 
     def _why(self, waiting: str, followed: str) -> str:
-        """Return "" if a priority is not known, or if `waiting` has the higher one.
+        """Return why the source `waiting` waits for `followed`, for example "which came first".
 
-        In the latter case `waiting` does not wait, but the robot refuses its commands.
+        Return "" if a priority is not known, or if `waiting` has the higher priority. With the
+        higher priority, the source does not wait: the robot refuses its commands.
         """
         one, other = self._priorities.get(waiting), self._priorities.get(followed)
         if one is None or other is None or one > other:

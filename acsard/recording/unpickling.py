@@ -91,8 +91,8 @@ tuples of allowed values."""
 def unpickle(data: bytes, find: FindClass) -> object:
     """Return the object that a pickle describes. The bytes may be forged.
 
-    `find` returns the class for the names of a module and a class. Raises `ValueError` if the bytes
-    are damaged, or if they contain anything that a pickled robot never contains.
+    `find` takes the names of a module and a class, and returns the class. Raises `ValueError` if
+    the bytes are damaged, or if they contain anything that a pickled robot never contains.
     """
     if len(data) > MAX_BYTES:
         raise ValueError(
@@ -127,11 +127,14 @@ class _Entry:
         self.depth = 0
         self.size = 1
         self.closed = False
-        """True once an opcode has fetched the value from the memo. The value may then not grow any
-        more."""
+        """True once an opcode has fetched the value from the memo, the pickle's list of earlier
+        values. From then on, the value must not grow."""
 
     def holds(self, parts: Sequence[_Entry]) -> None:
-        """Update the depth and the size for `parts`, which the caller will add to this value."""
+        """Update the depth and the size for `parts`, which the caller will add to this value.
+
+        Raises `ValueError` if the value must not grow, or if it exceeds a limit.
+        """
         if self.closed:
             raise ValueError(
                 "a part of the robot state contains itself, or grows after it was used: the file "
@@ -354,12 +357,16 @@ OPCODES: dict[str, Callable[[_Machine], None]] = {
     "NEWOBJ": _Machine.make_bare,
     "BUILD": _Machine.set_attributes,
 }
-"""Maps each remaining opcode to the method that executes it. `_Machine.do` executes the opcodes in
+"""Maps opcodes to the methods that execute them. `_Machine.do` itself executes the opcodes in
 `ARGUMENTS`, `VALUES`, `CONTAINERS` and `TUPLES`, and those that fetch a value from the memo."""
 
 
 def _keys(entries: Sequence[_Entry]) -> None:
-    """Reject keys that cannot be hashed, are slow to hash, or may be forged for equal hashes."""
+    """Raise `ValueError` for a dict key or set element of a type or size that is not allowed.
+
+    A value that is not hashable or is slow to hash is not allowed, and neither is a large integer,
+    because an attacker can forge many large integers with equal hashes.
+    """
     for entry in entries:
         value = entry.value
         parts = value if type(value) is tuple and len(value) <= MAX_KEY_PARTS else (value,)
@@ -382,9 +389,10 @@ def _is_part(kind: Any) -> bool:
 
 
 def _made(kind: type, given: tuple[Any, ...]) -> object:
-    """Construct an object, or raise `ValueError` if the class is not allowed here.
+    """Return an object of the class `kind`, constructed with the arguments `given`.
 
-    Wrong arguments also raise `TypeError` or a msgspec error.
+    Raises `ValueError` if the class is not allowed. Wrong arguments also raise `TypeError` or a
+    msgspec error.
     """
     match given:
         case (dict(),) if kind is Counter:

@@ -111,11 +111,10 @@ class Acceptor:
                 one.cut()
 
     def spoke(self, transport: asyncio.BaseTransport | None, body: StreamReader) -> None:
-        """End the time limit `REQUEST_TIMEOUT_S` of a connection, because a request's headers have
-        arrived.
+        """End the time limit `REQUEST_TIMEOUT_S` of a connection.
 
-        `transport` identifies the connection. `body` is the stream from which the body of this
-        request is read.
+        Call this when the headers of a request have arrived. `transport` identifies the connection,
+        and `body` is the stream from which the body of the request is read.
         """
         if (one := _connection(transport)) is not None:
             one.spoke(body)
@@ -162,7 +161,10 @@ class Acceptor:
             _Connection(self, pool, accepted, peer, secure, make).enter()
 
     def _no_file(self, opened: socket.socket, secure: ssl.SSLContext | None, make: Factory) -> None:
-        """Close an old connection, because the process has no free file descriptor."""
+        """Close an old connection, and accept no new ones at `opened` for `NO_FILES_PAUSE_S`.
+
+        Call this if the process has no free file descriptor.
+        """
         loop = asyncio.get_running_loop()
         loop.remove_reader(opened)
         loop.call_later(NO_FILES_PAUSE_S, self._resume, opened, secure, make)
@@ -220,7 +222,7 @@ class Acceptor:
             one = next(iter(same))
             del same[one]
             if same:
-                self._waiting[network] = same  # behind all other networks
+                self._waiting[network] = same  # after all other networks
             self._starting[one] = loop.time()
             one.start()
         # A handshake occupies the event loop for 1 to 2 ms. The pause between the handshakes lets
@@ -228,7 +230,11 @@ class Acceptor:
         self._again = loop.call_later(0.005, self._next)
 
     def _has_room(self, now: float) -> bool:
-        """Return whether a TLS handshake may start. If too many are running, abort one first."""
+        """Return whether a TLS handshake may start now. `now` is in s on the event loop's clock.
+
+        If `HANDSHAKES_AT_ONCE` handshakes are running, first abort one of them. If the handshake
+        to abort is younger than `MIN_ABORT_AGE_S`, return False instead.
+        """
         if len(self._starting) < HANDSHAKES_AT_ONCE:
             return True
         # Only the network with the most handshakes loses one. So a slow client in another network
@@ -264,7 +270,8 @@ class _Connection(asyncio.Protocol):
         self._task: asyncio.Task[None] | None = None
         self._transport: asyncio.BaseTransport | None = None
         self._head = 0
-        """Number of received bytes of the next request's head (request line and headers)."""
+        """Number of bytes received so far of the request head that is arriving (request line and
+        headers)."""
         self._body: StreamReader | None = None
         self._inner: Reader | None = None
 
@@ -421,7 +428,7 @@ class Reader(RequestHandler):
         """Return a JSON error as the answer to received bytes that are not a valid HTTP request.
 
         If `status` is 500 or more, a handler has failed, and aiohttp makes the answer. This method
-        replaces one of aiohttp, which logs a traceback for invalid bytes too.
+        overrides aiohttp's method, because that method logs a traceback even for invalid bytes.
         """
         if status >= 500:
             return super().handle_error(request, status, exc, message)

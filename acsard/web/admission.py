@@ -48,8 +48,8 @@ HOST = re.compile(r"([A-Za-z0-9.-]{1,253}|\[[0-9A-Fa-f:.]{2,45}\])(:[0-9]{1,5})?
 the content security policy of an answer."""
 
 STATUS_REASONS: dict[int, Reason] = {404: "path", 405: "path", 413: "too_big"}
-"""Reason under which an error that aiohttp raises is counted, by the HTTP status of the error. An
-error with any other status is counted as `malformed`."""
+"""Maps the HTTP status of an error that aiohttp raises to the reason under which the server counts
+the error. An error with any other status counts as `malformed`."""
 
 STATUS_TEXTS = {
     404: "this address does not exist; GET /api lists all addresses",
@@ -111,7 +111,8 @@ class Admission:
     ) -> None:
         """Create the checks for the page of the robot with the id `robot`.
 
-        `names` are the robot's host names and addresses, in lower case.
+        `names` are the robot's host names and addresses, in lower case. `rules` is the section
+        `web` of the configuration.
         """
         self._local, self._origins = Who(rules.local, LOCAL_NAME), frozenset(rules.origins)
         self._robot, self._names, self._vault = robot, names, vault
@@ -181,7 +182,7 @@ class Admission:
             self._counts.refuse(error.reason, _origin(request))
             answer = problem(STATUS_CODES.get(error.reason, 403), str(error))
             if error.reason == "too_many":
-                # A client that retries in a loop must not keep its TCP connection either.
+                # Close the TCP connection too. A client that retries in a loop would keep it.
                 answer.force_close()
             return answer
         except TimeoutError:

@@ -36,7 +36,7 @@ STATUS_CODES: dict[Reason, int] = {
     "path": 404,
     "malformed": 400,
 }
-"""HTTP status of the answer for each reason of a refusal. For any other reason it is 403."""
+"""Maps the reason of a refusal to the HTTP status of the answer: 403 for any other reason."""
 
 HEADERS = {
     "X-Content-Type-Options": "nosniff",
@@ -53,7 +53,7 @@ POLICY = (
     "default-src 'self'; connect-src 'self'{connect}; frame-ancestors 'none'; base-uri 'none'; "
     "form-action 'self'"
 )
-"""Content security policy of every answer except a report. The server replaces `{connect}` by the
+"""Content security policy of every answer except a report. The server replaces `{connect}` with the
 page's WebSocket URLs. The policy of an error answer does not contain these URLs, so the server
 never copies a forged `Host` header into an answer."""
 
@@ -262,7 +262,7 @@ class Files:
 
 
 def _read(paths: Sequence[Path], kind: str, stamp: tuple[tuple[int, int], ...]) -> File:
-    """Read the first file, and include the text of the others as `INLINED` says."""
+    """Read the first path, and include the text of the other paths as `INLINED` says."""
     whole, *parts = paths
     body, policy = whole.read_bytes(), ""
     for part in parts:

@@ -354,7 +354,10 @@ class Page:
 
 
 def settings_in(config: Mapping[str, Any]) -> list[Setting]:
-    """Return the settings that may change while the daemon runs. `config` is its configuration."""
+    """Return the settings that may change while the daemon runs.
+
+    `config` is the daemon's configuration.
+    """
     return [
         Setting(key, value, told.what, WHEN_TEXTS[told.when], **_allowed(key))
         for key, value in flat(config)
@@ -401,7 +404,7 @@ async def _token_posted(request: web.Request) -> TokenForm:
 def _limit_buffer(request: web.Request) -> None:
     at = None if request.transport is None else request.transport.get_extra_info("socket")
     if at is not None:
-        # In a larger send buffer of the kernel, data would wait so long that it arrives outdated.
+        # In a larger send buffer of the kernel, data would wait until it is outdated.
         at.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 65536)
 
 

@@ -28,11 +28,11 @@ from acsard.web.limits import REMOTE_STOP_RATE
 from acsard.web.robots import Robots
 
 AT_ONCE, STOPS_AT_ONCE = 16, 32
-"""Maximum number of service calls and queries at the same time (`AT_ONCE`). Stops are not counted
-in it. `STOPS_AT_ONCE` is the maximum number of simultaneous stops of the page's own robot."""
+"""`AT_ONCE` is the maximum number of simultaneous service calls and queries, without stops.
+`STOPS_AT_ONCE` is the maximum number of simultaneous stops of the page's own robot."""
 
 MAX_REMOTE_STOPS = 8
-"""Maximum number of other robots' replies to a stop for which the server waits at the same time.
+"""Maximum number of stops of other robots for whose replies the server waits at the same time.
 Beyond this number, the server sends a stop without waiting for the reply."""
 
 MIN_STOP_INTERVAL_S = 0.02
@@ -197,16 +197,16 @@ class Calls:
 
 
 class Merged:
-    """Sends at most one stop per `MIN_STOP_INTERVAL_S` for each client and robot.
+    """Merges the stops that one client requests for one robot in quick succession.
 
-    No stop is lost: all stops that a client requests within `MIN_STOP_INTERVAL_S` after a sent stop
-    share the next stop.
+    At most one stop per `MIN_STOP_INTERVAL_S` is sent for each client and robot. No stop is lost:
+    all stops that the client requests within that time after a sent stop share the next stop.
     """
 
     def __init__(self) -> None:
         self._rests: dict[Hashable, asyncio.Event] = {}
-        """Maps (client, robot) to an event. The event is set `MIN_STOP_INTERVAL_S` after the last
-        sent stop, and its entry is then removed."""
+        """Maps (client, robot) to an event. `MIN_STOP_INTERVAL_S` after the last sent stop, the
+        event is removed from this dict and set."""
         self._next: dict[Hashable, asyncio.Task[ServiceReply]] = {}
         """Maps (client, robot) to the task that waits for the event in `_rests` and then sends a
         stop."""

@@ -103,8 +103,8 @@ class Camera:
     def __init__(self, url: str) -> None:
         self._url = url
         self.newest: Picture | None = None
-        """The newest picture. It is None before the first picture, after a failure, and after no
-        client has requested a picture for 5 s."""
+        """The newest picture. It is None before the first picture, after a failure, and when the
+        last request of a client is more than 5 s old."""
         self._number = 0
         self._trouble = "the camera's stream has no picture yet"
         self._asked_ns = 0

@@ -55,9 +55,10 @@ class Fleet:
         self._tidy()
 
     def rows(self) -> list[Row]:
-        """Return one row per robot, sorted by id. Start the queries that are due in the background.
+        """Return one row per robot, sorted by id. Also start the queries that are due.
 
-        The result is [] until the subscription to the robots has been made.
+        The queries run in the background. The result is [] until the subscription to the robots has
+        been made.
         """
         self._look()
         rows = [] if self._tracked is None else self._tracked.rows()

@@ -33,10 +33,10 @@ from acsard.web.socket_messages import Begin, Ended, FrameError, Guided, Press, 
 SLOW_PORTS = "listing the serial ports took too long: try again"
 
 MAX_ERROR_BYTES = 4000
-"""Size of the last part of the child's standard error that is kept for its error text, bytes."""
+"""Largest number of bytes from the end of the child's standard error that the error text shows."""
 
 CONTINUATION_BYTES = bytes(range(0x80, 0xC0))
-"""The bytes of a UTF-8 character after its first byte."""
+"""All byte values that may follow the first byte of a UTF-8 character."""
 
 END_TIMEOUT_S = 6.0
 """Time, s, after which an interrupted child process is killed if it has not exited. Until then it
@@ -326,9 +326,10 @@ class _Errand:
         return Guided(Running(self.name, self.by, viewer is self.viewer))
 
     async def run(self, given: Sequence[str]) -> tuple[int, str]:
-        """Return (exit code, error output). The code is 128 plus the signal that ended the child.
+        """Run `acsard` with the arguments `given`, and return the pair (exit code, error output).
 
-        Raises `OSError` if the child cannot be started.
+        If a signal ended the child, the exit code is 128 plus the number of the signal. Raises
+        `OSError` if the child cannot be started.
         """
         if self.left:
             return int(Exit.FAILURE), ""
@@ -348,7 +349,10 @@ class _Errand:
         return True
 
     def key(self) -> None:
-        """Tell the child that the user pressed a key, which ends one drive of a calibration."""
+        """Tell the child that the user pressed a key, to end the present drive of a calibration.
+
+        Do nothing if no such drive is running.
+        """
         if self._rides:
             self._rides = False
             self._write({"key": True})
@@ -417,7 +421,7 @@ class _Errand:
 
 
 def last_part(said: bytes) -> bytes:
-    """Return the last lines of `said`, at most `MAX_ERROR_BYTES`.
+    """Return the last complete lines of `said`, with at most `MAX_ERROR_BYTES` in total.
 
     If the last line alone is longer, return its last characters.
     """

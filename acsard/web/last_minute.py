@@ -22,7 +22,7 @@ STEP_NS = NS_PER_S // 5
 pixel wide."""
 
 MAX_EARLY_NS = STEP_NS // 4
-"""Longest time, ns, by which a state may arrive before the next row is due and still become this
+"""Longest time, ns, by which a state may arrive too early for the next row and still become that
 row."""
 
 MAX_ROWS = MINUTE_NS // (STEP_NS - MAX_EARLY_NS)

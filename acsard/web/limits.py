@@ -260,7 +260,11 @@ class Seats:
             places.leave(name)
 
     def _places(self, address: str, token: str) -> list[tuple[Places, str, str]]:
-        """Return triples: a limit, the name under which it counts the WebSocket, and a refusal."""
+        """Return a triple for each limit that applies to a WebSocket.
+
+        The triple contains the limit, the name under which the limit counts the WebSocket, and the
+        text for the client if the limit is reached.
+        """
         if not token:
             here = f"{MAX_LOCAL_SOCKETS} pages are open on the robot itself: close some"
             return [(self._here, address, here)]

@@ -132,12 +132,19 @@ def bound(listen: Sequence[Listen], next_port: bool) -> list[tuple[Listen, socke
 
 
 def _older_ports(listen: Sequence[Listen]) -> set[int]:
-    """Return the ports at which a socket at `::` must not accept IPv4 connections."""
+    """Return the ports at which a socket at `::` must not accept IPv4 connections.
+
+    These are the ports of the addresses in `listen` whose host is an IPv4 address or a name.
+    """
     return {one.port for one in listen if ":" not in one.host}
 
 
 def _bound(one: Listen, next_port: bool, both: bool) -> tuple[Listen, socket.socket]:
-    """Bind one address. If `both` is true, a socket at `::` accepts IPv4 connections too."""
+    """Open a listening socket at the address `one`; return the used address and the socket.
+
+    `next_port` is explained at `bound()`. If `both` is true, a socket at `::` accepts IPv4
+    connections too.
+    """
     ports = range(one.port, min(65536, one.port + MAX_PORTS_TRIED)) if next_port else [one.port]
     both = both and one.host == EVERYWHERE_6 and socket.has_dualstack_ipv6()
     trouble: OSError | None = None

@@ -156,7 +156,7 @@ this limit, a client that uses many addresses could fill the memory."""
 
 
 class Counts:
-    """Thread-safe counters of the server's actions by name, and of its refusals by reason."""
+    """Thread-safe counters of the server's actions, by name, and of its refusals, by reason."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()

@@ -182,9 +182,9 @@ def _messages() -> Described:
 
 
 def _flat(node: Any, before: str) -> Any:
-    """Replace each reference to `$defs` by a reference to a component.
+    """Return `node`, a part of a JSON schema, with references to components instead of to `$defs`.
 
-    The name of the component is the old name with the prefix `before`.
+    The name of each component is the old name with the prefix `before`.
     """
     if isinstance(node, list):
         return [_flat(one, before) for one in node]

@@ -33,8 +33,8 @@ POLICY = (
     "frame-ancestors 'none'"
 )
 """Content security policy of a report. Because `allow-same-origin` is missing, the report has an
-opaque origin. The browser also enforces the policy inside the report, which contains the hashes of
-the allowed scripts."""
+opaque origin. The report itself contains a second policy with the hashes of the allowed scripts,
+and the browser enforces both."""
 
 MIN_LIST_INTERVAL_NS = NS_PER_S // 4
 
@@ -275,7 +275,7 @@ class Reports:
 
         While the report of another recording is being drawn, return the state "busy". A failed
         report is drawn again, and so is the report of a recording that has changed since. However,
-        the first call for the same recording after a drawing has ended returns the result of that
+        the first call for a recording after its drawing has ended returns the result of that
         drawing. `path` and `stamp` are the results of `BlackBox.found()`.
         """
         one, now_ns = self._one, clock.mono_ns()
@@ -381,7 +381,11 @@ async def _body(child: Process) -> bytes:
 
 
 async def _listened(child: Process, one: _Drawing) -> str:
-    """Return the child's error text. A line of digits is the progress in percent."""
+    """Read the child's standard error to its end, and return the error text.
+
+    A line of digits is the progress in percent. It updates `one.percent`, and is not a part of the
+    error text.
+    """
     assert child.stderr is not None
     # A read may end within a character, so the decoder keeps the first bytes of this character.
     said, decoder = "", codecs.getincrementaldecoder("utf-8")(errors="replace")

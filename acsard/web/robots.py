@@ -65,7 +65,7 @@ class About(Struct, frozen=True):
 
 def _path() -> Track:
     # The last argument, 1 m, is the longest step of a path. No robot drives 1 m between two states.
-    # So after a longer step the pose was set, and the path restarts.
+    # So a longer step means that the pose was set, and the path restarts.
     return Track(PATH_POINTS, PATH_STEP_M, PATH_S, 1.0)
 
 
@@ -213,7 +213,11 @@ class Robots:
             self._minute.add(now_ns, state, self._wished(now_ns))
 
     def _wished(self, now_ns: int) -> Twist | None:
-        """Return the daemon's newest output twist, or None if no viewer is subscribed to it."""
+        """Return the newest twist that the robot was commanded to drive, after the limits.
+
+        Return None if no viewer is subscribed to `cmd_vel_out`, if the newest twist is older than
+        2 s, or if it cannot be decoded.
+        """
         stream = self.streams.followed(self.id, "cmd_vel_out")
         raw = None if stream is None else stream.raw()
         # A twist that is older than 2 s does not belong to the row that is plotted now.

@@ -149,7 +149,10 @@ async def _tell(counts: Counts, log: Log) -> None:
 
 
 async def _held(leaving: asyncio.Event) -> None:
-    """Send signs of life to the parent, which ends this process by closing its standard input."""
+    """Send signs of life to the parent process, the daemon, until this task is cancelled.
+
+    Set `leaving` when the parent closes this process's standard input.
+    """
     parent, loop = Parent(sys.stdin.fileno()), asyncio.get_running_loop()
 
     def look() -> None:
@@ -191,7 +194,8 @@ def _about(wanted: Wanted) -> About:
 def _certified(wanted: Wanted) -> tuple[ssl.SSLContext | None, set[str]]:
     """Return the TLS context, and the names and addresses of this machine for the network.
 
-    Raises `MendableError` if the certificate is not usable.
+    Return None and an empty set if no address uses HTTPS. Raises `MendableError` if the certificate
+    is not usable.
     """
     if not any(one.secure for one in wanted.listen):
         return None, set()

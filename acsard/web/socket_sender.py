@@ -62,7 +62,7 @@ class Outgoing:
         self._origin = origin
         self.following: dict[tuple[str, str], Following] = {}
         """Subscribed keys by (robot, key)."""
-        # The queue is limited, because the client may not read.
+        # The queue is limited, because the client may have stopped reading.
         self._out: deque[bytes] = deque(maxlen=200)
         self._pong: bytes | None = None
         """Payload of the newest ping that is not answered yet, or None."""
@@ -120,7 +120,7 @@ class Outgoing:
         if self._closing:
             return
         self._closing = True
-        # A client that does not answer the close in time is cut off.
+        # Cut off a client that does not answer the close frame in time.
         asyncio.get_running_loop().call_later(1.0, cut, self._transport)
         said = aiohttp.WSCloseCode.POLICY_VIOLATION.to_bytes(2, "big") + why.encode()
         with suppress(ConnectionError):
@@ -152,7 +152,11 @@ class Outgoing:
             await self._send(self._out.popleft())
 
     async def _send_due(self, one: Following, now: float) -> float:
-        """Return the time at which the next value is due, s on the event loop's clock."""
+        """Send the newest value of a key if the value is due and new.
+
+        Return the time at which the next value is due, s on the event loop's clock. `now` is the
+        present time on this clock.
+        """
         stream = one.stream
         if stream is None:
             return now + one.period  # `Keys._join` wakes the task when the stream exists

@@ -62,8 +62,8 @@ class Vault:
     def known(self, text: str) -> Who | None:
         """Return the owner of the token `text`, or None if the token is not valid.
 
-        This method does not read the token file. It uses the tokens that the last call of another
-        method has read.
+        This method does not read the token file. It uses the tokens that the last call of `all()`,
+        `counting()` or `left_s()` has read.
         """
         return owner_in(self._own(self._read[1]), text)
 
@@ -160,9 +160,10 @@ class Vault:
 
     @contextmanager
     def _changing(self) -> Iterator[list[Token]]:
-        """Lock the token file, and yield the list of all robots' tokens. The block may change it.
+        """Lock the token file, and yield the list of all robots' tokens.
 
-        At the end, write the list to the file, unless the block has raised an exception.
+        The `with` block may change the list. At its end, write the list to the file, unless the
+        block has raised an exception.
         """
         directory = self.path.parent
         try:

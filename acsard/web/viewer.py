@@ -58,8 +58,8 @@ ACTIONS: dict[str, Role] = {
 controls of those actions that its user may not use."""
 
 PING_INTERVAL_S = 10.0
-"""Interval of the pings that the server sends, s. If a client does not answer a ping within half of
-this time, the connection ends."""
+"""Interval of the pings that the server sends, s. The connection ends if the client does not answer
+a ping within half of this time."""
 
 MAX_OPEN_CALLS = 8
 
@@ -317,9 +317,10 @@ class Viewer:
             self._start(self._answer(frame))
 
     def _refuse(self, frame: Frame, text: str) -> None:
-        """Refuse a message.
+        """Refuse the message `frame`, because the client exceeds a limit. `text` is the reason.
 
-        The client waits for an answer to a call, so send `text` as that answer.
+        The client waits for an answer to each call, so send `text` as the answer if the message is
+        a call.
         """
         if isinstance(frame, Call):
             self._counts.refuse("too_fast", self.who.origin)
@@ -375,7 +376,10 @@ class Viewer:
         self._out.say(socket_messages.Hello(greeting))
 
     def _look_around(self, now: float) -> float:
-        """Report changes; return when to call this again, s on the event loop's clock."""
+        """Report changes to the client, and return the time of the next call.
+
+        `now` is the present time. Both times are in s on the event loop's clock.
+        """
         if self._robots.gone != self._gone:
             self._gone = self._robots.gone
             if self._gone:
