@@ -86,7 +86,7 @@ class FarEnd:
     def _hear(self, now_ns: int) -> None:
         data = self._pty.read()
         if data:
-            self.seen.heard.append((now_ns, data))
+            self.seen.from_daemon.append((now_ns, data))
             self._mcu.receive(now_ns, data)
 
     def _advance(self) -> None:
@@ -94,7 +94,7 @@ class FarEnd:
         if data:
             at_ns = clock.mono_ns()
             if self._pty.write(data):
-                self.seen.said.append((at_ns, data))
+                self.seen.to_daemon.append((at_ns, data))
         due_ns = self._mcu.next_ns()
         if due_ns is not None:
             self._timer.set(due_ns)

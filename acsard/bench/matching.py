@@ -45,7 +45,7 @@ class Summary(Struct, frozen=True):
     max: float
 
 
-class Fed(Struct, frozen=True):
+class MatchedLine(Struct, frozen=True):
     """A feedback line for which the measured daemon published an odometry sample."""
 
     delay_ns: int
@@ -108,8 +108,8 @@ def commands_to_lines(sent: Sequence[Chunk], lines: Sequence[Chunk]) -> list[int
 
 def lines_to_samples(
     said: Sequence[tuple[int, float]], samples: Iterable[tuple[int, float]]
-) -> list[Fed]:
-    """Return a `Fed` for each feedback line that became an odometry sample.
+) -> list[MatchedLine]:
+    """Return a `MatchedLine` for each feedback line that became an odometry sample.
 
     Lines and samples are matched by their linear speed. A second sample of the same line is
     ignored.
@@ -129,7 +129,7 @@ def lines_to_samples(
         place = bisect_left(indices, before) - 1
         if place >= 0 and indices[place] > told:
             told = indices[place]
-            found.append(Fed(at_ns - all_ns[told], before - 1 - told))
+            found.append(MatchedLine(at_ns - all_ns[told], before - 1 - told))
     return found
 
 
@@ -154,9 +154,9 @@ def summary(durations_ns: Sequence[int]) -> Summary | None:
 class Seen(Struct, frozen=True):
     """All data that the simulated board received and sent, with monotonic times in ns."""
 
-    heard: list[Chunk] = []
+    from_daemon: list[Chunk] = []
     """Bytes from the daemon. Each chunk has the time at which the board could read it."""
-    said: list[Chunk] = []
+    to_daemon: list[Chunk] = []
     """Bytes to the daemon. Each chunk has the time just before the board wrote it."""
 
 
@@ -188,10 +188,10 @@ class Record(Struct, frozen=True):
     samples: list[Sample]
 
     @property
-    def said(self) -> list[Chunk]:
+    def feedback_lines(self) -> list[Chunk]:
         """Feedback lines that the board began to send in `window_ns`, each with its time, ns."""
         first_ns, last_ns = self.window_ns
-        lines = lines_of(self.seen.said) if self.seen else []
+        lines = lines_of(self.seen.to_daemon) if self.seen else []
         return [line for line in lines if first_ns <= line[0] < last_ns]
 
 
@@ -203,13 +203,16 @@ def command_waits(record: Record) -> list[int]:
     if record.seen is None:
         return []
     sent = [(sent.at_ns, sent.line) for sent in record.sent]
-    return commands_to_lines(sent, lines_of(record.seen.heard))
+    return commands_to_lines(sent, lines_of(record.seen.from_daemon))
 
 
-def feedback_fates(config: Config, record: Record) -> list[Fed]:
-    """Return a `Fed` for each feedback line that became an odometry sample."""
+def feedback_fates(config: Config, record: Record) -> list[MatchedLine]:
+    """Return a `MatchedLine` for each feedback line that became an odometry sample."""
     codec = Codec(config.mcu.wheels, config.mcu.trailing_comma)
     kinematics = Kinematics(config.drive)
-    said = [(at_ns, kinematics.twist(codec.decode(line)).linear) for at_ns, line in record.said]
+    said = [
+        (at_ns, kinematics.twist(codec.decode(line)).linear)
+        for at_ns, line in record.feedback_lines
+    ]
     samples = [(sample.at.mono_ns, sample.speed) for sample in record.samples]
     return lines_to_samples(said, samples)

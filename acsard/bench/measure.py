@@ -125,7 +125,7 @@ def _result(
     config: Config, port: str, seconds: float, rig: Rig, shares: tuple[float, float]
 ) -> Result:
     state, pid = rig.state(), rig.process.pid
-    realtime = bool(real_time.has(pid))
+    realtime = bool(real_time.is_real_time(pid))
     resident = resident_mb(pid)
     record = rig.end()
     read = [sample.at.wall_ns - sample.stamp_ns for sample in record.samples]
@@ -133,11 +133,11 @@ def _result(
     seen = lines_said = lines_waiting = start_up = None
     lines_told = len(record.samples)
     if record.seen is not None:
-        heard = lines_of(record.seen.heard)
+        heard = lines_of(record.seen.from_daemon)
         waits, fed = command_waits(record), feedback_fates(config, record)
         outside["command_to_wire"] = summary(waits)
         outside["feedback_to_odometry"] = summary([one.delay_ns for one in fed])
-        seen, lines_said, lines_told = len(waits), len(record.said), len(fed)
+        seen, lines_said, lines_told = len(waits), len(record.feedback_lines), len(fed)
         if record.sent and not seen:
             raise _nothing_seen(len(record.sent), state)
         lines_waiting = max((one.waiting for one in fed), default=0)

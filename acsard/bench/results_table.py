@@ -23,7 +23,7 @@ POINTS = {
 """Maps each duration that the benchmark measures to the events at its start and at its end."""
 
 OWN = {
-    "period_lateness": "control step due (the first missed step, if any) -> step begins",
+    "period_lateness": "control step due (or first missed step due) -> step begins",
     "step_time": "control step begins -> same step ends",
     "command_age": "command arrives at the daemon -> each line that carries it",
     "command_to_wire": "command of the active source arrives -> first line that carries it",
@@ -149,19 +149,21 @@ def _counts(result: Result) -> list[tuple[str, str]]:
     r = result
     seen = "" if r.commands_seen is None else f", {r.commands_seen} seen on the wire"
     said = "" if r.lines_said is None else f" of {r.lines_said}"
-    waiting = ""
-    if r.lines_waiting_max is not None:
-        waiting = f"; by then at most {r.lines_waiting_max} newer lines had been sent"
     start = "not measured" if r.start_up_ms is None else f"{r.start_up_ms:.0f} ms"
     rows = [
         ("commands", f"{r.commands_sent} sent{seen}"),
-        ("feedback lines", f"{r.lines_told}{said} reached the benchmark as odometry{waiting}"),
+        ("feedback lines", f"{r.lines_told}{said} reached the benchmark as odometry"),
         ("periods missed", f"{r.missed_periods}; {r.lines_sent} lines were sent"),
         ("processor", f"{r.cpu_percent_following:.1f} % of a core with one subscriber"),
         ("", f"{r.cpu_percent_commanded:.1f} % with 25 commands a second as well"),
         ("memory", f"{r.resident_mb:.0f} MB resident"),
         ("start-up", f"{start} from the start of the process to the first line on the port"),
     ]
+    if r.lines_waiting_max is not None:
+        text = (
+            f"when odometry arrived, the board had sent at most {r.lines_waiting_max} newer lines"
+        )
+        rows.insert(2, ("", text))
     if not r.simulated:
         rows.append(("left out", "lines on the wire: the benchmark cannot see them on a real port"))
     return rows

@@ -116,7 +116,7 @@ class Rig:
     Args:
         config: the configuration in `file`.
         file: the configuration file of the measured program.
-        words: the command line that starts the measured program.
+        command_line: the command line that starts the measured program.
         port: the serial port; "" starts a process that simulates the board on a pty.
         free_running: period at which the simulated board reports by its own clock, s; 0 simulates a
             board that answers each line.
@@ -128,12 +128,12 @@ class Rig:
         config: Config,
         file: Path,
         *,
-        words: Sequence[str] = ACSARD,
+        command_line: Sequence[str] = ACSARD,
         port: str = "",
         free_running: float = 0.0,
         wire_baud_rate: int = 0,
     ) -> None:
-        self._config, self._file, self._words, self._port = config, file, words, port
+        self._config, self._file, self._command_line, self._port = config, file, command_line, port
         self._part = Part(effective(config), free_running, wire_baud_rate)
         self._endpoint = config.bus.listen[0]
         self._codec = Codec(config.mcu.wheels, config.mcu.trailing_comma)
@@ -197,7 +197,7 @@ class Rig:
 
     def _start_program(self, stack: ExitStack, port: str) -> None:
         hidden = ("ACSARD_CONFIG", "ACSARD_TLS", "RUST_LOG", "STATE_DIRECTORY")
-        words = [*self._words, "--config", str(self._file), "--port", port]
+        words = [*self._command_line, "--config", str(self._file), "--port", port]
         env = environment(hidden)
         # The measured daemon must not leave files behind, so it writes its latches to the temporary
         # directory.
@@ -314,7 +314,7 @@ class Rig:
         self._publisher.put(payload, attachment=self._attachment)
         return Sent(at_ns, line)
 
-    def deaf(self) -> None:
+    def unsubscribe(self) -> None:
         """Unsubscribe from the odometry, so that no more samples are recorded."""
         self._kept.undeclare()
 
@@ -325,7 +325,7 @@ class Rig:
                 return Decoder(RobotState).decode(*encoded(reply.ok))
         raise NoAnswerError(f"no answer on {key}")
 
-    def leave(self) -> None:
+    def end_program(self) -> None:
         end(self.process, END_TIMEOUT_S)
 
     def end(self) -> Record:
@@ -334,8 +334,8 @@ class Rig:
         # Wait for messages that have not arrived yet.
         time.sleep(0.1)
         self._alive()
-        self.leave()
-        seen = None if self._far_end is None else _last_words(self._far_end)
+        self.end_program()
+        seen = None if self._far_end is None else _recorded_data(self._far_end)
         decoder = Decoder(Odometry)
         samples = []
         for at, payload in self._arrived:
@@ -348,7 +348,7 @@ class Rig:
         return Record(self._began_ns, window_ns, seen, self._sent, samples)
 
 
-def _last_words(far_end: subprocess.Popen[bytes]) -> Seen:
+def _recorded_data(far_end: subprocess.Popen[bytes]) -> Seen:
     assert far_end.stdin is not None
     assert far_end.stdout is not None
     far_end.stdin.close()

@@ -200,7 +200,7 @@ def report(log: str, calibration: Calibration, drive: DriveConfig, written: str)
         distance_noise_before=distance.before, distance_noise_after=distance.after,
         time_offsets=calibration.delays, gyro_bias=calibration.gyro_bias,
         runs=drives.runs, seconds=drives.seconds, distance=drives.metres, turns=drives.turns,
-        kept=calibration.kept, notes=calibration.notes, written=written or None,
+        kept=calibration.stays_configured, notes=calibration.notes, written=written or None,
     )  # fmt: skip
 
 
@@ -217,7 +217,11 @@ def _noise(calibration: Calibration) -> tuple[BeforeAfter, BeforeAfter]:
 
 
 def _deviations(calibration: Calibration) -> list[float | None]:
-    kept = TRACK in calibration.kept, RATIO in calibration.kept, RATIO in calibration.kept
+    kept = (
+        TRACK in calibration.stays_configured,
+        RATIO in calibration.stays_configured,
+        RATIO in calibration.stays_configured,
+    )
     deviations = calibration.multipliers.std.tolist()
     return [None if stays else std for stays, std in zip(kept, deviations, strict=True)]
 
@@ -288,26 +292,33 @@ def _better(report: Report) -> list[str]:
         f"random {{}} error after {REPORT_DISTANCE_M:g} m of driving, "
         "according to the odometry messages"
     )
-    sentences = [
+    errors = _compared(
+        (report.turn_error_before, report.turn_error_after,
+         "heading error after a turn of 360 deg", "deg", 1),
+        (report.straight_error_before, report.straight_error_after,
+         "heading error after 10 m straight ahead", "deg", 1),
+        (report.heading_error_before, report.heading_error_after,
+         "heading error over whole drives", "deg", 1),
+        (report.position_error_before, report.position_error_after,
+         "position error over whole drives", "cm", 100),
+    )  # fmt: skip
+    random = _compared(
+        (report.heading_noise_before, report.heading_noise_after,
+         noise.format("heading"), "deg", 1),
+        (report.distance_noise_before, report.distance_noise_after,
+         noise.format("distance"), "cm", 100),
+    )  # fmt: skip
+    unused = ["(errors on drives that the fit did not use)"] if errors else []
+    return [*errors, *unused, *random]
+
+
+def _compared(*rows: tuple[float | None, float | None, str, str, int]) -> list[str]:
+    return [
         f"{words}: {_two(before * factor)} {unit} now, {_two(after * factor)} {unit} with the new "
         "values"
-        for before, after, words, unit, factor in (
-            (report.turn_error_before, report.turn_error_after,
-             "heading error after a turn of 360 deg", "deg", 1),
-            (report.straight_error_before, report.straight_error_after,
-             "heading error after 10 m straight ahead", "deg", 1),
-            (report.heading_error_before, report.heading_error_after,
-             "heading error over whole drives", "deg", 1),
-            (report.position_error_before, report.position_error_after,
-             "position error over whole drives", "cm", 100),
-            (report.heading_noise_before, report.heading_noise_after,
-             noise.format("heading"), "deg", 1),
-            (report.distance_noise_before, report.distance_noise_after,
-             noise.format("distance"), "cm", 100),
-        )
+        for before, after, words, unit, factor in rows
         if before is not None and after is not None
-    ]  # fmt: skip
-    return [*sentences, "(errors on drives that the fit did not use)"] if sentences else []
+    ]
 
 
 def _two(value: float) -> str:
@@ -321,13 +332,13 @@ def _remains(report: Report, calibration: Calibration, *, guided: bool) -> list[
     known = (
         ""
         if TRACK in report.kept
-        else f"this log determines it with a standard deviation of {share:.1%}, and the track "
+        else f"This log determines the track to {share:.1%} (standard deviation). "
     )
     sentences = [
-        "remaining error: if wheels skid, the effective track is not constant: "
-        f"{known}{'it ' * (not known)}changes by {report.effective_track_growth * fastest:+.1%} "
-        f"(+- {report.effective_track_growth_std * fastest:.1%}) from slow turns to fast ones. The "
-        "track also differs on other ground, so calibrate where you drive"
+        f"remaining error: skidding changes the effective track. {known}From slow to fast turns, "
+        f"it changes by {report.effective_track_growth * fastest:+.1%} "
+        f"(+- {report.effective_track_growth_std * fastest:.1%}). It also depends on the ground, "
+        "so calibrate where you drive"
     ]
     if not report.scale:
         advice = (

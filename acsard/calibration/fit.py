@@ -23,7 +23,7 @@ from acsard.calibration.runs import Complexes, Mask
 from acsard.core.config.settings import DriveConfig
 
 
-class P(IntEnum):
+class Parameter(IntEnum):
     """Indices of the fitted parameters in an array of `PARAMETER_COUNT` numbers."""
 
     LEFT = 0
@@ -52,7 +52,7 @@ class P(IntEnum):
     """Relative error of the gyro's scale: with 0.01, the gyro shows turns 1 % too large."""
 
 
-PARAMETER_COUNT = len(P)
+PARAMETER_COUNT = len(Parameter)
 
 HUBER_LIMIT = 2.0
 """Size of a residual, in standard deviations, above which its weight is less than 1 (Huber)."""
@@ -83,11 +83,16 @@ class Base(Struct, frozen=True):
         The track growth and all parameters of sensors are 0.
         """
         return np.array(
-            [self.left, self.right, 1 / self.track, *[0.0] * (PARAMETER_COUNT - P.TRACK_GROWTH)]
+            [
+                self.left,
+                self.right,
+                1 / self.track,
+                *[0.0] * (PARAMETER_COUNT - Parameter.TRACK_GROWTH),
+            ]
         )
 
     @property
-    def gain(self) -> float:
+    def radius_per_separation(self) -> float:
         """Wheel radius / wheel separation, without multipliers.
 
         This is the robot's turn, rad, if the right wheels roll 1 rad further than the left wheels.
@@ -114,7 +119,7 @@ class Evidence(Struct, frozen=True):
     """Number of independent residuals per block."""
 
 
-def of_rows(
+def evidence_from_measurements(
     jacobian: Floats, residual: Floats, weight: Floats, block: npt.NDArray[np.int64], blocks: int
 ) -> Evidence:
     """Return the evidence of one sensor from its measurements, summed by block.
@@ -172,11 +177,20 @@ SMALL, SETTLED = 1e-5, 0.02
 
 The fit ends after a step below `SMALL`, or after `MAX_STEPS` steps. It has converged if its last
 step is below `SETTLED`. The size of a step is the largest change of the two radii, the inverse
-track and the track growth, in the units of `P`. A size of 0.01 is a change by 1 % of a radius.
+track and the track growth, in the units of `Parameter`. A size of 0.01 is a change by 1 % of a
+radius.
 """
 
-PRIOR_STD = {P.TRACK_GROWTH: 0.06, P.DELAY: 1.0, P.SENSOR_X: 0.5, P.SENSOR_Y: 0.5}
-"""Prior standard deviations of parameters that some logs do not determine, in the units of `P`."""
+PRIOR_STD = {
+    Parameter.TRACK_GROWTH: 0.06,
+    Parameter.DELAY: 1.0,
+    Parameter.SENSOR_X: 0.5,
+    Parameter.SENSOR_Y: 0.5,
+}
+"""Prior standard deviations of parameters that some logs do not determine.
+
+They are in the units of `Parameter`.
+"""
 
 GYRO_SCALE_STD = 0.005
 """Prior relative standard deviation of the scale of a MEMS gyro.
@@ -221,13 +235,13 @@ class Fit(Struct, frozen=True):
     """Left-hand sides of the normal equations, shape (blocks, PARAMETER_COUNT, PARAMETER_COUNT)."""
     score: Floats
     """Right-hand sides of the normal equations, shape (blocks, PARAMETER_COUNT)."""
-    known: Floats
+    prior_normal: Floats
     """Matrix that the constraints and the prior information add to the left-hand side of the normal
     equations, shape (PARAMETER_COUNT, PARAMETER_COUNT)."""
-    active: tuple[P, ...]
+    active: tuple[Parameter, ...]
     """Indices of the parameters that were fitted."""
     converged: bool
-    usual: Mapping[P, float]
+    prior_std: Mapping[Parameter, float]
     """Prior standard deviation of each parameter that has one."""
 
     def without(self, blocks: Mask) -> Floats:
@@ -237,7 +251,7 @@ class Fit(Struct, frozen=True):
 
         The result is an approximation: one linear step from `parameters`, without another fit.
         """
-        rest = self.normal[~blocks].sum(axis=0) + self.known
+        rest = self.normal[~blocks].sum(axis=0) + self.prior_normal
         found = self.parameters.copy()
         found[list(self.active)] -= _solved(rest, self.score[blocks].sum(axis=0), self.active)
         return found
@@ -254,11 +268,11 @@ class Fit(Struct, frozen=True):
           The shape is (2, 2). The unknowns are the right radius minus the left radius, and the
           inverse track.
         """
-        total = self.normal.sum(axis=0) + self.known
-        rest = [index for index in self.active if index > P.INVERSE_TRACK]
+        total = self.normal.sum(axis=0) + self.prior_normal
+        rest = [index for index in self.active if index > Parameter.INVERSE_TRACK]
         inner, cross = total[np.ix_(rest, rest)], total[:3, rest]
         three = np.asarray(total[:3, :3] - cross @ np.linalg.solve(inner, cross.T))
-        sized = P.DELAY in self.active
+        sized = Parameter.DELAY in self.active
         free = np.eye(3) if sized else np.array([[-0.5, 0.5, 0.0], [0.0, 0.0, 1.0]])
         return np.asarray(free @ three @ free.T)
 
@@ -277,12 +291,14 @@ class Fit(Struct, frozen=True):
             size = np.maximum(size, self._changes(np.array(runs))[1])
         wider = np.sqrt(size / np.maximum(change**2, 1e-150).sum(axis=0))
         chance = change.T @ change * np.outer(wider, wider)
-        usual = np.zeros(PARAMETER_COUNT)
-        usual[list(self.usual)] = np.array(list(self.usual.values())) ** -2
-        total = self.normal.sum(axis=0) + self.known
+        information = np.zeros(PARAMETER_COUNT)
+        information[list(self.prior_std)] = np.array(list(self.prior_std.values())) ** -2
+        total = self.normal.sum(axis=0) + self.prior_normal
         pull = np.zeros((PARAMETER_COUNT, PARAMETER_COUNT))
-        pull[list(self.active)] = _solved(total, np.diag(usual), self.active)
-        return np.asarray(chance + pull @ np.diag(1 / np.where(usual, usual, np.inf)) @ pull.T)
+        pull[list(self.active)] = _solved(total, np.diag(information), self.active)
+        return np.asarray(
+            chance + pull @ np.diag(1 / np.where(information, information, np.inf)) @ pull.T
+        )
 
     def _changes(self, group: npt.NDArray[np.int64]) -> tuple[Floats, Floats]:
         """Leave out each group of blocks in turn, and return the changes of the parameters.
@@ -318,15 +334,17 @@ def fit(
             bias.
         held: constraints on the parameters.
     """
-    active: tuple[P, ...] = tuple(P)[: P.BIAS_ERROR if places else P.DELAY]
+    active: tuple[Parameter, ...] = tuple(Parameter)[
+        : Parameter.BIAS_ERROR if places else Parameter.DELAY
+    ]
     usual = dict(PRIOR_STD)
     if gyro:
-        active, usual[P.SCALE_ERROR] = (*active, P.SCALE_ERROR), GYRO_SCALE_STD
+        active, usual[Parameter.SCALE_ERROR] = (*active, Parameter.SCALE_ERROR), GYRO_SCALE_STD
     if bias_std:
-        active, usual[P.BIAS_ERROR] = (*active, P.BIAS_ERROR), bias_std
+        active, usual[Parameter.BIAS_ERROR] = (*active, Parameter.BIAS_ERROR), bias_std
     if not places:
         both = np.zeros(PARAMETER_COUNT)
-        both[[P.LEFT, P.RIGHT]] = 1.0
+        both[[Parameter.LEFT, Parameter.RIGHT]] = 1.0
         held = (*held, (both, float(both @ start)))
     parameters, size = start.copy(), np.inf
     for at in range(MAX_STEPS):
@@ -337,7 +355,7 @@ def fit(
         # Far from the solution, take only a part of the step, because the linearization holds only
         # nearby. After a third of the steps, halve each step. Otherwise a residual could become an
         # outlier in every second step, and the fit would not converge.
-        size = float(np.max(np.abs(step[: P.DELAY])))
+        size = float(np.max(np.abs(step[: Parameter.DELAY])))
         whole = 1.0 if at < MAX_STEPS // 3 else 0.5
         parameters = parameters + step * min(whole, 0.3 / size if size else 1.0)
         if size < SMALL:
@@ -372,7 +390,7 @@ def _weight(part: Evidence) -> float:
 
 
 def _known(
-    parameters: Floats, held: Sequence[Held], usual: Mapping[P, float]
+    parameters: Floats, held: Sequence[Held], usual: Mapping[Parameter, float]
 ) -> tuple[Floats, Floats]:
     """Return the normal equations of the constraints `held` and the prior deviations `usual`."""
     normal, score = np.zeros((PARAMETER_COUNT, PARAMETER_COUNT)), np.zeros(PARAMETER_COUNT)

@@ -17,7 +17,14 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Struct
 
-from acsard.calibration.fit import PARAMETER_COUNT, Base, Evidence, P, huber, of_rows
+from acsard.calibration.fit import (
+    PARAMETER_COUNT,
+    Base,
+    Evidence,
+    Parameter,
+    evidence_from_measurements,
+    huber,
+)
 from acsard.calibration.log_table import Floats, LogError
 from acsard.calibration.runs import Block, Run, cumulative, gaps, inside, rests
 
@@ -85,7 +92,7 @@ class Headings(Struct, frozen=True):
 
     source: str
     """Column of the log from which the headings come: "yaw_rate" or "yaw"."""
-    of: tuple[Heading, ...]
+    per_run: tuple[Heading, ...]
     """Heading of each run."""
     delay: float
     """Delay of the sensor's recorded times relative to those of the wheels, s.
@@ -129,11 +136,11 @@ class Rows(Struct, frozen=True):
     left: Floats
     """Angle by which the left wheels rolled in each interval, rad."""
     right: Floats
-    fast: Floats
+    signed_square_integral: Floats
     """Integral of |w| w over each interval, rad2/s.
 
     w is the speed of the right wheels minus the speed of the left wheels, rad/s. The effect of
-    `P.TRACK_GROWTH` on the turn is proportional to this integral.
+    `Parameter.TRACK_GROWTH` on the turn is proportional to this integral.
     """
     seconds: Floats
     """Length of each interval, s."""
@@ -180,16 +187,17 @@ def of_gyro(driven: Sequence[Run]) -> Headings | None:
     )  # fmt: skip
 
 
-def of_yaw(driven: Sequence[Run], gain: float) -> Headings | None:
+def of_yaw(driven: Sequence[Run], radius_per_separation: float) -> Headings | None:
     """Return the headings in the column yaw, or None if no run has this column.
 
-    `gain` is wheel radius / wheel separation. Raises `LogError` if the yaw is in degrees.
+    `radius_per_separation` is wheel radius / wheel separation. Raises `LogError` if the yaw is in
+    degrees.
     """
     if not any(len(run.yaw) for run in driven):
         return None
     found = []
     for run in driven:
-        if _in_degrees(run, gain):
+        if _in_degrees(run, radius_per_separation):
             raise LogError(
                 "column yaw is in degrees, but must be in radians: multiply its values by pi / 180"
             )
@@ -198,14 +206,14 @@ def of_yaw(driven: Sequence[Run], gain: float) -> Headings | None:
     return Headings("yaw", tuple(found), offset(found, driven), 0.0, bias_unknown=False)
 
 
-def _in_degrees(run: Run, gain: float) -> bool:
+def _in_degrees(run: Run, radius_per_separation: float) -> bool:
     if len(run.yaw) < 2 or np.ptp(run.yaw) < 3 * np.pi:
         return False
     steps = np.diff(run.yaw)
     if np.any((np.abs(steps) > 300.0) & (np.abs(steps) < 400.0)):
         return True
     left, right = run.angles(run.yaw_t)
-    by_wheels = gain * np.diff(right - left)
+    by_wheels = radius_per_separation * np.diff(right - left)
     small = np.abs(steps) < 100.0
     return float(np.sum(np.abs(steps[small]))) > DEGREES_RATIO * float(
         np.sum(np.abs(by_wheels[small]))
@@ -316,22 +324,22 @@ def rows(headings: Headings | None, driven: Sequence[Run], parts: Sequence[Block
     The intervals are parts of the blocks `parts`. An interval is left out unless the samples of the
     heading sensor cover it without a gap. If `headings` is None, no interval is left out.
     """
-    fast = [_fast(run) for run in driven]
+    squares = [_signed_square_integral(run) for run in driven]
     found: list[tuple[Floats, ...]] = []
     for number, part in enumerate(parts):
         count = max(1, round((part.end - part.begin) / INTERVAL_S))
         edges = np.linspace(part.begin, part.end, count + 1)
         angle, whole = np.zeros(count + 1), np.ones(count, dtype=bool)
         if headings is not None:
-            heading, seen = headings.of[part.run], edges + headings.delay
+            heading, seen = headings.per_run[part.run], edges + headings.delay
             if not len(heading.t):
                 continue
             angle = np.interp(seen, heading.t, heading.angle)
             whole = inside(seen[:-1], seen[1:], heading.gaps)
             whole &= (seen[:-1] >= heading.t[0]) & (seen[1:] <= heading.t[-1])
         left, right = driven[part.run].angles(edges)
-        squares = np.interp(edges, driven[part.run].t, fast[part.run])
-        series = (angle, left, right, squares, edges)
+        square_sums = np.interp(edges, driven[part.run].t, squares[part.run])
+        series = (angle, left, right, square_sums, edges)
         found.append((np.full(count, number)[whole], *(np.diff(sums)[whole] for sums in series)))
     if not found:
         return Rows(np.zeros(0, dtype=np.int64), *[np.zeros(0)] * 5)
@@ -357,21 +365,21 @@ def rates(rows: Rows, by_wheels: Floats) -> Rates:
     return Rates(mean, float(fastest))
 
 
-def level(rows: Rows) -> Rows:
+def without_constant_rate(rows: Rows) -> Rows:
     """Return `rows` without the part of each column that is proportional to the intervals' length.
 
     An unknown constant gyro bias then has no effect on a comparison with the wheels. The column
     `seconds` does not change.
     """
     share = rows.seconds / float(rows.seconds @ rows.seconds)
-    turned, left, right, fast = (
+    turned, left, right, squares = (
         column - rows.seconds * float(share @ column)
-        for column in (rows.turned, rows.left, rows.right, rows.fast)
+        for column in (rows.turned, rows.left, rows.right, rows.signed_square_integral)
     )
-    return Rows(rows.block, turned, left, right, fast, rows.seconds)
+    return Rows(rows.block, turned, left, right, squares, rows.seconds)
 
 
-def _fast(run: Run) -> Floats:
+def _signed_square_integral(run: Run) -> Floats:
     apart = run.speed_difference(run.t)
     steps = np.minimum(np.diff(run.t), INTERVAL_S)
     return _sums(np.abs(apart) * apart, steps)
@@ -387,16 +395,18 @@ fraction `SHARE` of the wheels' turn.
 
 def turned(rows: Rows, base: Base, parameters: Floats) -> Floats:
     """Return the robot's turn in each interval, rad, computed from the wheels with `parameters`."""
-    left, right, inverse, growth = parameters[[P.LEFT, P.RIGHT, P.INVERSE_TRACK, P.TRACK_GROWTH]]
-    constant = base.gain * inverse * (right * rows.right - left * rows.left)
+    left, right, inverse, growth = parameters[
+        [Parameter.LEFT, Parameter.RIGHT, Parameter.INVERSE_TRACK, Parameter.TRACK_GROWTH]
+    ]
+    constant = base.radius_per_separation * inverse * (right * rows.right - left * rows.left)
     return np.asarray(constant + growth * _by_growth(rows, base, parameters))
 
 
 def _by_growth(rows: Rows, base: Base, parameters: Floats) -> Floats:
     """Return the derivative of each interval's turn with respect to TRACK_GROWTH, rad2/s."""
-    left, right, inverse = parameters[[P.LEFT, P.RIGHT, P.INVERSE_TRACK]]
-    gain = base.gain * inverse * (left + right) / 2
-    return np.asarray(-gain * abs(gain) * rows.fast)
+    left, right, inverse = parameters[[Parameter.LEFT, Parameter.RIGHT, Parameter.INVERSE_TRACK]]
+    gain = base.radius_per_separation * inverse * (left + right) / 2
+    return np.asarray(-gain * abs(gain) * rows.signed_square_integral)
 
 
 def evidence(rows: Rows, base: Base, parameters: Floats, blocks: int) -> Evidence:
@@ -405,20 +415,25 @@ def evidence(rows: Rows, base: Base, parameters: Floats, blocks: int) -> Evidenc
     The predictions are linearized at `parameters`. `rows` contains the turns of the sensor and of
     the wheels. `blocks` is the number of blocks (a few seconds of driving each).
     """
-    turn = parameters[P.INVERSE_TRACK]
+    turn = parameters[Parameter.INVERSE_TRACK]
     by_wheels = turned(rows, base, parameters)
     jacobian = np.zeros((len(rows.turned), PARAMETER_COUNT))
-    jacobian[:, P.LEFT] = -base.gain * turn * rows.left
-    jacobian[:, P.RIGHT] = base.gain * turn * rows.right
-    jacobian[:, P.TRACK_GROWTH] = _by_growth(rows, base, parameters)
-    jacobian[:, P.INVERSE_TRACK] = (
-        by_wheels + jacobian[:, P.TRACK_GROWTH] * parameters[P.TRACK_GROWTH]
+    jacobian[:, Parameter.LEFT] = -base.radius_per_separation * turn * rows.left
+    jacobian[:, Parameter.RIGHT] = base.radius_per_separation * turn * rows.right
+    jacobian[:, Parameter.TRACK_GROWTH] = _by_growth(rows, base, parameters)
+    jacobian[:, Parameter.INVERSE_TRACK] = (
+        by_wheels + jacobian[:, Parameter.TRACK_GROWTH] * parameters[Parameter.TRACK_GROWTH]
     ) / turn
-    jacobian[:, P.BIAS_ERROR] = rows.seconds
-    jacobian[:, P.SCALE_ERROR] = by_wheels
-    gyro = by_wheels * (1 + parameters[P.SCALE_ERROR]) + parameters[P.BIAS_ERROR] * rows.seconds
+    jacobian[:, Parameter.BIAS_ERROR] = rows.seconds
+    jacobian[:, Parameter.SCALE_ERROR] = by_wheels
+    gyro = (
+        by_wheels * (1 + parameters[Parameter.SCALE_ERROR])
+        + parameters[Parameter.BIAS_ERROR] * rows.seconds
+    )
     residual = rows.turned - gyro
-    return of_rows(jacobian, residual, _weight(rows, residual, by_wheels), rows.block, blocks)
+    return evidence_from_measurements(
+        jacobian, residual, _weight(rows, residual, by_wheels), rows.block, blocks
+    )
 
 
 def _weight(rows: Rows, residual: Floats, by_wheels: Floats) -> Floats:
@@ -439,28 +454,33 @@ def bias(rows: Rows, by_wheels: Floats) -> float:
     return found
 
 
-def first(rows: Rows, base: Base) -> Floats:
+def side_factors(rows: Rows, base: Base, *, in_place: bool = False) -> Floats:
     """Return the two factors with which the turns of the wheels fit the heading sensor best.
 
     The first factor is that of the left wheels, the second that of the right wheels. A factor is
     wheel radius / effective track, divided by the configured wheel radius / wheel separation
-    (`base.gain`). It is negative if the sign of this side's wheel speeds, or the sign of the
-    sensor, is wrong.
+    (`base.radius_per_separation`). It is negative if the sign of this side's wheel speeds, or the
+    sign of the sensor, is wrong.
+
+    If the robot only turns in place (`in_place`), the log does not show the ratio of the two
+    factors. Both factors are then equal.
     """
-    columns = base.gain * np.column_stack((-rows.left, rows.right))
+    columns = base.radius_per_separation * np.column_stack((-rows.left, rows.right))
+    if in_place:
+        columns = columns.sum(axis=1, keepdims=True)
     weight = np.ones(len(rows.turned))
-    found: Floats = np.zeros(2)
+    found: Floats = np.zeros(columns.shape[1])
     for _ in range(10):
         root = np.sqrt(weight)[:, None]
         found = np.asarray(np.linalg.lstsq(columns * root, rows.turned * root[:, 0], rcond=None)[0])
         by_wheels = columns @ found
         weight = _weight(rows, rows.turned - by_wheels, by_wheels)
-    return found
+    return np.resize(found, 2)
 
 
 def by_sides(rows: Rows, base: Base, sides: Floats) -> Floats:
     """Return the robot's turn in each interval of `rows`, rad, computed from the wheels.
 
-    `sides` contains the factors of the left and the right wheels, as `first()` returns them.
+    `sides` contains the factors of the left and the right wheels, as `side_factors()` returns them.
     """
-    return np.asarray(base.gain * (sides[1] * rows.right - sides[0] * rows.left))
+    return np.asarray(base.radius_per_separation * (sides[1] * rows.right - sides[0] * rows.left))

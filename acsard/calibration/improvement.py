@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Struct
 
-from acsard.calibration.fit import Base, Fit, P, student_factor
+from acsard.calibration.fit import Base, Fit, Parameter, student_factor
 from acsard.calibration.heading import STRAIGHT_RATE, Rates, Rows, turned
 from acsard.calibration.log_table import Floats
 from acsard.calibration.positions import Segment, WheelSteps, path, segments, spread
@@ -53,11 +53,12 @@ NOT_COMPARED = BeforeAfter(None, None)
 SURE_DEVIATIONS = 2.0
 """Smallest ratio of a gain to its standard deviation at which the gain counts as sure (95 %).
 
-A gain is a measure of the improvement that new settings bring, such as `Improvement.gain`.
+A gain is a measure of the improvement that new settings bring, such as
+`Improvement.log_improvement`.
 """
 
 SURE_GAIN = float(np.log(2.0))
-"""Value of `Improvement.gain` if the calibration halves one error.
+"""Value of `Improvement.log_improvement` if the calibration halves one error.
 
 A larger gain counts as sure even if its standard deviation is large. In a guided drive, one leg may
 show nearly all of the error. The standard deviation of the gain is then large although the gain is
@@ -67,9 +68,9 @@ real.
 NEAR, FAR = 2.0, 3.0
 """Limits for the distance between new and configured multipliers, in standard deviations.
 
-Up to `NEAR`, the configured multipliers are kept. Above `FAR`, the `Improvement.gain` that is
-needed to accept the new multipliers becomes smaller: at twice `FAR`, half of it is enough. By
-chance alone, the distance exceeds `FAR` in one log of thirty.
+Up to `NEAR`, the configured multipliers are kept. Above `FAR`, the `Improvement.log_improvement`
+that is needed to accept the new multipliers becomes smaller: at twice `FAR`, half of it is enough.
+By chance alone, the distance exceeds `FAR` in one log of thirty.
 """
 
 MIN_SQUARE = 1e-9
@@ -93,23 +94,26 @@ class Improvement(Struct, frozen=True):
 
     The path of each drive is first shifted and rotated so that it fits the positions best.
     """
-    gain: float = np.inf
+    log_improvement: float = np.inf
     """Size of the improvement, as a sum of logarithms; inf if it was not computed.
 
     Each term is ln(RMS error before / RMS error after) over whole drives. One term is for the
     heading, and one for the position. If the log shows only one of these errors, the sum has only
     this term.
     """
-    chance: float = 0.0
-    """Standard deviation of `gain`, from the differences between drives; inf for a single drive."""
+    gain_std: float = 0.0
+    """Standard deviation of `log_improvement`, from the differences between drives.
+
+    It is inf for a single drive.
+    """
     apart: float = FAR
     """Distance of the new multipliers from the configured multipliers, in standard deviations."""
 
     @property
     def sure(self) -> bool:
         """Whether the new multipliers are better by more than chance explains."""
-        least = SURE_DEVIATIONS * self.chance * min(1.0, FAR / max(NEAR, self.apart))
-        return self.apart > NEAR and self.gain > min(least, SURE_GAIN)
+        least = SURE_DEVIATIONS * self.gain_std * min(1.0, FAR / max(NEAR, self.apart))
+        return self.apart > NEAR and self.log_improvement > min(least, SURE_GAIN)
 
 
 UNMEASURED = Improvement(NOT_COMPARED, NOT_COMPARED, NOT_COMPARED, NOT_COMPARED)
@@ -174,8 +178,8 @@ def with_constant_track(parameters: Floats, rate: Rates) -> Floats:
     This track is the fitted track at the mean turn rate of the log.
     """
     fixed = parameters.copy()
-    fixed[P.INVERSE_TRACK] *= 1.0 - fixed[P.TRACK_GROWTH] * rate.mean
-    fixed[P.TRACK_GROWTH] = 0.0
+    fixed[Parameter.INVERSE_TRACK] *= 1.0 - fixed[Parameter.TRACK_GROWTH] * rate.mean
+    fixed[Parameter.TRACK_GROWTH] = 0.0
     return fixed
 
 
@@ -212,7 +216,7 @@ def improvement(
         metres = 0.0
     squares = [_of_headings(held, before, after, rows)] if measured.any() else []
     squares += [_of_positions(held, configured, base, places, steps)] if steps else []
-    gain, chance = _gain(squares)
+    gain, gain_std = _gain(squares)
     of_heading, of_place = (
         rms(squares[0].sum(axis=0)) if measured.any() else NOT_COMPARED,
         rms(squares[-1].sum(axis=0)) if steps else NOT_COMPARED,
@@ -220,7 +224,7 @@ def improvement(
     return Improvement(
         per_amount(_by_group(before, after, block_and_side, turning, angle), 360.0),
         per_amount(_by_group(before, after, rows.block, straight, metres), np.degrees(10.0)),
-        of_heading, of_place, gain, chance,
+        of_heading, of_place, gain, gain_std,
     )  # fmt: skip
 
 
@@ -251,7 +255,7 @@ def per_amount(sums: Floats, unit: float) -> BeforeAfter:
 
 
 def _gain(kinds: Sequence[Floats]) -> tuple[float, float]:
-    """Return `Improvement.gain` and `Improvement.chance`.
+    """Return `Improvement.log_improvement` and `Improvement.gain_std`.
 
     `kinds` has one array for each kind of error: heading or position. Each array has one row for
     each fold, in the form that `rms()` takes.
@@ -264,10 +268,10 @@ def _gain(kinds: Sequence[Floats]) -> tuple[float, float]:
         sums = [squares[left].sum(axis=0) + MIN_SQUARE for squares in kinds]
         return float(sum(np.log(before / after) for before, after, _ in sums) / 2)
 
-    return with_chance(gain, drives)
+    return with_gain_std(gain, drives)
 
 
-def with_chance(gain: Callable[[Mask], float], drives: Mask) -> tuple[float, float]:
+def with_gain_std(gain: Callable[[Mask], float], drives: Mask) -> tuple[float, float]:
     """Return a pair: the gain from all drives, and the standard deviation of this gain.
 
     `gain` computes a gain from the drives in a mask, and `drives` is the mask of all drives. The
@@ -278,8 +282,8 @@ def with_chance(gain: Callable[[Mask], float], drives: Mask) -> tuple[float, flo
     if count == 1:
         return gain(drives), np.inf
     alone = [gain(drives & (np.arange(len(drives)) != at)) for at in np.flatnonzero(drives)]
-    chance = float(np.sqrt((count - 1) * student_factor(count - 1.0)) * np.std(alone))
-    return gain(drives), chance
+    gain_std = float(np.sqrt((count - 1) * student_factor(count - 1.0)) * np.std(alone))
+    return gain(drives), gain_std
 
 
 def _by_group(

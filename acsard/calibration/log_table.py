@@ -69,9 +69,9 @@ def factor(name: str, unit: str) -> float | None:
 
 Floats = npt.NDArray[np.float64]
 
-WHEELS = ("fr", "fl", "rl", "rr", "left", "right")
+WHEEL_COLUMNS = ("fr", "fl", "rl", "rr", "left", "right")
 
-BOUNDS = dict.fromkeys(WHEELS, 1e3) | {"t": 1e20, "yaw_rate": 1e4, "yaw": 1e7}
+BOUNDS = dict.fromkeys(WHEEL_COLUMNS, 1e3) | {"t": 1e20, "yaw_rate": 1e4, "yaw": 1e7}
 DEFAULT_BOUND = 1e9
 """Largest plausible absolute value in a column that `BOUNDS` does not list, in SI units.
 
@@ -79,7 +79,7 @@ This limit and those in `BOUNDS` also allow values in degrees or nanoseconds, so
 can name the wrong unit.
 """
 
-SPIKE_COLUMNS = frozenset((*WHEELS, "yaw_rate"))
+SPIKE_COLUMNS = frozenset((*WHEEL_COLUMNS, "yaw_rate"))
 """Columns of wheel speeds and turn rates. Spikes are removed only from these columns."""
 
 SPIKE, FEW_VALUES, SLOW = 10.0, 0.02, 0.02
@@ -164,10 +164,11 @@ TRAILING_COMMENT = re.compile(r"(?:^|\s)#")
 It does not match the "#" in "1.#QNAN", which means NaN.
 """
 
-FEW, SHARE = 3, 0.01
+MAX_BAD_ROWS, MAX_BAD_FRACTION = 3, 0.01
 """Limits for the number of unreadable rows in a log.
 
-At most `FEW` rows may be unreadable, or the fraction `SHARE` of the readable rows if that is more.
+At most `MAX_BAD_ROWS` rows may be unreadable, or the fraction `MAX_BAD_FRACTION` of the readable
+rows if that is more.
 """
 
 EXAMPLE = '"t,left,right,yaw_rate" or "t,fr,fl,rl,rr,x,y"'
@@ -183,7 +184,7 @@ class RefusedError(AcsardError):
     """The data is readable, but gives no useful calibration. The text says why and what to do."""
 
 
-def noted(error: Exception, notes: Iterable[str]) -> None:
+def attach_notes(error: Exception, notes: Iterable[str]) -> None:
     """Attach the notes about a log to an error, because they may explain the error."""
     for note in notes:
         error.add_note(note)
@@ -430,7 +431,7 @@ class _Reader:
 
     def table(self, notes: list[str]) -> Table:
         rows = len(self._runs)
-        if self._bad > max(FEW, SHARE * rows) or (self._bad and not rows):
+        if self._bad > max(MAX_BAD_ROWS, MAX_BAD_FRACTION * rows) or (self._bad and not rows):
             raise LogError(
                 f"{self._first}, and {self._bad} of {self._bad + rows} rows have such errors: "
                 "write numbers with a decimal point, or leave a cell empty if it has no value"

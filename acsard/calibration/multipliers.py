@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from msgspec import Struct
 
-from acsard.calibration.fit import Base, P
+from acsard.calibration.fit import Base, Parameter
 from acsard.calibration.heading import Rates
 from acsard.calibration.log_table import Floats, RefusedError
 from acsard.core.config.settings import OdometryConfig
@@ -66,7 +66,7 @@ class Multipliers(Struct, frozen=True):
     @property
     def ratio_std(self) -> float:
         """Relative standard deviation of the ratio of the right to the left wheel radius."""
-        return self.own().ratio
+        return self.relative_deviations().ratio
 
     def apart(self, base: Base) -> float:
         """Return the distance of these multipliers from those of `base`, in standard deviations.
@@ -77,7 +77,7 @@ class Multipliers(Struct, frozen=True):
         off = self.values - (base.track, base.left, base.right)
         return math.sqrt(off @ np.linalg.solve(self.covariance + TOLERANCE**2 * np.eye(3), off))
 
-    def own(self) -> Deviations:
+    def relative_deviations(self) -> Deviations:
         """Return the relative standard deviations of track, ratio of the radii and mean radius.
 
         The settings of `[odometry]` have the same form, because the odometry treats the errors of
@@ -105,17 +105,19 @@ def multipliers(parameters: Floats, covariance: Floats, rate: Rates) -> Multipli
         covariance: the covariance of the parameters.
         rate: the turn rates of the log.
     """
-    inverse, growth = parameters[P.INVERSE_TRACK], parameters[P.TRACK_GROWTH]
+    inverse, growth = parameters[Parameter.INVERSE_TRACK], parameters[Parameter.TRACK_GROWTH]
     slower = 1.0 - growth * rate.mean
-    values = np.array([1 / (inverse * slower), parameters[P.LEFT], parameters[P.RIGHT]])
+    values = np.array(
+        [1 / (inverse * slower), parameters[Parameter.LEFT], parameters[Parameter.RIGHT]]
+    )
     jacobian = np.zeros((3, len(parameters)))
-    jacobian[LEFT_RADIUS, P.LEFT] = jacobian[RIGHT_RADIUS, P.RIGHT] = 1.0
-    jacobian[SEPARATION, P.INVERSE_TRACK] = -values[SEPARATION] / inverse
-    jacobian[SEPARATION, P.TRACK_GROWTH] = values[SEPARATION] * rate.mean / slower
+    jacobian[LEFT_RADIUS, Parameter.LEFT] = jacobian[RIGHT_RADIUS, Parameter.RIGHT] = 1.0
+    jacobian[SEPARATION, Parameter.INVERSE_TRACK] = -values[SEPARATION] / inverse
+    jacobian[SEPARATION, Parameter.TRACK_GROWTH] = values[SEPARATION] * rate.mean / slower
     return Multipliers(values, jacobian @ covariance @ jacobian.T)
 
 
-TAPE_STD_M = 0.01
+RUN_LENGTH_STD_M = 0.01
 """Standard deviation of a distance that a person measures by tape, m.
 
 It includes the error of choosing the point on the robot to measure.
@@ -214,7 +216,7 @@ def scaled(
     covariance = logs @ found.covariance @ logs
     if not known:
         covariance = covariance + UNKNOWN_SIZE_STD**2
-    noise = (TAPE_STD_M / tape.metres) ** 2
+    noise = (RUN_LENGTH_STD_M / tape.metres) ** 2
     variance = float(jacobian @ covariance @ jacobian + noise)
     longer_by = math.log(tape.metres / extent.distance)
     if known and abs(longer_by) > max(CONTRADICTS, CONTRADICTS_STD * math.sqrt(variance)):

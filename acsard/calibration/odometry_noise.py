@@ -20,9 +20,9 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Struct
 
-from acsard.calibration.fit import Base, P, student_factor
+from acsard.calibration.fit import Base, Parameter, student_factor
 from acsard.calibration.heading import Heading, Headings
-from acsard.calibration.improvement import SURE_DEVIATIONS, Fold, positions_of, with_chance
+from acsard.calibration.improvement import SURE_DEVIATIONS, Fold, positions_of, with_gain_std
 from acsard.calibration.log_table import Floats
 from acsard.calibration.multipliers import Deviations
 from acsard.calibration.plausibility import RATIO, TRACK
@@ -136,10 +136,10 @@ In the same way, `RATIO` gives the minimum for `YAW`, and `TRACK` gives the mini
 """
 
 CERTAIN_GAIN = math.log(2.0) - 3 / 8
-"""Value of `Noise.gain` above which the new noise always counts as better.
+"""Value of `Noise.log_likelihood_gain` above which the new noise always counts as better.
 
 The value is the mean loss of log likelihood per residual if each standard deviation is stated at
-twice its true value. Above this value, a large `Noise.chance` does not matter.
+twice its true value. Above this value, a large `Noise.gain_std` does not matter.
 """
 
 MAX_SETTING = 1.0
@@ -263,13 +263,13 @@ class Noise(Struct, frozen=True):
     """The noise that the log shows, a number for each `Source`."""
     present: Floats
     """The configured noise of the robot, a number for each `Source`."""
-    gain: float
+    log_likelihood_gain: float
     """Log likelihood per residual with the found noise, minus that with the configured noise.
 
     The two likelihoods are computed on drives that the fit did not use.
     """
-    chance: float
-    """Standard deviation of `gain`, from the differences between drives."""
+    gain_std: float
+    """Standard deviation of `log_likelihood_gain`, from the differences between drives."""
     places: bool
     """Whether the log has positions. Only positions show the noise of the distance."""
     turning: float
@@ -280,7 +280,7 @@ class Noise(Struct, frozen=True):
     @property
     def better(self) -> bool:
         """Whether the found noise describes other drives clearly better than the configured one."""
-        return self.gain > min(SURE_DEVIATIONS * self.chance, CERTAIN_GAIN)
+        return self.log_likelihood_gain > min(SURE_DEVIATIONS * self.gain_std, CERTAIN_GAIN)
 
     def heading(self) -> tuple[float, float]:
         """Return the standard deviations of the heading after `REPORT_DISTANCE_M` m of driving,
@@ -356,7 +356,10 @@ class Reference(Struct, frozen=True):
     steps: Sequence[WheelSteps]
     base: Base
     parameters: Floats
-    """The fitted parameters. Those with an index of at least `P.DELAY` describe the sensors."""
+    """The fitted parameters.
+
+    Those with an index of at least `Parameter.DELAY` describe the sensors.
+    """
 
 
 def noise(
@@ -397,11 +400,11 @@ def noise(
     if not seen.places:
         found[[Source.DISTANCE, Source.SLIP]] = present[[Source.DISTANCE, Source.SLIP]]
     sums = np.array(gains)
-    gain, chance = with_chance(
+    gain, gain_std = with_gain_std(
         lambda left: float(np.divide(*sums[left].sum(axis=0))), np.ones(len(sums), dtype=bool)
     )
     turning = sum(one.turned for one in motions) / max(0.1, sum(one.metres for one in motions))
-    return Noise(found, present, gain, chance, seen.places, turning, motions[0].track)
+    return Noise(found, present, gain, gain_std, seen.places, turning, motions[0].track)
 
 
 class _Motion(Struct, frozen=True):
@@ -506,11 +509,11 @@ def _windows(
 
 def _of_drive(fold: Fold, seen: Reference) -> Iterator[_Window]:
     drive, parameters = fold.drive, fold.parameters.copy()
-    parameters[P.DELAY :] = seen.parameters[P.DELAY :]
+    parameters[Parameter.DELAY :] = seen.parameters[Parameter.DELAY :]
     run, way = seen.runs[drive.run], path(seen.steps[drive.run], seen.base, parameters)
-    track = seen.base.separation / abs(float(parameters[P.INVERSE_TRACK]))
+    track = seen.base.separation / abs(float(parameters[Parameter.INVERSE_TRACK]))
     if seen.headings is not None:
-        heading, late = seen.headings.of[drive.run], seen.headings.delay
+        heading, late = seen.headings.per_run[drive.run], seen.headings.delay
         ends = heading.t[[0, -1]] - late if len(heading.t) else np.zeros(2)
         for t in _times(max(drive.begin, ends[0]), min(drive.end, ends[1])):
             at = t + late
@@ -544,8 +547,8 @@ def _by_headings(
     `t` are times on the wheels' clock, and `at` the same moments on the sensor's clock.
     """
     motion, since = _Motion.of(t, way, track), t - t[0]
-    turned = np.interp(at, heading.t, heading.angle) - parameters[P.BIAS_ERROR] * since
-    residual = turned / (1 + parameters[P.SCALE_ERROR]) - np.interp(t, way.t, way.heading)
+    turned = np.interp(at, heading.t, heading.angle) - parameters[Parameter.BIAS_ERROR] * since
+    residual = turned / (1 + parameters[Parameter.SCALE_ERROR]) - np.interp(t, way.t, way.heading)
     yaw = (motion.middle < t[:, None]).astype(np.float64)
     sensor = {Source.HEADING: np.eye(len(t))}
     if headings.source == "yaw_rate":
@@ -563,7 +566,7 @@ def _by_places(
 
     Each position belongs to the nearest of the times `t`. A residual is the median of (position
     minus aligned path) over the positions of one time. `place` contains the positions (x + iy, m),
-    and `at` their times, s.
+    and `at` their times, s. `t` and `at` are times on the clock of the positions.
     """
     group = np.searchsorted((t[1:] + t[:-1]) / 2, at)
     numbers = range(len(t))
@@ -577,8 +580,10 @@ def _by_places(
         [complex(np.median(o.real), np.median(o.imag)) for o in (off[group == n] for n in numbers)]
     )
     spots = np.array([along[group == number].mean() for number in numbers])
-    times = np.array([at[group == number].mean() for number in numbers]) - parameters[P.DELAY]
-    motion = _Motion.of(t, way, track)
+    times = (
+        np.array([at[group == number].mean() for number in numbers]) - parameters[Parameter.DELAY]
+    )
+    motion = _Motion.of(t - parameters[Parameter.DELAY], way, track)
     before = motion.middle < times[:, None]
     ahead = np.exp(1j * np.interp(motion.middle, way.t, way.heading))
     lever = spots[:, None] - np.interp(motion.middle, way.t, way.place)

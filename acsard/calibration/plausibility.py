@@ -7,12 +7,12 @@ reported as remarks.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
 from acsard.calibration import heading
-from acsard.calibration.fit import MIN_BLOCKS, Base, Fit, P, condition
+from acsard.calibration.fit import MIN_BLOCKS, Base, Fit, Parameter, condition
 from acsard.calibration.heading import Rows
 from acsard.calibration.log_table import Floats, RefusedError
 from acsard.calibration.multipliers import Multipliers
@@ -35,7 +35,7 @@ MAX_CORRELATION = 0.98
 If it is larger, the robot drives the same curve all the time, and the log is refused.
 """
 
-MAX_STDS = 0.2, 0.03
+MAX_LOG_STDS = 0.2, 0.03
 """Largest accepted relative standard deviations of the track and of the ratio of the radii."""
 
 MAX_CONDITION = 1e4
@@ -115,30 +115,40 @@ def drives_enough(parts: Sequence[Block]) -> None:
         )
 
 
+def turns_in_place(rows: Rows) -> bool:
+    """Return whether the log has only turns in place, apart from less than `MIN_ROLL` of rolling.
+
+    Such a log does not show the ratio of the right to the left wheel radius.
+    """
+    return float(np.abs(rows.right + rows.left).sum()) / 2 < MIN_ROLL
+
+
 def rolls_enough(rows: Rows, *, spins: bool = False) -> None:
     """Raise `RefusedError` if the log lacks a movement of the wheels that the fit needs.
 
     Two angles are computed in each interval of `rows`: the mean of the left and the right angle,
     and half of their difference. Each angle must add up to `MIN_ROLL`. The two angles must not
     be proportional to each other (`MAX_CORRELATION`). If `spins` is true, the mean may add up to
-    less than `MIN_ROLL`, as in a log with only turns in place.
+    less than `MIN_ROLL`, as in a log with only turns in place. The two angles may then also be
+    proportional.
     """
     together, against = (rows.right + rows.left) / 2, (rows.right - rows.left) / 2
+    in_place = spins and turns_in_place(rows)
     for rolled, what in ((together, "ahead or back"), (against, "in opposite directions")):
-        if (turns := float(np.abs(rolled).sum()) / (2 * np.pi)) < MIN_ROLL / (2 * np.pi):
-            if spins and what == "ahead or back":
-                continue
+        angle = float(np.abs(rolled).sum())
+        if angle < MIN_ROLL and not (in_place and rolled is together):
             raise RefusedError(
-                f"in the whole log, the wheels of the two sides roll only {turns:.1f} revolutions "
-                f"{what}, which is too little to measure the wheel radii and the effective track: "
-                f"{DRIVE_ADVICE}"
+                "in the whole log, the wheels of the two sides roll only "
+                f"{angle / (2 * np.pi):.1f} revolutions {what}, which is too little to measure the "
+                f"wheel radii and the effective track: {DRIVE_ADVICE}"
             )
-        cross = float(together @ against) ** 2
-        if cross > MAX_CORRELATION * float(together @ together) * float(against @ against):
-            raise RefusedError(
-                "the robot always drives the same curve, so the log cannot separate errors of the "
-                f"wheel radii from errors of the track width: {DRIVE_ADVICE}"
-            )
+    cross = float(together @ against) ** 2
+    same_curve = cross > MAX_CORRELATION * float(together @ together) * float(against @ against)
+    if same_curve and not in_place:
+        raise RefusedError(
+            "the robot always drives the same curve, so the log cannot separate errors of the "
+            f"wheel radii from errors of the track width: {DRIVE_ADVICE}"
+        )
 
 
 def turns_enough(turned: Floats) -> None:
@@ -153,12 +163,12 @@ def turns_enough(turned: Floats) -> None:
         )
 
 
-TRACK, RATIO = "the effective track", "the ratio of the left to the right wheel radius"
+TRACK, RATIO = "the effective track", "the ratio of the right to the left wheel radius"
 """Names of the two quantities that some logs do not determine accurately enough."""
 
 
-def unsure(
-    found: Multipliers, track_std: float, worst: tuple[float, float] = MAX_STDS
+def too_inaccurate(
+    found: Multipliers, track_std: float, worst: tuple[float, float] = MAX_LOG_STDS
 ) -> dict[str, float]:
     """Return the quantities that a log determines too inaccurately.
 
@@ -179,6 +189,25 @@ def unsure(
     }
 
 
+def inaccuracy(deviations: Mapping[str, float], worst: tuple[float, float]) -> str:
+    """Return the text of the error for a log that determines `TRACK` or `RATIO` too inaccurately.
+
+    Args:
+        deviations: the relative standard deviations of the quantities that are too inaccurate, by
+            name. A deviation is inf or NaN if the log does not determine the quantity at all.
+        worst: largest accepted relative standard deviations of `TRACK` and of `RATIO`.
+    """
+    accepted = dict(zip((TRACK, RATIO), worst, strict=True))
+    found = [
+        f"the standard deviation of {name} is {deviation:.1%}, but at most "
+        f"{100 * accepted[name]:g}% is accepted"
+        if np.isfinite(deviation)
+        else f"{name} cannot be determined"
+        for name, deviation in deviations.items()
+    ]
+    return f"this log is too inaccurate: {', and '.join(found)}: {DRIVE_ADVICE}"
+
+
 def separates_track(fitted: Fit) -> bool:
     """Return whether the log distinguishes errors of the wheel radii from errors of the track."""
     return condition(fitted.marginal()) <= MAX_CONDITION
@@ -188,7 +217,7 @@ def heading_follows(source: str, rows: Rows, base: Base, sides: Floats) -> None:
     """Raise `RefusedError` if the heading sensor's turns differ much from those of the wheels.
 
     `source` is the name of the sensor. `sides` contains the two factors with which the wheels fit
-    the sensor best, as `heading.first()` returns them.
+    the sensor best, as `heading.side_factors()` returns them.
     """
     spread = float(rows.turned @ rows.turned)
     off = rows.turned - heading.by_sides(rows, base, sides)
@@ -201,12 +230,12 @@ def heading_follows(source: str, rows: Rows, base: Base, sides: Floats) -> None:
         )
 
 
-def positions_follow(begun: StartingPoint) -> None:
+def positions_follow(starting_point: StartingPoint) -> None:
     """Raise `RefusedError` if the positions do not follow the path of the wheels.
 
-    `begun` is the result of `positions.search()`.
+    `starting_point` is the result of `positions.search()`.
     """
-    if begun.unexplained > MAX_CONTRADICTION:
+    if starting_point.unexplained > MAX_CONTRADICTION:
         raise RefusedError(
             "the positions do not match the motion of the wheels: check that x is ahead and y to "
             "the left in m (not latitude and longitude), that wheels and positions come from the "
@@ -214,20 +243,24 @@ def positions_follow(begun: StartingPoint) -> None:
         )
 
 
-def turns_the_right_way(source: str, sides: Floats | None, begun: StartingPoint | None) -> None:
+def turns_the_right_way(
+    source: str, sides: Floats | None, starting_point: StartingPoint | None
+) -> None:
     """Raise `RefusedError` if wheels and sensors show turns in opposite directions.
 
     The text of the error names the sign that is wrong.
 
     Args:
         source: the name of the heading sensor; "" without a heading sensor.
-        sides: the result of `heading.first()`, or None without a heading sensor.
-        begun: the result of `positions.search()`, or None without positions.
+        sides: the result of `heading.side_factors()`, or None without a heading sensor.
+        starting_point: the result of `positions.search()`, or None without positions.
     """
     by_places = by_heading = ""
-    if begun is not None:
-        turn = begun.parameters[P.INVERSE_TRACK]
-        by_places = by_heading = _wrong_sign(begun.parameters[[P.LEFT, P.RIGHT]] * turn)
+    if starting_point is not None:
+        turn = starting_point.parameters[Parameter.INVERSE_TRACK]
+        by_places = by_heading = _wrong_sign(
+            starting_point.parameters[[Parameter.LEFT, Parameter.RIGHT]] * turn
+        )
     if sides is not None:
         by_heading = _wrong_sign(sides)
     for side in ("left", "right"):
@@ -236,7 +269,7 @@ def turns_the_right_way(source: str, sides: Floats | None, begun: StartingPoint 
                 f"the {side} wheels turn backwards when the robot goes ahead: their speeds have "
                 "the wrong sign; rad/s must be positive ahead on both sides"
             )
-    if sides is not None and begun is not None and by_heading != by_places:
+    if sides is not None and starting_point is not None and by_heading != by_places:
         other = "x and y are swapped, or y is positive to the right"
         sign = f"{source} has the wrong sign (it must be positive to the left)"
         raise RefusedError(
@@ -250,7 +283,7 @@ def turns_the_right_way(source: str, sides: Floats | None, begun: StartingPoint 
         # If two sensors agree, the wheels are wrong. If there is only one sensor, it may be wrong.
         or_sensor = (
             ""
-            if begun is not None and sides is not None
+            if starting_point is not None and sides is not None
             else ", or x and y are swapped, or y is positive to the right"
             if sides is None
             else ", or the sensor is positive to the right (it must be positive to the left)"
@@ -300,16 +333,17 @@ def turn_rates(source: str, rows: Rows) -> None:
         )
 
 
-def turn_units(source: str, turn: float, bare: float, base: Base) -> None:
+def turn_units(source: str, turn: float, turn_without_multipliers: float, base: Base) -> None:
     """Raise `RefusedError` if the turns of sensor and wheels differ so much that a unit is wrong.
 
     Args:
         source: the name of the heading sensor, or "" if positions show the turns.
         turn: the ratio of the measured turn to the turn that the configured multipliers predict.
-        bare: the ratio of the measured turn to the turn that multipliers of 1 predict.
+        turn_without_multipliers: the ratio of the measured turn to the turn that multipliers of 1
+            predict.
         base: the configured geometry.
     """
-    if MIN_TURN_RATIO < turn < WRONG_UNIT_RATIO and bare < 1 / MIN_TRACK_RATIO:
+    if MIN_TURN_RATIO < turn < WRONG_UNIT_RATIO and turn_without_multipliers < 1 / MIN_TRACK_RATIO:
         return
     degrees = f"{source} is in degrees (multiply by pi / 180), or " * bool(source)
     may = (

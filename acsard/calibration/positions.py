@@ -17,7 +17,7 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
-from acsard.calibration.fit import PARAMETER_COUNT, Base, Evidence, P, fit, huber
+from acsard.calibration.fit import PARAMETER_COUNT, Base, Evidence, Parameter, fit, huber
 from acsard.calibration.log_table import Floats
 from acsard.calibration.runs import Block, Complexes, Run, cumulative
 
@@ -66,7 +66,7 @@ class WheelSteps(Struct, frozen=True):
     """Angle that the left wheels roll in each step, rad."""
     right: Floats
     """Angle that the right wheels roll in each step, rad."""
-    fast: Floats
+    signed_square_integral: Floats
     """Integral of |w| w over each step, rad2/s.
 
     w is the speed of the right wheels minus the speed of the left wheels, rad/s.
@@ -85,38 +85,38 @@ class Path(Struct, frozen=True):
     """Place x + iy of the robot at the times `t`, m."""
     heading: Floats
     """Heading of the robot at the times `t`, rad."""
-    derivatives: dict[P, Complexes]
+    derivatives: dict[Parameter, Complexes]
     """Derivatives of `place` with respect to the radii, the inverse track and the track growth."""
-    heading_derivatives: dict[P, Floats]
+    heading_derivatives: dict[Parameter, Floats]
     """Derivatives of `heading` with respect to the radii, the inverse track and the track growth.
     """
 
     def at(self, t: Floats, parameters: Floats) -> tuple[Complexes, Complexes]:
         """Return the places of the position sensor at the times `t`, m, and their derivatives.
 
-        `t` contains recorded times of positions, s. The delay `P.DELAY` is subtracted from them.
-        The derivatives are with respect to the parameters, and have the shape (times,
+        `t` contains recorded times of positions, s. The delay `Parameter.DELAY` is subtracted from
+        them. The derivatives are with respect to the parameters, and have the shape (times,
         PARAMETER_COUNT).
         """
-        t = t - parameters[P.DELAY]
+        t = t - parameters[Parameter.DELAY]
         derivatives = np.zeros((len(t), PARAMETER_COUNT), dtype=np.complex128)
         here, ahead = self._sensor(t, parameters)
-        lever = 1j * complex(parameters[P.SENSOR_X], parameters[P.SENSOR_Y]) * ahead
+        lever = 1j * complex(parameters[Parameter.SENSOR_X], parameters[Parameter.SENSOR_Y]) * ahead
         for index, values in self.derivatives.items():
             turned = np.interp(t, self.t, self.heading_derivatives[index])
             derivatives[:, index] = np.interp(t, self.t, values) + lever * turned
-        derivatives[:, P.SENSOR_X], derivatives[:, P.SENSOR_Y] = ahead, 1j * ahead
+        derivatives[:, Parameter.SENSOR_X], derivatives[:, Parameter.SENSOR_Y] = ahead, 1j * ahead
         before, after = (
             self._sensor(t + s, parameters)[0]
             for s in (-SPEED_HALF_INTERVAL_S, SPEED_HALF_INTERVAL_S)
         )
-        derivatives[:, P.DELAY] = (before - after) / (2 * SPEED_HALF_INTERVAL_S)
+        derivatives[:, Parameter.DELAY] = (before - after) / (2 * SPEED_HALF_INTERVAL_S)
         return here, derivatives
 
     def _sensor(self, t: Floats, parameters: Floats) -> tuple[Complexes, Complexes]:
         """Return the places of the sensor, x + iy, m, and the headings as unit complex numbers."""
         ahead = np.exp(1j * np.interp(t, self.t, self.heading))
-        lever = complex(parameters[P.SENSOR_X], parameters[P.SENSOR_Y])
+        lever = complex(parameters[Parameter.SENSOR_X], parameters[Parameter.SENSOR_Y])
         return np.interp(t, self.t, self.place) + lever * ahead, ahead
 
 
@@ -172,18 +172,27 @@ def path(steps: WheelSteps, base: Base, parameters: Floats) -> Path:
 
     Each step is an exact arc.
     """
-    left, right, turn, rate = parameters[[P.LEFT, P.RIGHT, P.INVERSE_TRACK, P.TRACK_GROWTH]]
-    gain = base.gain * turn
+    left, right, turn, rate = parameters[
+        [Parameter.LEFT, Parameter.RIGHT, Parameter.INVERSE_TRACK, Parameter.TRACK_GROWTH]
+    ]
+    gain = base.radius_per_separation * turn
     mean = gain * (left + right) / 2
     turn_derivatives = {
-        P.LEFT: -gain * steps.left,
-        P.RIGHT: gain * steps.right,
-        P.INVERSE_TRACK: base.gain * (right * steps.right - left * steps.left),
-        P.TRACK_GROWTH: -mean * abs(mean) * steps.fast,
+        Parameter.LEFT: -gain * steps.left,
+        Parameter.RIGHT: gain * steps.right,
+        Parameter.INVERSE_TRACK: base.radius_per_separation
+        * (right * steps.right - left * steps.left),
+        Parameter.TRACK_GROWTH: -mean * abs(mean) * steps.signed_square_integral,
     }
-    turns = turn * turn_derivatives[P.INVERSE_TRACK] + rate * turn_derivatives[P.TRACK_GROWTH]
-    rolls = {P.LEFT: base.radius * steps.left / 2, P.RIGHT: base.radius * steps.right / 2}
-    distance = left * rolls[P.LEFT] + right * rolls[P.RIGHT]
+    turns = (
+        turn * turn_derivatives[Parameter.INVERSE_TRACK]
+        + rate * turn_derivatives[Parameter.TRACK_GROWTH]
+    )
+    rolls = {
+        Parameter.LEFT: base.radius * steps.left / 2,
+        Parameter.RIGHT: base.radius * steps.right / 2,
+    }
+    distance = left * rolls[Parameter.LEFT] + right * rolls[Parameter.RIGHT]
     heading, ahead = _directions(turns)
     derivatives, heading_derivatives = {}, {}
     for index, of_step in turn_derivatives.items():
@@ -198,8 +207,10 @@ def place(steps: WheelSteps, base: Base, parameters: Floats) -> Complexes:
 
     The parameter TRACK_GROWTH must be 0.
     """
-    left, right = parameters[P.LEFT] * steps.left, parameters[P.RIGHT] * steps.right
-    _, ahead = _directions(base.gain * parameters[P.INVERSE_TRACK] * (right - left))
+    left, right = parameters[Parameter.LEFT] * steps.left, parameters[Parameter.RIGHT] * steps.right
+    _, ahead = _directions(
+        base.radius_per_separation * parameters[Parameter.INVERSE_TRACK] * (right - left)
+    )
     return _sums(ahead * base.radius * (left + right) / 2)
 
 
@@ -295,7 +306,7 @@ def spread(segments: Sequence[Segment], paths: Paths, parameters: Floats) -> flo
     return float(np.sqrt(squares / max(1, count)))
 
 
-TRACK_RATIOS = np.unique(
+INVERSE_TRACK_RATIOS = np.unique(
     np.concatenate((np.geomspace(0.03, 10.0, 60), np.geomspace(0.28, 1.4, 40)))
 )
 """Ratios of configured to true track that `search` tries.
@@ -381,7 +392,7 @@ def search(
         segments: the measured positions.
         driven: the runs of the log.
         base: the configured geometry.
-        sides: the result of `heading.first()`, or None without a heading sensor.
+        sides: the result of `heading.side_factors()`, or None without a heading sensor.
     """
     kept = _furthest(segments, MOST_SEGMENTS)
     needed = sorted({segment.run for segment in kept})
@@ -389,7 +400,7 @@ def search(
     points: list[StartingPoint] = []
     for left, way in itertools.product((1.0, -1.0), (1.0, -1.0)):
         points += _local_minima(
-            [_tried(kept, steps, base, (left, way * turn, 0.0)) for turn in TRACK_RATIOS]
+            [_tried(kept, steps, base, (left, way * turn, 0.0)) for turn in INVERSE_TRACK_RATIOS]
         )
     if sides is not None:
         left, way = np.sign(sides[0] * sides[1]), np.sign(sides[1]) * np.abs(sides).mean()
@@ -424,8 +435,14 @@ def _local_minima(tried: Sequence[StartingPoint]) -> list[StartingPoint]:
 
 
 def _penalty(point: StartingPoint, sides: Floats | None) -> float:
-    """Return 1, or more if the robot of `point` is unusual. `sides` is from `heading.first()`."""
-    signed = point.parameters[[P.LEFT, P.RIGHT]] * point.parameters[P.INVERSE_TRACK]
+    """Return 1, or more if the robot of `point` is unusual.
+
+    `sides` is the result of `heading.side_factors()`, or None.
+    """
+    signed = (
+        point.parameters[[Parameter.LEFT, Parameter.RIGHT]]
+        * point.parameters[Parameter.INVERSE_TRACK]
+    )
     turn, (least, most) = float(np.abs(signed).mean()), USUAL_TURN_RANGE
     like = np.ones(2)
     if sides is not None:
@@ -438,15 +455,18 @@ def _penalty(point: StartingPoint, sides: Floats | None) -> float:
 
 
 def _turn(parameters: Floats) -> float:
-    """Return the robot's turn if only the right wheels roll, by 1 rad, divided by `Base.gain`."""
-    return float(parameters[P.INVERSE_TRACK] * parameters[P.RIGHT])
+    """Return the robot's turn if only the right wheels roll, by 1 rad.
+
+    The turn is divided by `Base.radius_per_separation`.
+    """
+    return float(parameters[Parameter.INVERSE_TRACK] * parameters[Parameter.RIGHT])
 
 
 def _timed(
     point: StartingPoint, kept: Sequence[Segment], steps: dict[int, WheelSteps], base: Base
 ) -> StartingPoint:
     parameters = point.parameters
-    shape = float(np.sign(parameters[P.LEFT])), _turn(parameters)
+    shape = float(np.sign(parameters[Parameter.LEFT])), _turn(parameters)
     tried = [_tried(kept, steps, base, (*shape, late)) for late in DELAYS_S]
     return min([point, *tried], key=lambda point: point.unexplained)
 
@@ -464,7 +484,12 @@ def _tried(
     to its wheels.
     """
     parameters = base.start()
-    parameters[[P.LEFT, P.RIGHT, P.INVERSE_TRACK, P.DELAY]] = shape[0], 1.0, shape[1], shape[2]
+    parameters[[Parameter.LEFT, Parameter.RIGHT, Parameter.INVERSE_TRACK, Parameter.DELAY]] = (
+        shape[0],
+        1.0,
+        shape[1],
+        shape[2],
+    )
     paths = {run: place(of_run, base, parameters) for run, of_run in steps.items()}
     cross = squares = size = 0.0
     for segment in kept:
@@ -477,8 +502,8 @@ def _tried(
     if not size or not squares:
         return StartingPoint(parameters, np.inf)
     scale = cross / size
-    parameters[[P.LEFT, P.RIGHT]] *= scale
-    parameters[P.INVERSE_TRACK] /= scale
+    parameters[[Parameter.LEFT, Parameter.RIGHT]] *= scale
+    parameters[Parameter.INVERSE_TRACK] /= scale
     return StartingPoint(parameters, 1.0 - cross**2 / (size * squares))
 
 

@@ -15,14 +15,14 @@ from mcap.reader import NonSeekingReader
 from msgspec.structs import replace
 
 from acsard.calibration import ros_bag_log
-from acsard.calibration.log_table import CSV_ADVICE, LogError, Table, noted, read
+from acsard.calibration.log_table import CSV_ADVICE, LogError, Table, attach_notes, read
 from acsard.calibration.multipliers import Tape
 from acsard.calibration.ros_bag_log import GUIDE_PAGE, Choice, RosMessage
 from acsard.calibration.runs import runs
 from acsard.calibration.solve import Calibration, calibrate
 from acsard.core.config.settings import Config
 from acsard.host.errors import MendableError, RecordingError
-from acsard.recording.export import measured
+from acsard.recording.export import calibration_csv
 from acsard.recording.file import Recording
 from acsard.recording.mcap_records import DAMAGE_ERRORS, MAGIC
 
@@ -35,10 +35,10 @@ MAX_RECORD_BYTES = 1 << 28
 MAX_LOG_TIME_NS = (1 << 63) - 1
 """Largest time of a message that the table can contain, ns."""
 
-BAG_DAMAGE = (*DAMAGE_ERRORS, RuntimeError, KeyError)
+BAG_DAMAGE = (*DAMAGE_ERRORS, RuntimeError)
 """Exceptions of the MCAP reader, of LZ4 and of `_messages` that mean that a bag is damaged.
 
-A `KeyError` means that a schema is missing, or that a message has a time above `MAX_LOG_TIME_NS`.
+`_messages` raises a `ValueError` if a message has a time above `MAX_LOG_TIME_NS`.
 """
 
 OTHER_BAGS = {
@@ -75,7 +75,7 @@ def calibrated(log: Path, config: Config, tape: Tape | None, choice: Choice) -> 
     try:
         driven = runs(table)
     except LogError as error:
-        noted(error, table.notes)
+        attach_notes(error, table.notes)
         raise
     return calibrate(driven, config.drive, tape, config.odometry, config.feedback)
 
@@ -135,7 +135,7 @@ def _bag(files: list[Path], config: Config, choice: Choice) -> Table:
     try:
         table = ros_bag_log.table(messages, config.joints.as_tuple(), choice)
     except LogError as error:
-        noted(error, notes)
+        attach_notes(error, notes)
         raise
     return replace(table, notes=(*notes, *table.notes))
 
@@ -147,7 +147,7 @@ def _messages(file: Path, notes: list[str]) -> Iterator[RosMessage]:
                 type_ = "" if schema is None else schema.name
                 encoding = channel.message_encoding
                 if one.log_time > MAX_LOG_TIME_NS:
-                    raise KeyError(f"the time of a message is {one.log_time} ns")
+                    raise ValueError(f"the time of a message is {one.log_time} ns")
                 yield RosMessage(channel.topic, type_, encoding, one.log_time, one.data)
         except EndOfFile:
             notes.append(f"{file.name} is cut off: only the messages before the cut are used")
@@ -159,12 +159,12 @@ def _messages(file: Path, notes: list[str]) -> Iterator[RosMessage]:
 
 
 def _measured(log: Path) -> bytes:
-    """Return the CSV table that `measured` makes of a black-box recording."""
+    """Return the CSV table that `calibration_csv` makes of a black-box recording."""
     try:
         recording = Recording(log)
     except RecordingError as error:
         raise LogError(f"{error}; {CSV_ADVICE}") from None
     try:
-        return measured(recording)
+        return calibration_csv(recording)
     except RecordingError as error:
         raise LogError(str(error)) from None

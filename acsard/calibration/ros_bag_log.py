@@ -97,14 +97,14 @@ class _Topic:
     def __init__(self, name: str, type_: str) -> None:
         self.name, self.type = name, type_
         self.kind = TYPES[type_]
-        self.came, self.made, self.values = array("q"), array("q"), array("d")
+        self.arrivals, self.stamps, self.values = array("q"), array("q"), array("d")
         self.wheels: tuple[str, ...] = ()
         """Columns of the log that the joints of a `JointState` fill; () for other types."""
         self.joints: set[str] = set()
         self.unreadable, self.why = 0, ""
 
     def __len__(self) -> int:
-        return len(self.came)
+        return len(self.arrivals)
 
     def __str__(self) -> str:
         return f"{printable(self.name)} ({self.kind.__name__})"
@@ -120,8 +120,8 @@ class _Topic:
             return
         values = self._values(decoded, joints)
         if values:
-            self.came.append(message.wall_ns)
-            self.made.append(decoded.header.stamp.to_ns())
+            self.arrivals.append(message.wall_ns)
+            self.stamps.append(decoded.header.stamp.to_ns())
             self.values.extend(values)
 
     def _refuse(self, why: str) -> None:
@@ -167,7 +167,7 @@ class _Topic:
 
     @property
     def stamped(self) -> bool:
-        return all(self.made)
+        return all(self.stamps)
 
 
 def _yaw(turn: Quaternion) -> float:
@@ -380,11 +380,11 @@ class _Log:
 
     def _times(self, used: Sequence[_Topic]) -> list[Floats]:
         """Return the sample times of each topic, s, all on the same clock."""
-        since_ns = min(topic.came[0] for topic in used)
-        came = [topic.seconds(topic.came, since_ns) for topic in used]
-        made = [topic.seconds(topic.made, since_ns) for topic in used]
-        for topic, stamps in zip(used, made, strict=True):
-            back = float(np.diff(stamps).min(initial=0.0))
+        since_ns = min(topic.arrivals[0] for topic in used)
+        arrivals = [topic.seconds(topic.arrivals, since_ns) for topic in used]
+        stamps = [topic.seconds(topic.stamps, since_ns) for topic in used]
+        for topic, times in zip(used, stamps, strict=True):
+            back = float(np.diff(times).min(initial=0.0))
             if topic.stamped and back < -MIN_BACKWARD_STEP_S:
                 raise LogError(
                     f"the stamps of {topic} go back by {-back:.0f} s in the middle of the bag, "
@@ -393,17 +393,17 @@ class _Log:
                 )
         start = since_ns / NS_PER_S
         if all(topic.stamped for topic in used):
-            delays = [float(np.median(c - m)) for c, m in zip(came, made, strict=True)]
+            delays = [float(np.median(c - m)) for c, m in zip(arrivals, stamps, strict=True)]
             apart = max(delays) - min(delays)
             if apart <= MAX_DELAY_DIFFERENCE_S:
-                return [stamps + start for stamps in made]
+                return [times + start for times in stamps]
             self._notes.append(
                 f"the stamps of the topics come from different clocks, {apart:.3g} s apart: the "
                 "tool moves the stamps of each topic to the clock of the recording"
             )
         return [
             (on_arrival_clock(c, m) if topic.stamped else c) + start
-            for topic, c, m in zip(used, came, made, strict=True)
+            for topic, c, m in zip(used, arrivals, stamps, strict=True)
         ]
 
     # Columns

@@ -55,24 +55,24 @@ The times were rounded if the median interval between different times exceeds `R
 on average more than `REPEATED` rows have the same time.
 """
 
-ROLLING, AGAIN = 0.2, 0.4
+ROLLING, MAX_REPEATED_FRACTION = 0.2, 0.4
 """Limits that show that the logger repeated old positions or yaws. Such rows are removed.
 
 The wheels roll if the absolute speeds of the left and the right side add up to more than `ROLLING`
-rad/s. The logger repeats values if, while the wheels roll, more than the fraction `AGAIN` of the
-rows have the same value as the row before.
+rad/s. The logger repeats values if, while the wheels roll, more than the fraction
+`MAX_REPEATED_FRACTION` of the rows have the same value as the row before.
 """
 
-WHEELS = "left right"
+WHEEL_STREAM = "left right"
 COMMANDS = " ".join(APPLIED)
-STREAMS = (WHEELS, "yaw_rate", "yaw", "x y", COMMANDS)
+SENSOR_NAMES = (WHEEL_STREAM, "yaw_rate", "yaw", "x y", COMMANDS)
 """Names of the sensors of a log. The commands count as a sensor.
 
 A name consists of the columns of the sensor, separated by spaces.
 """
 
 Streams = dict[str, tuple[Floats, ...]]
-"""The times and the values of each sensor, by the name of the sensor in `STREAMS`."""
+"""The times and the values of each sensor, by the name of the sensor in `SENSOR_NAMES`."""
 
 MAX_RUNS = 1000
 """Maximum number of different values in the column `run`. A log with more values is refused."""
@@ -80,11 +80,11 @@ MAX_RUNS = 1000
 SUMMED_ROWS = 50
 """Number of rows over which wheel speeds are summed before two wheels are compared."""
 
-NOTED, APART = 0.15, 0.8
+REPORTED_DIFFERENCE, MAX_DIFFERENCE = 0.15, 0.8
 """Limits for the difference between the front and the rear wheel of a side.
 
-The limits are fractions of the distance rolled. The report mentions a difference above `NOTED`. A
-log with a difference above `APART` is refused.
+The limits are fractions of the distance rolled. The report mentions a difference above
+`REPORTED_DIFFERENCE`. A log with a difference above `MAX_DIFFERENCE` is refused.
 """
 
 GAP_S, GAP_PERIODS = 0.3, 5.0
@@ -298,7 +298,7 @@ def _sides(columns: dict[str, Floats], notes: Notes) -> tuple[Floats, Floats]:
         return columns["left"], columns["right"]
     for front, rear in (("fl", "rl"), ("fr", "rr")):
         apart = _apart(columns, front, rear)
-        if apart > NOTED:
+        if apart > REPORTED_DIFFERENCE:
             notes.add(
                 f"{front} and {rear} differ by {apart:.0%} of the distance driven: the tool uses "
                 "their mean"
@@ -315,14 +315,14 @@ def _apart(columns: dict[str, Floats], front: str, rear: str) -> float:
         return 0.0
     a, b = (np.add.reduceat(columns[name][seen], starts) for name in (front, rear))
     apart, rolled = np.abs(a - b).sum(), np.maximum(np.abs(a), np.abs(b)).sum()
-    if apart <= APART * rolled:
+    if apart <= MAX_DIFFERENCE * rolled:
         return float(apart / rolled) if rolled else 0.0
     least, most = (front, rear) if np.abs(a).sum() < np.abs(b).sum() else (rear, front)
     sizes = sorted(float(np.abs(speeds).sum()) for speeds in (a, b))
     raise LogError(
         f"{least} hardly turns while {most} does: rename the columns of the working wheels to "
         "left and right, and omit the others"
-        if sizes[0] < (1 - APART) * sizes[1]
+        if sizes[0] < (1 - MAX_DIFFERENCE) * sizes[1]
         else f"{front} and {rear} turn in opposite directions: a sign is wrong, or columns are "
         "swapped"
     )
@@ -383,8 +383,8 @@ def _pauses(t: Floats, rows: Rows, columns: dict[str, Floats]) -> list[Rows]:
 
 
 def _streams(columns: dict[str, Floats], rows: Rows, notes: Notes) -> Streams | None:
-    streams = {name: _stream(columns, rows, name.split(), notes) for name in STREAMS}
-    if len(streams[WHEELS][0]) >= MIN_ROWS:
+    streams = {name: _stream(columns, rows, name.split(), notes) for name in SENSOR_NAMES}
+    if len(streams[WHEEL_STREAM][0]) >= MIN_ROWS:
         return streams
     notes.add(
         f"runs left out because they have fewer than {MIN_ROWS} rows of wheel speeds: {{}}",
@@ -394,7 +394,7 @@ def _streams(columns: dict[str, Floats], rows: Rows, notes: Notes) -> Streams | 
 
 
 def _run(name: str, streams: Streams) -> Run:
-    wheels, gyro, yaw, place, commands = (streams[stream] for stream in STREAMS)
+    wheels, gyro, yaw, place, commands = (streams[stream] for stream in SENSOR_NAMES)
     start = float(wheels[0][0])
     x, y = place[1:] if len(place[0]) else (np.zeros(0), np.zeros(0))
     points = (x - x[:1]) + 1j * (y - y[:1])
@@ -409,7 +409,7 @@ def _remove_repeats(drives: Iterable[tuple[str, Streams]], notes: Notes) -> None
     for what in ("yaw", "x y"):
         found = [(streams, *_repeats(streams, what)) for _, streams in drives]
         rolling = sum(int((again & rolls).sum()) for _, again, rolls in found)
-        if rolling <= AGAIN * sum(int(rolls.sum()) for *_, rolls in found):
+        if rolling <= MAX_REPEATED_FRACTION * sum(int(rolls.sum()) for *_, rolls in found):
             continue
         notes.add(
             f"the columns {what} repeat their last value between samples: such rows are left out "
@@ -428,7 +428,7 @@ def _repeats(streams: Streams, what: str) -> tuple[Mask, Mask]:
     if not len(t):
         return np.zeros(0, dtype=bool), np.zeros(0, dtype=bool)
     again = np.concatenate([[False], np.all(np.diff(values) == 0.0, axis=0)])
-    wheels = streams[WHEELS]
+    wheels = streams[WHEEL_STREAM]
     return again, np.interp(t, wheels[0], np.abs(wheels[1]) + np.abs(wheels[2])) > ROLLING
 
 
@@ -544,17 +544,17 @@ def _turned(run: Run, begin: float, end: float, left: Floats, right: Floats) -> 
     return bool(speed * (end - begin) / max(1, b - a) >= MIN_BLOCK_ROLL)
 
 
-def on_arrival_clock(came: Floats, made: Floats) -> Floats:
+def on_arrival_clock(arrivals: Floats, stamps: Floats) -> Floats:
     """Return the times at which a sender made its samples, s, on the receiver's clock.
 
     The times are the stamps plus the smallest delay from stamp to arrival. If this delay varies by
     more than `MAX_JITTER_S`, the times are the times of arrival.
 
     Args:
-        came: the times of arrival on the receiver's clock, s.
-        made: the stamps of the sender's clock, s.
+        arrivals: the times of arrival on the receiver's clock, s.
+        stamps: the stamps of the sender's clock, s.
     """
-    delay = came - made
+    delay = arrivals - stamps
     if float(np.ptp(delay)) > MAX_JITTER_S:
-        return came
-    return np.asarray(made + float(delay.min()))
+        return arrivals
+    return np.asarray(stamps + float(delay.min()))

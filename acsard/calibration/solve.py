@@ -12,7 +12,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from acsard.calibration import heading, plausibility, positions
-from acsard.calibration.fit import PARAMETER_COUNT, Base, Fit, Held, P, Source, fit
+from acsard.calibration.fit import PARAMETER_COUNT, Base, Fit, Held, Parameter, Source, fit
 from acsard.calibration.heading import Headings, Rates, Rows, rates
 from acsard.calibration.improvement import (
     UNMEASURED,
@@ -23,7 +23,7 @@ from acsard.calibration.improvement import (
     no_better,
     positions_of,
 )
-from acsard.calibration.log_table import Floats, RefusedError, noted
+from acsard.calibration.log_table import Floats, RefusedError, attach_notes
 from acsard.calibration.multipliers import (
     LEFT_RADIUS,
     RIGHT_RADIUS,
@@ -38,7 +38,7 @@ from acsard.calibration.multipliers import (
     scaled,
 )  # fmt: skip
 from acsard.calibration.odometry_noise import Noise, Reference, noise, settings
-from acsard.calibration.plausibility import DRIVE_ADVICE, RATIO, TRACK
+from acsard.calibration.plausibility import DRIVE_ADVICE, MAX_LOG_STDS, RATIO, TRACK
 from acsard.calibration.positions import Segment, WheelSteps, search
 from acsard.calibration.runs import Block, Log, Run, blocks
 from acsard.calibration.wheel_response import response
@@ -147,7 +147,7 @@ class Calibration(Struct, frozen=True):
     These settings state the uncertainty of the wheel radii and of the track. The noise settings
     are included only if `Noise.better` is true.
     """
-    kept: tuple[str, ...] = ()
+    stays_configured: tuple[str, ...] = ()
     """Names of the quantities that stay as configured.
 
     The possible names are `plausibility.TRACK` and `plausibility.RATIO`.
@@ -186,7 +186,7 @@ def calibrate(
         found = _calibrated(log, drive, tape, odometry or OdometryConfig())
         return replace(found, feedback={} if follows is None else follows.settings())
     except AcsardError as error:
-        noted(error, log.notes)
+        attach_notes(error, log.notes)
         raise
 
 
@@ -227,7 +227,7 @@ def prepared(
     count, start = len(parts), base.start()
     every = rows = heading.rows(headings, driven, parts)
     if headings is not None and headings.bias_unknown and len(every.turned):
-        rows = heading.level(every)
+        rows = heading.without_constant_rate(every)
     if headings is not None and not len(rows.turned):
         raise RefusedError(
             f"{headings.source} has no samples while the wheels turn: record it at the same time "
@@ -241,7 +241,7 @@ def prepared(
     if headings is not None:
         plausibility.turns_like_the_wheels(headings.source, rows, base)
         plausibility.turns_enough(rows.turned)
-        sides = heading.first(rows, base)
+        sides = heading.side_factors(rows, base, in_place=plausibility.turns_in_place(rows))
         plausibility.heading_follows(headings.source, rows, base, sides)
         sources.append(lambda p: heading.evidence(rows, base, p, count))
     if segments:
@@ -260,9 +260,9 @@ def prepared(
         )
     plausibility.turns_the_right_way(headings.source if headings else "", sides, by_positions)
     if sides is not None:
-        mean, size = float(sides.mean()), float(start[[P.LEFT, P.RIGHT]].mean())
-        start[[P.LEFT, P.RIGHT]] = size * sides / mean
-        start[P.INVERSE_TRACK] = mean / size
+        mean, size = float(sides.mean()), float(start[[Parameter.LEFT, Parameter.RIGHT]].mean())
+        start[[Parameter.LEFT, Parameter.RIGHT]] = size * sides / mean
+        start[Parameter.INVERSE_TRACK] = mean / size
     if headings is not None:
         plausibility.turn_rates(headings.source, rows)
     _check_units(headings, start, base, by_positions is not None)
@@ -270,12 +270,16 @@ def prepared(
 
 
 def _check_units(headings: Headings | None, start: Floats, base: Base, sized: bool) -> None:
-    size, configured = float(start[[P.LEFT, P.RIGHT]].mean()), base.start()
+    size, configured = float(start[[Parameter.LEFT, Parameter.RIGHT]].mean()), base.start()
     if sized:
         plausibility.distance_units(size, base)
-    bare = size * float(start[P.INVERSE_TRACK])
-    turn = bare / float(configured[[P.LEFT, P.RIGHT]].mean() * configured[P.INVERSE_TRACK])
-    plausibility.turn_units(headings.source if headings else "", turn, bare, base)
+    turn_without_multipliers = size * float(start[Parameter.INVERSE_TRACK])
+    turn = turn_without_multipliers / float(
+        configured[[Parameter.LEFT, Parameter.RIGHT]].mean() * configured[Parameter.INVERSE_TRACK]
+    )
+    plausibility.turn_units(
+        headings.source if headings else "", turn, turn_without_multipliers, base
+    )
 
 
 class Candidate(Struct, frozen=True):
@@ -292,7 +296,7 @@ class Candidate(Struct, frozen=True):
     """Gyro bias, rad/s; 0 without a gyro."""
     result: Multipliers
     improvement: Improvement
-    kept: dict[str, float]
+    stays_configured: dict[str, float]
     """Quantities that stay as configured, with the uncertainty that they have in this log.
 
     The names of the quantities, `plausibility.TRACK` and `RATIO`, are mapped to the relative
@@ -305,7 +309,7 @@ def _calibrated(
     log: Log, drive: DriveConfig, tape: Tape | None, odometry: OdometryConfig
 ) -> Calibration:
     base = Base.of(drive)
-    headings = heading.of_gyro(log.runs) or heading.of_yaw(log.runs, base.gain)
+    headings = heading.of_gyro(log.runs) or heading.of_yaw(log.runs, base.radius_per_separation)
     candidates: list[Candidate] = []
     refusals: list[RefusedError] = []
     places = any(len(run.place) for run in log.runs)
@@ -319,11 +323,11 @@ def _calibrated(
             refusals.append(error)  # coarse positions may still follow the wheels in longer blocks
     if not candidates:
         raise refusals[0]
-    best = max(candidates, key=lambda candidate: candidate.improvement.gain)
+    best = max(candidates, key=lambda candidate: candidate.improvement.log_improvement)
     worse = "" if best.improvement.sure else no_better(best.improvement)
     if worse:
         best = replace(
-            best, result=configured(base), kept={TRACK: np.inf, RATIO: np.inf},
+            best, result=configured(base), stays_configured={TRACK: np.inf, RATIO: np.inf},
             improvement=UNMEASURED,
         )  # fmt: skip
     known = _known(best, odometry)
@@ -335,12 +339,12 @@ def _calibrated(
 
 
 def _known(best: Candidate, odometry: OdometryConfig) -> Deviations:
-    base, own = best.made.base, best.result.own()
+    base, new = best.made.base, best.result.relative_deviations()
     now = Deviations.of(odometry, base)
     return Deviations(
-        now.track if TRACK in best.kept else own.track,
-        now.ratio if RATIO in best.kept else own.ratio,
-        own.scale if best.made.segments and len(best.kept) < 2 else now.scale,
+        now.track if TRACK in best.stays_configured else new.track,
+        now.ratio if RATIO in best.stays_configured else new.ratio,
+        new.scale if best.made.segments and len(best.stays_configured) < 2 else now.scale,
     )
 
 
@@ -355,11 +359,11 @@ def _noise(
     held = folds(fitted, made.parts, drives(made.runs), best.rate)
     if present:
         start = fitted.parameters.copy()
-        start[: P.DELAY] = made.base.start()[: P.DELAY]
+        start[: Parameter.DELAY] = made.base.start()[: Parameter.DELAY]
         held = [replace(fold, parameters=start) for fold in held]
     parameters = fitted.parameters.copy()
     if made.headings is not None:
-        parameters[P.BIAS_ERROR] = best.gyro_bias - made.headings.bias
+        parameters[Parameter.BIAS_ERROR] = best.gyro_bias - made.headings.bias
     steps = made.steps or [positions.wheel_steps(run) for run in made.runs]
     seen = Reference(made.runs, made.headings, bool(made.segments), steps, made.base, parameters)
     return noise(held, seen, known, odometry)
@@ -373,11 +377,12 @@ def _candidates(made: Prepared) -> list[Candidate]:
     """
     found: list[Candidate] = []
     deviations: dict[str, float] = {}
+    refused: dict[str, float] = {}
     headings = made.headings
     gyro = headings is not None and headings.source == "yaw_rate"
     bias_std = headings.bias_std if headings is not None else 0.0
     for kept, held in _held(made.base).items():
-        if found and not found[0].kept:
+        if found and not found[0].stays_configured:
             break
         fitted = fit(
             made.sources, made.start, places=bool(made.segments), gyro=gyro, bias_std=bias_std,
@@ -385,21 +390,24 @@ def _candidates(made: Prepared) -> list[Candidate]:
         )  # fmt: skip
         if fitted.converged:
             candidate = _candidate(made, fitted)
-            track = float(np.sqrt(candidate.covariance[P.INVERSE_TRACK, P.INVERSE_TRACK]))
-            track /= abs(float(fitted.parameters[P.INVERSE_TRACK]))
-            too_wide = plausibility.unsure(candidate.result, track)
+            track = float(
+                np.sqrt(candidate.covariance[Parameter.INVERSE_TRACK, Parameter.INVERSE_TRACK])
+            )
+            track /= abs(float(fitted.parameters[Parameter.INVERSE_TRACK]))
+            too_wide = plausibility.too_inaccurate(candidate.result, track, MAX_LOG_STDS)
             if not kept:
                 deviations = {TRACK: track, RATIO: candidate.result.ratio_std}
                 if not plausibility.separates_track(fitted):
                     too_wide[RATIO] = deviations[RATIO] = np.inf
             if not too_wide:
-                unsure_by = {kept: deviations.get(kept, np.inf)} if kept else {}
-                found.append(replace(candidate, kept=unsure_by))
+                deviation_by_name = {kept: deviations.get(kept, np.inf)} if kept else {}
+                found.append(replace(candidate, stays_configured=deviation_by_name))
+            # The fit of both quantities comes first, so its deviations are reported.
+            refused = too_wide | refused
     if not found:
-        shares = " and ".join(f"{name} only to {share:.1%}" for name, share in deviations.items())
         raise RefusedError(
-            f"this log determines {shares}. That is too inaccurate: {DRIVE_ADVICE}"
-            if shares
+            plausibility.inaccuracy(refused, MAX_LOG_STDS)
+            if refused
             else f"the search for the parameters does not converge: {DRIVE_ADVICE}"
         )
     return found
@@ -407,16 +415,16 @@ def _candidates(made: Prepared) -> list[Candidate]:
 
 def _held(base: Base) -> dict[str, list[Held]]:
     ratio, track, growth = np.zeros((3, PARAMETER_COUNT))
-    ratio[[P.LEFT, P.RIGHT]] = base.right, -base.left
-    track[P.INVERSE_TRACK] = growth[P.TRACK_GROWTH] = 1.0
+    ratio[[Parameter.LEFT, Parameter.RIGHT]] = base.right, -base.left
+    track[Parameter.INVERSE_TRACK] = growth[Parameter.TRACK_GROWTH] = 1.0
     return {"": [], RATIO: [(ratio, 0.0)], TRACK: [(track, 1 / base.track), (growth, 0.0)]}
 
 
 def _candidate(made: Prepared, fitted: Fit) -> Candidate:
     headings, base = made.headings, made.base
     rows, by_wheels = made.rows, heading.turned(made.rows, base, fitted.parameters)
-    gyro_scale = 1 + float(fitted.parameters[P.SCALE_ERROR])
-    bias_error = float(fitted.parameters[P.BIAS_ERROR])
+    gyro_scale = 1 + float(fitted.parameters[Parameter.SCALE_ERROR])
+    bias_error = float(fitted.parameters[Parameter.BIAS_ERROR])
     if headings is None:
         plausibility.turns_enough(by_wheels)
     elif headings.bias_unknown:
@@ -425,7 +433,7 @@ def _candidate(made: Prepared, fitted: Fit) -> Candidate:
     rows = replace(rows, turned=(rows.turned - bias_error * rows.seconds) / gyro_scale)
     rate = rates(rows, by_wheels)
     present = fitted.parameters.copy()
-    present[: P.DELAY] = base.start()[: P.DELAY]
+    present[: Parameter.DELAY] = base.start()[: Parameter.DELAY]
     held = folds(fitted, made.parts, drives(made.runs), rate)
     places = [positions_of(fold.drive, made.runs) if made.segments else [] for fold in held]
     better = improvement(held, present, base, rows, places, made.steps)
@@ -443,9 +451,10 @@ def _calibration(
     by_wheels, result = heading.turned(rows, base, fitted.parameters), best.result
     delays = {headings.source: headings.delay} if headings is not None else {}
     if made.segments:
-        delays["positions"] = float(fitted.parameters[P.DELAY])
-    # Without an improvement, `kept` has both quantities, and no sensor has measured the scale.
-    measured = bool(made.segments) and len(best.kept) < 2
+        delays["positions"] = float(fitted.parameters[Parameter.DELAY])
+    # Without an improvement, `stays_configured` has both quantities, and no sensor has measured the
+    # scale.
+    measured = bool(made.segments) and len(best.stays_configured) < 2
     scale, notes = ["positions"] if measured else [], list(log.notes)
     if tape is not None:
         follow = _follow(made, fitted, rate)
@@ -456,9 +465,9 @@ def _calibration(
     plausibility.in_range(result.values)
     known = _known(best, odometry)
     if tape is not None:
-        known = replace(known, scale=result.own().scale)
+        known = replace(known, scale=result.relative_deviations().scale)
     totals = Drives.of(log.runs, rows, by_wheels, base, result, rate)
-    notes += [_stays(name, deviation) for name, deviation in best.kept.items()]
+    notes += [_stays(name, deviation) for name, deviation in best.stays_configured.items()]
     notes += _of_noise(shown)
     notes += _cuts(log.runs)
     notes += _too_good(made, fitted, log)
@@ -468,19 +477,19 @@ def _calibration(
     return Calibration(
         reference=" and ".join(delays), drives=totals, configured=configured(base),
         multipliers=result, scale=" and ".join(scale),
-        growth=float(fitted.parameters[P.TRACK_GROWTH]),
-        growth_std=float(np.sqrt(best.covariance[P.TRACK_GROWTH, P.TRACK_GROWTH])),
+        growth=float(fitted.parameters[Parameter.TRACK_GROWTH]),
+        growth_std=float(np.sqrt(best.covariance[Parameter.TRACK_GROWTH, Parameter.TRACK_GROWTH])),
         improvement=best.improvement, delays=delays, gyro_bias=best.gyro_bias, notes=tuple(notes),
         odometry=settings(
-            known, float(result.values[SEPARATION]), best.kept, odometry,
+            known, float(result.values[SEPARATION]), best.stays_configured, odometry,
             shown if shown is not None and shown.better else None, scaled=bool(scale),
         ),
-        kept=tuple(best.kept), noise=shown,
+        stays_configured=tuple(best.stays_configured), noise=shown,
     )  # fmt: skip
 
 
 def _stays(name: str, deviation: float) -> str:
-    known = f" (this log determines it to {deviation:.1%})" if deviation < 1.0 else ""
+    known = f" (standard deviation in this log: {deviation:.1%})" if deviation < 1.0 else ""
     return f"{name} stays as configured, because this log does not improve it{known}"
 
 
@@ -514,15 +523,15 @@ def _too_good(made: Prepared, fitted: Fit, log: Log) -> Iterator[str]:
         off = rows.turned - heading.turned(rows, base, fitted.parameters)
         off -= np.median(off / rows.seconds) * rows.seconds
         if float(off @ off) < MIN_DIFFERENCE**2 * float(rows.turned @ rows.turned):
-            yield _own(headings.source)
+            yield _copied_from_wheels(headings.source)
     if made.segments and not log.true_positions:
         along = [positions.path(steps, base, fitted.parameters) for steps in made.steps]
         reach = max(positions.extent(segment.place) for segment in made.segments)
         if positions.spread(made.segments, along, fitted.parameters) < MIN_DIFFERENCE * reach:
-            yield _own("the positions")
+            yield _copied_from_wheels("the positions")
 
 
-def _own(what: str) -> str:
+def _copied_from_wheels(what: str) -> str:
     return (
         f"{what}: these values agree better with the wheels than a sensor can. If they were "
         "computed from the same wheels, like the odometry of a motor driver, the result describes "
@@ -533,9 +542,9 @@ def _own(what: str) -> str:
 def _follow(made: Prepared, fitted: Fit, rate: Rates) -> Follow:
     def follow(values: Floats, number: int) -> Extent:
         parameters = fitted.parameters.copy()
-        parameters[[P.LEFT, P.RIGHT]] = values[[LEFT_RADIUS, RIGHT_RADIUS]]
-        parameters[P.INVERSE_TRACK] = 1 / (
-            values[SEPARATION] * (1 - parameters[P.TRACK_GROWTH] * rate.mean)
+        parameters[[Parameter.LEFT, Parameter.RIGHT]] = values[[LEFT_RADIUS, RIGHT_RADIUS]]
+        parameters[Parameter.INVERSE_TRACK] = 1 / (
+            values[SEPARATION] * (1 - parameters[Parameter.TRACK_GROWTH] * rate.mean)
         )
         steps = positions.wheel_steps(made.runs[number])
         place = positions.path(steps, made.base, parameters).place

@@ -62,10 +62,10 @@ class WheelResponse(Struct, frozen=True):
     proposed: float | None
     """Response time to configure, s; None if the tool proposes no change.
 
-    There is a proposal only if `false_fault` is true. The proposal is the smallest time in
-    `RESPONSE_TIMES_S`, not below `seconds`, with which no wheel looks faulty for longer than
-    `MAX_FAULTY_FRACTION` permits, rounded to two digits. If no time meets this condition, the value
-    is None.
+    There is a proposal only if `false_fault` is true. The candidates are the times in
+    `RESPONSE_TIMES_S`, rounded to two digits. The proposal is the smallest candidate, not below
+    `seconds`, with which no wheel looks faulty for longer than `MAX_FAULTY_FRACTION` permits. If no
+    candidate meets this condition, the value is None.
     """
     present: float
     """Configured response time, s."""
@@ -150,12 +150,14 @@ def response(
     limit, proposed = feedback.fault_time, None
     false_fault = limit > 0.0 and _evidence(parts, feedback.response_time, limit) > limit
     if false_fault:
+        rounded = (float(f"{t:.2g}") for t in RESPONSE_TIMES_S[best:])
         good = (
             t
-            for t in RESPONSE_TIMES_S[best:].tolist()
-            if _evidence(parts, t, limit) <= MAX_FAULTY_FRACTION * limit
+            for t in rounded
+            if t >= RESPONSE_TIMES_S[best]
+            and _evidence(parts, t, limit) <= MAX_FAULTY_FRACTION * limit
         )
-        proposed = next((float(f"{t:.2g}") for t in good), None)
+        proposed = next(good, None)
     return WheelResponse(
         float(RESPONSE_TIMES_S[best]), proposed, feedback.response_time, false_fault, fastest
     )
@@ -170,9 +172,9 @@ def _commanded(run: Run, drive: DriveConfig) -> tuple[Floats, Floats, Floats]:
     ahead = kinematics.wheel_speeds(Twist(1.0, 0.0))
     turning = kinematics.wheel_speeds(Twist(0.0, 1.0))
     at = np.searchsorted(run.commands_t, run.t, side="right") - 1
-    told = (at >= 0) & (run.t - run.commands_t[at] < GAP_S)
+    has_command = (at >= 0) & (run.t - run.commands_t[at] < GAP_S)
     steps = np.diff(run.t, prepend=np.nan)
-    steps[~told | (steps > GAP_S)] = np.nan
+    steps[~has_command | (steps > GAP_S)] = np.nan
     wanted = run.linear[at, None] * (ahead.front_left, ahead.front_right) + run.angular[
         at, None
     ] * (turning.front_left, turning.front_right)
@@ -202,9 +204,11 @@ def _evidence(
     longest, most = 0.0, fault_time / MIN_EVIDENCE_LINES
     for steps, wanted, seen in parts:
         sides = [(Expected(), Witness()) for _ in range(2)]
-        for step, told, speeds in zip(steps.tolist(), wanted.tolist(), seen.tolist(), strict=True):
-            still = max(map(abs, told)) < MIN_COMMANDED_SPEED
-            for (expected, witness), command, speed in zip(sides, told, speeds, strict=True):
+        for step, commands, speeds in zip(
+            steps.tolist(), wanted.tolist(), seen.tolist(), strict=True
+        ):
+            still = max(map(abs, commands)) < MIN_COMMANDED_SPEED
+            for (expected, witness), command, speed in zip(sides, commands, speeds, strict=True):
                 if math.isnan(step):
                     expected.forget()
                     witness.forget()
@@ -222,8 +226,10 @@ def _fastest(parts: Sequence[tuple[Floats, Floats, Floats]]) -> float:
     """
     found: list[float] = []
     for steps, wanted, seen in parts:
-        for told, speed in zip(wanted.T, np.abs(seen.T), strict=True):
-            short = (speed > MIN_FAULT_SPEED) & (speed < REACHED * np.abs(told)) & ~np.isnan(steps)
+        for command, speed in zip(wanted.T, np.abs(seen.T), strict=True):
+            short = (
+                (speed > MIN_FAULT_SPEED) & (speed < REACHED * np.abs(command)) & ~np.isnan(steps)
+            )
             edges = np.flatnonzero(np.diff(short.astype(np.int8), prepend=0, append=0))
             for begin, end in edges.reshape(-1, 2):
                 at = np.cumsum(steps[begin:end])

@@ -105,7 +105,8 @@ class Board:
     """The board that is checked, with its replies and the results of the steps.
 
     It is a context manager, which opens the serial line (`wire`) at the beginning and closes it at
-    the end. Before it closes the line, it sends zero speeds, unless a motor runs away (`fled`).
+    the end. Before it closes the line, it sends zero speeds, unless a motor runs away
+    (`runaway_seen`).
     """
 
     def __init__(
@@ -117,7 +118,7 @@ class Board:
         self.armed = False
         """Whether the check has seen all motors stand still. From then on, the check ends if a
         motor runs away or if the board falls silent."""
-        self.between: Callable[[], object] = _nothing
+        self.abort_check: Callable[[], object] = _nothing
         """Callback that can end the check by an exception. `send` calls it before each line that
         turns a motor. `listen` calls it at its beginning and after each wait, which lasts `BEAT_NS`
         at most. It is not called while the check sends its last zeros."""
@@ -141,7 +142,7 @@ class Board:
         """Fraction of lines that are lost or damaged, to the board and from the board together."""
         # Received lines
         self.replies: list[Reply] = []
-        self.others: list[bytes] = []
+        self.unrecognized_lines: list[bytes] = []
         """Received lines that are neither valid replies nor status lines."""
         self.inputs: dict[int, bool] = {}
         """Maps the number of each input to whether the board last reported it as pressed.
@@ -156,7 +157,7 @@ class Board:
         self.lateness = Lateness()
         """The delays by which this computer ran the check too late. If the board is simulated on
         this computer, the delays of the simulator are included."""
-        self.fled = False
+        self.runaway_seen = False
         """Whether a motor runs away, or keeps turning although zeros are sent. The check sends
         nothing more in this case, so that the board's watchdog can stop the motor."""
 
@@ -179,7 +180,7 @@ class Board:
     def forget(self) -> None:
         """Discard all received lines and the signs of a restart. Keep the results of the steps."""
         self.restarts, self._unanswered_s = Restarts(), 0.0
-        for heard in (self._lines, self.replies, self.others):
+        for heard in (self._lines, self.replies, self.unrecognized_lines):
             heard.clear()
 
     def __enter__(self) -> Board:
@@ -199,14 +200,14 @@ class Board:
     def _farewell(self) -> None:
         # If an encoder is reversed, the firmware's speed control may make the motor run away even
         # when zeros are sent. Each further line would keep the watchdog from stopping the motor.
-        self.armed, self.restarts.watched, self.between = False, False, _nothing
+        self.armed, self.restarts.watched, self.abort_check = False, False, _nothing
         try:
             for _ in range(FINAL_ZEROS):
-                if self.fled:
+                if self.runaway_seen:
                     break
                 self.zeros()
                 self.listen(2 * self.period_s)
-                self.fled = motion.fastest(self.replies, motion.RUNAWAY_SPEED) is not None
+                self.runaway_seen = motion.fastest(self.replies, motion.RUNAWAY_SPEED) is not None
         except WireLostError:
             # No line reaches the board any more, so its own watchdog must stop the motors.
             pass
@@ -217,16 +218,16 @@ class Board:
         return self.wire.now_ns() / NS_PER_S
 
     @property
-    def known(self) -> dict[str, object]:
+    def saved_results(self) -> dict[str, object]:
         """Mapping from each name in `RESULT_FIELDS` to the value of that attribute.
 
         Assign an earlier mapping to restore the attributes before a step is repeated.
         """
         return {name: getattr(self, name) for name in RESULT_FIELDS}
 
-    @known.setter
-    def known(self, known: Mapping[str, object]) -> None:
-        for name, value in known.items():
+    @saved_results.setter
+    def saved_results(self, results: Mapping[str, object]) -> None:
+        for name, value in results.items():
             setattr(self, name, value)
 
     @property
@@ -260,7 +261,7 @@ class Board:
         The line ends with a comma if `comma` is true. None means the value of `self.comma`.
         """
         if any(motors):
-            self.between()
+            self.abort_check()
         turned, self._commanded = any(self._commanded), motors
         self.wire.send(self.line(motors, comma))
         self.sent_lines += 1
@@ -279,7 +280,7 @@ class Board:
         self.wire.send(b"\r\n" + plain + (self.line(ZERO) if self.sealed else b""))
         self.restarts.sent(ZERO, self.now_s)
 
-    def wakes(self, seconds: float) -> bool:
+    def answers_within(self, seconds: float) -> bool:
         """Send zero speeds until the board answers. Return False if it does not in `seconds` s."""
         before, end_s = len(self.replies), self.now_s + seconds
         while len(self.replies) == before:
@@ -334,15 +335,26 @@ class Board:
             answers = self.listen(min(period_s, end_s - began_s))
             took_s = self.now_s - began_s
             self._unanswered_s += 0.0 if answers else min(took_s, period_s)
-            if self.armed and self._unanswered_s > WATCHDOG_S + 4 * self.gap_s:
+            if self.armed and self._unanswered_s > self._max_silence_s:
                 self.zeros()
-                names = motor_names(self.mcu, [m for m in range(4) if motors[m]]) or "nothing"
-                found = outcomes.find("link: silent", motors=names, seconds=self._unanswered_s)
-                raise StoppedError(found)
+                raise self._silence(motors, self._unanswered_s)
             got += answers
         return got
 
-    def let_go(self, silent_s: float) -> None:
+    @property
+    def _max_silence_s(self) -> float:
+        return WATCHDOG_S + 4 * self.gap_s
+
+    def _silence(self, motors: Motors, seconds: float) -> StoppedError:
+        turned = [motor for motor in range(4) if motors[motor]]
+        outcome = "link: silent" if turned else "link: silent at zeros"
+        names = motor_names(self.mcu, turned)
+        # A delay of this computer that is much shorter than the silence cannot cause it.
+        beyond_s = seconds - self._max_silence_s
+        found = outcomes.find(outcome, motors=names, seconds=seconds, margin_s=beyond_s)
+        return StoppedError(found)
+
+    def stop_and_be_silent(self, silent_s: float) -> None:
         """Send zero speeds once, then send nothing for `silent_s` s.
 
         In this time the board's watchdog can stop the motors.
@@ -364,7 +376,7 @@ class Board:
             # then.
             self.wire.late_ns()
         got: list[Reply] = []
-        self.between()
+        self.abort_check()
         while True:
             until_ns = min(end_ns, self.wire.now_ns() + BEAT_NS)
             got += self._hear(until_ns)
@@ -372,7 +384,7 @@ class Board:
             self._listened_s = now_ns / NS_PER_S
             late_ns = max(now_ns - until_ns, self.wire.late_ns())
             self.lateness.look(late_ns / NS_PER_S, self._listened_s)
-            self.between()
+            self.abort_check()
             if now_ns >= end_ns:
                 return got
 
@@ -418,31 +430,33 @@ class Board:
                 plain, reading = checked.plain, checked.reading
             return Reply(at_s, self._codecs[False].decode(plain).as_tuple(), line, reading)
         except FrameError:
-            self.others.append(line)
+            self.unrecognized_lines.append(line)
             return None
 
     @property
     def silent_s(self) -> float:
         """Time since the board's last reply, s.
 
-        It is 0 before the first reply. It is also 0 after a motor has run away (`fled`).
+        It is 0 before the first reply. It is also 0 after a motor has run away (`runaway_seen`).
         """
-        return self.now_s - self.replies[-1].at_s if self.replies and not self.fled else 0.0
+        return self.now_s - self.replies[-1].at_s if self.replies and not self.runaway_seen else 0.0
 
     def _guard(self) -> None:
         fastest = motion.fastest(self.replies, motion.RUNAWAY_SPEED)
         if fastest is None:
             return
         motor, seen = fastest
-        told = self._commanded[motor]
-        self._flee()
-        outcome = "runaway: against" if told * seen < 0 else "runaway: along"
+        commanded = self._commanded[motor]
+        self._abandon()
+        outcome = "runaway: against" if commanded * seen < 0 else "runaway: along"
         name, letter, most = motor_name(self.mcu, motor), LETTERS[motor], motion.RUNAWAY_SPEED
-        found = outcomes.find(outcome, motor=name, letter=letter, told=told, seen=seen, most=most)
+        found = outcomes.find(
+            outcome, motor=name, letter=letter, told=commanded, seen=seen, most=most
+        )
         raise StoppedError(found)
 
-    def _flee(self) -> None:
-        self.fled = True
+    def _abandon(self) -> None:
+        self.runaway_seen = True
         self.zeros()
 
     # Standing still
@@ -454,7 +468,7 @@ class Board:
     def rest(self) -> None:
         """Send zero speeds until all motors stand still.
 
-        Raises `StoppedError` if a motor keeps turning.
+        Raises `StoppedError` if a motor keeps turning, or if the board falls silent.
 
         If a motor does not stop in time, try lines with the other ending: a comma or none. Some
         firmware stops motor d only at lines with one of the two endings. If only motor d kept
@@ -466,14 +480,25 @@ class Board:
             return
         turning = motion.turning(self.replies, self.now_s)
         kept = turning == [3] and not self._slows()
+        silent = self._unheard_s(began_s) > self._max_silence_s
         if self.settles(not self.comma):
             if kept:
                 self.latched, self.comma = True, not self.comma
             return
-        self._flee()
-        motors = motor_names(self.mcu, turning, ", ") or "something"
+        # A board may ignore lines with the other ending. So a silence counts only if the board
+        # answered neither ending.
+        if silent and (seconds := self._unheard_s(began_s)) > self._max_silence_s:
+            raise self._silence(ZERO, seconds)
+        self._abandon()
+        turning = motion.turning(self.replies, self.now_s) or turning
+        motors = motor_names(self.mcu, turning, ", ") or "a motor"
         seconds = round(self.now_s - began_s, 1)
         raise StoppedError(outcomes.find("stop: turns", motors=motors, seconds=seconds))
+
+    def _unheard_s(self, since_s: float) -> float:
+        """Return the time since the last reply, but at most since the time `since_s`, s."""
+        heard = motion.since(self.replies[-1:], since_s)
+        return self.now_s - (heard[-1].at_s if heard else since_s)
 
     def settles(self, comma: bool) -> bool:
         """Send zero speeds until all motors stand still, and return whether they do so in time.

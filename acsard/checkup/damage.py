@@ -11,7 +11,7 @@ from acsard.checkup.motion import SHORT_MEASUREMENT_S, SPEED, ZERO, moving
 from acsard.core.link.checked_line import seal
 from acsard.core.link.codec import LETTERS
 
-WHOLE = {"over-long", "garbage before it"}
+HARMLESS_KINDS = {"over-long", "garbage before it"}
 """Kinds of damage that do not change the speeds in a line.
 
 It is not dangerous if the board obeys lines with these kinds of damage.
@@ -67,7 +67,8 @@ def finding(board: Board, motors: Sequence[int]) -> Finding:
     took = dict.fromkeys(what for what, line in lines if _moves(board, line))
     if not took:
         return outcomes.find("damaged lines: right", lines=len(lines))
-    outcome, kinds = "lenient" if took.keys() <= WHOLE else "taken", {what for what, _ in lines}
+    outcome = "lenient" if took.keys() <= HARMLESS_KINDS else "taken"
+    kinds = {what for what, _ in lines}
     seen = {"took": len(took), "kinds": len(kinds), "which": ", ".join(took)}
     return outcomes.find(f"damaged lines: {outcome}", None, **seen)
 

@@ -64,21 +64,21 @@ def identity(board: Board) -> Finding:
     The identification is optional for the board. Raises `StoppedError` if only the question itself
     comes back, because then no board answers.
     """
-    board.others.clear()
+    board.unrecognized_lines.clear()
     # Ask up to three times, because the question or its answer may be lost.
     for _ in range(3):
         board.restarts.asked(board.now_s)
         board.wire.send(b"\r\n?\r\n")
         board.listen(1.5 * SHORT_MEASUREMENT_S)
-        if any(line.startswith(IDENTITY) or line == b"?" for line in board.others):
+        if any(line.startswith(IDENTITY) or line == b"?" for line in board.unrecognized_lines):
             break
-    for line in board.others:
+    for line in board.unrecognized_lines:
         if line.startswith(IDENTITY):
             text = line.decode("ascii", "replace").removeprefix("!")
             words = text.split()
             board.identity = dict(word.split("=", 1) for word in words[2:] if "=" in word)
             return outcomes.find("identification: named", short=" ".join(words[:2]), text=text)
-    if b"?" in board.others:
+    if b"?" in board.unrecognized_lines:
         raise StoppedError(outcomes.find("identification: echo"))
     return outcomes.find("identification: none")
 

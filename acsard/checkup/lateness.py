@@ -13,7 +13,7 @@ from collections.abc import Iterable
 
 from acsard.checkup import motion, outcomes
 from acsard.checkup.findings import Finding
-from acsard.checkup.outcomes import Unsure
+from acsard.checkup.outcomes import TimingFinding
 
 MIN_DELAY_S = 0.005
 """Shortest delay of this computer that `Lateness` records, s. Shorter delays are normal."""
@@ -56,7 +56,7 @@ class Lateness:
         return max((late_s for at_s, late_s in self._seen if at_s >= began_s), default=0.0)
 
 
-def spoilt(found: Unsure, late_s: float) -> bool:
+def is_doubtful(found: TimingFinding, late_s: float) -> bool:
     """Return whether the finding may be wrong because this computer ran the check too late.
 
     `late_s` is the longest delay of this computer during the step, s. The result is True if the
@@ -79,7 +79,7 @@ def finding(name: str, late_s: float) -> Finding:
 
 def judged(found: Finding) -> bool:
     """Return whether a finding judges its step: False if this computer ran the step too late."""
-    return found.figure != outcomes.MANUAL[NOT_JUDGED].figure
+    return found.figure != outcomes.OUTCOMES_BY_NAME[NOT_JUDGED].figure
 
 
 def unjudged(findings: Iterable[Finding]) -> list[str]:

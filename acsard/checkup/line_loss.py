@@ -29,11 +29,11 @@ MAX_LOSS = 0.02
 MIN_LOST_LINES = 2
 """Smallest number of lost lines that shows a fault. A single lost line may be a coincidence."""
 
-LINES, LEAST_S, MOST_S = 300, 3.0, 10.0
+MAX_COUNTED_LINES, MIN_COUNT_S, MAX_COUNT_S = 300, 3.0, 10.0
 """Limits of the step that counts lost lines: a number of lines, and two durations, s.
 
-The step takes `LEAST_S` if no line is lost. Otherwise it ends after `LINES` lines, which are enough
-to show a loss of 2 %, or after `MOST_S`.
+The step takes `MIN_COUNT_S` if no line is lost. Otherwise it ends after `MAX_COUNTED_LINES` lines,
+which are enough to show a loss of 2 %, or after `MAX_COUNT_S`.
 """
 
 SILENCE_FACTOR = 2.0
@@ -69,13 +69,14 @@ def finding(board: Board) -> Finding:
         return lateness.finding("lost lines", board.lateness.since(0.0))
     # Wait until the replies to earlier lines have arrived.
     board.listen(motion.SHORT_MEASUREMENT_S)
-    began_s, sent, others = board.now_s, board.sent_lines, len(board.others)
-    board.drive(ZERO, LEAST_S, _period_s(board))
+    began_s, sent, others = board.now_s, board.sent_lines, len(board.unrecognized_lines)
+    board.drive(ZERO, MIN_COUNT_S, _period_s(board))
     silent_s = _silence_s(board, motion.since(board.replies, began_s))
     while True:
         board.listen(motion.SHORT_MEASUREMENT_S)
         count = _counted(board, began_s, board.sent_lines - sent, others)
-        if not count.lost or count.lines >= LINES or board.now_s - began_s > MOST_S:
+        enough = count.lines >= MAX_COUNTED_LINES or board.now_s - began_s > MAX_COUNT_S
+        if enough or not count.lost:
             break
         board.drive(ZERO, 0.5, _period_s(board))
     board.lost = count.share
@@ -85,6 +86,7 @@ def finding(board: Board) -> Finding:
         outcome = "silent" if board.own_clock else "either"
     else:
         outcome = "back" if 2 * count.damaged > count.lost else "both"
+    last = board.unrecognized_lines[-1] if count.damaged else b""
     found = outcomes.find(
         f"lost lines: {outcome}",
         lines=count.lines,
@@ -92,7 +94,7 @@ def finding(board: Board) -> Finding:
         share=board.lost,
         silent=silent_s * 1000,
         damaged=count.damaged,
-        last=printable_bytes(board.others[-1], MAX_SHOWN_BYTES) if count.damaged else "",
+        last=printable_bytes(last, MAX_SHOWN_BYTES),
     )
     if outcome in ("back", "both") and not board.sealed:
         raise StoppedError(found)
@@ -109,7 +111,7 @@ def _period_s(board: Board) -> float:
 
 
 def _counted(board: Board, began_s: float, lines: int, others: int) -> Count:
-    damaged = sum(not line.startswith(IDENTITY) for line in board.others[others:])
+    damaged = sum(not line.startswith(IDENTITY) for line in board.unrecognized_lines[others:])
     got = motion.since(board.replies, began_s)
     if not board.own_clock:
         return Count(lines, max(damaged, lines - len(got)), damaged)
@@ -146,11 +148,11 @@ This time is long enough for the encoders to show the movement. It is too short 
 watchdog to act.
 """
 
-TOLD, PULSES_S = 8, 20.0
+MAX_UNANSWERED_PULSES, MAX_PULSES_S = 8, 20.0
 """Limits of the search for the direction in which lines are lost.
 
-The check sends pulses (single lines that turn the motors) until `TOLD` pulses have had no reply, or
-until `PULSES_S` s have passed.
+The check sends pulses (single lines that turn the motors) until `MAX_UNANSWERED_PULSES` pulses have
+had no reply, or until `MAX_PULSES_S` s have passed.
 """
 
 SPREAD, STRIDE = 12, 5
@@ -166,25 +168,25 @@ OBEYED_FRACTION = 0.5
 It is a fraction of the median angle by which all pulses turned the motors.
 """
 
-SEEN, GRAINS = 0.02, 4
+MIN_PULSE_ANGLE, MIN_PULSE_STEPS = 0.02, 4
 """Limits for the median angle by which pulses (single lines) turn the motors.
 
-The check can tell which pulses arrived if the median is at least `SEEN` rad, and at least `GRAINS`
-times the smallest angle that the encoders showed between two replies.
+The check can tell which pulses arrived if the median is at least `MIN_PULSE_ANGLE` rad, and at
+least `MIN_PULSE_STEPS` times the smallest angle that the encoders showed between two replies.
 """
 
 
-class Ways(Struct, frozen=True):
+class PulseCounts(Struct, frozen=True):
     """Numbers of pulses. A pulse is a single line that turns the motors for a moment.
 
-    `sent` is the number of pulses whose movement was measured. `there` is the number of pulses that
-    were lost on their way to the board. `back` is the number of pulses that the motors obeyed,
-    although no reply arrived.
+    `sent` is the number of pulses whose movement was measured. `lost_out` is the number of pulses
+    that were lost on their way to the board. `lost_back` is the number of pulses that the motors
+    obeyed, although no reply arrived.
     """
 
     sent: int
-    there: int
-    back: int
+    lost_out: int
+    lost_back: int
 
 
 def direction(board: Board, operator: Operator, motors: Sequence[int]) -> Finding | None:
@@ -197,19 +199,20 @@ def direction(board: Board, operator: Operator, motors: Sequence[int]) -> Findin
     if not (board.own_clock or board.lost > MAX_LOSS):
         return None
     operator.doing("the motors turn briefly, several times, to find out where lines are lost")
-    ways = pulsed(board, motors) if motors else None
-    if ways is None:
+    counts = pulsed(board, motors) if motors else None
+    if counts is None:
         return outcomes.find("lost where: untold")
-    if ways.there + ways.back < MIN_LOST_LINES:
+    if counts.lost_out + counts.lost_back < MIN_LOST_LINES:
         outcome = "not seen"
-    elif min(ways.there, ways.back) >= MIN_LOST_LINES:
+    elif min(counts.lost_out, counts.lost_back) >= MIN_LOST_LINES:
         outcome = "both"
     else:
-        outcome = "there" if ways.there > ways.back else "back"
-    return outcomes.find(f"lost where: {outcome}", sent=ways.sent, there=ways.there, back=ways.back)
+        outcome = "there" if counts.lost_out > counts.lost_back else "back"
+    there, back = counts.lost_out, counts.lost_back
+    return outcomes.find(f"lost where: {outcome}", sent=counts.sent, there=there, back=back)
 
 
-def pulsed(board: Board, motors: Sequence[int]) -> Ways | None:
+def pulsed(board: Board, motors: Sequence[int]) -> PulseCounts | None:
     """Send pulses, and count the lost pulses and the lost replies.
 
     A pulse is a single line that turns `motors` for a moment from a standstill. Return None if the
@@ -218,11 +221,11 @@ def pulsed(board: Board, motors: Sequence[int]) -> Ways | None:
     on = motion.each(lambda motor: motion.SPEED if motor in motors else 0.0)
     # If the board reports by its own clock, no earlier step has found a loss of lines to the board,
     # so a shorter search is enough.
-    end_s = board.now_s + (10.0 if board.own_clock else PULSES_S)
+    end_s = board.now_s + (10.0 if board.own_clock else MAX_PULSES_S)
     every: list[float] = []
     unanswered: list[float] = []
     count = 0
-    while len(unanswered) < TOLD and board.now_s < end_s:
+    while len(unanswered) < MAX_UNANSWERED_PULSES and board.now_s < end_s:
         # The reply to an earlier line must not be taken for the reply to this pulse.
         board.listen(motion.SHORT_MEASUREMENT_S / 4)
         since_s, coasting = board.now_s, board.replies[-1].motors
@@ -238,14 +241,14 @@ def pulsed(board: Board, motors: Sequence[int]) -> Ways | None:
         if not (answered or board.own_clock):
             unanswered.append(every[-1])
     usual = median(every) if every else 0.0
-    if usual < max(SEEN, GRAINS * _grain(board, motors)):
+    if usual < max(MIN_PULSE_ANGLE, MIN_PULSE_STEPS * _grain(board, motors)):
         return None
-    if board.own_clock and len(every) < TOLD:
+    if board.own_clock and len(every) < MAX_UNANSWERED_PULSES:
         return None
     if board.own_clock:
-        return Ways(len(every), sum(angle < OBEYED_FRACTION * usual for angle in every), 0)
+        return PulseCounts(len(every), sum(angle < OBEYED_FRACTION * usual for angle in every), 0)
     back = sum(angle >= OBEYED_FRACTION * usual for angle in unanswered)
-    return Ways(len(every), len(unanswered) - back, back)
+    return PulseCounts(len(every), len(unanswered) - back, back)
 
 
 def _whole(board: Board, since_s: float) -> bool:

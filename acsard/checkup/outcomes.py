@@ -97,9 +97,9 @@ FAIL? checked link: required | none
 
 PASS lost lines: none | none of {lines}
 PASS lost lines: few | {lost} of {lines}
-WARN? lost lines: late | none of {lines}, but silent for {silent:.0f} ms
-    nothing arrived for that time, then all lines together: the daemon takes such a silence for a
-    lost link, and the robot stops
+WARN? lost lines: late | {lost} of {lines} lost, but nothing arrived for {silent:.0f} ms
+    afterward all lines arrived together: the daemon takes such a silence for a lost link, and the
+    robot stops
     -> use another USB port without a hub, and no USB power saving; does the firmware wait
     somewhere?
 FAIL? lost lines: back | {share:.0%} of {lines}
@@ -120,7 +120,7 @@ FAIL? lost lines: silent | {share:.0%} of {lines}
     -> check the lead from the board's TX to the computer's RX; use a short cable away from the
     motors' leads, a common ground, or a lower baud rate at both ends
 
-PASS lost where: not seen | none of {sent} more lines
+PASS lost where: not seen | {sent} more lines sent, fewer than 2 lost
 FAIL? lost where: there | of {sent} lines, {there} lost on the way out, {back} on the way back
     lines are lost on the way to the board: the motors did not follow these lines
     -> check the lead from the computer's TX to the board's RX and the ground, or use a lower baud
@@ -158,14 +158,17 @@ FAIL? motor: dead, turns | {figure}
     the wheel turns, but encoder {here} shows nothing: the encoder is dead
     -> check the supply, the plug and the A and B leads of encoder {here}
 FAIL motor: reversed, not seen | {figure}
-    encoder {here} counts against motor {here}; no configuration can fix that
+    encoder {here} counts backward when motor {here} is commanded to turn forward; no configuration
+    can fix that
     -> swap the two leads of motor {here} if the wheel turns the wrong way, otherwise A and B of
     encoder {here}
 FAIL motor: reversed, encoder | {figure}
-    encoder {here} counts against motor {here}; no configuration can fix that
+    encoder {here} counts backward when motor {here} is commanded to turn forward; no configuration
+    can fix that
     -> the motor is right: swap A and B of encoder {here}
 FAIL motor: reversed, motor | {figure}
-    encoder {here} counts against motor {here}; no configuration can fix that
+    encoder {here} counts backward when motor {here} is commanded to turn forward; no configuration
+    can fix that
     -> the motor is reversed: swap the two leads of motor {here}
 FAIL motor: other, not seen | {shown}
     motor {here} moves encoder {there}: two motors or two encoders are swapped{reversed}
@@ -266,7 +269,7 @@ WARN? watchdog: unclear | {figure}
     the watchdog stops the motors, but the encoders are too coarse to show whether it does so
     within 500 ms
     -> look the time up in the firmware: 300 ms is right
-FAIL? watchdog: fed | {figure}, but fed by broken lines
+FAIL? watchdog: fed | {figure}, but damaged lines keep it from acting
     the watchdog stops the motors when no lines arrive, but not when only broken lines arrive: a
     robot with a half-broken cable drives on
     -> only a whole valid line may feed the firmware's watchdog
@@ -314,7 +317,7 @@ FAIL runaway: against | {letter}: commanded {told:.1f}, measured {seen:.1f} rad/
     control loop makes the motor run away
     -> swap this motor's two leads, or A and B of its encoder
 FAIL stop: turns | turns {seconds:g} s after zeros
-    according to its encoder, {motors} still turns although this computer sends zeros
+    the encoders report that {motors} did not stop although this computer sends zeros
     -> does a hand or a slope turn it? If not, cut the motors' power: the firmware must stop a motor
     at `p00.00`
 FAIL restarts: seen | {times}
@@ -324,24 +327,25 @@ FAIL restarts: seen | {times}
     boards)?
     Otherwise its own watchdog or a crash of its firmware restarts it
 FAIL restarts: supply | {times}
-    the supply of the board failed: the board restarted {told}
+    the supply of the board failed. The board restarted {told}
     -> use a separate supply for the board, not the motors' supply or a USB hub; use thicker leads,
     a common ground and a capacitor at the driver; is a plug loose?
 FAIL restarts: motors | {times}
-    the board restarted {told}: each time while motors turned, as with a weak supply
+    the board restarted {told}. Motors turned at each restart, so the supply may be weak
     -> use a separate supply for the board, thicker leads, a common ground and a capacitor at the
     driver. If the supply is good, the firmware's own watchdog or a crash restarts the board
 FAIL restarts: watchdog | {times}
-    the board's own watchdog restarted it, so the firmware hung: the board restarted {told}
+    the board's own watchdog restarted it, so the firmware hung. The board restarted {told}
     -> where does the firmware wait: for room to print, for an encoder, in an interrupt? Feed the
     watchdog only in the main loop. A supply that dips can also hang the firmware
 FAIL restarts: pin | {times}
-    something pulled the board's reset pin: the board restarted {told}
+    something pulled the board's reset pin. The board restarted {told}
     -> does a second program open the port (DTR resets many boards): a serial monitor,
     ModemManager, another computer? `fuser DEVICE` names it. Otherwise, is a long lead connected to
     the reset pin?
 FAIL restarts: silence | {times}
-    the board restarted {told}: each time this computer had sent nothing for {silent:.1f} s or more
+    the board restarted {told}. Before each restart, this computer had sent nothing for
+    {silent:.1f} s or more
     -> the firmware's watchdog restarts the whole board when no line comes: let that watchdog only
     stop the motors, and restart the board only when the firmware hangs
 FAIL restarts: gone | {times}
@@ -349,8 +353,11 @@ FAIL restarts: gone | {times}
     -> switch it off and on; does its bootloader hang after a reset by the watchdog, or does its
     supply fail?
 FAIL? link: silent | silent for {seconds:.1f} s
-    the microcontroller fell silent when {motors} had to turn
+    the microcontroller stopped replying while it had to turn {motors}
     -> does its supply dip when a motor starts, so that it restarts? is a cable loose?
+FAIL? link: silent at zeros | silent for {seconds:.1f} s
+    the microcontroller stopped replying while this computer sent it only zeros
+    -> is a cable or plug loose? did its supply fail, or does its firmware hang?
 WARN late: not judged | not judged
     this computer ran the check up to {late:.0f} ms too late, so the check does not judge this step
     -> stop other programs here (`top`) and check again, or give the check real-time priority:
@@ -361,7 +368,7 @@ FAIL serial line: lost | lost
 """
 
 
-class Unsure(Finding, frozen=True):
+class TimingFinding(Finding, frozen=True):
     """A finding that may be wrong if this computer ran the check too late.
 
     `margin_s` is the time by which the measurement exceeds its limit, s. A delay that is shorter
@@ -398,7 +405,7 @@ def _read(manual: str) -> dict[str, Outcome]:
     return found
 
 
-MANUAL = _read(OUTCOMES)
+OUTCOMES_BY_NAME = _read(OUTCOMES)
 """Maps the name of each outcome, such as "baud rate: right", to the outcome."""
 
 
@@ -406,20 +413,21 @@ def find(outcome: str, keys: dict[str, object] | None = None, **seen: object) ->
     """Return the finding for an outcome, with the measured values in its texts.
 
     Args:
-        outcome: a key of `MANUAL`. The part before the colon is the name of the finding.
+        outcome: a key of `OUTCOMES_BY_NAME`. The part before the colon is the name of the finding.
         keys: the configuration values that the finding suggests, by dotted key.
         seen: the measured values by name. The value `name` replaces the name of the finding. The
-            value `margin_s` is stored in the finding if the outcome is unsure (see `Unsure`).
+            value `margin_s` is stored in the finding if the outcome is unsure (see
+            `TimingFinding`).
     """
-    entry = MANUAL[outcome]
+    entry = OUTCOMES_BY_NAME[outcome]
     name = str(seen.get("name", outcome.partition(":")[0]))
     figure, text, mend = (s.format(**seen) for s in (entry.figure, entry.text, entry.mend))
     if not entry.unsure:
         return Finding(name, entry.verdict, figure, text, mend, keys or {})
     margin_s = float(str(seen.get("margin_s", 0.0)))
-    return Unsure(name, entry.verdict, figure, text, mend, keys or {}, margin_s)
+    return TimingFinding(name, entry.verdict, figure, text, mend, keys or {}, margin_s)
 
 
 def plain(found: Finding) -> Finding:
-    """Return a copy of the finding as a `Finding`, even if it is an `Unsure`."""
+    """Return a copy of the finding as a `Finding`, even if it is a `TimingFinding`."""
     return Finding(*(getattr(found, name) for name in Finding.__struct_fields__))

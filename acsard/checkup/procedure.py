@@ -27,7 +27,7 @@ from acsard.checkup import (
 from acsard.checkup.board import Board, Operator, Wire
 from acsard.checkup.findings import SKIPPED_STEPS, Finding, StoppedError, WireLostError, motor_name
 from acsard.checkup.motion import BOOT_S, SHORT_MEASUREMENT_S
-from acsard.checkup.outcomes import Unsure
+from acsard.checkup.outcomes import TimingFinding
 from acsard.checkup.restarts import Restart, RestartedError
 from acsard.checkup.wheels import Channel, encoder_finding, wheel_map
 from acsard.core.config.motion_rules import longest_reply
@@ -144,7 +144,7 @@ def run(
             if operator.ask(CONFIRMATION, (LIFTED,)) != LIFTED:
                 raise StoppedError(outcomes.find("wheels: not lifted"))
             watched = _Watched(operator, board, asleep_ns)
-            board.between = watched.look
+            board.abort_check = watched.look
             _Steps(board, watched, once, seen).all(config.safety)
     except StoppedError as end:
         once(end.finding)
@@ -250,7 +250,7 @@ class _Steps:
         if found is not None and not lateness.judged(found):
             channels[motor] = structs.replace(channels[motor], judged=False)
             return found
-        channels[motor] = wheels.seen(board, operator, channels[motor])
+        channels[motor] = wheels.ask_which_wheel(board, operator, channels[motor])
         return encoder_finding(board.mcu, channels[motor])
 
     def _measure(self, doing: str, step: Step) -> None:
@@ -258,42 +258,43 @@ class _Steps:
 
     def _in_time(self, step: Step) -> Finding | None:
         """Run a step again while its finding is doubtful because this computer was too late."""
-        board, known, late_s = self._board, self._board.known, 0.0
+        board, saved, late_s = self._board, self._board.saved_results, 0.0
         for _ in range(1 + min(LATE_AGAIN, self._late_left)):
             if late_s:
                 self._late_left -= 1
                 self._operator.doing("this computer ran the check too late; this part runs again")
-                board.known = known
+                board.saved_results = saved
                 if board.armed:
                     board.rest()
             began_s = board.now_s
             found, ends = _ended(step)
-            # A finding that is not `Unsure` is right even if this computer ran the check too late.
-            if board.fled or not isinstance(found, Unsure):
+            # A finding that is not `TimingFinding` is right even if this computer ran the check too
+            # late.
+            if board.runaway_seen or not isinstance(found, TimingFinding):
                 break
             # The delay of a simulated board is known only when its program runs again, so wait for
             # an answer. If the board does not answer at all, a delay is not the cause.
-            if found.verdict != "PASS" and not board.wakes(BOOT_S):
+            if found.verdict != "PASS" and not board.answers_within(BOOT_S):
                 break
             meanwhile_s = board.lateness.since(began_s)
-            if not lateness.spoilt(found, meanwhile_s):
+            if not lateness.is_doubtful(found, meanwhile_s):
                 break
             late_s = max(late_s, meanwhile_s)
             told = lateness.finding(found.name, late_s)
             if ends and board.armed:
                 # The step has ended the check. So do not turn a motor again, even if the cause was
                 # only a delay of this computer.
-                found, board.known = told, known
+                found, board.saved_results = told, saved
                 break
         else:
-            found, board.known = told, known
+            found, board.saved_results = told, saved
         if found is not None and ends:
             raise StoppedError(found)
         return found
 
     def _take(self, doing: str, step: Step) -> None:
         board, again = self._board, 0
-        known = board.known
+        saved = board.saved_results
         while True:
             try:
                 if again:
@@ -307,7 +308,7 @@ class _Steps:
                 again += 1
                 if again > AGAIN or len(self._seen) >= MOST:
                     raise StoppedError(restarts.finding(board.mcu, self._seen)) from None
-                board.known = known
+                board.saved_results = saved
 
     def _tried(self, step: Step) -> Finding | None:
         """Run a step. Raise `RestartedError` if the board restarted during the step.
@@ -326,7 +327,7 @@ class _Steps:
     def _await_return(self, silent_s: float) -> None:
         board = self._board
         if board.silent_s > max(silent_s, 4 * board.gap_s):
-            board.wakes(BOOT_S)
+            board.answers_within(BOOT_S)
 
     def _come_back(self) -> None:
         board = self._board
@@ -334,9 +335,9 @@ class _Steps:
         self._operator.doing(
             "the board restarted; this part of the check runs again when the board answers"
         )
-        if not board.wakes(BOOT_S):
+        if not board.answers_within(BOOT_S):
             raise StoppedError(restarts.finding(board.mcu, self._seen, back=False))
-        if said := restarts.cause(board.others):
+        if said := restarts.cause(board.unrecognized_lines):
             self._seen[-1] = structs.replace(self._seen[-1], cause=said)
         if board.armed:
             board.rest()

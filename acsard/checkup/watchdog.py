@@ -37,7 +37,7 @@ A motor at `TURNING` or above has not slowed down. A motor below `STOPPED` stand
 NOT_MEASURED = math.inf
 """Upper bound of the watchdog's delay if the motors did not stop even in the longest silence."""
 
-Between = tuple[float, float]
+Bounds = tuple[float, float]
 """Pair: a lower and an upper bound of the time for which motors run on after the last line, s."""
 
 
@@ -121,7 +121,7 @@ def _judged(least_s: float, most_s: float) -> Finding:
     return outcomes.find(f"watchdog: {outcome}", figure=figure, seconds=middle_s, margin_s=beyond_s)
 
 
-def measured(board: Board, motors: Sequence[int], stop: Run) -> Between:
+def measured(board: Board, motors: Sequence[int], stop: Run) -> Bounds:
     """Measure for how long motors run on when no lines are sent.
 
     Return a lower and an upper bound of this time, s. If the motors do not stop even in the longest
@@ -149,12 +149,12 @@ def measured(board: Board, motors: Sequence[int], stop: Run) -> Between:
     return max(0.0, ran_on_s - about_s), max(0.0, ran_on_s + about_s)
 
 
-def _asked(board: Board, motors: Sequence[int], stop: Run, between: Between) -> Between:
+def _asked(board: Board, motors: Sequence[int], stop: Run, bounds: Bounds) -> Bounds:
     """Narrow the bounds of the time for which motors run on, by bisection.
 
-    `between` are the first bounds. `stop` is the behavior of the motors in an ordinary stop.
+    `bounds` are the first bounds. `stop` is the behavior of the motors in an ordinary stop.
     """
-    least_s, most_s = between
+    least_s, most_s = bounds
     # Each run halves the interval between the bounds, unless this computer is late.
     for _ in range(8):
         if most_s - least_s <= max(0.03, 0.1 * most_s):

@@ -116,7 +116,7 @@ def encoder_finding(mcu: McuConfig, channel: Channel) -> Finding:
     there = moved[0] if moved else motor
     # If a motor seems to stand still for half of `beyond_s` in a measurement of
     # `SHORT_MEASUREMENT_S`, then it seems too slow by the part of the error that exceeds
-    # `FAIL_TOLERANCE`. `lateness.spoilt` compares a delay of this computer with half of this
+    # `FAIL_TOLERANCE`. `lateness.is_doubtful` compares a delay of this computer with half of this
     # margin.
     beyond_s = (
         2 * SHORT_MEASUREMENT_S * (channel.error - FAIL_TOLERANCE)
@@ -204,7 +204,7 @@ WHEEL_ANSWERS = {
 }  # fmt: skip
 
 
-def one(motor: int, speed: float) -> Motors:
+def only_motor(motor: int, speed: float) -> Motors:
     """Return the speeds that turn only the motor number `motor`, at `speed` rad/s."""
     return motion.each(lambda index: speed if index == motor else 0.0)
 
@@ -215,12 +215,12 @@ def turn(board: Board, motor: int, speed: float) -> tuple[Motors, float]:
     Return a pair: the measured speeds, rad/s, and the possible relative error of this motor's
     measured speed. This error exists because an encoder counts only whole steps.
     """
-    means = run_up(board, one(motor, speed))
+    means = run_up(board, only_motor(motor, speed))
     unsure = _unsure(board, motor, 2 * _look_s(board))
     if REPEAT_FRACTION * WARN_TOLERANCE + unsure < abs(means[motor] / speed - 1) <= FAIL_TOLERANCE:
         # The motor is weak, or its wheel is heavy and has not yet reached its speed. A longer
         # measurement shows which of the two is the case.
-        board.drive(one(motor, speed), motion.MOTOR_TIMEOUT_S)
+        board.drive(only_motor(motor, speed), motion.MOTOR_TIMEOUT_S)
         means = motion.mean(motion.since(board.replies, board.now_s - LONG_MEASUREMENT_S))
         unsure = _unsure(board, motor, LONG_MEASUREMENT_S)
     return means, unsure
@@ -248,9 +248,9 @@ def run_up(board: Board, motors: Motors) -> Motors:
         a, b, c, d = (round(speed * step / steps, 2) for speed in motors)
         board.drive((a, b, c, d), board.period_s)
     began_s, look_s = board.now_s, _look_s(board)
-    told = [motor for motor in range(4) if motors[motor]]
+    driven = [motor for motor in range(4) if motors[motor]]
     means, looks, steady = ZERO, 0, 0
-    while steady < 2 and board.now_s - began_s < _patience_s(board, told):
+    while steady < 2 and board.now_s - began_s < _patience_s(board, driven):
         board.drive(motors, look_s)
         looks += 1
         # A coarse encoder needs more measurements than a fine one.
@@ -259,16 +259,16 @@ def run_up(board: Board, motors: Motors) -> Motors:
         near = [
             m for m in moving(means) if abs(abs(means[m]) / motion.SPEED - 1) < 0.4 * FAIL_TOLERANCE
         ]
-        steady = steady + 1 if len(near) >= len(told) else 0
+        steady = steady + 1 if len(near) >= len(driven) else 0
         if looks * look_s >= motion.WATCHDOG_SILENCE_S and not moving(means, motion.STANDING_SPEED):
             # Do not go on: without an encoder, the firmware's speed control may command ever more.
             break
     return means
 
 
-def _patience_s(board: Board, told: list[int]) -> float:
+def _patience_s(board: Board, driven: list[int]) -> float:
     shares = motion.trend(board.replies, board.now_s, board.gap_s)
-    rises = any(shares[motor] > 1 / motion.SLOWING_RATIO for motor in told)
+    rises = any(shares[motor] > 1 / motion.SLOWING_RATIO for motor in driven)
     return motion.SLOWING_TIMEOUT_S if rises else motion.MOTOR_TIMEOUT_S
 
 
@@ -295,7 +295,7 @@ def _both_ways(board: Board, motor: int) -> Channel:
         back, other = turn(board, motor, -motion.SPEED)
         unsure = max(unsure, other)
     if motor not in moving(back):
-        board.let_go(motion.WATCHDOG_SILENCE_S)
+        board.stop_and_be_silent(motion.WATCHDOG_SILENCE_S)
     board.rest()
     return Channel(motor, forth, back, unsure=unsure)
 
@@ -339,7 +339,7 @@ def _probe(board: Board, motor: int, speed: float) -> Motors | None:
     while (
         board.now_s < began_s + motion.SHORT_MEASUREMENT_S and own > -4 * motion.PROBE_MOVING_SPEED
     ):
-        board.drive(one(motor, speed), board.period_s)
+        board.drive(only_motor(motor, speed), board.period_s)
         own = shown()[motor]
     if own >= motion.PROBE_MOVING_SPEED:
         return None
@@ -347,7 +347,7 @@ def _probe(board: Board, motor: int, speed: float) -> Motors | None:
     # zeros. Only its watchdog stops the motor. So a motor that has moved must stand still before
     # the next zeros are sent.
     moved = moving(shown(), motion.PROBE_MOVING_SPEED)
-    board.let_go(motion.STANDSTILL_TIMEOUT_S if moved else motion.WATCHDOG_SILENCE_S)
+    board.stop_and_be_silent(motion.STANDSTILL_TIMEOUT_S if moved else motion.WATCHDOG_SILENCE_S)
     board.rest()
     seen = shown()
     return None if seen[motor] >= motion.PROBE_MOVING_SPEED else seen
@@ -366,7 +366,7 @@ def _with_other_comma(board: Board, dead: Channel) -> Channel:
     return channel
 
 
-def seen(board: Board, operator: Operator, channel: Channel) -> Channel:
+def ask_which_wheel(board: Board, operator: Operator, channel: Channel) -> Channel:
     """Ask the operator which wheel turned and in which direction. Add the answers to `channel`.
 
     The wheels stand still during a question. If the operator wants to see the movement again, the

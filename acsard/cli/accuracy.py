@@ -1,6 +1,6 @@
-"""Observe the robot while someone drives it, and print the odometry error that each cause alone
-would produce if the drive continued in the same way: in mm after 100 m, and in degrees after a turn
-of 360 degrees. The causes are the timing and the rounding of the feedback lines, times without
+"""Observe the robot while someone drives it. For each cause of odometry errors, print the error
+that it alone would produce if the drive continued like this: mm after 100 m, and degrees after a
+turn of 360 degrees. The causes are the timing and the rounding of the feedback lines, times without
 feedback lines, slip, wheel radii, track width, and the gyro if there is one. The tool also says how
 to reduce the largest error. It sends no commands. While the robot stands still, the tool prints
 only the errors that follow from the settings.

@@ -1,20 +1,31 @@
-"""Measure the wheel radii and the effective track width, each with its standard deviation, and say
-how much they improve the odometry. If the tool has data of a gyro or positions, it also estimates
-the noise settings of [odometry]. Without --log the tool drives the robot and guides a person at
-this terminal through the drive. The person stands near the robot on a free floor of 3 m x 3 m,
-starts each leg with Enter, stops it with any key, and types the tape measurements that the tool
-asks for. The robot drives for at most 90 s. With --log the tool uses a recorded drive: a black-box
-recording of a robot with a gyro, a ROS 2 bag in MCAP (its file or directory), or a CSV file with a
-header. A bag must contain the wheels as JointState messages. It must also contain Imu, PoseStamped
-or Odometry messages, with which the tool compares the wheels. The tool reads the topics that have
-these types, or those that --topic names. The CSV file has the column t (s) and the columns of the
-wheel speeds (rad/s), "fr,fl,rl,rr" or "left,right". It also has yaw_rate (rad/s, from a gyro), or x
-and y (m, from any source of positions) with or without yaw (rad), or both. If the file contains
-several drives, the column run names the drive of each row. The columns applied_linear (m/s) and
-applied_angular (rad/s) contain the commands, and show how fast the wheels respond. The columns may
-be in any order, and a cell is empty if its sensor has no value at that time. A good log begins with
-3 s of standing still. Then it contains 60 s or more of straight drives, slow and fast turns to both
-sides, and curves. The exit code is 0 if the tool found the values. Otherwise it is 1, and a message
+"""Measure the wheel radii and the effective track width, each with its standard
+deviation, and say how much they improve the odometry. If the tool has data of a
+gyro or positions, it also estimates the noise settings of [odometry].
+
+Without --log the tool drives the robot and guides a person at this terminal
+through the drive. The person stands near the robot on a free floor of 3 m x 3 m,
+starts each leg with Enter, stops it with any key, and types the tape measurements
+that the tool asks for. The robot drives for at most 90 s.
+
+With --log the tool uses a recorded drive: a black-box recording of a robot with a
+gyro, a ROS 2 bag in MCAP (its file or directory), or a CSV file with a header.
+
+A bag must contain the wheels as JointState messages. It must also contain Imu,
+PoseStamped or Odometry messages, with which the tool compares the wheels. The tool
+reads the topics that have these types, or those that --topic names.
+
+The CSV file has the column t (s) and the columns of the wheel speeds (rad/s),
+"fr,fl,rl,rr" or "left,right". It also has yaw_rate (rad/s, from a gyro), or x and
+y (m, from any source of positions), or all three. With x and y, yaw (rad) is
+optional. If the file contains several drives, the column run names the drive of
+each row. The columns applied_linear (m/s) and applied_angular (rad/s) contain the
+commands, and show how fast the wheels respond. The columns may be in any order,
+and a cell is empty if its sensor has no value at that time.
+
+A good log begins with 3 s of standing still. Then it contains 60 s or more of
+straight drives, slow and fast turns to both sides, and curves.
+
+The exit code is 0 if the tool found the values. Otherwise it is 1, and a message
 says what to do instead.
 """
 
@@ -47,7 +58,7 @@ from acsard.daemon.bus.address import address_of
 from acsard.daemon.bus.zenoh_sessions import client_session
 from acsard.host.config_file import change, writable
 from acsard.host.errors import Exit, MendableError, UsageError
-from acsard.host.terminal_modes import one_by_one
+from acsard.host.terminal_modes import single_key_mode
 from acsard.terminal.json_prompt import JsonPrompt
 from acsard.terminal.output import MAX_TEXT_WIDTH, plain, show
 from acsard.terminal.prompt import NobodyError, Prompt, ended_by_signals
@@ -61,6 +72,7 @@ DRIVE_OPTIONS = ("method", "positions", "positions_at", "imu", "yes", "json_line
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
     add_bus(parser)
     _add_drive_options(parser)
     parser.add_argument(
@@ -89,10 +101,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--distance",
         type=_distance,
-        metavar="[RUN=]METRES",
+        metavar="[RUN=]METERS",
         help="with --log: the straight-line distance from the start to the end of the run RUN, "
         "by tape measure. acsard computes the size of the wheels from this distance. Without RUN, "
-        "METRES is the distance of the straightest run",
+        "METERS is the distance of the straightest run",
     )
     add_outcome(parser, "the result")
 
@@ -107,22 +119,23 @@ def main(args: argparse.Namespace) -> int:
 
 def _calibrate(args: argparse.Namespace, lines: JsonPrompt | None) -> int:
     _require_fitting(args)
-    where, mine = load(args.config)
+    where, local_config = load(args.config)
     if args.write:
         writable(args.config)
     # Messages and reports name a recorded drive by the path of its file.
     source = str(args.log) if args.log else "the drive"
     try:
         if args.log:
-            found, config = calibrated(args.log, mine, args.distance, _choice(args)), mine
+            found = calibrated(args.log, local_config, args.distance, _choice(args))
+            config = local_config
         else:
-            found, config = _guided(args, mine, where, lines)
+            found, config = _guided(args, local_config, where, lines)
     except (LogError, RefusedError, GuideError, NobodyError) as error:
         notes = tuple(getattr(error, "__notes__", ()))
         if args.json:
             print(msgspec.json.encode(Refusal(source, str(error), notes)).decode(), flush=True)
-        behind = "".join(f"\nnote: {note}" for note in notes)
-        raise MendableError(f"{source}: {error}{behind}") from None
+        notes_text = "".join(f"\nnote: {note}" for note in notes)
+        raise MendableError(f"{source}: {error}{notes_text}") from None
     written, trouble = "", None
     if args.write:
         try:
@@ -131,16 +144,16 @@ def _calibrate(args: argparse.Namespace, lines: JsonPrompt | None) -> int:
         except MendableError as error:
             # Print the result of the long drive before the error.
             trouble = error
-    told = report(source, found, config.drive, written)
-    words = parts(told, found, where, guided=not args.log)
+    result = report(source, found, config.drive, written)
+    words = parts(result, found, where, guided=not args.log)
     if lines is None:
         if args.json:
-            print(msgspec.json.encode(told).decode())
+            print(msgspec.json.encode(result).decode())
         else:
             show(*words, most=MAX_TEXT_WIDTH)
     else:
         lines.result(plain(*words, width=MAX_TEXT_WIDTH))
-        differing = _differing(config, mine, where)
+        differing = _differing(config, local_config, where)
         if not args.write and lines.offer(args.config, keys(found), differing):
             written = where
     if trouble is not None:
@@ -232,7 +245,7 @@ def _guided(
                 "--yes is only for the built-in simulator: this robot is real, and a person "
                 "must stand near it and start each leg. Leave --yes out"
             )
-        mine = config
+        local_config = config
         try:
             config = msgspec.convert(client.get("config"), Config)
         except msgspec.ValidationError as error:
@@ -240,9 +253,9 @@ def _guided(
                 f"this version of acsard cannot read the daemon's configuration ({error}): use the "
                 f"daemon's version, {info.version}"
             ) from None
-        if args.write and (trouble := _differing(config, mine, where)):
+        if args.write and (trouble := _differing(config, local_config, where)):
             raise GuideError(trouble)
-        name = _way(args, config)
+        name = _method(args, config)
         made = setup(config)
         prompt = stack.enter_context(_prompt(args, lines))
         prompt.begin(f"robot {robot_id} at {endpoint}", simulated=info.simulated)
@@ -293,9 +306,9 @@ def _usable(args: argparse.Namespace, odometry: str) -> None:
         )
 
 
-def _differing(config: Config, mine: Config, where: str) -> str:
+def _differing(config: Config, local_config: Config, where: str) -> str:
     same = config.drive.wheel_radius, config.drive.wheel_separation
-    if same == (mine.drive.wheel_radius, mine.drive.wheel_separation):
+    if same == (local_config.drive.wheel_radius, local_config.drive.wheel_separation):
         return ""
     return (
         f"the daemon runs with drive.wheel_radius = {same[0]:g} and drive.wheel_separation "
@@ -304,7 +317,7 @@ def _differing(config: Config, mine: Config, where: str) -> str:
     )
 
 
-def _way(args: argparse.Namespace, config: Config) -> str:
+def _method(args: argparse.Namespace, config: Config) -> str:
     if args.positions:
         return "positions"
     gyro = args.method == "gyro" or args.imu
@@ -313,8 +326,8 @@ def _way(args: argparse.Namespace, config: Config) -> str:
             "this robot's daemon does not read a gyro: set odometry.gyro = true and restart "
             "the daemon, or use --method tape, wall or umbmark"
         )
-    way: str = args.method or ("gyro" if gyro or config.odometry.gyro else "tape")
-    return way
+    method: str = args.method or ("gyro" if gyro or config.odometry.gyro else "tape")
+    return method
 
 
 @contextmanager
@@ -326,5 +339,5 @@ def _prompt(args: argparse.Namespace, lines: JsonPrompt | None) -> Iterator[Prom
         if lines is not None:
             yield lines
             return
-        with one_by_one():
+        with single_key_mode():
             yield TerminalPrompt(args.json)

@@ -17,7 +17,7 @@ from acsard.core.messages.keys_and_roles import PLAIN_SERVICES, SERVICES
 from acsard.core.messages.schema import MESSAGES
 from acsard.core.values import Verb
 from acsard.daemon.bus import robot_discovery
-from acsard.daemon.bus.robot_discovery import named
+from acsard.daemon.bus.robot_discovery import parse_ids
 from acsard.host.errors import UsageError
 
 CALLABLE_SERVICES = tuple(service for service in SERVICES if service != "set")
@@ -55,8 +55,8 @@ def main(args: argparse.Namespace) -> int:
     for name, value in zip(wanted, args.values, strict=True):
         if not math.isfinite(value):
             raise UsageError(f"{name.upper()} = {value}: the number must be finite; correct it")
-    if args.service != "stop" and (ids := named(args.id or "")):
-        raise UsageError(for_one(args.service, args.values, ids))
+    if args.service != "stop" and (ids := parse_ids(args.id or "")):
+        raise UsageError(one_robot_only_text(args.service, args.values, ids))
     with connected_to_many(args) as (robot, many):
         if many:
             return _stop_all(robot, many, as_json=args.json)
@@ -71,7 +71,7 @@ def _fields(service: Verb) -> tuple[str, ...]:
     return MESSAGES[SERVICES[service].payload].__struct_fields__
 
 
-def for_one(service: str, values: Sequence[float], ids: tuple[str, ...]) -> str:
+def one_robot_only_text(service: str, values: Sequence[float], ids: tuple[str, ...]) -> str:
     """Return the error text for a service that can be called on only one robot at a time.
 
     The text contains the command to type for each robot in `ids`. `values` are the numbers that the

@@ -175,7 +175,7 @@ def load(path: str | None, options: Mapping[str, object] | None = None) -> tuple
         ) from None
 
 
-def recorded(config: Config) -> Config:
+def with_record_directory(config: Config) -> Config:
     """Return a copy of `config` with an absolute path of the recording directory.
 
     If no directory is configured, the path comes from the environment variable ACSARD_RECORD, which

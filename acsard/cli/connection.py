@@ -23,7 +23,7 @@ from acsard.core.config.settings import TLS_PREFIX
 from acsard.core.formatting import printable
 from acsard.core.messages.keys_and_roles import key_hint, row_of, unknown
 from acsard.daemon.bus.address import Address, address_of
-from acsard.daemon.bus.robot_discovery import Presence, explain_silence, named, presence
+from acsard.daemon.bus.robot_discovery import Presence, explain_silence, parse_ids, presence
 from acsard.daemon.bus.tls import trouble
 from acsard.host.errors import UsageError
 
@@ -73,7 +73,7 @@ def robot_address(args: argparse.Namespace) -> Address:
 
 def require_one(args: argparse.Namespace) -> None:
     """Raise `UsageError` if `--id` names several robots."""
-    if named(args.id or ""):
+    if parse_ids(args.id or ""):
         raise UsageError(
             f"--id '{args.id}' names several robots, but `acsard {args.verb}` takes one: "
             "`acsard fleet` lists the robots; only echo, get, set, fleet and call stop take several"
@@ -86,10 +86,10 @@ def connected_to_many(args: argparse.Namespace) -> Iterator[tuple[Client, tuple[
 
     If `--id` names one robot, the client is for this robot, and the tuple of ids is empty. Without
     `--id`, the client is for the configured robot. If `--id` names several robots, the tuple
-    contains their ids, or only "*" for `--id '*'`. Then use `Client.like` to get a client of one of
-    these robots.
+    contains their ids, or only "*" for `--id '*'`. Then use `Client.sibling` to get a client of
+    one of these robots.
     """
-    many = named(args.id or "")
+    many = parse_ids(args.id or "")
     _, config = load(args.config)
     where = address_of(config, args.connect, None if many else args.id, args.tls)
     with connect(where.endpoint, robot_id=where.robot_id, tls=where.tls) as robot:

@@ -30,8 +30,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     require_one(args)
-    told = partial(address_of, connect=args.connect, robot_id=args.id, tls=args.tls)
-    findings = list(examine(*find(args.config), by_environment(), told))
+    find_address = partial(address_of, connect=args.connect, robot_id=args.id, tls=args.tls)
+    findings = list(examine(*find(args.config), by_environment(), find_address))
     if args.json:
         print(msgspec.json.encode(findings).decode())
     else:

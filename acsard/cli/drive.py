@@ -15,7 +15,7 @@ from acsard.core.messages.permissions import COMMAND_ROLE, has
 from acsard.host.errors import NoAnswerError, NotPermittedError, UsageError
 from acsard.top import terminal
 from acsard.top.drive_screen import HELP
-from acsard.top.keyboard import Keyboard, Ride
+from acsard.top.keyboard import Keyboard, KeyboardDrive
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -50,10 +50,10 @@ def main(args: argparse.Namespace) -> int:
     with connected(args, args.source) as robot:
         if robot.where.tls and not has((us := robot.whoami()).role, COMMAND_ROLE):
             raise (NotPermittedError if us.role else NoAnswerError)(us.words())
-        ride = Ride(robot, Keyboard(args.linear, args.angular))
+        ride = KeyboardDrive(robot, Keyboard(args.linear, args.angular))
         try:
             terminal.drive(ride)
         finally:
             ride.end()
-        terminal.part(ride)
+        terminal.print_last_report(ride)
     return 0

@@ -33,7 +33,13 @@ from acsard.core.messages.encodings import DecodeError, Decoder
 from acsard.core.messages.keys_and_roles import TOPICS, by_key
 from acsard.core.messages.schema import MESSAGES
 from acsard.core.messages.short_texts import SHORT_TEXTS, short
-from acsard.daemon.bus.robot_discovery import ALL_ROBOTS, follow, named, present, robot_of
+from acsard.daemon.bus.robot_discovery import (
+    ALL_ROBOTS,
+    follow,
+    parse_ids,
+    robot_of,
+    running_robots,
+)
 from acsard.daemon.bus.subscription import encoded
 from acsard.host import clock
 from acsard.host.errors import Exit, NoAnswerError, UsageError
@@ -68,7 +74,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     topic = args.topic[0]
     if args.csv:
-        if named(args.id or ""):
+        if parse_ids(args.id or ""):
             raise UsageError(
                 "a CSV log can contain only one robot: with --csv, name one robot in --id"
             )
@@ -209,7 +215,7 @@ def _report_left_out(full_key: str, key: str, error: Exception) -> None:
     print(
         f"acsard: a message on {full_key} is left out of the log: "
         f"{formatting.printable(str(error))}. Further such messages on this key are left out "
-        f"without a report. Mend the program that sends them; `acsard echo {key}` prints them",
+        f"without a report. Correct the program that sends them; `acsard echo {key}` prints them",
         file=sys.stderr,
     )
 
@@ -220,7 +226,7 @@ def _expected(robot: Client, ids: tuple[str, ...]) -> Collection[str]:
     # robot.
     there: list[str] = []
     try:
-        there = present(robot.session, ids, robot.where.endpoint)
+        there = running_robots(robot.session, ids, robot.where.endpoint)
         missing = [one for one in ids if one not in there and one != ALL_ROBOTS]
         words = f"following {', '.join(there) or 'no robot yet'}"
         words += f"; not present: {', '.join(missing)}" if missing else ""

@@ -1,5 +1,5 @@
-"""Show mode, speed, link, place, version and reason of every robot that the bus or router at
---connect knows, live; q or Ctrl-C quits. Over TLS a role may use only exact keys, so name the
+"""Show a live table of every robot on the bus or router at --connect: mode, speed, link, place,
+version and reason. Press q or Ctrl-C to quit. Over TLS a role may use only exact keys, so name the
 robots: --id robot1,robot2. Into a pipe, or with --once, the tool prints one table. PLACE gives x
 and y in m and the heading. SEEN gives the age of the last report. WHY gives the warnings, then the
 reason why the robot moves or does not move, then the details of the warnings. A robot that is ready
@@ -46,7 +46,7 @@ def main(args: argparse.Namespace) -> int:
         if not rows:
             # Over TLS the client's certificate may not be permitted to see any of the named robots.
             named = robot.where.tls and ids != (ALL_ROBOTS,)
-            silence = robot.like(ids[0]).whoami().silence if named else ""
+            silence = robot.sibling(ids[0]).whoami().silence if named else ""
             raise UnreachableError("; ".join(filter(None, (fleet.hint(), silence))))
         if args.json:
             print(json_line(msgspec.json.encode(rows).decode()), flush=True)
@@ -54,6 +54,6 @@ def main(args: argparse.Namespace) -> int:
         width = output_size().columns
         # Flush now, so that a session that closes slowly does not hold back the table.
         print("\n".join(table(rows, width)), flush=True)
-    for told in filter(None, (fleet.seen, fleet.more)):
+    for told in filter(None, (fleet.seen, fleet.left_out_text)):
         print(f"acsard: {told}", file=sys.stderr)
     return int(Exit.OK)

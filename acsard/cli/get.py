@@ -16,7 +16,7 @@ from acsard.cli.replies import json_line, of_robot
 from acsard.core import formatting
 from acsard.core.formatting import printable
 from acsard.core.values import AcsardError
-from acsard.daemon.bus.robot_discovery import ALL_ROBOTS, present
+from acsard.daemon.bus.robot_discovery import ALL_ROBOTS, running_robots
 from acsard.host.errors import Exit
 
 
@@ -32,10 +32,14 @@ def main(args: argparse.Namespace) -> int:
             _show(json_line(*robot.reply(args.key)))
             return 0
         silent = 0
-        wanted = present(robot.session, many, robot.where.endpoint) if ALL_ROBOTS in many else many
+        wanted = (
+            running_robots(robot.session, many, robot.where.endpoint)
+            if ALL_ROBOTS in many
+            else many
+        )
         for one in wanted:
             try:
-                line = json_line(*robot.like(one).reply(args.key))
+                line = json_line(*robot.sibling(one).reply(args.key))
             except AcsardError as error:
                 silent += 1
                 print(printable(f"{one}: NO ANSWER: {error}"), file=sys.stderr)

@@ -23,7 +23,7 @@ from acsard.host import clock
 from acsard.host.config_file import change, writable
 from acsard.host.errors import Exit, MendableError, UsageError
 from acsard.host.processes import master_of
-from acsard.host.terminal_modes import one_by_one
+from acsard.host.terminal_modes import single_key_mode
 from acsard.terminal.json_prompt import JsonPrompt
 from acsard.terminal.prompt import Prompt, ended_by_signals
 from acsard.terminal.terminal_prompt import NoPrompt, TerminalPrompt
@@ -107,7 +107,7 @@ def _checked(
             ended_by_signals(
                 "stopping: acsard sends zero speeds to the board, then closes the port", exits=True
             ),
-            one_by_one() if isinstance(prompt, TerminalPrompt) else nullcontext(),
+            single_key_mode() if isinstance(prompt, TerminalPrompt) else nullcontext(),
         ):
             procedure.run(_wire(config), prompt, config, tell, clock.asleep_ns)
     except MendableError as error:

@@ -2,7 +2,8 @@
 first, with the main events of each. `!` marks recordings with a stop, a fault or a crash. With
 --from and --to, list only the recordings from the time between them. The argument FILE of a
 subcommand is the file of a recording, its number in the list, or `all`. Without FILE, a subcommand
-uses the newest recording, or all recordings between --from and --to if these are dates or times.
+uses the newest recording. If --from or --to is a date or a time of day, it uses all recordings in
+that span.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from acsard.host.extras import missing
 from acsard.recording.atomic_output import replacing
 from acsard.recording.directory import is_being_recorded
 from acsard.recording.directory import listed as recordings_in
-from acsard.recording.end_record import CRASH_CUTS, EndRecord, how_it_ends, read_end
+from acsard.recording.end_record import CRASH_CUTS, EndRecord, ending_text, read_end
 from acsard.recording.export import SUFFIX, Kind, export
 from acsard.recording.file import UNFINISHED, Recording, is_part, rewrite
 from acsard.recording.file_replay import config_of, replay_file, steps
@@ -57,7 +58,7 @@ from acsard.recording.time_span import (
     span,
 )
 from acsard.recording.timeline import TimelineEntry, TimelineWriter, is_serious
-from acsard.report.page import drawn
+from acsard.report.page import make_report
 from acsard.terminal.output import show, table
 
 MAX_NAMES = 10
@@ -251,7 +252,7 @@ def main(args: argparse.Namespace) -> int:
                 recording = Recording(path)
                 end = recording.compute_end_record()
                 fresh = is_being_recorded(path, time.time())
-                note = "being recorded" if fresh else recording.missing
+                note = "being recorded" if fresh else recording.missing_text
             begin_ns = end.wall_ns if end.earliest_ns is None else end.earliest_ns
             if begin_ns / NS_PER_S <= last and first <= end.last_ns / NS_PER_S:
                 rows.append(_row(path, end, note))
@@ -273,7 +274,7 @@ def _row(path: Path, end: EndRecord, note: str) -> tuple[str, ...]:
     began = clock(end.wall_ns / 1e9, day=True)
     seconds, size = (end.last_ns - end.wall_ns) / 1e9, path.stat().st_size / 1000
     mark = "! " if is_serious(end.said) or end.cut in CRASH_CUTS else "  "
-    said = end.said + _bracketed(how_it_ends(end.cut, end.why)) + _bracketed(note)
+    said = end.said + _bracketed(ending_text(end.cut, end.why)) + _bracketed(note)
     return path.name, began, f"{seconds:.0f} s", f"{size:.0f} kB", mark + printable(said).strip()
 
 
@@ -287,7 +288,7 @@ def main_show(args: argparse.Namespace) -> int:
             raise RecordingError(
                 f"{recording.path} has no step in that span of time: correct --from and --to"
             )
-        note = recording.missing
+        note = recording.missing_text
         if _is_being_recorded(recording):
             note = note.replace(UNFINISHED, "being recorded")
         _note(recording, _bracketed(note))
@@ -313,7 +314,8 @@ def _show(recording: Recording, part: Span, as_json: bool) -> bool:
     found, over = False, False
     for step in steps(recording):
         if over:
-            # Read the remaining steps too, so that `recording.missing` covers the whole recording.
+            # Read the remaining steps too, so that `recording.missing_text` covers the whole
+            # recording.
             continue
         seconds = (step.inputs.now.mono_ns - recording.about.mono_ns) / NS_PER_S
         over = seconds > part.end
@@ -375,7 +377,7 @@ def main_replay(args: argparse.Namespace) -> int:
         print(printable(row))
     left_out = describe_gaps(result.gaps, "not compared")
     _note(recording, left_out)
-    _note(recording, _bracketed(recording.missing))
+    _note(recording, _bracketed(recording.missing_text))
     if not result.same and other is None:
         return int(Exit.FAILURE)
     return int(Exit.INCOMPLETE if left_out else Exit.OK)
@@ -398,7 +400,7 @@ def main_recover(args: argparse.Namespace) -> int:
             count = rewrite(recording, part)
     except OSError as error:
         raise MendableError(f"cannot write {new}: {error.strerror}") from None
-    print(f"{many(count, 'message')} in {new}{replaces}{_bracketed(recording.missing)}")
+    print(f"{many(count, 'message')} in {new}{replaces}{_bracketed(recording.missing_text)}")
     return int(Exit.OK)
 
 
@@ -416,7 +418,7 @@ def main_export(args: argparse.Namespace) -> int:
         print(f"{done.count} {'rows' if kind == 'csv' else 'messages'} in {new}")
         left_out = describe_gaps(done.gaps, "not exported")
         _note(recording, left_out)
-        _note(recording, _bracketed(recording.missing))
+        _note(recording, _bracketed(recording.missing_text))
         if left_out:
             code = Exit.INCOMPLETE
     return int(code)
@@ -432,12 +434,12 @@ def main_report(args: argparse.Namespace) -> int:
     for recording, part in _files_to_write(args):
         if args.supervised:
             end_with_parent(signal.SIGKILL)
-            text, _ = drawn(recording, plotly, part, _percent(recording))
+            text, _ = make_report(recording, plotly, part, _percent(recording))
             sys.stdout.buffer.write(text.encode())
             continue
         new = Path(args.new or f"{recording.path.name.partition('.')[0]}.html")
         with _written(new), replacing(new, args.force) as file, _progress(recording) as tell:
-            text, notes = drawn(recording, plotly, part, tell)
+            text, notes = make_report(recording, plotly, part, tell)
             file.write_text(text, encoding="utf-8")
         print(f"{new}: {len(text) / 1e6:.1f} MB; open it in any browser")
         for note in notes:

@@ -14,7 +14,7 @@ from acsard.core.formatting import printable
 from acsard.core.messages.encodings import DecodeError, detect, encode
 from acsard.core.messages.schema import ServiceReply
 from acsard.core.values import AcsardError
-from acsard.daemon.bus.robot_discovery import ALL_ROBOTS, present, seen
+from acsard.daemon.bus.robot_discovery import ALL_ROBOTS, count_text, running_robots
 from acsard.host.errors import Exit
 
 
@@ -61,11 +61,13 @@ def of_each(
         ids: the ids of the robots. An id "*" stands for all robots that are present.
         call: function that gets a client of one robot, and calls the service of this robot.
     """
-    wanted = present(robot.session, ids, robot.where.endpoint) if ALL_ROBOTS in ids else list(ids)
+    wanted = (
+        running_robots(robot.session, ids, robot.where.endpoint) if ALL_ROBOTS in ids else list(ids)
+    )
 
     def called(one: str) -> ServiceReply | AcsardError:
         try:
-            return call(robot.like(one))
+            return call(robot.sibling(one))
         except AcsardError as error:  # the robot did not answer, or its answer cannot be decoded
             return error
 
@@ -94,7 +96,7 @@ def print_each(
         line = encode(reply, "json").decode()
         print(of_robot(one, line) if as_json else printable(f"{one}: {reply.message}"))
     if ALL_ROBOTS in ids:
-        print(f"acsard: {seen(robot.where.endpoint, len(replies))}", file=sys.stderr)
+        print(f"acsard: {count_text(robot.where.endpoint, len(replies))}", file=sys.stderr)
     if any(isinstance(reply, AcsardError) for reply in replies.values()):
         return int(Exit.UNREACHABLE)
     done = [isinstance(reply, ServiceReply) and reply.success for reply in replies.values()]

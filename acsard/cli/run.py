@@ -13,7 +13,7 @@ import sys
 from importlib.util import find_spec
 from pathlib import Path
 
-from acsard.cli.common import add_config, by_environment, load, recorded, tables
+from acsard.cli.common import add_config, by_environment, load, tables, with_record_directory
 from acsard.core.config.contradictions import warnings
 from acsard.core.config.parsing import parse
 from acsard.core.config.settings import Config
@@ -89,7 +89,7 @@ def options(args: argparse.Namespace) -> dict[str, object]:
 
 def main(args: argparse.Namespace) -> int:
     where, config = load(args.config, options(args))
-    config = recorded(config)
+    config = with_record_directory(config)
     log, screen, served = Log(config.log), Writer(sys.stdout), page(config, where)
 
     def announce(device: str, trouble: str) -> None:
@@ -154,7 +154,7 @@ def settings_file(where: str, config: Config, given: dict[str, object]) -> Setti
     """
     overrides = tables(given, by_environment())
     file = Path(where).absolute() if Path(where).is_file() else None
-    return SettingsFile(file, lambda text: recorded(parse(text, overrides)), config)
+    return SettingsFile(file, lambda text: with_record_directory(parse(text, overrides)), config)
 
 
 def page(config: Config, where: str) -> list[str] | None:

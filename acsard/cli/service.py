@@ -11,7 +11,7 @@ from collections.abc import Iterable
 
 from acsard.host.errors import Exit, MendableError, NotPermittedError
 from acsard.machine import service_installation as service
-from acsard.machine.service_installation import Step, lacking, misplaced
+from acsard.machine.service_installation import Step, missing_prerequisite, unusable_location
 from acsard.terminal.output import show, table
 
 
@@ -46,7 +46,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def main_install(args: argparse.Namespace) -> int:
     _ready(args)
-    trouble = misplaced() or lacking()
+    trouble = unusable_location() or missing_prerequisite()
     if trouble:
         print(f"acsard: {trouble}", file=sys.stderr)
         if not (args.dry_run or args.force):
@@ -68,7 +68,7 @@ def main_uninstall(args: argparse.Namespace) -> int:
     steps = service.uninstalling(
         files,
         service.present(files),
-        service.strangers(files, service.own_places()),
+        service.foreign_entries(files, service.config_directories()),
         force=args.force or args.purge,
         purge=args.purge,
         stateful=[unit for unit, (where, _) in service.STATE_DIRECTORIES.items() if where.exists()],

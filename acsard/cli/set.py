@@ -4,8 +4,8 @@ logs them and publishes them on the key `config`. They last until the daemon's n
 limits of speed, acceleration and jerk are an exception: they also survive the next start, but not
 on the simulator. With --keep the robot also writes the settings into its own configuration file,
 and the answer names that file. With --write this tool writes them into the configuration file of
-this machine. Neither --keep nor --write changes the file for a source's timeout: edit
-[[commands.sources]] yourself. A robot that drives faster than a new limit slows down to it.
+this machine. --keep and --write cannot write a source's timeout: edit [[commands.sources]] in the
+file. A robot that drives faster than a new limit slows down to it.
 Without a setting, list the settings that can be changed. If --id names several robots, all of them
 get the settings at the same time, and each line has the answer of one robot. The exit code is 1 if
 a robot refuses, and 69 if a robot does not answer.
@@ -25,7 +25,7 @@ from acsard.cli.connection import SEVERAL_IDS, add_bus, connected_to_many
 from acsard.cli.replies import of_each, print_each
 from acsard.client import Client
 from acsard.core.config.live import flat, live
-from acsard.core.config.lowered import LIMITS_PREFIX, lowered, stays
+from acsard.core.config.lowered import LIMITS_PREFIX, lowered, survives_restart
 from acsard.core.config.settings import LimitsConfig
 from acsard.core.config.validation import finite, show
 from acsard.core.formatting import json_line, lines
@@ -33,7 +33,7 @@ from acsard.core.messages.encodings import encode
 from acsard.core.messages.schema import ServiceReply
 from acsard.core.ros.parameters import described
 from acsard.core.values import Plain
-from acsard.daemon.bus.robot_discovery import named
+from acsard.daemon.bus.robot_discovery import parse_ids
 from acsard.host.config_file import change, require_changeable, writable
 from acsard.host.errors import Exit, MendableError, UsageError
 from acsard.host.extras import install
@@ -72,7 +72,7 @@ def main(args: argparse.Namespace) -> int:
     settings = pairs(args.settings)
     if args.keep and not settings:
         raise UsageError("--keep needs a setting: acsard set limits.linear_speed 0.8 --keep")
-    if named(args.id or ""):
+    if parse_ids(args.id or ""):
         _require_for_many(args, settings)
     file = _file(args.config, settings) if args.write else None
     if file is not None:
@@ -84,7 +84,7 @@ def main(args: argparse.Namespace) -> int:
         if many:
             return _set_all(robot, many, settings, keep=args.keep, as_json=args.json)
         reply = robot.set(settings, keep=args.keep)
-    text = reply.message if args.keep or not reply.success else _lasting(reply.message)
+    text = reply.message if args.keep or not reply.success else _with_duration(reply.message)
     if reply.success and file is not None:
         try:
             change(file, settings)
@@ -131,12 +131,12 @@ def _require_for_many(args: argparse.Namespace, settings: dict[str, Plain]) -> N
         )
 
 
-def _lasting(message: str) -> str:
-    until = _until(message)
+def _with_duration(message: str) -> str:
+    until = _duration_of_changes(message)
     return f"{message}; {until}" if until else message
 
 
-def _until(message: str) -> str:
+def _duration_of_changes(message: str) -> str:
     """Return a text that says how long the changes stay in force, or "" if there is no change.
 
     `message` is the daemon's answer, with text such as "KEY = NEW (was OLD)" for each change.
@@ -144,7 +144,7 @@ def _until(message: str) -> str:
     changes = {key: (new, old) for key, new, old in _CHANGE.findall(message)}
     if not changes:
         return ""
-    limits = {key: pair for key, pair in changes.items() if stays(key)}
+    limits = {key: pair for key, pair in changes.items() if survives_restart(key)}
     try:
         kept = lowered(_limits(limits, 1), _limits(limits, 0))
     except (TypeError, ValueError):  # a daemon of another version may have other limits
@@ -177,7 +177,7 @@ def _set_all(
         reply = one.set(settings, keep=keep)
         if as_json or keep or not reply.success:
             return reply
-        return ServiceReply(True, _lasting(reply.message))
+        return ServiceReply(True, _with_duration(reply.message))
 
     replies = of_each(robot, ids, change_one)
     return print_each(replies, robot, ids, "NO ANSWER: {error}", as_json=as_json)

@@ -118,7 +118,7 @@ async def _play(config: Config, args: argparse.Namespace) -> int:
             if fault.name == RESET_FAULT:
                 _reset_again(mcu, fault.values[0])
             else:
-                stack.enter_context(mcu.having(fault))
+                stack.enter_context(mcu.switched_on(fault))
         device = stack.enter_context(SimPty(mcu)).path
         if args.link:
             link = Path(args.link)

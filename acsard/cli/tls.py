@@ -234,7 +234,10 @@ def _admit_service(directory: Path) -> None:
     if step is None:
         return
     step.do()
-    print(f"{step}\nThis file sets which networks reach the TLS gateway. Check them, then run:")
+    print(
+        f"{step}\nThis file lists the networks that may reach the TLS gateway."
+        " Check the list, then run:"
+    )
     print("systemctl daemon-reload && systemctl restart acsard\n")
 
 
@@ -266,8 +269,8 @@ COMMAND_NAMES_WARNING = """\
 `acsard router`, `acsard web` and the gateway of `acsard run` use the new certificate within 5 s by
 themselves. For this, the gateway and the router disconnect their clients for about a second, and a
 robot that one of those clients drives ramps to zero. If you started `acsard gateway` by hand, it
-ends with code 1: start it again. A robot that connects to a router uses the new certificate from
-its next connection on. Until then, `acsard doctor` warns of the old certificate; a restart of
+ends with code 1: start it again. A robot that connects to a router uses the new certificate when it
+connects the next time. Until then, `acsard doctor` warns about the old certificate; a restart of
 `acsard run` ends the warning immediately.
 
 A systemd service has copies of the files. To renew the copies, run these commands on the machine

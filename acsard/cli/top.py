@@ -1,5 +1,5 @@
-"""Show mode, pose, wheels, command sources, link and timing on one screen, live; q or Ctrl-C quits.
-Into a pipe, or with --once, the tool prints one screen as plain text.
+"""Show mode, pose, wheels, command sources, link and timing live on one screen. Press q or Ctrl-C
+to quit. Into a pipe, or with --once, the tool prints one screen as plain text.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ def main(args: argparse.Namespace) -> int:
     with connected(args) as robot:
         feed = Feed(robot)
         if args.once or not has_screen():
-            print(terminal.once(feed))
+            print(terminal.one_screen(feed))
         else:
             terminal.live(feed)
     return 0

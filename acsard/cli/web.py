@@ -13,7 +13,7 @@ import time
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from acsard.cli.common import load, recorded, whole
+from acsard.cli.common import load, whole, with_record_directory
 from acsard.cli.connection import add_bus
 from acsard.core.config.settings import Config
 from acsard.core.formatting import lasting
@@ -101,7 +101,7 @@ def main(args: argparse.Namespace) -> int:
         ) from None
     options = {"record.directory": args.record or None, "bus.tls": args.tls or None}
     where, loaded = load(args.config, options)
-    config = recorded(loaded)
+    config = with_record_directory(loaded)
     if args.invite:
         return _invite(args, config, where)
     if args.tokens:
@@ -113,18 +113,18 @@ def main(args: argparse.Namespace) -> int:
 
 def _serve(args: argparse.Namespace, config: Config) -> int:
     from acsard.web import server, tokens
-    from acsard.web.listen import opened_by
+    from acsard.web.listen import page_urls
 
     def announce(found: Sequence[Listen]) -> None:
         for one, wished in zip(found, listen, strict=True):
             taken = "" if one == wished else f"  ({wished.url} is taken)"
-            for url in opened_by(one, tls):
+            for url in page_urls(one, tls):
                 print(f"  page    {url}{taken}", flush=True)
 
     tls = args.tls or config.bus.tls
     listen = _listen(args, config)
     log_from_environment()
-    wanted = server.Wanted(
+    options = server.ServerOptions(
         config,
         address_of(config, args.connect, args.id, args.tls),
         listen,
@@ -135,16 +135,16 @@ def _serve(args: argparse.Namespace, config: Config) -> int:
     )
     log = Log(config.log)
     try:
-        asyncio.run(server.serve(wanted, announce, log))
+        asyncio.run(server.serve(options, announce, log))
     finally:
         log.close()
     return int(Exit.OK)
 
 
 def _listen(args: argparse.Namespace, config: Config) -> tuple[Listen, ...]:
-    from acsard.web.listen import listens
+    from acsard.web.listen import parse_listen
 
-    return tuple(listens(text) for text in args.address or config.web.address)
+    return tuple(parse_listen(text) for text in args.address or config.web.address)
 
 
 def _invite(args: argparse.Namespace, config: Config, where: str) -> int:

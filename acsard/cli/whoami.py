@@ -1,6 +1,7 @@
 """Ask the robot for the role of this client: viewer, operator or maintainer. Over TLS the
-certificate decides; on the robot's own machine every client is maintainer. The exit code is 69 if
-no daemon answers. Over TLS it is 77 instead, because this client's certificate may have no role.
+certificate decides; on the robot's own machine every client is maintainer. If no daemon answers,
+the exit code is 69. Over TLS it is 77, because the daemon also does not answer a client whose
+certificate has no role.
 """
 
 from __future__ import annotations

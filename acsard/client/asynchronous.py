@@ -7,22 +7,29 @@ the loop for up to 3 ms (`MIN_SPACING_S`) if another command was sent just befor
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Mapping
+from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import aclosing, asynccontextmanager, closing, suppress
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
 from acsard.client.commander import REPEAT_ZERO_S
 from acsard.client.driving import UnheardError, drive
 from acsard.client.synchronous import REPLY_TIMEOUT_S, Client, close, decoder
 from acsard.core.messages import schema
-from acsard.core.values import Plain, Pose
+from acsard.core.values import AcsardError, Plain, Pose
 from acsard.daemon.bus.address import address_by_environment
 from acsard.daemon.bus.identity import Identity
 from acsard.daemon.bus.subscription import encoded
 from acsard.daemon.bus.zenoh_sessions import client_session
 from acsard.host.errors import NoAnswerError
 from acsard.host.threads import in_thread
+
+T = TypeVar("T")
+
+CALL_TIMEOUT_S = 6 * REPLY_TIMEOUT_S
+"""Time within which a call must end, s. The longest call is a `clear`, which takes up to 15 s: it
+queries the state, repeats this query for 3 s while the daemon is busy, calls the service, and finds
+out why no reply came."""
 
 CLOSE_TIMEOUT_S = 5.0
 """Time within which a connection must close, s."""
@@ -40,8 +47,8 @@ async def connect_async(
 
     The arguments are those of `connect`.
     """
-    where = await in_thread(lambda: address_by_environment(endpoint, robot_id, tls), 5.0)
-    session = await in_thread(lambda: client_session(where.endpoint, where.tls), 10.0, late=close)
+    where = await _in_thread(lambda: address_by_environment(endpoint, robot_id, tls), 5.0)
+    session = await _in_thread(lambda: client_session(where.endpoint, where.tls), 10.0, late=close)
     robot = Client(session, where.robot_id, source, where.tls, where.endpoint)
     try:
         yield AsyncClient(robot)
@@ -56,6 +63,28 @@ async def connect_async(
         raise NoAnswerError(
             f"the connection could not be closed within {CLOSE_TIMEOUT_S:g} s, so the final zeros "
             "may be lost: the robot stops after the timeout of its source"
+        ) from None
+
+
+async def _in_thread(
+    call: Callable[[], T], timeout_s: float | None = None, late: Callable[[T], None] | None = None
+) -> T:
+    """Call `call` in a new thread, and return its result, as `in_thread` does.
+
+    Raises `NoAnswerError` if `call` has not returned after `timeout_s` s (None means
+    `CALL_TIMEOUT_S`), or if no thread can be started.
+    """
+    timeout_s = CALL_TIMEOUT_S if timeout_s is None else timeout_s
+    try:
+        return await in_thread(call, timeout_s, late)
+    except AcsardError:
+        # `NoAnswerError` is also a `TimeoutError`.
+        raise
+    except TimeoutError as error:
+        raise NoAnswerError(
+            str(error)
+            or f"this call did not end within {timeout_s:g} s: the daemon or the network is stuck; "
+            "try again, or run `acsard doctor` on the robot"
         ) from None
 
 
@@ -76,8 +105,7 @@ class AsyncClient:
                 for pause in steps:
                     await asyncio.sleep(pause)
         except (UnheardError, NoAnswerError) as error:
-            found = await in_thread(partial(self._client.unheard, error), 2 * REPLY_TIMEOUT_S)
-            raise found from None
+            raise await _in_thread(partial(self._client.explain_error, error)) from None
         except BaseException:
             await asyncio.sleep(REPEAT_ZERO_S)
             self._client.zero_again()
@@ -85,25 +113,25 @@ class AsyncClient:
 
     async def call(self, service: str, **fields: float) -> schema.ServiceReply:
         """Call a service and return its reply, as `Client.call` does."""
-        return await in_thread(lambda: self._client.call(service, **fields), 2 * REPLY_TIMEOUT_S)
+        return await _in_thread(lambda: self._client.call(service, **fields))
 
     async def set(
         self, settings: Mapping[str, Plain], *, keep: bool = False
     ) -> schema.ServiceReply:
         """Change settings of the daemon and return the reply, as `Client.set` does."""
-        return await in_thread(lambda: self._client.set(settings, keep=keep), 2 * REPLY_TIMEOUT_S)
+        return await _in_thread(lambda: self._client.set(settings, keep=keep))
 
     async def get(self, name: str) -> Any:
         """Return the last message on a key, decoded to its type, as `Client.get` does."""
-        return await in_thread(lambda: self._client.get(name), 2 * REPLY_TIMEOUT_S)
+        return await _in_thread(lambda: self._client.get(name))
 
     async def whoami(self) -> Identity:
         """Return this client's role and name at the robot, as `Client.whoami` does."""
-        return await in_thread(self._client.whoami, 2 * REPLY_TIMEOUT_S)
+        return await _in_thread(self._client.whoami)
 
     async def pose(self) -> Pose:
         """Return the present pose of the robot in the odom frame, m and rad."""
-        return await in_thread(self._client.pose, 2 * REPLY_TIMEOUT_S)
+        return await _in_thread(self._client.pose)
 
     async def messages(self, name: str) -> AsyncIterator[Any]:
         """Yield the messages of a published key as they arrive, decoded to their types."""

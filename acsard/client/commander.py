@@ -48,11 +48,11 @@ operator or ends the drive. A drive also ends if the program itself sends no com
 this. The commands of a new sender have no effect during the first 0.25 s, so this time must be
 longer. It must also be longer than a short delay of a known sender."""
 
-SILENCE_NS = 3 * NS_PER_S // 10
+BRAKING_AFTER_NS = 3 * NS_PER_S // 10
 """Time without a command after which the robot is assumed to brake, ns. It is a little longer than
 a source's default timeout of 0.25 s."""
 
-RELEASED_NS = 3 * NS_PER_S // 2
+RELEASE_TIMEOUT_NS = 3 * NS_PER_S // 2
 """Time without input after which a button or a key that was held counts as released, ns. A shorter
 silence may be a pause of the network. A panel of Foxglove publishes once a second by default, and
 must not seem released between its messages. The time must be shorter than 2 s, because the daemon
@@ -74,7 +74,7 @@ operator may no longer want it."""
 DRIVING_TIMEOUT_NS = NS_PER_S // 2
 """Time for which a sender still counts as driving after its last nonzero command, ns."""
 
-MAX_OPEN_TIMEOUT_S = 10.0
+MAX_SOURCE_TIMEOUT_S = 10.0
 """Longest timeout that a command source may have, s. The robot follows no command older than
 this."""
 
@@ -101,33 +101,42 @@ class Commander:
     At most one command waits to be sent. A newer command replaces the waiting command.
 
     Args:
-        leads: whether to send a zero (a command with the speed 0) before the first command, and
-            before the first command after each silence longer than `RELEASED_NS`. The daemon
-            requires a zero before a sender may move the robot, so set `leads` for a sender that
-            never sends zeros itself. No zero is sent after a shorter silence: a button may still be
-            held, and after a stop and a `clear`, a zero would let this button drive the robot.
-        since_ns: the monotonic time of the sender's connection, ns. Set this for a sender that may
-            connect while a button is held. If its first command arrives within `RELEASED_NS` after
-            this time, no zero is sent before that command. None means that no button was held.
-        gathers: whether the first command after a silence waits for `BURST_WINDOW_NS`. If several
-            commands arrive in this time, a congested link or a stalled process has delayed these
-            commands. In this case they are dropped, except the last one if it is a zero. Set this
-            for a sender without stamps, because the daemon cannot measure the delay of its
+        sends_leading_zero: whether to send a zero (a command with the speed 0) before the first
+            command, and before the first command after each silence longer than
+            `RELEASE_TIMEOUT_NS`. The daemon requires a zero before a sender may move the robot, so
+            set this for a sender that never sends zeros itself. No zero is sent after a shorter
+            silence: a button may still be held, and after a stop and a `clear`, a zero would let
+            this button drive the robot.
+        connected_ns: the monotonic time of the sender's connection, ns. Set this for a sender that
+            may connect while a button is held. If its first command arrives within
+            `RELEASE_TIMEOUT_NS` after this time, no zero is sent before that command. None means
+            that no button was held.
+        detects_bursts: whether the first command after a silence waits for `BURST_WINDOW_NS`. If
+            several commands arrive in this time, a congested link or a stalled process has delayed
+            these commands. In this case they are dropped, except the last one if it is a zero. Set
+            this for a sender without stamps, because the daemon cannot measure the delay of its
             commands.
     """
 
     def __init__(
-        self, *, leads: bool = False, gathers: bool = False, since_ns: int | None = None
+        self,
+        *,
+        sends_leading_zero: bool = False,
+        detects_bursts: bool = False,
+        connected_ns: int | None = None,
     ) -> None:
         self.replaced = self.stale = 0
         """Two counters of commands that were not sent. `replaced` counts the commands that a newer
         command replaced, and `stale` counts the commands that were too old or came in a burst."""
-        self._leads, self._gather_ns = leads, BURST_WINDOW_NS if gathers else 0
+        self._sends_leading_zero, self._gather_ns = (
+            sends_leading_zero,
+            BURST_WINDOW_NS if detects_bursts else 0,
+        )
         self._wish: Wish | None = None
         self._last = Wish(REST)
         """The newest command, sent or not."""
         self._came_ns = 0
-        self._since_ns = since_ns
+        self._connected_ns = connected_ns
         """Monotonic time of the sender's connection, ns; None if no button was held then."""
         self._heard_ns: int | None = None
         """Monotonic time of the newest command, ns; None before the first command."""
@@ -147,14 +156,14 @@ class Commander:
         """Store a command that has arrived. It replaces a command that still waits to be sent.
 
         Returns the time since the previous command arrived, ns, if this time is longer than
-        `SILENCE_NS`. Returns None after a shorter time, and for the first command. `now_ns` is the
-        monotonic time, ns.
+        `BRAKING_AFTER_NS`. Returns None after a shorter time, and for the first command. `now_ns`
+        is the monotonic time, ns.
         """
         silence = None if self._heard_ns is None else now_ns - self._heard_ns
-        begins = silence is None or silence > SILENCE_NS
-        before_ns = self._since_ns if self._heard_ns is None else self._heard_ns
-        if before_ns is None or now_ns - before_ns > RELEASED_NS:
-            self._lead = self._leads
+        begins = silence is None or silence > BRAKING_AFTER_NS
+        before_ns = self._connected_ns if self._heard_ns is None else self._heard_ns
+        if before_ns is None or now_ns - before_ns > RELEASE_TIMEOUT_NS:
+            self._lead = self._sends_leading_zero
         if begins or (self._crowded and now_ns >= self._hold_until_ns):
             self._burst, self._crowded = 0, False
             self._hold_until_ns = now_ns + self._gather_ns
@@ -199,7 +208,7 @@ class Commander:
         self._moved_ns = now_ns if moves else None
         return wish
 
-    def end(self, now_ns: int, timeout_s: float = MAX_OPEN_TIMEOUT_S) -> Wish | None:
+    def end(self, now_ns: int, timeout_s: float = MAX_SOURCE_TIMEOUT_S) -> Wish | None:
         """End the drive of this sender, and return a zero to send, or None.
 
         The command that waits to be sent is discarded. The result is a zero if the robot may still
@@ -225,11 +234,11 @@ class Commander:
         return Wish(REST, stamp_ns, self._last.steady)
 
     @property
-    def moves(self) -> bool:
+    def last_is_nonzero(self) -> bool:
         """Whether the last command that arrived was not zero, even if it arrived long ago."""
         return self._asked_ns is not None
 
-    def drives(self, now_ns: int) -> bool:
+    def is_driving(self, now_ns: int) -> bool:
         """Return whether this sender counts as driving at the monotonic time `now_ns`, ns.
 
         A sender counts as driving if its last command was not zero, and arrived within the last
@@ -284,7 +293,7 @@ def objection(state: RobotState, source: str, sender: str) -> str:
         )
     if state.mode == "waiting":
         return state.reason
-    if not heard(state, source):
+    if not receives_commands(state, source):
         return no_command(source)
     if state.source != source:
         return ours.waits_for or state.reason
@@ -307,7 +316,7 @@ def no_command(source: str) -> str:
     )
 
 
-def ends_hold(state: RobotState, source: str) -> bool:
+def must_release_key(state: RobotState, source: str) -> bool:
     """Return whether the operator must release a held key and press it again to drive.
 
     The operator must do so if the robot cannot drive in its present mode (a mode in
@@ -319,7 +328,7 @@ def ends_hold(state: RobotState, source: str) -> bool:
     return state.mode in NEVER_DRIVING_MODES or state.mode == "waiting" or zero_first
 
 
-def heard(state: RobotState, source: str) -> bool:
+def receives_commands(state: RobotState, source: str) -> bool:
     """Return whether `state` shows that the daemon receives commands of this source.
 
     Late commands count too.
@@ -327,7 +336,7 @@ def heard(state: RobotState, source: str) -> bool:
     return any(one.name == source and one.waits_for != "a command" for one in state.sources)
 
 
-def hopeless(state: RobotState, source: str) -> bool:
+def refuses_for_good(state: RobotState, source: str) -> bool:
     """Return whether the daemon will keep refusing the commands of this source.
 
     If so, waiting cannot help: no command moves the robot in its present mode, or the source is not

@@ -22,11 +22,11 @@ from acsard.client.commander import (
     OPENING_PERIOD_S,
     OPENING_S,
     SEND_PERIOD_S,
-    heard,
-    hopeless,
     objection,
+    receives_commands,
+    refuses_for_good,
 )
-from acsard.client.follower import QUIET_S, Followed, Watch
+from acsard.client.follower import MAX_STATE_AGE_S, Followed, Watch
 from acsard.host import clock
 from acsard.host.errors import NoAnswerError, NotDrivenError, UsageError
 
@@ -49,7 +49,7 @@ class UnheardError(NotDrivenError):
     """The daemon receives no commands from this client's command source, so the drive has ended."""
 
 
-class Driven(Followed, Protocol):
+class CommandClient(Followed, Protocol):
     """The part of a client that `drive` uses."""
 
     source: str
@@ -61,7 +61,7 @@ class Driven(Followed, Protocol):
 
 
 def drive(
-    robot: Driven, linear: float, angular: float, seconds: float
+    robot: CommandClient, linear: float, angular: float, seconds: float
 ) -> Generator[float, None, None]:
     """Drive for `seconds`, then send zeros until the robot stands still.
 
@@ -124,7 +124,7 @@ def _opening(checks: _Drive) -> Iterator[float]:
         yield OPENING_PERIOD_S
         checks.require_no_pause()
         checks.look()
-        if passed >= OPEN_TIMEOUT_S or (passed >= SETTLED_S and checks.hopeless):
+        if passed >= OPEN_TIMEOUT_S or (passed >= SETTLED_S and checks.refuses_for_good):
             checks.require(0.0)
 
 
@@ -137,11 +137,11 @@ def _stopping(checks: _Drive) -> Iterator[float]:
     """
     begun = since = clock.steady_s()
     watch, slowest = checks.watch, math.inf
-    while since + SLOWS_S > (now := clock.steady_s()) or watch.age(now) > QUIET_S:
+    while since + SLOWS_S > (now := clock.steady_s()) or watch.age(now) > MAX_STATE_AGE_S:
         checks.send(0.0, 0.0)
         yield SEND_PERIOD_S
         checks.look()
-        if checks.hopeless:
+        if checks.refuses_for_good:
             checks.require(0.0)
         if watch.state is None or watch.last_seen < begun + SETTLED_S:
             continue
@@ -159,19 +159,19 @@ def _stopping(checks: _Drive) -> Iterator[float]:
 class _Drive:
     """Checks, from the daemon's `state`, whether the robot follows the commands of this client."""
 
-    def __init__(self, robot: Driven) -> None:
+    def __init__(self, robot: CommandClient) -> None:
         self._robot = robot
         self.watch = Watch(robot, clock.steady_s())
         # Read the clock again here, because the subscription above may take long.
-        self._fine = self._stepped = clock.steady_s()
+        self._followed_s = self._last_command_s = clock.steady_s()
         self.objection: str | None = None
         """Reason why the robot does not follow the commands; "" if it follows them, None before the
         first state."""
 
     @property
-    def hopeless(self) -> bool:
+    def refuses_for_good(self) -> bool:
         state = self.watch.state
-        return state is not None and hopeless(state, self._robot.source)
+        return state is not None and refuses_for_good(state, self._robot.source)
 
     def send(self, linear: float, angular: float) -> None:
         try:
@@ -184,7 +184,7 @@ class _Drive:
         # not have accepted the command. The received states cannot reveal such a pause, because old
         # states that waited in the queue seem to arrive now.
         now = clock.steady_s()
-        paused, self._stepped = now - self._stepped, now
+        paused, self._last_command_s = now - self._last_command_s, now
         if paused > GRACE_S:
             raise NotDrivenError(
                 f"this program sent no command for {paused:.1f} s, so the robot was stopped and "
@@ -195,19 +195,19 @@ class _Drive:
     def look(self) -> None:
         now, watch = clock.steady_s(), self.watch
         try:
-            news = watch.look(now)
+            states = watch.look(now)
         except zenoh.ZError:
             raise NoAnswerError(CONNECTION_CLOSED) from None
-        for state in news:
+        for state in states:
             self.objection = objection(state, self._robot.source, self._robot.sender)
             if not self.objection:
-                self._fine = now
+                self._followed_s = now
         if watch.silent(now):
             raise NoAnswerError(
                 "the daemon's state cannot be read: does the daemon run another version of acsard "
                 "than this program? Use the same version for both"
                 if watch.unreadable
-                else f"nothing received from the daemon for {watch.patience_s:g} s: does "
+                else f"nothing received from the daemon for {watch.silence_timeout_s:g} s: does "
                 "the daemon run, and does it have the robot.id that this program uses? `acsard "
                 "fleet` lists the robots"
             )
@@ -221,7 +221,7 @@ class _Drive:
         self.look()
         if not self.objection:
             return
-        if self.hopeless or clock.steady_s() - self._fine >= grace:
+        if self.refuses_for_good or clock.steady_s() - self._followed_s >= grace:
             state = self.watch.state
-            arrives = state is None or heard(state, self._robot.source)
+            arrives = state is None or receives_commands(state, self._robot.source)
             raise (NotDrivenError if arrives else UnheardError)(self.objection)

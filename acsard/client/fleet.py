@@ -121,7 +121,7 @@ class Fleet:
         with self._lock:
             for name, one in self._known.items():
                 self._take(one)
-                if one.follower.asks(now):
+                if one.follower.query_is_due(now):
                     due.append((name, "state"))
                 if one.here and not one.version and now >= one.info_due:
                     one.info_due = now + FLEET_QUERY_PERIOD_S
@@ -131,9 +131,9 @@ class Fleet:
     def ask(self, due: Sequence[tuple[str, str]]) -> None:
         """Send the queries that `due()` returned. This may wait for the bus. Raises `ZError`."""
         for name, key in due:
-            self._robot.like(name).ask(key, self._answer if key == "state" else self._info)
+            self._robot.sibling(name).ask(key, self._answer if key == "state" else self._info)
 
-    def here(self, robot_id: str) -> bool:
+    def is_present(self, robot_id: str) -> bool:
         """Return whether the liveliness token of this robot's daemon is present."""
         one = self._known.get(robot_id)
         return one is not None and bool(one.here)
@@ -146,10 +146,10 @@ class Fleet:
     def _row(self, name: str, one: _Known, now: float) -> Row:
         follower, state = one.follower, one.follower.state
         silent = follower.silent(now)
-        if one.here and not follower.heard and not silent:
+        if one.here and not follower.is_confirmed and not silent:
             # A storage on a router may have sent this old state. Wait for the daemon's own answer.
             state = None
-        age = follower.age(now) if follower.heard else math.inf
+        age = follower.age(now) if follower.is_confirmed else math.inf
         return Row(name, one.here, state, age, one.version, silent)
 
     def _take(self, one: _Known) -> None:

@@ -26,10 +26,10 @@ QUERY_PERIOD_S = 0.3
 """Time without a new state after which the client queries `state`, s. Such queries are necessary if
 the robot is configured to publish its state seldom."""
 
-QUIET_S = 0.5
+MAX_STATE_AGE_S = 0.5
 """Age of a state above which a program must not base an action on it, s."""
 
-SILENT_S = 1.0
+ROBOT_SILENCE_TIMEOUT_S = 1.0
 """Age of the last state above which the robot counts as silent and a drive ends, s."""
 
 FIRST_STATE_TIMEOUT_S = 2.0
@@ -46,7 +46,7 @@ MAX_WAITING_ANSWERS = 16
 """Maximum number of replies that wait to be processed. The daemon and each storage send one reply
 to a query."""
 
-STEADY_COUNTERS = ("lines", "lines_sent", "commands")
+MONOTONIC_COUNTERS = ("lines", "lines_sent", "commands")
 """Names of counters in `state` that decrease only when the daemon restarts."""
 
 
@@ -54,30 +54,30 @@ class Follower:
     """The newest state of one robot, with its age. All times are in s on the same monotonic clock.
 
     This clock must also advance while the computer is suspended, as `clock.steady_s` does. `now` is
-    the present time, s. `ask_s` is the time without a new state after which the caller must query
-    `state`, s.
+    the present time, s. `query_period_s` is the time without a new state after which the caller
+    must query `state`, s.
     """
 
-    def __init__(self, now: float, ask_s: float = QUERY_PERIOD_S) -> None:
+    def __init__(self, now: float, query_period_s: float = QUERY_PERIOD_S) -> None:
         self.state: RobotState | None = None
-        """The newest state; None before the first state. Until `heard` is true, it may be an old
-        state from the storage of a router."""
-        self.heard = False
+        """The newest state; None before the first state. Until `is_confirmed` is true, it may be an
+        old state from the storage of a router."""
+        self.is_confirmed = False
         """Whether a state has proved that the daemon runs (see `answered()`)."""
         self.last_seen = now
         """Time at which the last state arrived that proved that the daemon runs. Before the first
         such state, it is the time at which this object was created."""
-        self.due = now + ask_s
+        self.due = now + query_period_s
         """Time of the next query, unless a state arrives before this time."""
         self.unreadable = 0
         """Number of consecutive messages on `state` that could not be decoded."""
-        self._ask_s = ask_s
+        self._query_period_s = query_period_s
         self._answer: RobotState | None = None
 
     def published(self, state: RobotState, now: float) -> None:
         """Store a state that the daemon published. It arrived at the time `now`, s."""
-        self.state, self.last_seen, self.heard = state, now, True
-        self.due, self.unreadable = now + self._ask_s, 0
+        self.state, self.last_seen, self.is_confirmed = state, now, True
+        self.due, self.unreadable = now + self._query_period_s, 0
 
     def answered(self, state: RobotState, now: float) -> bool:
         """Process an answer to a query of `state`. Return whether it proves that the daemon runs.
@@ -99,14 +99,14 @@ class Follower:
             self.state, self.due = state, now
         return False
 
-    def asks(self, now: float) -> bool:
+    def query_is_due(self, now: float) -> bool:
         """Return whether the caller must query `state` now. If so, set the time of the next query.
 
         `now` is the present time, s.
         """
         if now < self.due:
             return False
-        self.due = now + self._ask_s
+        self.due = now + self._query_period_s
         return True
 
     def age(self, now: float) -> float:
@@ -118,24 +118,28 @@ class Follower:
         return max(0.0, now - self.last_seen)
 
     @property
-    def patience_s(self) -> float:
+    def silence_timeout_s(self) -> float:
         """Age of the last state above which the robot counts as silent, s."""
-        # If a robot publishes seldom, only answers arrive, at intervals of `ask_s`.
-        return (SILENT_S if self.heard else FIRST_STATE_TIMEOUT_S) + self._ask_s - QUERY_PERIOD_S
+        # If a robot publishes seldom, only answers arrive, at intervals of `query_period_s`.
+        return (
+            (ROBOT_SILENCE_TIMEOUT_S if self.is_confirmed else FIRST_STATE_TIMEOUT_S)
+            + self._query_period_s
+            - QUERY_PERIOD_S
+        )
 
     def silent(self, now: float) -> bool:
         """Return whether the robot counts as silent at the time `now`, s."""
-        return self.age(now) > self.patience_s
+        return self.age(now) > self.silence_timeout_s
 
 
 def restarted(before: RobotState | None, state: RobotState) -> bool:
     """Return whether the daemon restarted between the states `before` and `state`.
 
-    The sign of a restart is that a counter in `STEADY_COUNTERS` is lower in `state` than in
+    The sign of a restart is that a counter in `MONOTONIC_COUNTERS` is lower in `state` than in
     `before`. Returns False if `before` is None.
     """
     return before is not None and any(
-        state.counters.get(name, 0) < before.counters.get(name, 0) for name in STEADY_COUNTERS
+        state.counters.get(name, 0) < before.counters.get(name, 0) for name in MONOTONIC_COUNTERS
     )
 
 
@@ -173,7 +177,7 @@ class Watch(Follower):
         If no state has arrived for some time, also send a query. A later call processes its reply.
         `now` is the present time, s. Raises `ZError` if the session was closed.
         """
-        news = []
+        states = []
         for _ in range(MAX_QUEUED_SAMPLES):  # bounded, so that a flood cannot block the caller
             sample = self._states.try_recv()
             if sample is None:
@@ -181,16 +185,16 @@ class Watch(Follower):
             state = self._read(sample)
             if state is not None:
                 self.published(state, now)
-                news.append(state)
+                states.append(state)
         # Process the replies last, so that `answered` compares their stamps with the published
         # states. `published` compares no stamps.
         for sample in self._answers.take():
             state = self._read(sample)
             if state is not None and self.answered(state, now):
-                news.append(state)
-        if self.asks(now):
+                states.append(state)
+        if self.query_is_due(now):
             self._robot.ask(STATE_KEY, self._answers.put)
-        return news
+        return states
 
     def _read(self, sample: zenoh.Sample) -> RobotState | None:
         try:

@@ -12,7 +12,7 @@ from concurrent.futures import Future
 from threading import Condition, Thread
 from typing import Never
 
-from acsard.client.commander import MAX_OPEN_TIMEOUT_S, Commander, Wish
+from acsard.client.commander import MAX_SOURCE_TIMEOUT_S, Commander, Wish
 from acsard.core.values import NS_PER_S
 from acsard.host import clock
 
@@ -47,7 +47,7 @@ class Outbox:
             self._news.notify_all()
         return silence
 
-    def release(self, commander: Commander, timeout_s: float = MAX_OPEN_TIMEOUT_S) -> None:
+    def release(self, commander: Commander, timeout_s: float = MAX_SOURCE_TIMEOUT_S) -> None:
         """Remove the sender `commander`, and queue a zero if necessary.
 
         A zero is necessary if the robot may still follow the last command of this sender.

@@ -16,7 +16,7 @@ import zenoh
 from msgspec import field
 
 from acsard.client.commander import (
-    MAX_OPEN_TIMEOUT_S,
+    MAX_SOURCE_TIMEOUT_S,
     MIN_SPACING_S,
     REPEAT_ZERO_S,
     Sender,
@@ -103,7 +103,7 @@ def close(session: zenoh.Session) -> None:
         pass
 
 
-class _Puts:
+class _CommandSpacing:
     """Keeps a minimum pause between the commands of all clients on one connection.
 
     The daemon accepts at most 1000 commands a second per connection and key. Without the pause, the
@@ -118,7 +118,7 @@ class _Puts:
         zero."""
 
     @contextmanager
-    def turn(self) -> Iterator[None]:
+    def wait(self) -> Iterator[None]:
         """Wait until the next command may be sent. The caller sends it in the `with` block."""
         # Each thread reserves a time and waits for it without the lock. Otherwise a thread that
         # sends without end would take the lock again and again before the others.
@@ -151,12 +151,12 @@ class Client:
         self.name = own_name()
         """Name of this client in the daemon's log of service calls. You may change it."""
         self._opened = False
-        self._puts = _Puts()
+        self._spacing = _CommandSpacing()
         self.certificate = shown_at(endpoint, tls)
         """Common name of the certificate that this client shows to the daemon; "" if it shows no
         certificate."""
-        # The secret identifies this program as a caller of services. Clients made by `like` share
-        # it, although they may send commands under another name.
+        # The secret identifies this program as a caller of services. Clients made by `sibling`
+        # share it, although they may send commands under another name.
         self._secret = new_secret()
         self._sign_as(f"{platform.node()[:32]}/{os.getpid()}")
         # Compute stamps from the steady clock. If stamps came from the wall clock and it were set
@@ -178,7 +178,7 @@ class Client:
         """
         return sender_id(self.name, self._secret)
 
-    def like(self, robot_id: str, name: str = "") -> Client:
+    def sibling(self, robot_id: str, name: str = "") -> Client:
         """Return a new client on the same connection, which is a separate sender of commands.
 
         Args:
@@ -187,7 +187,7 @@ class Client:
             name: the name of the new client as a sender; "" means the host name and the process id.
         """
         other = Client(self.session, robot_id, self.source, self.where.tls, self.where.endpoint)
-        other.name, other._secret, other._puts = self.name, self._secret, self._puts
+        other.name, other._secret, other._spacing = self.name, self._secret, self._spacing
         if name:
             other._sign_as(name)
         return other
@@ -209,7 +209,7 @@ class Client:
         Repeat the call to keep the robot moving. The first call sends a zero (a command with the
         speed 0) instead, because the daemon requires a zero before it follows a sender.
         """
-        with self._puts.turn():
+        with self._spacing.wait():
             if self._opened:
                 self._put(linear, angular, None)
             else:
@@ -222,7 +222,7 @@ class Client:
         `linear` is in m/s, and `angular` in rad/s (left is +). `stamp_ns` is the time of the
         command on the clock of that sender, ns; None if that sender has no clock.
         """
-        with self._puts.turn():
+        with self._spacing.wait():
             self._put(linear, angular, stamp_ns)
 
     def end(self) -> None:
@@ -233,8 +233,8 @@ class Client:
         """
         begun_s = clock.steady_s()
         # When the longest timeout has passed, a zero would only stop the next sender that drives.
-        known = list(self._puts.moving.items())
-        moving = [one for one, at_s in known if begun_s - at_s < MAX_OPEN_TIMEOUT_S]
+        known = list(self._spacing.moving.items())
+        moving = [one for one, at_s in known if begun_s - at_s < MAX_SOURCE_TIMEOUT_S]
         try:
             for pause_s in (REPEAT_ZERO_S, 0.0) if moving else ():
                 for client in moving:
@@ -264,7 +264,7 @@ class Client:
                 for pause in steps:
                     time.sleep(pause)
         except (UnheardError, NoAnswerError) as error:
-            raise self.unheard(error) from None
+            raise self.explain_error(error) from None
         except BaseException:
             time.sleep(REPEAT_ZERO_S)
             self.zero_again()
@@ -399,7 +399,7 @@ class Client:
             source: the command source on which the command is sent; "" for the source of this
                 client.
         """
-        with self._puts.turn():
+        with self._spacing.wait():
             self._publish(twist, signature, source or self.source)
 
     def _publish(
@@ -424,9 +424,9 @@ class Client:
         )
         self._publish(message, self._sender.sign(stamp_ns, steady=steady), self.source)
         if linear or angular:
-            self._puts.moving[self] = clock.steady_s()
+            self._spacing.moving[self] = clock.steady_s()
         else:
-            self._puts.moving.pop(self, None)
+            self._spacing.moving.pop(self, None)
 
     def _ask(self, name: str, payload: bytes | None = None) -> tuple[str, bytes]:
         # Ignore later replies, because any client on the bus may send any number of replies.
@@ -437,8 +437,8 @@ class Client:
                 raise self._unanswered(name)
             if reply.ok is not None:
                 return encoded(reply.ok)
-            said = reply.err.payload.to_string() if reply.err is not None else ""
-            if said == TIMED_OUT:
+            error_text = reply.err.payload.to_string() if reply.err is not None else ""
+            if error_text == TIMED_OUT:
                 raise NoAnswerError(
                     f"no answer on the Zenoh key {self.key(name)} within {REPLY_TIMEOUT_S:g} s: "
                     "the daemon or the network is stuck; try again, or run `acsard doctor` on the "
@@ -446,8 +446,8 @@ class Client:
                 )
             # Repeat a query, but not a service call: since the first attempt, another client may
             # have called a service with the opposite effect.
-            if said != BUSY or name in VERBS or time.monotonic() > end_s:
-                raise ReplyError(f"{name}: {said}")
+            if error_text != BUSY or name in VERBS or time.monotonic() > end_s:
+                raise ReplyError(f"{name}: {error_text}")
             time.sleep(0.03)
 
     def _first(self, name: str, payload: bytes | None) -> zenoh.Reply | None:
@@ -493,7 +493,7 @@ class Client:
             f"{no_answer}: {explain_silence(key, where.robot_id, where.endpoint, seen)}"
         )
 
-    def unheard(self, error: UnheardError | NoAnswerError) -> MendableError:
+    def explain_error(self, error: UnheardError | NoAnswerError) -> MendableError:
         """Return the error to raise in place of `error`, which ended a drive or a query.
 
         The returned error has one of the types that `acsard.client` documents. If the role of this

@@ -104,7 +104,7 @@ class Guard:
         """The state of this guard. A new `Guard` that starts with it makes the same decisions."""
         return Memory(self._last, self._commanded_ns, self._halted_ns, *self._longest)
 
-    def left(self, line: bytes) -> None:
+    def record_written(self, line: bytes) -> None:
         """Record that `line` was written to the serial port."""
         self._last, self._wheels = line, _wheels(line[:31])
         if self._wheels == _ZERO:

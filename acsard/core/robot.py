@@ -20,7 +20,7 @@ from acsard.core.config.lowered import lowered, with_lowered
 from acsard.core.config.motion_rules import longest_reply
 from acsard.core.config.parsing import ConfigError
 from acsard.core.config.settings import Config
-from acsard.core.link.board_status import shown
+from acsard.core.link.board_status import as_text
 from acsard.core.link.feedback import Feedback
 from acsard.core.link.link_diagnosis import UnansweredLines
 from acsard.core.link.link_state import WATCHDOG_S
@@ -28,7 +28,7 @@ from acsard.core.link.session import McuSession
 from acsard.core.motion.arbiter import Arbiter, Choice
 from acsard.core.motion.arbiter_text import REFUSED, CommandEvents, chosen, missed, refused
 from acsard.core.motion.battery import EMPTY_REASON, Battery
-from acsard.core.motion.bumpers import Bumpers, missing
+from acsard.core.motion.bumpers import Bumpers, missing_text
 from acsard.core.motion.emergency_stop import (
     DRIVER_FAULT_ADVICE,
     DRIVER_FAULT_REASON,
@@ -189,8 +189,8 @@ class Robot:
         counters |= {f"line_{reason}": count for reason, count in session.rejects.items() if count}
         if session.count_recovery.coarse_lines:
             counters["coarse_encoder_lines"] = session.count_recovery.coarse_lines
-        if self._arbiter.forgiven_ns:
-            counters["clock_adjustments_ms"] = self._arbiter.forgiven_ns // NS_PER_MS
+        if self._arbiter.clock_adjustment_ns:
+            counters["clock_adjustments_ms"] = self._arbiter.clock_adjustment_ns // NS_PER_MS
         checks = self._odometry.checks
         return Snapshot(
             pose=self._odometry.pose,
@@ -247,11 +247,11 @@ class Robot:
         answers = self._serve(inputs, events)
         self._arbiter.begin(inputs.now.mono_ns)
         if inputs.commands or inputs.refusals:
-            self._hear(inputs, events)
+            self._accept_commands(inputs, events)
         self._choice = self._arbiter.choose(inputs.now.mono_ns)
         limiting = self._bumpers.limiting
         if limiting:
-            self._keep_away(inputs.now.mono_ns)
+            self._limit_by_bumpers(inputs.now.mono_ns)
         self._life.command(self._choice.twist is not None)
         # A line may be sent at once after a new command, a change of the mode, or a press of the
         # emergency stop or of a bumper.
@@ -349,13 +349,13 @@ class Robot:
             self._life.link(up=not (self._estop.missing or self._bumpers.missing))
         now = inputs.now
         if inputs.gyro:
-            self._odometry.checks.hear(inputs.gyro)
+            self._odometry.checks.add_samples(inputs.gyro)
         if not feedback:
             return ()
         estimates: list[Estimate] = []
         for received in feedback:
             for line in self._plausible(received, now, events):
-                estimates.append(self._believe(line, now, events))
+                estimates.append(self._check_and_integrate(line, now, events))
         return tuple(estimates)
 
     def _forget(self) -> None:
@@ -424,7 +424,7 @@ class Robot:
             return why, f"wait until the board has reported {INPUT_NAMES[name]}"
         return "", ""
 
-    def _keep_away(self, now_ns: int) -> None:
+    def _limit_by_bumpers(self, now_ns: int) -> None:
         """Reduce the command to motion that leads away from the pressed bumpers.
 
         If no motion remains, each sender must send a zero before it drives again. Without this
@@ -446,7 +446,7 @@ class Robot:
         if status_ns is None:
             return {}
         age_s = (now_ns - status_ns) / NS_PER_S
-        return shown(self.session.status) | {"age_s": f"{age_s:.1f}"}
+        return as_text(self.session.status) | {"age_s": f"{age_s:.1f}"}
 
     def _plausible(self, line: Feedback, now: Instant, events: list[Event]) -> list[Feedback]:
         """Return the feedback lines that the odometry may use now, the oldest first.
@@ -474,7 +474,7 @@ class Robot:
             Event("lines_rejected", why, "warning", kind="implausible", count=count, news=False)
         )
 
-    def _believe(self, line: Feedback, now: Instant, events: list[Event]) -> Estimate:
+    def _check_and_integrate(self, line: Feedback, now: Instant, events: list[Event]) -> Estimate:
         checks = self._odometry.checks
         wheels = checks.wheels
         # While the emergency stop counts as pressed, the motors may have no power, so wheels that
@@ -517,7 +517,7 @@ class Robot:
     def _answer(self, request: Request, now: Instant, events: list[Event]) -> Answer:
         before = self._life.mode
         try:
-            message = self._obey(request, now)
+            message = self._execute(request, now)
         except RefusedError as refusal:
             return Answer(request.id, False, str(refusal))
         asked = (request.verb, request.by, request.asked_ns)
@@ -527,7 +527,7 @@ class Robot:
         self._asked = asked
         return Answer(request.id, True, message)
 
-    def _obey(self, request: Request, now: Instant) -> str:
+    def _execute(self, request: Request, now: Instant) -> str:
         life = self._life
         asked_ns = now.mono_ns if request.asked_ns is None else request.asked_ns
         match request.verb:
@@ -575,7 +575,7 @@ class Robot:
         if self.config.commands != before.commands:
             self._arbiter.use(self.config.commands)
             self._arbiter.require_neutral(now_ns)
-        return news or "nothing changes: all settings have these values already"
+        return news or "nothing changed: all settings already have these values"
 
     def _fault(self, why: str, now: Instant, events: list[Event]) -> None:
         if self._life.fault(why, now):
@@ -584,7 +584,7 @@ class Robot:
 
     # Commands.
 
-    def _hear(self, inputs: Inputs, events: list[Event]) -> None:
+    def _accept_commands(self, inputs: Inputs, events: list[Event]) -> None:
         now_ns = inputs.now.mono_ns
         heard: Sequence[Command | Refusal] = inputs.commands
         if inputs.refusals:
@@ -659,7 +659,9 @@ class Robot:
                 return f"{chosen(self._choice)}{self.session.note}"
             case Mode.WAITING:
                 if self.session.link == "up":
-                    return MISSING_REASON if self._estop.missing else missing(self.config.safety)
+                    return (
+                        MISSING_REASON if self._estop.missing else missing_text(self.config.safety)
+                    )
                 return self.session.words(self._port_trouble)
             case Mode.STOPPED | Mode.FAULT | Mode.INACTIVE:
                 return self._life.why

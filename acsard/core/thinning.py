@@ -129,6 +129,8 @@ class Band:
         `ranks` lists the kinds of state, the most important first. If two spans are merged, the
         result has the more important kind of the two.
         """
+        if most < 2:
+            raise ValueError(f"a band must keep at least 2 spans, not {most}")
         self._rank = {kind: at for at, kind in enumerate(ranks)}
         self._most, self._least = most, FIRST_WIDTH
         self._spans: list[Span] = []

@@ -391,12 +391,13 @@ class GyroSample(Struct, frozen=True, omit_defaults=True):
 
 
 GyroDoes = Literal[
-    "off", "waiting for rest", "used", "silent", "disagrees",
+    "off", "waiting for rest", "waiting for turn", "used", "silent", "disagrees",
     "reversed", "in degrees", "dead", "not believed",
 ]  # fmt: skip
 """State of the gyro. The odometry takes the heading from the gyro only in the states `used` and
-`disagrees`. In the state `disagrees`, the wheels slip. Even in the state `used`, the wheels provide
-the turns until the gyro has agreed with the wheels in one turn."""
+`disagrees`. In the state `disagrees`, the wheels slip. In the state `waiting for turn`, the wheels
+provide the turns until the gyro has agreed with the wheels in one turn. While the wheels stand
+still in this state, the gyro provides the turn."""
 
 TrackUse = Literal["shown", "uncertain", "too far off", "used"]
 """Whether the odometry uses the effective track that it has learned with a gyro: `used`, or the

@@ -201,16 +201,16 @@ class ControlLoop:
         A command waits if it arrived too soon after the last line to the board. The value is None
         if no command waits.
         """
-        return self._pace.retry_ns(self._port.sent_ns) if self._pace.waits else None
+        return self._pace.retry_ns(self._port.sent_ns) if self._pace.command_waits else None
 
     @property
-    def listens(self) -> bool:
+    def accepts_early_command(self) -> bool:
         """Whether the next command gets an extra step immediately.
 
         If this is False, the command waits for a step that another event runs, such as the end of
         the control period.
         """
-        return self._pace.listens
+        return self._pace.accepts_early_command
 
     def step(self, now: Instant, period: Period = NO_PERIOD) -> Outputs:
         """Run one control step at the time `now`, and return the robot's outputs.
@@ -239,11 +239,11 @@ class ControlLoop:
                 # event. After missed periods, the robot's own event follows in this step. Its text
                 # states only the number of periods, and would hide the cause.
                 if not missed:
-                    self._others += self._late_watch.news()
+                    self._others += self._late_watch.take_events()
         commands, refusals, requests = self._from_bus(now)
         requests += self._keepable(now)
         requests, refused_sets = self._speed.requests(requests, now.mono_ns)
-        self._others += self._handover.news()
+        self._others += self._handover.take_events()
         port, pace = self._port, self._pace
         # Call `take` before reading `is_open`. After a suspend of the computer, `take` closes the
         # port.
@@ -278,7 +278,7 @@ class ControlLoop:
         if refused_sets:
             self._step_answers = (*refused_sets, *self._step_answers)
         heard = bool(commands or refusals or requests)
-        pace.note(inputs.tick, outputs.due, went, outputs.news, heard)
+        pace.record_step(inputs.tick, outputs.due, went, outputs.news, heard)
         self._publish(outputs)
         # `adopted` may change the log's level, so call it after logging this step's events.
         if self._config is not before and self._adopted:
@@ -482,7 +482,7 @@ class ControlLoop:
         before_ns = self._port.sent_ns
         offered = self._port.offer(line, now)
         if offered == "sent":
-            self._guard.left(line)
+            self._guard.record_written(line)
             sent_ns = self._port.sent_ns
             self._stopwatch.line(outputs, sent_ns, before_ns)
             late_ns = sent_ns - now.mono_ns
@@ -497,17 +497,17 @@ class ControlLoop:
         return None
 
     def _publish(self, outputs: Outputs) -> None:
-        bus, told_ns = self._bus, None
+        bus, queued_ns = self._bus, None
         for key, message in self.report.due(outputs, bus.wanted, self._look):
             bus.publish(key, message)
             if key in FEEDBACK_TOPICS:
-                told_ns = self._mono_ns()
+                queued_ns = self._mono_ns()
         for estimate in outputs.estimates:
-            self._stopwatch.feedback(estimate, told_ns)
+            self._stopwatch.feedback(estimate, queued_ns)
         if self._step_answers:
             file, now_ns = self._settings_file, outputs.now.mono_ns
             for answer in self._step_answers:
-                if file is None or not file.obeyed(answer):
+                if file is None or not file.defers_answer(answer):
                     self._answers.append((now_ns, answer))
         if self._answers:
             self._answer(outputs.now)

@@ -24,8 +24,7 @@ from acsard.core.messages.schema import Info
 from acsard.core.values import NS_PER_S, Event, Latches
 from acsard.daemon.bus.bus import ZenohBus
 from acsard.daemon.bus.certificate_watch import watch_certificates
-from acsard.daemon.bus.tls import ends as ends_of
-from acsard.daemon.bus.tls import require_usable
+from acsard.daemon.bus.tls import expiry_times, require_usable
 from acsard.daemon.bus.zenoh_sessions import log_from_environment
 from acsard.daemon.control_loop import ControlLoop
 from acsard.daemon.latch_file import LatchFile
@@ -153,7 +152,7 @@ async def run(
         sys.setswitchinterval(SWITCH_INTERVAL_S)
         # Ask for real-time priority before the first thread starts. Only this thread then has it:
         # the threads of the bus do not inherit it.
-        refused = real_time.ask() if config.control.real_time else ""
+        refused = real_time.request() if config.control.real_time else ""
         if refused:
             log.info("real_time", text=refused)
         totals: dict[str, object] = {}
@@ -172,7 +171,7 @@ async def run(
         async with _patience(config, log, manager):
             await stack.enter_async_context(bus)
         if simulated is not None:
-            simulated.tell(bus)
+            simulated.publish_on(bus)
         between = stack.enter_context(ExitStack())
         await stack.enter_async_context(port)
         control = ControlLoop(
@@ -256,15 +255,15 @@ async def _beside(helpers: Iterable[Coroutine[Any, Any, object]]) -> AsyncIterat
 def _certificates(config: Config, ours: bool) -> dict[str, int]:
     """Return the expiry time of each TLS certificate of this robot, ns since 1970.
 
-    The keys of the returned dict are those of `tls.ends`. Return {} if neither the daemon nor its
-    gateway uses TLS. Raises `MendableError` if a certificate file cannot be used. `ours` is true if
-    this daemon itself starts the TLS gateway.
+    The keys of the returned dict are those of `tls.expiry_times`. Return {} if neither the daemon
+    nor its gateway uses TLS. Raises `MendableError` if a certificate file cannot be used. `ours` is
+    true if this daemon itself starts the TLS gateway.
     """
     bus = config.bus
     if not (any(e.startswith(TLS_PREFIX) for e in bus.connect) or (ours and bus.outside)):
         return {}
     require_usable(bus.tls)
-    return ends_of(bus.tls)
+    return expiry_times(bus.tls)
 
 
 async def _control(
@@ -288,10 +287,20 @@ async def _control(
             manager.step(control.step(now, period))
             if control.shutting_down and departure.over(now.mono_ns, control.at_rest):
                 return None
-            return Next(control.listens, control.retry_ns, period_ended=period.expired > 0)
+            return Next(
+                control.accepts_early_command, control.retry_ns, period_ended=period.expired > 0
+            )
 
         ticker.start(clock.now().mono_ns)
-        await wake.run(step)
+        try:
+            await wake.run(step)
+        except BaseException:
+            # No more steps feed systemd's watchdog, and ending the daemon may take longer than the
+            # watchdog waits. Its SIGABRT would hide the error. After `stopping`, systemd stops the
+            # watchdog, and waits for TimeoutStopSec instead.
+            manager.stopping()
+            manager.status("ending after an error in the daemon")
+            raise
 
 
 @asynccontextmanager

@@ -29,9 +29,9 @@ from acsard.core.values import NS_PER_S, Event, Instant, Latches
 from acsard.daemon.latch_rules import (
     MAX_BYTES,
     LatchFileError,
+    after_failed_write,
     at_start,
     decode,
-    doubted,
     encode,
     stopped,
     unreadable,
@@ -135,18 +135,18 @@ class LatchFile:
         self._box = Mailbox[Latches](1)
         """Passes the latches of the last call of `keep` to the writing thread."""
         self._news = Mailbox[Event](MAX_EVENTS)
-        self._held: Latches | None = None
+        self._written_latches: Latches | None = None
         """The latches that this process wrote last. None before the first write."""
         self._failed = ""
-        self._handed: Latches | None = None
+        self._newest_latches: Latches | None = None
         """The latches of the last call of `keep`."""
         self._busy_ns: int | None = None
         """Monotonic time at which the present write began, ns; None between two writes."""
         self._syncing_ns: int | None = None
         """Monotonic time at which the present sync began, ns; None between two syncs."""
         self._hung = False
-        """True if `news` has reported that the disk hangs, and has not yet reported that it works
-        again."""
+        """True if `take_events` has reported that the disk hangs, and has not yet reported that it
+        works again."""
         self._renamed = Mailbox[Latches](1)
         """Passes the newest latches in the file to the syncing thread."""
         self._threads: tuple[threading.Thread, ...] = ()
@@ -171,7 +171,7 @@ class LatchFile:
                 self._blind = True
                 latches = stopped(Latches(), unreadable(self.where, why), now)
             else:
-                latches = doubted(found, at_start(unwritable(self.where, why)), now)
+                latches = after_failed_write(found, at_start(unwritable(self.where, why)), now)
             self.keep(latches)
         threads = (
             threading.Thread(target=self._work, args=(now,), name="latches", daemon=True),
@@ -185,7 +185,7 @@ class LatchFile:
             # write, and must not report a recovery. `_barred` prevents both.
             self._barred = f"this process cannot start another thread ({error})"
             self._fail(self._barred)
-            return doubted(latches, at_start(unwritable(self.where, self._failed)), now)
+            return after_failed_write(latches, at_start(unwritable(self.where, self._failed)), now)
         self._threads = threads
         return latches
 
@@ -197,7 +197,9 @@ class LatchFile:
             trouble = self._replace(latches)
             if trouble and not self._abandoned:
                 self._fail(trouble)
-                latches = doubted(latches, at_start(unwritable(self.where, trouble)), now)
+                latches = after_failed_write(
+                    latches, at_start(unwritable(self.where, trouble)), now
+                )
                 self.keep(latches)
             return latches
 
@@ -259,7 +261,7 @@ class LatchFile:
         If this method is called again before the thread has written the latches, the thread writes
         only the newest latches.
         """
-        self._handed = latches
+        self._newest_latches = latches
         self._box.put(latches)
 
     def holds(self, latches: Latches) -> bool:
@@ -267,7 +269,7 @@ class LatchFile:
 
         `latches` must be the object that was passed to `keep`. An equal copy does not count.
         """
-        return self._held is latches
+        return self._written_latches is latches
 
     def wait(self, latches: Latches, seconds: float) -> None:
         """Block until the file contains these latches or a write fails, but at most `seconds` s.
@@ -279,7 +281,7 @@ class LatchFile:
         while not self.holds(latches) and not self._failed and clock.mono_ns() < end_ns:
             time.sleep(0.001)
 
-    def news(self) -> list[Event]:
+    def take_events(self) -> list[Event]:
         if self._hangs is not self._hung:
             self._hung = not self._hung
             if self._hung:
@@ -302,7 +304,7 @@ class LatchFile:
         if self._failed:
             return False
         # A write does not matter if the file already contains the newest latches.
-        busy_ns = None if self._held is self._handed else self._busy_ns
+        busy_ns = None if self._written_latches is self._newest_latches else self._busy_ns
         begun_ns = [one for one in (busy_ns, self._syncing_ns) if one is not None]
         return any(clock.mono_ns() - one > HANG_TIMEOUT_S * NS_PER_S for one in begun_ns)
 
@@ -380,7 +382,7 @@ class LatchFile:
             replace(self._path, content, synced=False)
         except OSError as error:
             return _reason(error)
-        self._held = latches
+        self._written_latches = latches
         self._renamed.put(latches)
         return ""
 
@@ -394,8 +396,8 @@ class LatchFile:
             if failed:
                 # The kernel may have dropped the bytes that it could not sync, so write them again.
                 with self._disk:
-                    assert self._held is not None
-                    self._replace(self._held)
+                    assert self._written_latches is not None
+                    self._replace(self._written_latches)
             if self._renamed.pop() is not None:
                 self._syncing_ns = clock.mono_ns()
                 trouble = self._sync()
@@ -403,7 +405,7 @@ class LatchFile:
                 failed = bool(trouble)
                 if failed:
                     self._fail(trouble)
-                elif self._handed is None or self._held is self._handed:
+                elif self._newest_latches is None or self._written_latches is self._newest_latches:
                     # If the newest latches are not written yet, the recovery is reported later.
                     self._recover()
             if over:

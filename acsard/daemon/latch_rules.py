@@ -144,7 +144,7 @@ def stopped(
     return replace(latches, stop=Latch(number, now.wall_ns, by, why))
 
 
-def doubted(latches: Latches, why: str, now: Instant) -> Latches:
+def after_failed_write(latches: Latches, why: str, now: Instant) -> Latches:
     """Return the latches with which the robot starts if the latch file cannot be written.
 
     The previous process may have set latches that are not in the file. So the robot starts stopped,
@@ -183,7 +183,7 @@ class LatchKeeper(Protocol):
     def wait(self, latches: Latches, seconds: float) -> None:
         """Block until these latches are stored, but at most `seconds` s."""
 
-    def news(self) -> list[Event]:
+    def take_events(self) -> list[Event]:
         """Return the events of the storage since the last call, such as a failed write."""
 
     @property
@@ -252,8 +252,8 @@ class Handover:
         if self._keeper is not None:
             self._keeper.wait(self.latches, MAX_ANSWER_DELAY_NS / NS_PER_S)
 
-    def news(self) -> list[Event]:
-        return [] if self._keeper is None else self._keeper.news()
+    def take_events(self) -> list[Event]:
+        return [] if self._keeper is None else self._keeper.take_events()
 
     @property
     def trouble(self) -> str | None:

@@ -114,16 +114,17 @@ def heat(late: Lateness) -> str:
     the processor, and on a Raspberry Pi one of the bits 1 to 3 of `get_throttled`.
     """
     hotter = late.after.conditions.throttled > late.before.conditions.throttled
-    return hot(late.after.conditions, hotter) if late.computed else ""
+    return heat_text(late.after.conditions, hotter) if late.computed else ""
 
 
-def hot(now: Conditions, hotter: bool = False) -> str:
+def heat_text(now: Conditions, hotter: bool = False) -> str:
     """Return the cause in words if heat slows the processor down, else "".
 
-    One of two signs is enough: `now.hot` says that heat slows the processor down at this moment,
-    and `hotter` says that the kernel's count of such slow-downs has risen since an earlier reading.
+    One of two signs is enough: `now.slowed_by_heat` says that heat slows the processor down at this
+    moment, and `hotter` says that the kernel's count of such slow-downs has risen since an earlier
+    reading.
     """
-    return "the processor is too hot and runs slower" if now.hot or hotter else ""
+    return "the processor is too hot and runs slower" if now.slowed_by_heat or hotter else ""
 
 
 def governor(late: Lateness) -> str:
@@ -134,10 +135,10 @@ def governor(late: Lateness) -> str:
     `scaling_min_freq` instead. If the function `heat` returns a cause, return "", because heat also
     limits the frequency.
     """
-    return slow(late.after.conditions) if late.computed and not heat(late) else ""
+    return clock_text(late.after.conditions) if late.computed and not heat(late) else ""
 
 
-def slow(now: Conditions) -> str:
+def clock_text(now: Conditions) -> str:
     """Return the cause in words if the conditions `now` show a limited clock frequency, else ""."""
     clock = now.slow_clock
     if clock is None:
@@ -254,14 +255,14 @@ BECAUSE = ", because "
 """Separator between the lateness and its causes in the text of an event."""
 
 
-def event_of(late: Lateness, clause: str, *, news: bool) -> Event:
+def event_of(late: Lateness, clause: str, *, immediate: bool) -> Event:
     """Return the log event that reports a lateness and its causes.
 
-    `clause` is the text from `causes`. `news` is False if a recent event had the same causes. The
-    log may then delay this event.
+    `clause` is the text from `causes`. `immediate` is False if a recent event had the same causes.
+    The log may then delay this event.
     """
     text = f"by {late.late_ns / NS_PER_S:.2f} s{BECAUSE}{clause}"
-    return Event("missed_periods", text, "warning", kind="late", news=news)
+    return Event("missed_periods", text, "warning", kind="late", news=immediate)
 
 
 def cause_in(text: str) -> str:
@@ -291,8 +292,8 @@ def present(before: Reading, after: Reading, within_ns: int) -> list[tuple[str, 
     host = f"the host gave this virtual machine no processor for {_seconds(stolen_ns)}"
     clauses = {
         "undervoltage": low_voltage(now),
-        "heat": hot(now, hotter),
-        "governor": slow(now),
+        "heat": heat_text(now, hotter),
+        "governor": clock_text(now),
         "steal": host if stolen_ns > STOLEN_FRACTION * within_ns else "",
     }
     return [(clauses[one.name], one.advice) for one in CAUSES if clauses.get(one.name)]

@@ -82,7 +82,7 @@ class Late(Struct, frozen=True):
     """Content of `THREAD_TIMES_FILE` in the late period; b"" if it is unknown."""
 
     @property
-    def loop(self) -> Scheduled:
+    def thread_times(self) -> Scheduled:
         """Two durations of the control loop's thread, ns.
 
         They are how long the thread ran, and how long it was ready but waited for a processor. Both
@@ -95,8 +95,8 @@ class Late(Struct, frozen=True):
 class LateWatch:
     """Detects late periods of one control loop, and finds their causes. It is a context manager.
 
-    The control loop's own thread must create this object, and call `period` and `news`. A second
-    thread reads the kernel's files while the context is open.
+    The control loop's own thread must create this object, and call `period` and `take_events`. A
+    second thread reads the kernel's files while the context is open.
     """
 
     def __init__(self, kernel: Kernel | None = None) -> None:
@@ -160,7 +160,7 @@ class LateWatch:
             return os.pread(self._file, 64, 0) if self._file >= 0 else b""
         return b""
 
-    def news(self) -> list[Event]:
+    def take_events(self) -> list[Event]:
         """Return the events about causes of late periods since the last call."""
         return self._news.take() if self._news.waiting else []
 
@@ -184,7 +184,7 @@ class LateWatch:
             conditions, looked_ns = after.conditions, clock.mono_ns()
             self._keep(after)
             if late is not None and before is not None:
-                self._report(kernel, Lateness(late.late_ns, late.loop, before, after))
+                self._report(kernel, Lateness(late.late_ns, late.thread_times, before, after))
                 free_ns = clock.mono_ns() + PAUSE_NS
 
     def _keep(self, reading: Reading) -> None:
@@ -203,10 +203,10 @@ class LateWatch:
             return
         now_ns = clock.mono_ns()
         reported_ns = self._reported.get(names)
-        news = reported_ns is None or now_ns - reported_ns >= REPEAT_EVENT_NS
-        if news:
+        immediate = reported_ns is None or now_ns - reported_ns >= REPEAT_EVENT_NS
+        if immediate:
             self._reported[names] = now_ns
-        self._news.put(event_of(late, clause, news=news))
+        self._news.put(event_of(late, clause, immediate=immediate))
 
     def _busiest_of(self, kernel: Kernel) -> Program | None:
         now_ns = clock.mono_ns()

@@ -204,20 +204,20 @@ class Stopwatch:
         if command_ns > before_ns:
             self.figures["command_to_wire"].add(sent_ns, sent_ns - command_ns)
 
-    def feedback(self, estimate: Estimate, told_ns: int | None) -> None:
+    def feedback(self, estimate: Estimate, queued_ns: int | None) -> None:
         """Record the latencies `mcu_round_trip` and `feedback_to_bus` of a feedback line.
 
         Args:
             estimate: the estimate that was computed from the feedback line.
-            told_ns: monotonic time at which the messages of the line were queued for the bus, ns.
+            queued_ns: monotonic time at which the messages of the line were queued for the bus, ns.
                 None if no client subscribes to these messages, so that only the round trip is
                 recorded.
         """
         at_ns, asked_ns = estimate.heard_ns, estimate.asked_ns
         if asked_ns is not None:
             self.figures["mcu_round_trip"].add(at_ns, at_ns - asked_ns)
-        if told_ns is not None:
-            self.figures["feedback_to_bus"].add(told_ns, told_ns - at_ns)
+        if queued_ns is not None:
+            self.figures["feedback_to_bus"].add(queued_ns, queued_ns - at_ns)
 
     def step(self, began_ns: int, ended_ns: int) -> None:
         self.figures["step_time"].add(began_ns, ended_ns - began_ns)

@@ -77,25 +77,27 @@ class Pace:
         """
         return self._possible and not self._tried and now_ns - sent_ns >= self._gap_ns
 
-    def note(self, tick: bool, due: bool, went: bool, news: bool, heard: bool) -> None:
+    def record_step(
+        self, tick: bool, due: bool, written: bool, changed: bool, had_input: bool
+    ) -> None:
         """Record the result of a step.
 
         Args:
             tick: whether the step had to write the line of a period. The line of any other step is
                 an early line.
             due: whether the step had a line to write.
-            went: whether the line was written.
-            news: whether the command or the mode has changed since the last line that was due, or
-                the emergency stop or a bumper was pressed.
-            heard: whether the bus had input for this step.
+            written: whether the line was written.
+            changed: whether the command or the mode has changed since the last line that was due,
+                or the emergency stop or a bumper was pressed.
+            had_input: whether the bus had input for this step.
         """
-        self._waiting = news and not due
-        self._idle += heard and not news
+        self._waiting = changed and not due
+        self._idle += had_input and not changed
         if due and not tick:
-            self._tried, self._ahead = True, went
+            self._tried, self._ahead = True, written
 
     @property
-    def listens(self) -> bool:
+    def accepts_early_command(self) -> bool:
         """Whether the next command gets an extra step immediately.
 
         If this is False, the command waits for a step that another event runs, such as the end of
@@ -104,7 +106,7 @@ class Pace:
         return self._possible and not (self._tried or self._waiting or self._idle > MAX_IDLE_WAKES)
 
     @property
-    def waits(self) -> bool:
+    def command_waits(self) -> bool:
         """Whether a new command waits, because it came too soon after the last line."""
         return self._waiting and self._possible and not self._tried
 
@@ -114,4 +116,4 @@ class Pace:
         Return None if no command waits. `sent_ns` is the monotonic time at which the last line was
         written, ns.
         """
-        return sent_ns + self._gap_ns if self.waits else None
+        return sent_ns + self._gap_ns if self.command_waits else None

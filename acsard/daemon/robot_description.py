@@ -54,8 +54,8 @@ def robot_description(path: str) -> str:
     except PermissionError:
         raise _error(
             path,
-            "no permission to read it; a service reads only files that its user may read, such as "
-            "/etc/acsard/robot.urdf",
+            "no permission to read it; make it readable for the user of the daemon. A service "
+            "cannot read home directories: move a file from there to /etc/acsard/robot.urdf",
             Exit.NO_PERMISSION,
         ) from None
     except OSError as error:

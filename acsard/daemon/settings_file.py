@@ -26,7 +26,7 @@ from acsard.core.formatting import listed, printable
 from acsard.core.messages.encodings import Decoder
 from acsard.core.messages.schema import Settings
 from acsard.core.values import NS_PER_S, Answer, Event, Latches, Request
-from acsard.host.config_file import Edit, keep, keepable
+from acsard.host.config_file import Edit, apply_edit, prepare_edit
 from acsard.host.errors import MendableError
 from acsard.host.mailbox import Mailbox
 
@@ -76,8 +76,9 @@ class _Pending(Struct):
     due_ns: int
     """Monotonic time after which the client is told that the request has failed, ns. This limit
     does not apply while the robot decides about the request."""
-    too_many: bool
-    """True if the request exceeds the limit `MAX_JOBS`."""
+    refused: str
+    """The reason why the request is refused immediately, and a remedy, in words; "" if the thread
+    checks the request."""
     edit: Edit | None = None
     """The prepared change of the file. It is None until the thread has checked the request."""
     answer: Answer | None = None
@@ -124,6 +125,8 @@ class SettingsFile:
         """`_started` contains the limits at the start of the daemon. `_limits` contains the limits
         in the file: those in `_started`, except that each limit that the daemon has written to the
         file since its start has the new value."""
+        self._no_thread = ""
+        """The reason why the thread could not be started, or "" if it runs."""
         self._kept: tuple[Latches, LimitsConfig, LimitsConfig, Latches] | None = None
         """Cache of the method `latches`: the two arguments of its last computation, the value of
         `_limits` at that time, and the result."""
@@ -139,6 +142,7 @@ class SettingsFile:
         try:
             thread.start()
         except RuntimeError as error:
+            self._no_thread = str(error)
             self.differ = f"the daemon cannot compare its settings with its file ({error})"
 
     def use(self, config: Config) -> None:
@@ -157,12 +161,21 @@ class SettingsFile:
         `results` later returns the request, if the robot must use its settings, or an answer for
         the client. `now_ns` is the present monotonic time, ns.
         """
-        full = len(self._pending) >= MAX_JOBS
-        # A request beyond the limit is overdue from the start, so that `results` refuses it in this
-        # step.
-        due_ns = now_ns - 1 if full else now_ns + REPLY_TIMEOUT_NS
-        self._pending[request.id] = _Pending(request, due_ns, full)
-        if not full:
+        why = ""
+        if self._no_thread:
+            why = (
+                "the daemon could not start the thread that changes the file "
+                f"({self._no_thread}); restart acsard, or send the request without `keep`"
+            )
+        elif len(self._pending) >= MAX_JOBS:
+            why = (
+                f"more than {MAX_JOBS} changes of the file wait for the disk; try again in some "
+                "seconds"
+            )
+        # A refused request is overdue from the start, so that `results` answers it in this step.
+        due_ns = now_ns - 1 if why else now_ns + REPLY_TIMEOUT_NS
+        self._pending[request.id] = _Pending(request, due_ns, why)
+        if not why:
             self._box.put(request)
 
     def _look(self) -> None:
@@ -170,7 +183,7 @@ class SettingsFile:
         if not self._box.waiting:
             self._box.put("look")
 
-    def obeyed(self, answer: Answer) -> bool:
+    def defers_answer(self, answer: Answer) -> bool:
         """Process the robot's answer to a client's request; return whether the answer must wait.
 
         If the client sent a `set` request with the field `keep`, and the robot now uses the new
@@ -299,14 +312,14 @@ class SettingsFile:
         except ConfigError as error:
             return Answer(request.id, False, str(error))
         try:
-            return _Checked(request, keepable(self._file, request.settings))
+            return _Checked(request, prepare_edit(self._file, request.settings))
         except MendableError as error:
             return Answer(request.id, False, f"nothing is set: {error}")
 
     def _written_answer(self, edit: Edit, answer: Answer) -> Answer:
         told = answer.message
         try:
-            keep(edit)
+            apply_edit(edit)
         except MendableError as error:
             return Answer(
                 answer.id, False, f"{told}, but only until the daemon's next start, because {error}"
@@ -350,14 +363,12 @@ class SettingsFile:
 
 
 def _overdue(pending: _Pending) -> Answer:
-    """Return the answer to a request that took too long, or that exceeded the limit `MAX_JOBS`."""
+    """Return the answer to a request that took too long, or that is refused immediately."""
     answer = pending.answer
-    if pending.too_many:
-        why = f"more than {MAX_JOBS} changes of the file wait for the disk"
-        text = f"nothing is set: {why}; try again in some seconds"
+    why = f"the disk did not answer within {REPLY_TIMEOUT_NS / NS_PER_S:g} s"
+    if answer is not None:
+        text = f"{answer.message}, but {why}: check whether the file has the new value"
     else:
-        why = f"the disk did not answer within {REPLY_TIMEOUT_NS / NS_PER_S:g} s"
-        text = f"nothing is set: {why}; check the disk (`dmesg`), then try again"
-        if answer is not None:
-            text = f"{answer.message}, but {why}: check whether the file has the new value"
+        refused = pending.refused or f"{why}; check the disk (`dmesg`), then try again"
+        text = f"nothing is set: {refused}"
     return Answer(pending.request.id, False, text)

@@ -33,15 +33,15 @@ class Kind(Struct, frozen=True):
     """Name of the log event that reports the end of the process."""
     final: frozenset[int] = frozenset()
     """Exit codes after which the process is not started again."""
-    again_s: float = RESTART_PAUSE_S
+    restart_pause_s: float = RESTART_PAUSE_S
     """Pause before a restart, s.
 
     After an exit code above 1 the pause is `LONG_RESTART_PAUSE_S` instead.
     """
     final_at_first: frozenset[int] = frozenset()
-    """Exit codes after which the process is not started again if it has never been restarted. A
-    restarted process may end with such a code because a person is changing its files, so it is
-    started again."""
+    """Exit codes after which the process is not started again if no process of this kind has run
+    before. After an earlier run, a process may end with such a code because a person is changing
+    its files, so it is started again."""
 
 
 GATEWAY = Kind("the TLS gateway", "gateway_ended")
@@ -90,4 +90,4 @@ async def keep_running(
         finally:
             child.release()
         log(Event(kind.ended, f"{kind.name} {why}; it is restarted", "warning"))
-        await asyncio.sleep(kind.again_s if code <= Exit.FAILURE else LONG_RESTART_PAUSE_S)
+        await asyncio.sleep(kind.restart_pause_s if code <= Exit.FAILURE else LONG_RESTART_PAUSE_S)

@@ -113,7 +113,7 @@ class Ticker(_Timer):
 class Next(Struct, frozen=True):
     """Result of a step: the events that may run another step before the present period ends."""
 
-    listens: bool
+    accepts_early_command: bool
     """Whether the next command gets an extra step immediately. If this is False, the command waits
     for a step that another event runs, such as the end of the control period."""
     retry_ns: int | None
@@ -136,7 +136,7 @@ class Wakeup:
         self._over: asyncio.Future[None] | None = None
         self._alarm = Alarm(self)
         self._stepping = self._again = False
-        self._listens = self._heard = self._stop_told = False
+        self._accepts_early_command = self._command_arrived = self._stop_pending = False
 
     def __call__(self) -> None:
         if self._stepping:
@@ -147,22 +147,23 @@ class Wakeup:
     def command(self) -> None:
         """Report that the bus has a sample that may be a command. Any thread may call this method.
 
-        If `listens` was True in the result of the last step, the first such sample runs a step.
-        Every other sample waits for the next step.
+        If `accepts_early_command` was True in the result of the last step, the first such sample
+        runs a step. Every other sample waits for the next step.
         """
-        self._heard = True
-        if self._listens:
-            self._listens = False
+        self._command_arrived = True
+        if self._accepts_early_command:
+            self._accepts_early_command = False
             self._from_thread()
 
     def stop(self) -> None:
         """Report that the bus has a stop. Any thread may call this method.
 
         The first stop runs a step. Further stops then wait for the next step. This ends when a step
-        has run at the end of a period, or has returned a `Next` in which `listens` is True.
+        has run at the end of a period, or has returned a `Next` in which `accepts_early_command` is
+        True.
         """
-        if not self._stop_told:
-            self._stop_told = True
+        if not self._stop_pending:
+            self._stop_pending = True
             self._from_thread()
 
     def _from_thread(self) -> None:
@@ -185,7 +186,7 @@ class Wakeup:
                 self._step = None
 
     def _run(self, step: Callable[[], Next | None], over: asyncio.Future[None]) -> None:
-        self._stepping, self._again, self._heard = True, False, False
+        self._stepping, self._again, self._command_arrived = True, False, False
         try:
             then = step()
             if then is None:
@@ -202,9 +203,9 @@ class Wakeup:
 
     def _arm(self, then: Next) -> None:
         self._alarm.set(then.retry_ns)
-        self._listens = then.listens
-        if then.listens or then.period_ended:
-            self._stop_told = False
+        self._accepts_early_command = then.accepts_early_command
+        if then.accepts_early_command or then.period_ended:
+            self._stop_pending = False
         # A command arrived during the step, perhaps too late for this step. So run another step.
-        if then.listens and self._heard:
-            self._listens, self._again = False, True
+        if then.accepts_early_command and self._command_arrived:
+            self._accepts_early_command, self._again = False, True

@@ -12,7 +12,7 @@ import foxglove
 import zenoh
 
 from acsard.client import Client
-from acsard.client.commander import MAX_OPEN_TIMEOUT_S
+from acsard.client.commander import MAX_SOURCE_TIMEOUT_S
 from acsard.client.follower import Watch
 from acsard.core.ros.names import full_name
 from acsard.core.values import NS_PER_S, AcsardError
@@ -40,7 +40,8 @@ LEARN_RETRY_S = 1.0
 """Shortest time between a failed query of the facts about the robot and the next one, s."""
 
 RELEASE_ADVICE = "release the button for two seconds, and press it again"
-"""Advice to an operator whose panel must send a zero command (see `commander.RELEASED_NS`)."""
+"""Advice to an operator whose panel must send a zero command. See
+`commander.RELEASE_TIMEOUT_NS`."""
 
 
 class Bridge:
@@ -85,7 +86,7 @@ class Bridge:
         context = foxglove.Context()
         self._relay = Relay(robot, context, self._wake.set)
         self._relay.offer(facts)
-        self._deaf = facts.deaf
+        self._commands_hidden_reason = facts.commands_hidden_reason
         """Reason why the viewers cannot see the commands of other programs, in words. It is "" if
         they can see these commands, or after the reason has been sent to the viewers."""
         logging.getLogger("foxglove").addHandler(Refusals(self._notices))
@@ -127,7 +128,7 @@ class Bridge:
     def _viewer(self, client: int) -> Client:
         """Return a bus client for one viewer. To the daemon, each viewer is a different sender."""
         name = self._robot.sender.rpartition("/")[0]
-        return self._robot.like(self._id, f"{name}/{client}")
+        return self._robot.sibling(self._id, f"{name}/{client}")
 
     def _alive(self, sample: zenoh.Sample) -> None:
         self._here = sample.kind == zenoh.SampleKind.PUT
@@ -145,10 +146,12 @@ class Bridge:
         driving = self._drives.driving()
         shown, fresh = self._shown.take()
         self._relay.follow(shown, fresh)
-        if self._deaf and not shown.isdisjoint(self._relay.commanders):
-            self._notices.say("warning", "commands", self._deaf, stays="commands")
-            self._deaf = ""
-        self._relay.pass_on()
+        if self._commands_hidden_reason and not shown.isdisjoint(self._relay.commanders):
+            self._notices.say(
+                "warning", "commands", self._commands_hidden_reason, status_id="commands"
+            )
+            self._commands_hidden_reason = ""
+        self._relay.forward()
         self._follow(bool(driving) and here)
         self._object(driving)
         if news := self._settings.refresh(here):
@@ -157,7 +160,7 @@ class Bridge:
 
     def _went(self) -> None:
         words = f"the daemon of robot {self._id} is gone; `acsard foxglove` waits for it"
-        self._notices.say("error", "daemon", words, stays=DAEMON_GONE_ID)
+        self._notices.say("error", "daemon", words, status_id=DAEMON_GONE_ID)
 
     def _came_back(self) -> None:
         # The daemon may restart during the query, which makes the reply outdated.
@@ -166,10 +169,10 @@ class Bridge:
             facts = learn(self._robot)
         except AcsardError as error:
             self._outdated, self._retry_s = True, clock.steady_s() + LEARN_RETRY_S
-            self._notices.say("error", "daemon", str(error), stays=DAEMON_GONE_ID)
+            self._notices.say("error", "daemon", str(error), status_id=DAEMON_GONE_ID)
             return
         self._learn(facts)
-        self._notices.over(DAEMON_GONE_ID)
+        self._notices.remove(DAEMON_GONE_ID)
         self._notices.say("info", "daemon", f"the daemon of robot {self._id} is back")
 
     def _learn(self, facts: Facts) -> None:
@@ -181,7 +184,7 @@ class Bridge:
     def _timeout_s(self, facts: Facts) -> float:
         sources = facts.config.commands.sources
         return next(
-            (one.timeout for one in sources if one.name == self._robot.source), MAX_OPEN_TIMEOUT_S
+            (one.timeout for one in sources if one.name == self._robot.source), MAX_SOURCE_TIMEOUT_S
         )
 
     def _follow(self, driving: bool) -> None:
@@ -204,18 +207,18 @@ class Bridge:
         now_ns = clock.steady_ns()
         for client in driving.keys() - self._objections.keys():
             self._objections[client] = Objections()
-        for client, told in list(self._objections.items()):
+        for client, objections in list(self._objections.items()):
             robot, why = driving.get(client), ""
             if robot is not None and self._watch is not None:
                 why = self._watch.objection(robot.source, robot.sender, now_ns / NS_PER_S)
-            if told.look(why, now_ns):
-                stays = f"drive {client}"
-                if told.told:
-                    zero_first = "must send a zero" in told.told
+            if objections.look(why, now_ns):
+                status_id = f"drive {client}"
+                if objections.reported:
+                    zero_first = "must send a zero" in objections.reported
                     mend = f" ({RELEASE_ADVICE})" if zero_first else ""
-                    words = f"your commands do not drive the robot: {told.told}{mend}"
-                    self._notices.say("warning", "drive", words, stays=stays)
+                    words = f"your commands do not drive the robot: {objections.reported}{mend}"
+                    self._notices.say("warning", "drive", words, status_id=status_id)
                 else:
-                    self._notices.over(stays)
+                    self._notices.remove(status_id)
             if robot is None:
                 del self._objections[client]

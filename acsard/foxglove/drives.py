@@ -19,7 +19,7 @@ from threading import Lock
 import zenoh
 
 from acsard.client import Client
-from acsard.client.commander import MAX_OPEN_TIMEOUT_S, Commander, Wish
+from acsard.client.commander import MAX_SOURCE_TIMEOUT_S, Commander, Wish
 from acsard.client.outbox import Outbox
 from acsard.core.config.settings import DriveConfig, JointsConfig
 from acsard.core.incoming.commands import STAMPED_TWISTS, TWISTS, Arrival, Receiver
@@ -31,7 +31,7 @@ from acsard.host import clock
 
 SLOW_NS, SLOW_TIMES = 5 * NS_PER_S // 2, 3
 """Limits that decide whether a panel publishes too rarely. It does if the silence before each of
-`SLOW_TIMES` consecutive messages is longer than `commander.SILENCE_NS` (0.3 s) and at most
+`SLOW_TIMES` consecutive messages is longer than `commander.BRAKING_AFTER_NS` (0.3 s) and at most
 `SLOW_NS` (2.5 s)."""
 
 MAX_CHANNELS = 64
@@ -88,7 +88,9 @@ class Viewer:
 
     def __init__(self, robot: Client) -> None:
         self.robot = robot
-        self.commander = Commander(leads=True, gathers=True, since_ns=clock.steady_ns())
+        self.commander = Commander(
+            sends_leading_zero=True, detects_bursts=True, connected_ns=clock.steady_ns()
+        )
         self.channels: dict[int, tuple[str, str]] = {}
         """Maps a channel's id to (Zenoh encoding, ""). If messages on the channel cannot drive the
         robot, the value is ("", reason)."""
@@ -98,7 +100,8 @@ class Viewer:
         """Return whether the panel publishes so rarely that the robot stops between the messages.
 
         Call this method once for each message. `silence_ns` is the time since the previous message,
-        ns. It is None for the first message, and if that time is at most `commander.SILENCE_NS`.
+        ns. It is None for the first message, and if that time is at most
+        `commander.BRAKING_AFTER_NS`.
         """
         slow = silence_ns is not None and silence_ns <= SLOW_NS
         self._slow = self._slow + 1 if slow else 0
@@ -116,7 +119,7 @@ class Drives:
         self._viewers: dict[int, Viewer] = {}
         self._lock = Lock()
         self.outbox = Outbox()
-        self.timeout_s = MAX_OPEN_TIMEOUT_S
+        self.timeout_s = MAX_SOURCE_TIMEOUT_S
         """Timeout of the command source that the viewers use, s."""
 
     # The server's threads call the methods below.
@@ -126,8 +129,9 @@ class Drives:
     ) -> None:
         """Register a channel on which a viewer publishes.
 
-        If messages on the channel cannot drive the robot, `came` reports the reason when a message
-        arrives. A channel beyond `MAX_CHANNELS` is not registered, and `came` reports that.
+        If messages on the channel cannot drive the robot, `received` reports the reason when a
+        message arrives. A channel beyond `MAX_CHANNELS` is not registered, and `received` reports
+        that.
 
         Args:
             client: the id of the viewer.
@@ -151,7 +155,7 @@ class Drives:
             if len(viewer.channels) < MAX_CHANNELS:
                 viewer.channels[channel] = found, problem
 
-    def came(self, client: int, channel: int, data: bytes) -> None:
+    def received(self, client: int, channel: int, data: bytes) -> None:
         """Queue the command in a viewer's message. If it is refused, tell the viewers why.
 
         `client` and `channel` are the ids of the viewer and of its channel. `data` is the message.
@@ -182,7 +186,7 @@ class Drives:
             self._notices.say(
                 "warning",
                 "drive",
-                "the panel publishes so seldom that the robot stops between its messages: set the "
+                "the panel publishes so rarely that the robot stops between its messages: set the "
                 "panel's publish rate to 10 Hz or more",
             )
 
@@ -209,7 +213,7 @@ class Drives:
         now_ns = clock.steady_ns()
         with self._lock:
             viewers = self._viewers.items()
-            return {one: it.robot for one, it in viewers if it.commander.drives(now_ns)}
+            return {one: it.robot for one, it in viewers if it.commander.is_driving(now_ns)}
 
     def end(self) -> None:
         """Send a zero command for each viewer that may be driving, then stop the sending thread."""

@@ -33,14 +33,14 @@ MAX_WAITING = 100
 class Notice(Struct, frozen=True):
     """A message to the viewers.
 
-    If `stays` is not "", it is the id of a message that remains visible until a later notice has
-    the same id and an empty `text`.
+    If `status_id` is not "", it is the id of a message that remains visible until a later notice
+    has the same id and an empty `text`.
     """
 
     level: Level
     name: str
     text: str
-    stays: str = ""
+    status_id: str = ""
 
 
 class Notices:
@@ -53,26 +53,26 @@ class Notices:
         self._texts = Buckets(REPEAT_RATE)
         self._staying: dict[str, Notice] = {}
 
-    def say(self, level: Level, name: str, text: str, stays: str = "") -> None:
+    def say(self, level: Level, name: str, text: str, status_id: str = "") -> None:
         """Queue a message to all viewers.
 
         Args:
             level: how serious the message is.
             name: the subject of the message on the topic `log`.
             text: the message.
-            stays: id of a message that remains visible until `over` is called with this id. The
-                message is dropped if it is visible already. With "", the message is dropped if its
-                text is repeated faster than `REPEAT_RATE` permits.
+            status_id: id of a message that remains visible until `remove` is called with this id.
+                The message is dropped if it is visible already. With "", the message is dropped if
+                its text is repeated faster than `REPEAT_RATE` permits.
         """
         now_ns = clock.mono_ns()
         with self._lock:
             new = self._texts.take(text, now_ns)
-        if new or stays:
-            self._waiting.put(Notice(level, name, text, stays))
+        if new or status_id:
+            self._waiting.put(Notice(level, name, text, status_id))
 
-    def over(self, stays: str) -> None:
-        """Remove the message with the id `stays` from the viewers."""
-        self._waiting.put(Notice("info", "", "", stays))
+    def remove(self, status_id: str) -> None:
+        """Remove the message with the id `status_id` from the viewers."""
+        self._waiting.put(Notice("info", "", "", status_id))
 
     def send(self, server: WebSocketServer, log: Callable[[Log], None], *, newcomers: bool) -> None:
         """Send the waiting notices to the viewers, and print them at the terminal.
@@ -85,17 +85,17 @@ class Notices:
         """
         if newcomers:
             for one in self._staying.values():
-                server.publish_status(one.text, STATUS_LEVELS[one.level], one.stays)
+                server.publish_status(one.text, STATUS_LEVELS[one.level], one.status_id)
         for one in self._waiting.take():
             if not one.text:
-                if self._staying.pop(one.stays, None):
-                    server.remove_status([one.stays])
+                if self._staying.pop(one.status_id, None):
+                    server.remove_status([one.status_id])
                 continue
-            if one.stays:
-                if self._staying.get(one.stays) == one:
+            if one.status_id:
+                if self._staying.get(one.status_id) == one:
                     continue  # the viewers show it already
-                self._staying[one.stays] = one
-            server.publish_status(one.text, STATUS_LEVELS[one.level], one.stays or None)
+                self._staying[one.status_id] = one
+            server.publish_status(one.text, STATUS_LEVELS[one.level], one.status_id or None)
             stamp = Time.from_ns(clock.now().wall_ns)
             log(Log(stamp, LEVELS[one.level], f"foxglove.{one.name}", one.text))
             self._tell(one.text)
@@ -106,12 +106,12 @@ class Objections:
 
     def __init__(self) -> None:
         self._since_ns: int | None = None
-        self.told = ""
+        self.reported = ""
         """Reason why the robot does not follow the viewer, as it was last reported, in words. It is
         "" if no reason is reported."""
 
     def look(self, objection: str, now_ns: int) -> bool:
-        """Update the reported reason `told`, and return whether it has changed.
+        """Update the reported reason `reported`, and return whether it has changed.
 
         A reason is reported if the robot has not followed the viewer for `GRACE_S`.
 
@@ -122,11 +122,11 @@ class Objections:
         """
         if not objection:
             self._since_ns = None
-            changed, self.told = bool(self.told), ""
+            changed, self.reported = bool(self.reported), ""
             return changed
         if self._since_ns is None:
             self._since_ns = now_ns
-        if now_ns - self._since_ns < GRACE_S * NS_PER_S or objection == self.told:
+        if now_ns - self._since_ns < GRACE_S * NS_PER_S or objection == self.reported:
             return False
-        self.told = objection
+        self.reported = objection
         return True

@@ -23,7 +23,7 @@ from acsard.core.messages.keys_and_roles import by_key, source_keys
 from acsard.core.messages.schema import Events, LogEvent, Time, TwistStamped
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.ros.channels import CMD_VEL_IN, ENCODING, LOG_CHANNEL, SCHEMA_ENCODING, Channel
-from acsard.core.ros.shapes import Log, asked, log
+from acsard.core.ros.shapes import Log, command_message, log
 from acsard.core.ros.transports import endpoints
 from acsard.daemon.bus.subscription import Subscription, encoded, queue_on
 from acsard.foxglove.robot_facts import Facts, key_of
@@ -33,7 +33,7 @@ from acsard.host.mailbox import Mailbox
 EVENTS_KEY = "events"
 
 
-class News:
+class EventDeduplicator:
     """Converts the daemon's lists of events to log messages.
 
     Successive lists overlap, but each event becomes one log message only.
@@ -71,7 +71,7 @@ class _Out:
         self.channel.log(self.last)
 
 
-class Way(Struct, frozen=True):
+class CommandForm(Struct, frozen=True):
     """The form in which commands arrive on one key of the bus."""
 
     native: str
@@ -82,8 +82,10 @@ class Way(Struct, frozen=True):
     via: Via = "native"
 
 
-def ways(key_of: Callable[[str], str], ros: RosConfig, source: str) -> dict[str, Way]:
-    """Return a `Way` for each full key on which commands of a source may arrive.
+def command_forms(
+    key_of: Callable[[str], str], ros: RosConfig, source: str
+) -> dict[str, CommandForm]:
+    """Return a `CommandForm` for each full key on which commands of a source may arrive.
 
     These are the keys of acsard and those of ROS.
 
@@ -93,10 +95,10 @@ def ways(key_of: Callable[[str], str], ros: RosConfig, source: str) -> dict[str,
         source: the name of the command source.
     """
     native = source_keys([source])
-    found = {key_of(key): Way(key) for key in (*native, *source_keys([source], "*"))}
+    found = {key_of(key): CommandForm(key) for key in (*native, *source_keys([source], "*"))}
     for one in endpoints(ros, "*"):
         if one.native in native:
-            found[one.key] = Way(one.native, one.encoding, one.transport)
+            found[one.key] = CommandForm(one.native, one.encoding, one.transport)
     return found
 
 
@@ -114,7 +116,7 @@ class Reader:
         the command is not valid.
         """
         twist = self._receiver.command(arrival).twist
-        return asked(twist, Time.from_ns(wall_ns), self._frame)
+        return command_message(twist, Time.from_ns(wall_ns), self._frame)
 
 
 class Commanders:
@@ -125,8 +127,8 @@ class Commanders:
 
     def __init__(self, robot: Client, wake: Callable[[], object]) -> None:
         self._robot, self._wake = robot, wake
-        self._reader, self._deaf = Reader(Config()), False
-        self._ways: dict[str, dict[str, Way]] = {}
+        self._reader, self._commands_hidden = Reader(Config()), False
+        self._forms: dict[str, dict[str, CommandForm]] = {}
         self._heard: dict[str, _Heard] = {}
 
     def use(self, facts: Facts) -> None:
@@ -134,17 +136,17 @@ class Commanders:
 
         All subscriptions end, because the keys may have changed.
         """
-        ros, self._deaf = facts.config.ros, bool(facts.deaf)
+        ros, self._commands_hidden = facts.config.ros, bool(facts.commands_hidden_reason)
         self._reader = Reader(facts.config)
         for source in facts.sources:
             topic = CMD_VEL_IN.topic(ros.namespace, source)
-            self._ways[topic] = ways(self._robot.key, ros, source)
+            self._forms[topic] = command_forms(self._robot.key, ros, source)
         self.follow(())  # the keys may have changed
 
     @property
     def topics(self) -> Collection[str]:
         """The names of the topics that show commands, one for each command source."""
-        return self._ways.keys()
+        return self._forms.keys()
 
     def follow(self, topics: Collection[str]) -> None:
         """Subscribe to the commands of `topics` only.
@@ -152,11 +154,11 @@ class Commanders:
         If this program is connected over TLS, do not subscribe at all, because it is not permitted
         to receive the commands of other clients.
         """
-        wanted = set() if self._deaf else self._ways.keys() & set(topics)
+        wanted = set() if self._commands_hidden else self._forms.keys() & set(topics)
         for topic in self._heard.keys() - wanted:
             self._heard.pop(topic).undeclare()
         for topic in wanted - self._heard.keys():
-            self._heard[topic] = _Heard(self._robot.session, self._ways[topic], self._wake)
+            self._heard[topic] = _Heard(self._robot.session, self._forms[topic], self._wake)
 
     def take(self) -> Iterator[tuple[str, TwistStamped]]:
         """Yield a pair (topic, command) for each valid command since the last call."""
@@ -172,9 +174,9 @@ class _Heard:
     """The subscriptions to the commands of one source, and the queue of these commands."""
 
     def __init__(
-        self, session: zenoh.Session, by_key: Mapping[str, Way], wake: Callable[[], object]
+        self, session: zenoh.Session, by_key: Mapping[str, CommandForm], wake: Callable[[], object]
     ) -> None:
-        self._ways = by_key
+        self._forms = by_key
         # This is one second of commands at 100 Hz. If more wait, the oldest are dropped.
         self._box = Mailbox[tuple[Arrival, int]](100, wake)
         handler = zenoh.handlers.Callback(self._take)
@@ -184,21 +186,21 @@ class _Heard:
         now = clock.now()
         key = str(sample.key_expr)
         head, _, last = key.rpartition("/")
-        way = self._ways.get(key) or self._ways.get(f"{head}/*")
-        if way is None:
+        form = self._forms.get(key) or self._forms.get(f"{head}/*")
+        if form is None:
             return  # published on a wildcard key, which matches no source
         put = sample.kind == zenoh.SampleKind.PUT
         attached = sample.attachment
         arrival = Arrival(
-            way.native.replace("*", last),
+            form.native.replace("*", last),
             put,
             # One byte over the limit is enough for the receiver to refuse the command.
             sample.payload.to_bytes()[: MAX_COMMAND_BYTES + 1],
-            way.encoding or str(sample.encoding),
+            form.encoding or str(sample.encoding),
             now.mono_ns,
             None,
             "",
-            way.via,
+            form.via,
             b"" if attached is None else attached.to_bytes(),
         )
         self._box.put((arrival, now.wall_ns))
@@ -223,7 +225,7 @@ class Relay:
         self._outs: dict[str, _Out] = {}
         self._followed: dict[str, Subscription] = {}
         self._commanders = Commanders(robot, wake)
-        self._news = News()
+        self._deduplicator = EventDeduplicator()
         self.log_topic = ""
         self.unreadable = 0
         """Number of samples that could not be decoded."""
@@ -258,7 +260,8 @@ class Relay:
                 message is sent again for the new viewer.
         """
         if self.log_topic in fresh:
-            self._news = News()  # a viewer that opens the log receives the last events too
+            # A viewer that opens the log receives the last events too.
+            self._deduplicator = EventDeduplicator()
         self._commanders.follow(topics)
         shown = [
             out
@@ -289,7 +292,7 @@ class Relay:
             self._robot.ask(key, arrivals.put)  # the next message may be seconds away
         return Subscription(arrivals, self._robot.key(key))
 
-    def pass_on(self) -> None:
+    def forward(self) -> None:
         """Forward the messages and commands that have arrived since the last call."""
         for topic, command in self._commanders.take():
             self._outs[topic].log(command)
@@ -297,7 +300,7 @@ class Relay:
             outs = [out for out in self._outs.values() if out.key == key]
             for message in self._messages(key, samples):
                 if isinstance(message, Events):
-                    for line in self._news.of(message):
+                    for line in self._deduplicator.of(message):
                         self.log(line)
                     continue
                 for out in outs:

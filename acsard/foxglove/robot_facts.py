@@ -29,7 +29,7 @@ class Facts(Struct, frozen=True):
     """Names of the robot's command sources."""
     forbidden: str
     """Reason why this program may not drive the robot, in words; "" if it may drive."""
-    deaf: str = ""
+    commands_hidden_reason: str = ""
     """Reason why this program cannot receive the commands of other programs, in words; "" if it
     can."""
 
@@ -64,9 +64,9 @@ def learn(robot: Client) -> Facts:
 
     Raises the errors of `Client.get`, and `ReplyError` if a reply is not readable.
     """
-    forbidden, role, deaf = "", "maintainer", ""
+    forbidden, role, commands_hidden_reason = "", "maintainer", ""
     if robot.where.tls:
-        deaf = (
+        commands_hidden_reason = (
             "clients over TLS cannot receive the commands that programs send to the robot "
             "(/cmd_vel_in/…): to see these commands, either run `acsard foxglove` on the robot, or "
             "use `acsard recording export` later"
@@ -80,7 +80,7 @@ def learn(robot: Client) -> Facts:
         config = Config() if tables is None else from_builtins(tables)
     except (DecodeError, msgspec.ValidationError) as error:
         raise ReplyError(
-            f"cannot read the robot's state ({error}); does the daemon have another version? Use "
+            f"cannot read the robot's state ({error}); is the daemon a different version? Use "
             "the same version here"
         ) from None
-    return Facts(config, tables, sources, forbidden, deaf)
+    return Facts(config, tables, sources, forbidden, commands_hidden_reason)

@@ -229,7 +229,7 @@ class Listener:
         self._drives.withdrawn(client.id, client_channel_id)
 
     def on_message_data(self, client: Client, client_channel_id: int, data: bytes) -> None:
-        self._drives.came(client.id, client_channel_id, data)
+        self._drives.received(client.id, client_channel_id, data)
 
     def on_get_parameters(
         self, client: Client, param_names: list[str], request_id: str | None = None

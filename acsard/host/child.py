@@ -50,23 +50,23 @@ slowly on a busy machine."""
 class Silence:
     """Measures how long another process has been silent, which means without a sign of life.
 
-    The silence is too long if it exceeds `most_ns`, ns.
+    The silence is too long if it exceeds `timeout_ns`, ns.
 
     If more than 0.5 s passes between two calls of `too_long`, only 0.5 s of this time counts as
     silence, because the computer may have stopped both processes meanwhile.
     """
 
-    def __init__(self, most_ns: int) -> None:
-        self._most_ns, self._ns = most_ns, 0
+    def __init__(self, timeout_ns: int) -> None:
+        self._timeout_ns, self._ns = timeout_ns, 0
 
-    def too_long(self, heard: bool, passed_ns: int) -> bool:
+    def too_long(self, alive: bool, passed_ns: int) -> bool:
         """Return whether the silence exceeds the limit.
 
-        `heard` is true if a sign of life came since the last call. `passed_ns` is the time since
+        `alive` is true if a sign of life came since the last call. `passed_ns` is the time since
         the last call, ns.
         """
-        self._ns = 0 if heard else self._ns + min(passed_ns, NS_PER_S // 2)
-        return self._ns > self._most_ns
+        self._ns = 0 if alive else self._ns + min(passed_ns, NS_PER_S // 2)
+        return self._ns > self._timeout_ns
 
 
 # The parent's side: start, limit and end
@@ -102,13 +102,17 @@ class Limits(Struct, frozen=True):
 def limit(pid: int, limits: Limits) -> None:
     """Set the limits of the child with the process id `pid`.
 
+    If the child's hard limit of memory is already lower than `limits.memory_bytes`, it stays.
     The kernel will also kill this child before other processes if the computer runs out of memory.
     """
     try:
         with suppress(OSError):
             Path(f"/proc/{pid}/oom_score_adj").write_bytes(b"1000")
         os.setpriority(os.PRIO_PROCESS, pid, limits.nice)
-        memory = limits.memory_bytes
+        memory, hard = limits.memory_bytes, resource.prlimit(pid, resource.RLIMIT_DATA)[1]
+        if hard != resource.RLIM_INFINITY:
+            # Without CAP_SYS_RESOURCE, a process cannot raise the hard limit of its child.
+            memory = min(memory, hard)
         resource.prlimit(pid, resource.RLIMIT_DATA, (memory, memory))
     except ProcessLookupError:
         pass  # the child has ended already, and its output says why
@@ -122,11 +126,11 @@ def how_it_ended(code: int) -> str:
     return f"was ended by signal {-code}" if code < 0 else f"ended with exit code {code}"
 
 
-def end(process: subprocess.Popen[bytes], patience_s: float) -> None:
-    """End a child with SIGTERM, and with SIGKILL if it still runs after `patience_s` seconds."""
+def end(process: subprocess.Popen[bytes], timeout_s: float) -> None:
+    """End a child with SIGTERM, and with SIGKILL if it still runs after `timeout_s` seconds."""
     process.terminate()
     try:
-        process.wait(patience_s)
+        process.wait(timeout_s)
     except subprocess.TimeoutExpired:
         process.kill()
         process.wait()
@@ -178,7 +182,7 @@ class Child:
 
     def __init__(self, command: Sequence[str]) -> None:
         self._command = command
-        self._ours: socket.socket | None = None
+        self._parent_end: socket.socket | None = None
         self._over = False
         self.silent = ""
         """The reason why the child was killed, in words; "" if it was not killed."""
@@ -189,48 +193,54 @@ class Child:
         If the child falls silent meanwhile, kill it and set `silent`. If a signal ended the child,
         return the negative number of the signal. Raises `OSError` if the child cannot be started.
         """
-        ours, its = socket.socketpair()
-        with ours:
-            with its:
+        parent_end, child_end = socket.socketpair()
+        with parent_end:
+            with child_end:
                 process: subprocess.Popen[bytes] = subprocess.Popen(
                     self._command,
-                    stdin=its.fileno(),
+                    stdin=child_end.fileno(),
                     stdout=2,
                     start_new_session=True,
                     env=environment(),
                 )
-            self._ours = ours
+            self._parent_end = parent_end
             if self._over:  # `release` was called while the child was being started
                 self.release()
-            if self._falls_silent(ours):
+            if self._falls_silent(parent_end):
                 process.kill()
             return process.wait()
 
-    def _falls_silent(self, ours: socket.socket) -> bool:
+    def _falls_silent(self, parent_end: socket.socket) -> bool:
         """Wait until the child falls silent, and return True.
 
-        Return False if the child ends first, or if `release` is called first. `ours` is the
+        Return False if the child ends first, or if `release` is called first. `parent_end` is the
         parent's end of the socket.
         """
         silence, before_ns, alive = Silence(START_TIMEOUT_NS), clock.mono_ns(), False
         while True:
-            beat = ours.recv(4096) if select.select([ours], [], [], HEARTBEAT_S)[0] else None
+            beat = (
+                parent_end.recv(4096)
+                if select.select([parent_end], [], [], HEARTBEAT_S)[0]
+                else None
+            )
             if beat == b"":
                 return False
             if beat and not alive:
                 alive, silence = True, Silence(SILENCE_TIMEOUT_NS)
             now_ns = clock.mono_ns()
             if silence.too_long(bool(beat), now_ns - before_ns):
-                self.silent = "no longer reported that it is alive (stopped or hung), and was ended"
+                self.silent = (
+                    "sent no more signs of life (stopped or hung), so its parent killed it"
+                )
                 return True
             before_ns = now_ns
 
     def release(self) -> None:
         """Make the child end by closing its standard input. Any thread may call this."""
         self._over = True
-        if self._ours is not None:
+        if self._parent_end is not None:
             try:
-                self._ours.shutdown(socket.SHUT_RDWR)
+                self._parent_end.shutdown(socket.SHUT_RDWR)
             except OSError:
                 pass  # the child has ended, or has closed its end of the socket
 

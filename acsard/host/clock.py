@@ -62,7 +62,7 @@ MIN_SUSPEND_NS = 100_000_000
 """Shortest time that counts as a suspend, ns. Every real suspend takes longer."""
 
 
-class Asleep:
+class SuspendDetector:
     """Detector that reports each suspend of this computer once.
 
     The daemon's monotonic clock stands still during a suspend. Without this detector, commands and
@@ -72,7 +72,7 @@ class Asleep:
     def __init__(self, read: Callable[[], int] = asleep_ns) -> None:
         self._read, self._known_ns = read, read()
 
-    def was(self) -> bool:
+    def detect(self) -> bool:
         """Return whether this computer has been suspended since the last call.
 
         A suspend of less than 0.1 s (`MIN_SUSPEND_NS`) does not count yet. The next call adds its

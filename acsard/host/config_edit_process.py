@@ -46,7 +46,7 @@ class Result(Struct, frozen=True):
     """Whether the text `error` also says how to remove the cause."""
 
 
-def edited_apart(text: str, keys: Mapping[str, object]) -> str:
+def edited_in_process(text: str, keys: Mapping[str, object]) -> str:
     """Return the configuration `text` with new values, computed in a separate process.
 
     `keys` maps dotted keys, such as "mcu.port", to their new values. Raises `MendableError` or
@@ -69,8 +69,8 @@ def edited_apart(text: str, keys: Mapping[str, object]) -> str:
     try:
         result = msgspec.json.decode(done.stdout, type=Result)
     except msgspec.DecodeError:
-        told = done.stderr.decode(errors="replace").strip().rpartition("\n")[2]
-        raise ValueError(f"the process that changes the file failed: {told}") from None
+        last_line = done.stderr.decode(errors="replace").strip().rpartition("\n")[2]
+        raise ValueError(f"the process that changes the file failed: {last_line}") from None
     if result.error:
         raise (MendableError if result.mendable else ValueError)(result.error)
     return result.text

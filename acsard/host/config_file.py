@@ -15,7 +15,7 @@ from acsard.core.config.settings import Config
 from acsard.core.config.toml_editing import edited
 from acsard.core.values import AcsardError
 from acsard.host.atomic_file import replace, sync
-from acsard.host.config_edit_process import edited_apart
+from acsard.host.config_edit_process import edited_in_process
 from acsard.host.errors import Exit, ExitError, MendableError
 from acsard.host.extras import install
 
@@ -94,7 +94,7 @@ class Edit(Struct, frozen=True):
     """The new content of the file."""
 
 
-def keepable(file: Path | None, keys: Keys) -> Edit:
+def prepare_edit(file: Path | None, keys: Keys) -> Edit:
     """Prepare the change that writes settings into the configuration file of the running daemon.
 
     `file` is this file, or None if the daemon runs without a configuration file. `keys` are the
@@ -121,12 +121,12 @@ def keepable(file: Path | None, keys: Keys) -> Edit:
                 "with a copy of it (--config)"
             )
         before = place.read_bytes()
-        return Edit(file, keys, before, edited_apart(before.decode(), keys))
+        return Edit(file, keys, before, edited_in_process(before.decode(), keys))
     except (OSError, ValueError, MendableError) as error:
-        raise _left(file, error) from None
+        raise _not_changed(file, error) from None
 
 
-def keep(edit: Edit) -> None:
+def apply_edit(edit: Edit) -> None:
     """Write a prepared change to the configuration file.
 
     If another program has changed the file since the change was prepared, prepare the change again
@@ -145,10 +145,10 @@ def keep(edit: Edit) -> None:
                 with suppress(OSError):
                     sync(place.parent)
                 return
-            edit = keepable(edit.file, edit.keys)
+            edit = prepare_edit(edit.file, edit.keys)
         raise ValueError("another program changes it again and again")
     except (OSError, ValueError) as error:
-        raise _left(edit.file, error) from None
+        raise _not_changed(edit.file, error) from None
 
 
 def _require_writable(place: Path) -> None:
@@ -219,7 +219,7 @@ def change(file: Path, keys: Keys | Callable[[Config], Keys], *, new: bool = Fal
         replace(place, text.encode())
         return given
     except (OSError, ValueError, ConfigError) as error:
-        raise _left(file, error) from None
+        raise _not_changed(file, error) from None
 
 
 def require_changeable(
@@ -234,7 +234,7 @@ def require_changeable(
         if not os.access(place.parent, os.W_OK):
             raise PermissionError(f"no permission to write to {place.parent}")
     except (OSError, ValueError, ConfigError) as error:
-        raise _left(file, error) from None
+        raise _not_changed(file, error) from None
 
 
 def _changed(
@@ -247,7 +247,7 @@ def _changed(
     return place, edited(text, given), given
 
 
-def _left(file: Path, error: Exception) -> MendableError:
+def _not_changed(file: Path, error: Exception) -> MendableError:
     # The text of an `AcsardError` contains its own remedy.
-    mend = "" if isinstance(error, AcsardError) else "; write the lines by hand"
+    mend = "" if isinstance(error, AcsardError) else "; edit the file by hand"
     return MendableError(f"{file} was not changed: {error}{mend}")

@@ -27,7 +27,7 @@ def install(extra: Extra) -> str:
     Error messages about missing libraries show this command.
     """
     try:
-        wanted = wanted_by(distribution("acsard"), extra)
+        wanted = requirements_of(distribution("acsard"), extra)
     # acsard runs from its source directory and has not been installed.
     except PackageNotFoundError:
         wanted = [f".[{extra}]"]
@@ -41,18 +41,18 @@ def missing(library: str, extra: Extra) -> MendableError:
     )
 
 
-def wanted_by(installed: Distribution, extra: Extra) -> list[str]:
+def requirements_of(installed: Distribution, extra: Extra) -> list[str]:
     """Return the arguments of `pip install` that install an extra.
 
     The result is like ["DIRECTORY[EXTRA]"], with the directory from which acsard was installed. If
     this directory no longer exists, the result contains the names of the extra's libraries.
     `installed` is the metadata of the installed acsard.
     """
-    told = json.loads(installed.read_text("direct_url.json") or "{}")
-    url = urlsplit(told.get("url", ""))
+    direct_url = json.loads(installed.read_text("direct_url.json") or "{}")
+    url = urlsplit(direct_url.get("url", ""))
     place = Path(unquote(url.path))
     if url.scheme == "file" and (place / "pyproject.toml").is_file():
-        editable = told.get("dir_info", {}).get("editable", False)
+        editable = direct_url.get("dir_info", {}).get("editable", False)
         return [*(["-e"] if editable else []), f"{place}[{extra}]"]
     libraries = (line.partition(";") for line in installed.requires or ())
     only = ["extra", "==", f"'{extra}'"]

@@ -42,7 +42,7 @@ class Conditions(Struct, frozen=True, omit_defaults=True):
     """Present conditions that slow the processors down: low voltage, heat or a clock limit."""
 
     undervoltage: bool = False
-    hot: bool = False
+    slowed_by_heat: bool = False
     """Whether a cooling device or the firmware slows the processor down now."""
     throttled: int = 0
     """Total number of times that the processors have slowed down because of heat."""

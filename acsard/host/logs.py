@@ -22,7 +22,7 @@ from typing import Any, Literal, TextIO
 from acsard.core.config.settings import LogConfig
 from acsard.core.formatting import printable
 from acsard.core.values import Event, EventName
-from acsard.host.terminal_modes import coloured
+from acsard.host.terminal_modes import may_use_color
 
 # structlog imports rich to draw tracebacks, but this log contains no tracebacks. The daemon's
 # modules take 39 MB without rich and 44 MB with it, so rich is hidden while structlog is imported.
@@ -250,7 +250,7 @@ def _renderer(form: Form, stream: TextIO) -> Any:
         case "console":
             # The number is the width to which event names are padded. structlog has renamed the
             # parameter, so it is passed by position.
-            return structlog.dev.ConsoleRenderer(14, colors=coloured(stream))
+            return structlog.dev.ConsoleRenderer(14, colors=may_use_color(stream))
         case "json":
             return structlog.processors.JSONRenderer()
         case "logfmt":

@@ -12,7 +12,7 @@ import sys
 from pathlib import Path
 
 from acsard.core.messages.signature import MAX_NAME_LENGTH
-from acsard.host.processes import called
+from acsard.host.processes import run_command
 
 
 def own_name() -> str:
@@ -46,7 +46,7 @@ def own_addresses() -> list[str]:
     The list is empty if the command `ip` fails.
     """
     try:
-        found = json.loads(called(("ip", "-json", "address"), 5.0).stdout or "[]")
+        found = json.loads(run_command(("ip", "-json", "address"), 5.0).stdout or "[]")
     except (OSError, ValueError, subprocess.TimeoutExpired):
         return []
     told = [one["local"] for link in found for one in link.get("addr_info", ()) if "local" in one]

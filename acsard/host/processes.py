@@ -8,8 +8,9 @@ process.
 from __future__ import annotations
 
 import os
+import re
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from msgspec import Struct
@@ -19,6 +20,11 @@ PROC = Path("/proc")
 PTY_MAJORS = range(136, 144)
 """Major device numbers of ptys. Each number stands for 256 ptys. No serial port has any of these
 numbers."""
+
+
+OPTION_WITH_ARGUMENT = re.compile(r"-[^-cmWX]*(?P<letter>[cmWX])(?P<argument>.*)", re.DOTALL)
+"""A word of options for Python, such as "-Pm", that ends with an option which takes an argument.
+The argument may follow in the same word."""
 
 
 class Holder(Struct, frozen=True):
@@ -35,7 +41,7 @@ class _Open(Struct, frozen=True):
     def device(self) -> int:
         return os.stat(self.process / "fd" / self.fd).st_rdev
 
-    def about(self) -> list[str]:
+    def fdinfo(self) -> list[str]:
         return (self.process / "fdinfo" / self.fd).read_text().splitlines()
 
 
@@ -59,7 +65,7 @@ def holder_of(path: str) -> Holder | None:
         try:
             if one.process.name != str(os.getpid()):
                 found = _holder(one.process)
-                if any(line.startswith("lock:") for line in one.about()):
+                if any(line.startswith("lock:") for line in one.fdinfo()):
                     return found
         except OSError:
             # The process has ended.
@@ -78,7 +84,7 @@ def master_of(path: str) -> Holder | None:
     index = f"tty-index:\t{os.minor(wanted) + 256 * (os.major(wanted) - PTY_MAJORS[0])}"
     for one in _open_devices("/ptmx"):
         try:
-            if index in one.about():
+            if index in one.fdinfo():
                 return _holder(one.process)
         except OSError:
             # The process has ended.
@@ -108,7 +114,7 @@ def waited_ns(pid: int) -> int:
         return 0
 
 
-def running(name: str) -> bool:
+def is_running(name: str) -> bool:
     for process in _processes():
         try:
             if _comm(process) == name[:15]:
@@ -165,19 +171,38 @@ def _holder(process: Path) -> Holder:
 def _name(process: Path) -> str:
     """Return the program name of a process, whose directory in /proc is `process`.
 
-    The name of `python -m acsard` is "acsard", not "python".
+    The name of `python -m acsard` and of `python /usr/bin/acsard` is "acsard", not "python".
     """
-    words = (process / "cmdline").read_bytes().split(b"\0")
-    if any(Path(os.fsdecode(word)).name == "acsard" for word in words[:4]):
-        return "acsard"
-    return _comm(process)
+    command = os.fsdecode((process / "cmdline").read_bytes()).split("\0")
+    return "acsard" if _executed(command) == "acsard" else _comm(process)
+
+
+def _executed(command: Sequence[str]) -> str:
+    """Return the base name of the program, Python script or Python module that a command executes.
+
+    Return "" for a Python interpreter that executes neither a script nor a module.
+    """
+    program = Path(command[0]).name
+    if not program.startswith(("python", "pypy")):
+        return program
+    words = iter(command[1:])
+    for word in words:
+        option = OPTION_WITH_ARGUMENT.fullmatch(word)
+        # The word "-" stands for a script on standard input.
+        if option is None and (word == "-" or not word.startswith("-")):
+            return Path(word).name
+        if option is not None:
+            argument = option["argument"] or next(words, "")
+            if option["letter"] in "cm":
+                return argument if option["letter"] == "m" else ""
+    return ""
 
 
 def _comm(process: Path) -> str:
     return (process / "comm").read_text().strip()
 
 
-def called(words: tuple[str, ...], within_s: float) -> subprocess.CompletedProcess[str]:
+def run_command(words: tuple[str, ...], within_s: float) -> subprocess.CompletedProcess[str]:
     """Run a command until it ends, and return its output and exit code.
 
     `words` are the program and its arguments. Raises `OSError` if the program cannot be started,

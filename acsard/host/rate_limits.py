@@ -15,10 +15,10 @@ from acsard.core.values import NS_PER_S
 
 
 class Rate(NamedTuple):
-    """A permitted rate: `hz` units per second on average, in bursts of up to `most` units."""
+    """A permitted rate: `hz` units per second on average, in bursts of up to `burst` units."""
 
     hz: float
-    most: float = 1.0
+    burst: float = 1.0
 
 
 class Bucket:
@@ -29,37 +29,37 @@ class Bucket:
 
     def __init__(self, rate: Rate) -> None:
         self._unit_ns = round(NS_PER_S / rate.hz)
-        self._burst_ns = round((rate.most - 1.0) * self._unit_ns)
-        self._paid_ns = 0
+        self._burst_ns = round((rate.burst - 1.0) * self._unit_ns)
+        self._full_at_ns = 0
         """Time at which the bucket is full again, ns. Each unit that is taken makes this time later
         by `_unit_ns`."""
 
     def room(self, now_ns: int) -> bool:
         """Return whether the bucket contains at least one unit now."""
-        return self._paid_ns <= now_ns + self._burst_ns
+        return self._full_at_ns <= now_ns + self._burst_ns
 
     def full(self, now_ns: int) -> bool:
-        return self._paid_ns <= now_ns
+        return self._full_at_ns <= now_ns
 
     def take(self, now_ns: int) -> bool:
         """Take one unit from the bucket and return True. Return False if the bucket is empty."""
         if not self.room(now_ns):
             return False
-        self._paid_ns = max(self._paid_ns, now_ns) + self._unit_ns
+        self._full_at_ns = max(self._full_at_ns, now_ns) + self._unit_ns
         return True
 
 
 class Buckets:
     """A token bucket for each name, and optionally a bucket that all names share."""
 
-    def __init__(self, of_one: Rate, in_all: Rate | None = None) -> None:
+    def __init__(self, per_name: Rate, shared: Rate | None = None) -> None:
         """Create the buckets.
 
-        `of_one` is the permitted rate of each name. `in_all` is the permitted rate of all names
+        `per_name` is the permitted rate of each name. `shared` is the permitted rate of all names
         together; None means that this rate is not limited.
         """
-        self._of_one = of_one
-        self._shared = None if in_all is None else Bucket(in_all)
+        self._per_name = per_name
+        self._shared = None if shared is None else Bucket(shared)
         self._buckets: dict[str, Bucket] = {}
 
     def room(self, name: str, now_ns: int) -> bool:
@@ -74,7 +74,7 @@ class Buckets:
             # Drop the full buckets, which equal new ones, so that many names do not fill the
             # memory.
             self._buckets = {k: one for k, one in self._buckets.items() if not one.full(now_ns)}
-        own = self._buckets.setdefault(name, Bucket(self._of_one))
+        own = self._buckets.setdefault(name, Bucket(self._per_name))
         if self._shared is None:
             return own.take(now_ns)
         # A name whose bucket is empty must not consume units of the shared bucket.
@@ -84,11 +84,11 @@ class Buckets:
 class Places:
     """A limit on the number of simultaneous uses, such as connections. Each use takes a place.
 
-    At most `most` places may be in use in total, and at most `of_one` of them for the same name.
+    At most `most` places may be in use in total, and at most `per_name` of them for the same name.
     """
 
-    def __init__(self, most: int, of_one: int) -> None:
-        self._most, self._of_one = most, of_one
+    def __init__(self, most: int, per_name: int) -> None:
+        self._most, self._per_name = most, per_name
         self._taken: Counter[str] = Counter()
 
     @property
@@ -96,7 +96,7 @@ class Places:
         return self._taken.total()
 
     def room(self, name: str) -> bool:
-        return self._taken[name] < self._of_one and self.taken < self._most
+        return self._taken[name] < self._per_name and self.taken < self._most
 
     def enter(self, name: str) -> bool:
         """Take a place for `name` and return True. Return False if no place is free."""
@@ -111,7 +111,7 @@ class Places:
             del self._taken[name]
 
     @contextmanager
-    def held(self, name: str = "") -> Iterator[bool]:
+    def place(self, name: str = "") -> Iterator[bool]:
         """Take a place for `name` during a `with` block, and yield True.
 
         If no place is free, yield False.

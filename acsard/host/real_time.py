@@ -28,7 +28,7 @@ _CAP_IPC_LOCK, _CAP_SYS_NICE = 14, 23
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
 
 
-def ask() -> str:
+def request() -> str:
     """Ask the kernel for real-time scheduling, locked memory and a processor that stays awake.
 
     Return "" if the kernel grants all three requests. Otherwise return a text for the user that
@@ -50,7 +50,7 @@ def ask() -> str:
     )
 
 
-def has(pid: int) -> bool | None:
+def is_real_time(pid: int) -> bool | None:
     """Return whether the first thread of a process has real-time scheduling.
 
     In the daemon, the first thread runs the control loop. `pid` 0 stands for the calling thread.
@@ -79,12 +79,16 @@ def _capable(capability: int) -> bool:
 
 
 def _schedule() -> bool:
-    if has(0):
+    if is_real_time(0):
         # systemd has started this process with real-time scheduling.
         return True
     try:
         policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
-        resource.setrlimit(resource.RLIMIT_RTTIME, (MAX_SPIN_S * 1_000_000, MAX_SPIN_S * 1_000_000))
+        spin_us, hard_us = MAX_SPIN_S * 1_000_000, resource.getrlimit(resource.RLIMIT_RTTIME)[1]
+        if hard_us != resource.RLIM_INFINITY:
+            # Without CAP_SYS_RESOURCE, a process cannot raise its hard limit.
+            spin_us = min(spin_us, hard_us)
+        resource.setrlimit(resource.RLIMIT_RTTIME, (spin_us, spin_us))
         os.sched_setscheduler(0, policy, os.sched_param(PRIORITY))
     except OSError:
         return False

@@ -11,7 +11,7 @@ from contextlib import contextmanager, suppress
 from typing import TextIO
 
 
-def coloured(stream: TextIO) -> bool:
+def may_use_color(stream: TextIO) -> bool:
     """Return whether output to a stream may contain colors.
 
     The output may contain colors if the stream is a terminal, TERM is not "dumb", and the
@@ -22,7 +22,7 @@ def coloured(stream: TextIO) -> bool:
 
 
 @contextmanager
-def one_by_one() -> Iterator[None]:
+def single_key_mode() -> Iterator[None]:
     """Make the terminal deliver each key press immediately, without Enter, during a `with` block.
 
     In the block, Ctrl-S is an ordinary key. Otherwise Ctrl-S would stop the output of the terminal,

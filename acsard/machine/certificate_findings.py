@@ -10,15 +10,15 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from acsard.core.config.settings import TLS_PREFIX, Config
-from acsard.core.messages.certificate_expiry import expiry, first
-from acsard.daemon.bus.certificate_watch import ends_of
+from acsard.core.messages.certificate_expiry import expiry, first_expiry
+from acsard.daemon.bus.certificate_watch import router_expiry_times
 from acsard.daemon.bus.tls import (
     AUTHORITY,
     CA,
     CERTIFICATE,
     KEY,
     common_name,
-    ends,
+    expiry_times,
     files_in,
     host_of,
     require_usable,
@@ -59,10 +59,10 @@ def certificates(tls: str) -> Iterator[Finding]:
         text = f"Zenoh refuses {directory / CERTIFICATE} with the key {directory / KEY} ({why})"
         yield Finding("certificates", "failure", text, renewal(tls, ""))
         return
-    found = ends(tls)
+    found = expiry_times(tls)
     level, words = expiry(found, now().wall_ns)
     mend = (
-        renewal(tls, first(found)[0])
+        renewal(tls, first_expiry(found)[0])
         if found
         else f"run `{install('tls')}`, which installs the library that reads certificates"
     )
@@ -138,6 +138,6 @@ def router_certificates(config: Config) -> Iterator[Finding]:
     """
     tls = config.bus.tls
     routers = [endpoint for endpoint in config.bus.connect if endpoint.startswith(TLS_PREFIX)]
-    for whose, ends_ns in ends_of(routers, tls).items():
+    for whose, ends_ns in router_expiry_times(routers, tls).items():
         level, words = expiry({whose: ends_ns}, now().wall_ns)
         yield Finding("router", LEVELS[level], words, renewal(tls, whose) if level else "")

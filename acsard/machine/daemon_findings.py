@@ -21,7 +21,7 @@ from acsard.core.config.parsing import from_builtins
 from acsard.core.config.settings import SIMULATOR, BatteryConfig, Config
 from acsard.core.config.validation import write
 from acsard.core.formatting import listed, many
-from acsard.core.link.link_diagnosis import BUSY_ADVICE, MAX_UNANSWERED_FRACTION, is_ours
+from acsard.core.link.link_diagnosis import BUSY_ADVICE, MAX_UNANSWERED_FRACTION, blames_host
 from acsard.core.messages.diagnostics import NO_ROUTER
 from acsard.core.messages.schema import (
     BatterySummary,
@@ -107,19 +107,19 @@ class Running(Struct, frozen=True):
     config: Config
     before: RobotState
     state: RobotState
-    looked_ns: int
+    queried_ns: int
     """Time halfway between sending the query of `state` and receiving its answer, by this machine's
     wall clock, ns."""
-    trip_ns: int = 0
+    round_trip_ns: int = 0
     """Time from sending the query of `state` to receiving its answer, ns."""
     rows: tuple[DiagnosticStatus, ...] = ()
     """Rows of the daemon's diagnostics."""
-    here: bool = True
+    is_local: bool = True
     """Whether the daemon runs on this machine."""
     events: tuple[LogEvent, ...] = ()
 
 
-def asked(config: Config, address: Address) -> Running:
+def query(config: Config, address: Address) -> Running:
     """Query the daemon at `address`, and return its answers. This takes about a second.
 
     `config` is the configuration in the local file. If the daemon does not return its own
@@ -131,12 +131,12 @@ def asked(config: Config, address: Address) -> Running:
         info, before = robot.get("info"), robot.get("state")
         time.sleep(1.0)  # the daemon counts about a hundred lines in this time
         rows, events = tuple(robot.get("diagnostics").status), tuple(robot.get("events").events)
-        runs, here = _configuration(robot, info, config), name_of(info.pid) == "acsard"
-        asked = clock.now()
+        runs, is_local = _configuration(robot, info, config), name_of(info.pid) == "acsard"
+        sent = clock.now()
         state, answered = robot.get("state"), clock.now()
-        trip_ns = answered.mono_ns - asked.mono_ns
-        looked_ns = asked.wall_ns + trip_ns // 2
-        return Running(info, runs, before, state, looked_ns, trip_ns, rows, here, events)
+        round_trip_ns = answered.mono_ns - sent.mono_ns
+        queried_ns = sent.wall_ns + round_trip_ns // 2
+        return Running(info, runs, before, state, queried_ns, round_trip_ns, rows, is_local, events)
 
 
 def _configuration(robot: Client, info: Info, file: Config) -> Config:
@@ -161,30 +161,30 @@ def compared(running: Running, file: Config) -> Iterator[Finding]:
     finding with the level "ok".
     """
     info, others = running.info, differences(running.config, file)
-    who = f"acsard {info.version}, pid {info.pid}"
+    daemon_name = f"acsard {info.version}, pid {info.pid}"
     if not others:
         yield Finding(
             "configuration",
             "ok",
-            f"the running daemon ({who}) uses the configuration file's values",
+            f"the running daemon ({daemon_name}) uses the configuration file's values",
         )
         return
-    for belongs, level, how, mend in DIFFERENCE_REASONS:
-        its = {key: one for key, one in others.items() if belongs(key)}
-        if not its:
+    for belongs, level, reason, mend in DIFFERENCE_REASONS:
+        differing = {key: one for key, one in others.items() if belongs(key)}
+        if not differing:
             continue
-        told = [one.words(key) for key, one in its.items()]
-        text = f"the running daemon ({who}) has other values than the file ({how}): "
+        told = [one.words(key) for key, one in differing.items()]
+        text = f"the running daemon ({daemon_name}) has other values than the file ({reason}): "
         text += listed(told, MAX_KEYS, "; ")
         mend = mend.format(
-            which="these values" if len(its) > 1 else "this value", lines=_tables(its)
+            which="these values" if len(differing) > 1 else "this value", lines=_tables(differing)
         )
         yield Finding("configuration", level, text, mend)
 
 
-def _tables(its: Mapping[str, Difference]) -> str:
-    """Return text for the configuration file that sets the daemon's values of the keys `its`."""
-    parts = [(key.rpartition("."), write(one.its)) for key, one in its.items()]
+def _tables(differing: Mapping[str, Difference]) -> str:
+    """Return text for the configuration file that sets the daemon's values of these keys."""
+    parts = [(key.rpartition("."), write(one.its)) for key, one in differing.items()]
     return "; ".join(f"[{table}] {name} = {value}" for (table, _, name), value in parts)
 
 
@@ -216,10 +216,10 @@ def link(running: Running) -> Iterator[Finding]:
         if state.link == "down":
             mend = (
                 "see the finding about the serial port above"
-                if running.here
+                if running.is_local
                 else "run `acsard doctor` on the daemon's machine, where it checks the serial port"
             )
-        if config.mcu.simulated or is_ours(state.reason):
+        if config.mcu.simulated or blames_host(state.reason):
             mend = BUSY_ADVICE
         text = f"{state.link}: {state.reason}" if state.mode == "waiting" else state.link
         yield Finding("link", "failure", text, mend)
@@ -239,14 +239,21 @@ def link(running: Running) -> Iterator[Finding]:
             "computer did not run the daemon in time"
         )
         yield Finding("link", "warning" if late > often else "ok", text, BUSY_ADVICE)
-    problems = [*lost(passed, config), *(refused(passed) or refused(state.counters))]
+    problems = [*unanswered_lines(passed, config), *(refused(passed) or refused(state.counters))]
     for text in problems:
         yield Finding("link", "warning", text, mend)
-    went = [] if config.mcu.simulated else gone(state.counters)
+    went = [] if config.mcu.simulated else link_losses(state.counters)
     for times, text in went:
         yield Finding("link", "warning" if times > often else "ok", text, mend)
     if not problems and not late and not went:
-        yield Finding("link", "ok", "the link is up, and no line to or from the board is lost")
+        text = "the link is up, and no line to or from the board is lost"
+        if config.mcu.reply_period:
+            text = (
+                "the link is up, and the daemon can read the lines from the board; the lines to "
+                "the board were not judged, because a board with mcu.reply_period does not answer "
+                "each line"
+            )
+        yield Finding("link", "ok", text)
     if state.wheel_fault:
         yield Finding("wheels", "warning", state.wheel_fault, mend)
     yield from _emergency_stop(config, state, mend)
@@ -281,7 +288,7 @@ def _bumpers(config: Config, state: RobotState, mend: str) -> Iterator[Finding]:
         text = f"the board reports {many(len(pressed), 'bumper')}, and none is pressed"
         yield Finding("bumpers", "ok", text)
     elif safety.bumpers and safety.bumper != "off":
-        yield Finding("bumpers", "failure", bumpers.missing(safety), mend)
+        yield Finding("bumpers", "failure", bumpers.missing_text(safety), mend)
 
 
 def _battery(config: BatteryConfig, battery: BatterySummary | None, mend: str) -> Iterator[Finding]:
@@ -303,7 +310,7 @@ def _battery(config: BatteryConfig, battery: BatterySummary | None, mend: str) -
         yield Finding("battery", "warning", text, "charge it")
 
 
-def lost(passed: Mapping[str, int], config: Config) -> Iterator[str]:
+def unanswered_lines(passed: Mapping[str, int], config: Config) -> Iterator[str]:
     """Yield a warning text if the board answered too few of the daemon's lines.
 
     Yield nothing for a board with a configured `mcu.reply_period`. `passed` maps the name of each
@@ -315,7 +322,7 @@ def lost(passed: Mapping[str, int], config: Config) -> Iterator[str]:
         return
     yield (
         f"the board answered only {came} of the {sent} lines that the daemon sent in a second: "
-        "lines or answers get lost, or the board sends reports at its own times instead of answers"
+        "the serial line loses data, or the board is free-running and does not answer each line"
     )
 
 
@@ -336,7 +343,7 @@ def refused(counters: Mapping[str, int]) -> list[str]:
     return [f"the daemon rejected lines from the microcontroller, by reason: {told}"]
 
 
-def gone(counters: Mapping[str, int]) -> list[tuple[int, str]]:
+def link_losses(counters: Mapping[str, int]) -> list[tuple[int, str]]:
     """Return [(number of times that the link was lost, sentence about these losses)].
 
     A loss does not count if it occurred because the computer did not run the daemon in time. Return
@@ -362,6 +369,7 @@ def check(running: Running) -> str:
 GYRO_MENDS: dict[GyroDoes, str] = {
     "used": "",
     "waiting for rest": "",
+    "waiting for turn": "",
     "silent": "check that the gyro's driver runs, and that it publishes on the Zenoh key `imu` "
     "(the ROS topic imu/data)",
     "disagrees": "turn the robot more slowly, or drive on other ground; if that does not help, "
@@ -443,7 +451,7 @@ def routers(config: Config) -> Iterator[Finding]:
         )
 
 
-def found(config: Config, address: Address) -> Running | Finding:
+def query_or_finding(config: Config, address: Address) -> Running | Finding:
     """Return the answers of the daemon at `address`.
 
     If the daemon does not answer, return a finding with the reason instead. `config` is the
@@ -463,7 +471,7 @@ def found(config: Config, address: Address) -> Running | Finding:
             return Finding("daemon", "warning", text, mend)
         return Finding("daemon", "warning", f"no program listens at {endpoint}", START_ADVICE)
     try:
-        return asked(config, address)
+        return query(config, address)
     except NoAnswerError as error:
         return Finding("daemon", "failure", str(error), OTHER_DAEMON_ADVICE)
     except MendableError as error:
@@ -493,7 +501,7 @@ def daemon(running: Running) -> Iterator[Finding]:
     yield from gyro(state.gyro, state.counters)
     rows = {row.name: row for row in running.rows}
     yield from linked(rows)
-    yield from certificate(rows.get("acsard: certificate"), running.here)
+    yield from certificate(rows.get("acsard: certificate"), running.is_local)
     if state.counters.get("gateway_full"):
         text = (
             "at times, clients from the network used all connections of the TLS gateway: the log "
@@ -505,7 +513,7 @@ def daemon(running: Running) -> Iterator[Finding]:
         mend = "free disk space, or set control.state_directory to a writable directory"
         yield Finding("latch file", "warning", state.latch_file_error, mend)
     # If the daemon runs on this machine, `compared` reports these differences.
-    if state.settings_differ and not running.here:
+    if state.settings_differ and not running.is_local:
         mend = (
             "when the daemon restarts, it uses the values of the file; `acsard set KEY VALUE "
             "--keep` writes a value into the file"
@@ -518,16 +526,16 @@ def daemon(running: Running) -> Iterator[Finding]:
     yield from late(running)
 
 
-def certificate(row: DiagnosticStatus | None, here: bool) -> Iterator[Finding]:
+def certificate(row: DiagnosticStatus | None, is_local: bool) -> Iterator[Finding]:
     """Yield a finding if a certificate of the daemon or its TLS gateway expires soon.
 
     `row` is the row about certificates in the daemon's diagnostics, or None if this row is missing.
-    `here` says whether the daemon runs on this machine.
+    `is_local` says whether the daemon runs on this machine.
     """
     if row is None or not row.level:
         return
     mend = "run `acsard doctor` on the daemon's machine, where it examines the certificate files"
-    if here:
+    if is_local:
         mend = (
             "if you have already renewed the certificate files of the findings above, give the "
             "services copies of them: run `sudo systemctl try-reload-or-restart acsard-gateway "
@@ -535,7 +543,7 @@ def certificate(row: DiagnosticStatus | None, here: bool) -> Iterator[Finding]:
             "acsard`. The daemon uses the new files for its next connection. A restart of the "
             "daemon ends this warning at once, but stops the robot"
         )
-    text = f"of the daemon's certificates, the one that expires first: {row.message}"
+    text = f"the daemon's certificate that expires first: {row.message}"
     yield Finding("certificates", LEVELS[min(row.level, 2)], text, mend)
 
 
@@ -577,10 +585,10 @@ def clocks(running: Running) -> Iterator[Finding]:
     0.5 s ahead.
     """
     its_ns, counters = running.state.stamp.to_ns(), running.state.counters
-    apart = (its_ns - running.looked_ns) / NS_PER_S
+    apart = (its_ns - running.queried_ns) / NS_PER_S
     # The limit of 0.4 s is a little below the 0.5 s from which on Zenoh replaces time stamps. The
     # daemon has read its clock at an unknown moment between the query and the answer.
-    if not running.here and abs(apart) > 0.4 + running.trip_ns / 2 / NS_PER_S:
+    if not running.is_local and abs(apart) > 0.4 + running.round_trip_ns / 2 / NS_PER_S:
         way = "ahead of" if apart > 0 else "behind"
         text = f"the daemon's clock is {abs(apart):.1f} s {way} this machine's"
         yield Finding(

@@ -25,9 +25,16 @@ from acsard.daemon.bus.address import Address, address_of
 from acsard.daemon.late_causes import present
 from acsard.host import clock, real_time
 from acsard.host.kernel_counters import Kernel
-from acsard.host.processes import holders, running
+from acsard.host.processes import holders, is_running
 from acsard.machine.certificate_findings import certificates, router_certificates
-from acsard.machine.daemon_findings import Running, compared, daemon, found, gateway, routers
+from acsard.machine.daemon_findings import (
+    Running,
+    compared,
+    daemon,
+    gateway,
+    query_or_finding,
+    routers,
+)
 from acsard.machine.finding import Finding, Level
 from acsard.machine.serial_ports import BOARDS, serial_devices
 
@@ -37,15 +44,15 @@ REAL_TIME_ADVICE = (
 )
 
 
-def meddlers() -> Iterator[Finding]:
+def port_grabbers() -> Iterator[Finding]:
     """Yield findings about running programs that take over serial ports or send data to them."""
-    if running("brltty"):
+    if is_running("brltty"):
         mend = (
             "run `sudo apt remove brltty`, unless you use a Braille display: brltty takes the "
             "serial ports of CH340 and FTDI chips"
         )
         yield Finding("brltty", "failure", "the program brltty is running", mend)
-    if running("ModemManager") and not Path("/etc/udev/rules.d/70-acsar.rules").is_file():
+    if is_running("ModemManager") and not Path("/etc/udev/rules.d/70-acsar.rules").is_file():
         mend = "install deploy/udev/70-acsar.rules (`acsard service install` does that)"
         yield Finding(
             "ModemManager",
@@ -55,7 +62,7 @@ def meddlers() -> Iterator[Finding]:
         )
 
 
-def clock_set() -> Iterator[Finding]:
+def clock_year() -> Iterator[Finding]:
     """Yield a finding about whether this computer's wall clock shows a plausible year.
 
     The time stamps of all messages come from this clock.
@@ -66,9 +73,9 @@ def clock_set() -> Iterator[Finding]:
             "set this computer's clock (timedatectl), or run chrony: the time stamps of the "
             "odometry come from this clock"
         )
-        yield Finding("clock", "warning", f"the year is {year}", mend)
+        yield Finding("clock", "warning", f"this computer's clock shows the year {year}", mend)
     else:
-        yield Finding("clock", "ok", f"the year is {year}")
+        yield Finding("clock", "ok", f"this computer's clock shows the year {year}")
 
 
 def scheduling(wanted: bool, pid: int | None) -> Iterator[Finding]:
@@ -78,7 +85,7 @@ def scheduling(wanted: bool, pid: int | None) -> Iterator[Finding]:
     scheduling. `wanted` is the setting `control.real_time`, and `pid` is the process id of the
     running daemon, or None if no daemon runs.
     """
-    has = None if pid is None else real_time.has(pid)
+    has = None if pid is None else real_time.is_real_time(pid)
     if not wanted:
         yield Finding(
             "real time",
@@ -214,7 +221,7 @@ def examine(
     where: str,
     text: bytes,
     given: dict[str, dict[str, object]],
-    told: Callable[[Config], Address] = address_of,
+    find_address: Callable[[Config], Address] = address_of,
 ) -> Iterator[Finding]:
     """Yield all findings of the doctor.
 
@@ -222,7 +229,7 @@ def examine(
         where: the path of the configuration file, for messages.
         text: the content of the configuration file.
         given: the values that replace values in the file, by table and key.
-        told: function that returns the daemon's address for a configuration.
+        find_address: function that returns the daemon's address for a configuration.
 
     Raises:
         UsageError: the daemon's address contains an invalid endpoint.
@@ -234,9 +241,9 @@ def examine(
             yield Finding("configuration", "failure", f"{where}: {problem}", "see acsard.toml")
         return
     yield Finding("configuration", "ok", where)
-    address, written = told(config), ""
-    running = found(config, address)
-    if isinstance(running, Running) and not running.here:
+    address, written = find_address(config), ""
+    running = query_or_finding(config, address)
+    if isinstance(running, Running) and not running.is_local:
         elsewhere = (
             "the daemon runs on another machine (on this machine, no process of acsard has its pid "
             f"{running.info.pid})"
@@ -253,8 +260,8 @@ def examine(
     for warning in warnings(config):
         yield Finding("configuration", "warning", warning, "see acsard.toml")
     yield from serial_port(config)
-    yield from meddlers()
-    yield from clock_set()
+    yield from port_grabbers()
+    yield from clock_year()
     yield from scheduling(
         config.control.real_time, running.info.pid if isinstance(running, Running) else None
     )

@@ -23,7 +23,7 @@ import acsard
 from acsard.host.atomic_file import replace
 from acsard.host.child import how_it_ended
 from acsard.host.errors import MendableError, NotPermittedError
-from acsard.host.processes import called
+from acsard.host.processes import run_command
 
 HOME = "/opt/acsard/venv"
 """Path of the venv in the unit files of `deploy/`. The installation replaces this path by the path
@@ -37,7 +37,7 @@ HIDDEN_DIRECTORIES = ("/home", "/root", "/run/user", "/tmp", "/var/tmp")
 """Directories that systemd hides from the service."""
 
 
-def misplaced(
+def unusable_location(
     prefix: str = sys.prefix,
     base: str = sys.base_prefix,
     executable: str = sys.executable,
@@ -51,7 +51,12 @@ def misplaced(
         executable: path of the Python interpreter.
         hidden: directories that systemd hides from the service.
     """
-    if prefix == base or _hidden(Path(prefix), hidden):
+    if prefix == base:
+        return (
+            f"acsard runs from {prefix} and does not run from a venv, but a service needs one; "
+            f"install acsard in a venv at {HOME} (deploy/systemd/README.md)"
+        )
+    if _hidden(Path(prefix), hidden):
         return (
             f"a service cannot run from {prefix}, because services have no access to home "
             f"directories and /tmp; install acsard in a venv at {HOME} (deploy/systemd/README.md)"
@@ -62,19 +67,19 @@ def misplaced(
         if _hidden(path, hidden):
             return (
                 f"the venv {prefix} uses the Python in {path}, which a service cannot see; "
-                f"{_anew(prefix)}"
+                f"{_remake_venv_advice(prefix)}"
             )
     for path in (Path(prefix), interpreter):
-        closed = _closed(path)
+        closed = _inaccessible_part(path)
         if closed:
             return (
                 f"the service's user has no permission to enter {closed}, but needs {path}; run "
-                f"`chmod o+rx {closed}`, or {_anew(prefix)}"
+                f"`chmod o+rx {closed}`, or {_remake_venv_advice(prefix)}"
             )
     return ""
 
 
-def lacking(group: str = GROUP, program: str = SETPRIV) -> str:
+def missing_prerequisite(group: str = GROUP, program: str = SETPRIV) -> str:
     """Return an error text if this system does not have the service's group or a needed program.
 
     Return "" if the system has the group `group` and the program `program`.
@@ -94,7 +99,7 @@ def lacking(group: str = GROUP, program: str = SETPRIV) -> str:
     return ""
 
 
-def _anew(prefix: str) -> str:
+def _remake_venv_advice(prefix: str) -> str:
     return (
         f"make the venv again with the system's Python: /usr/bin/python3 -m venv --clear {prefix}"
     )
@@ -105,7 +110,7 @@ def _hidden(path: Path, hidden: Sequence[str]) -> bool:
     return any(real.is_relative_to(place) for place in hidden)
 
 
-def _closed(path: Path) -> Path | None:
+def _inaccessible_part(path: Path) -> Path | None:
     """Return the outermost part of `path` that the service's user has no permission to enter."""
     for place in (*reversed(path.parents), path):
         try:
@@ -261,7 +266,7 @@ class Run(Struct, frozen=True):
         `may_fail` is true.
         """
         try:
-            done = called(self.words, 60.0)
+            done = run_command(self.words, 60.0)
             code = done.returncode
             failed = (done.stderr.strip() or how_it_ended(code)) if code else ""
         except (OSError, subprocess.TimeoutExpired) as error:
@@ -443,12 +448,12 @@ def installing(
     return [*steps, *INSTALL_COMMANDS]
 
 
-def own_places() -> list[Path]:
+def config_directories() -> list[Path]:
     """Return the directories of the service in /etc, which may also contain the user's files."""
     return [*(UNIT_DIRECTORY / f"{unit}.d" for unit in reversed(ALL_UNITS)), CONFIG_DIRECTORY]
 
 
-def strangers(files: Iterable[File], places: Iterable[Path]) -> list[Path]:
+def foreign_entries(files: Iterable[File], places: Iterable[Path]) -> list[Path]:
     """Return the entries of the directories `places` that are not files of the installation."""
     ours = {file.path for file in files}
     inside = (path for place in places if place.is_dir() for path in sorted(place.iterdir()))
@@ -510,7 +515,7 @@ def uninstalling(
         what = (
             "certificates and their authority"
             if path == Path(TLS_DIRECTORY)
-            else "not the service's own"
+            else "not a file of the service"
         )
         steps.append(Remove(path) if purge else Keep(path, f"{what}; --purge removes it"))
     for unit in stateful:
@@ -530,7 +535,7 @@ def state(unit: str) -> str:
     """
     about = "--property=ActiveState,SubState,StatusText,NRestarts"
     try:
-        done = called(("systemctl", "show", unit, about), 10.0)
+        done = run_command(("systemctl", "show", unit, about), 10.0)
     except (OSError, subprocess.TimeoutExpired):
         return ""
     return done.stdout.strip() or done.stderr.strip()

@@ -30,16 +30,16 @@ from acsard.core.config.settings import RECORD_VARIABLE, RecordConfig
 from acsard.core.values import NS_PER_S, Instant
 from acsard.host.atomic_file import sync
 from acsard.recording.end_record import CUT_TEXTS
-from acsard.recording.file import FILE_MODE, About, Writing
+from acsard.recording.file import FILE_MODE, About, RecordingWriter
 from acsard.recording.recovery import recover
 from acsard.recording.retention import (
     INCIDENT_MARGIN_NS,
     Bounds,
     ClockWatch,
     Disk,
-    Ended,
+    FinishedFile,
     Kind,
-    share,
+    file_size_limit,
     to_delete,
 )
 
@@ -67,10 +67,11 @@ MARKER_SUFFIX = ".left"
 SUFFIX_OF_KIND: dict[Kind, str] = {"plain": MCAP_SUFFIX, "near": NEAR_SUFFIX, "kept": KEPT_SUFFIX}
 """Maps each retention class to the end of the name of a finished file."""
 
-# `Ring.tend` is called once a second, so there is a search every ten minutes. More searches are not
-# needed, because a single file may cover an hour.
+# `RecordingDirectory.maintain` is called once a second, so there is a search every ten minutes.
+# More searches are not needed, because a single file may cover an hour.
 TRIM_ROUNDS = 600
-"""Number of calls of `Ring.tend` between two searches for files that are too old."""
+"""Number of calls of `RecordingDirectory.maintain` between two searches for files that are too
+old."""
 
 S_PER_DAY = 86400
 
@@ -153,7 +154,8 @@ def _marked(part: Path) -> tuple[Kind, str] | None:
 class Run(Struct):
     """State of the directory of recordings in one run of the daemon.
 
-    A disk error ends the `Ring`. The next `Ring` of this run of the daemon gets the same object.
+    A disk error ends the `RecordingDirectory`. The next `RecordingDirectory` of this run of the
+    daemon gets the same object.
     """
 
     numbers: set[int] = field(default_factory=set)
@@ -167,11 +169,11 @@ class Run(Struct):
     clock: ClockWatch = field(default_factory=ClockWatch)
 
 
-class Ring:
+class RecordingDirectory:
     """The directory of recordings: begins and ends files, and deletes old files to make room.
 
-    A `Ring` locks the directory until `close`, so that only one daemon records to it. Every method
-    may raise `OSError`.
+    A `RecordingDirectory` locks the directory until `close`, so that only one daemon records to it.
+    Every method may raise `OSError`.
     """
 
     def __init__(
@@ -184,15 +186,15 @@ class Ring:
 
         Args:
             settings: the configuration of the recordings.
-            run: the state that the previous `Ring` of this run of the daemon left after a disk
-                error; None for the first `Ring`.
+            run: the state that the previous `RecordingDirectory` of this run of the daemon left
+                after a disk error; None for the first `RecordingDirectory`.
             refused: true if the last write failed because the disk was full.
         """
         self._directory = Path(settings.directory)
         self._bytes, self._days = int(settings.megabytes * 1e6), settings.days
         self._run = run or Run()
         self._rounds = self.file_bytes = 0
-        """`_rounds` is the number of calls of `tend`. `file_bytes` is the size above which the
+        """`_rounds` is the number of calls of `maintain`. `file_bytes` is the size above which the
         file that is being written should end, bytes."""
         self.messages: list[str] = []
         """Messages for the log about damaged files, and files that could not be finished."""
@@ -287,7 +289,7 @@ class Ring:
         """Release the lock of the directory."""
         os.close(self._lock)
 
-    def begin(self, about: About) -> Writing:
+    def begin(self, about: About) -> RecordingWriter:
         """Create a new file with the metadata `about`, and return the open file.
 
         The number in the name of the file is one above the largest number in the directory.
@@ -296,12 +298,12 @@ class Ring:
         number = 1 + max([_number(path) or 0 for path in files], default=0)
         stamp = time.strftime(NAME_TIME_FORMAT, time.gmtime(about.wall_ns // 1_000_000_000))
         path = self._directory / f"{number:06}-{stamp}{PART_SUFFIX}"
-        writing = Writing(path, about, OPEN_MODE if self._open_to_all else FILE_MODE)
+        writing = RecordingWriter(path, about, OPEN_MODE if self._open_to_all else FILE_MODE)
         # Not only the content of the new file but also its name must reach the disk.
         sync(self._directory)
         return writing
 
-    def end(self, writing: Writing, kind: Kind, cut: str = "", why: str = "") -> Path:
+    def end(self, writing: RecordingWriter, kind: Kind, cut: str = "", why: str = "") -> Path:
         """Finish a file, rename it, and return its new path.
 
         Args:
@@ -340,7 +342,7 @@ class Ring:
                 path.rename(path.with_name(_stem(path) + NEAR_SUFFIX))
             sync(self._directory)
 
-    def tend(self, now: Instant) -> None:
+    def maintain(self, now: Instant) -> None:
         """Call `trim` if it is due: every ten minutes, and whenever the disk is nearly full.
 
         After a jump of the wall clock, also correct the modification times of the files that ended
@@ -383,9 +385,9 @@ class Ring:
                 if file.name in names:
                     (self._directory / file.name).unlink()
                     self._run.freed += file.size if refused else 0
-        self.file_bytes = share(self._bytes, sum(file.size for file in ended), disk)
+        self.file_bytes = file_size_limit(self._bytes, sum(file.size for file in ended), disk)
 
-    def _ended(self) -> list[Ended]:
+    def _ended(self) -> list[FinishedFile]:
         ended = []
         for path in listed(self._directory):
             if path.name.endswith(PART_SUFFIX):
@@ -395,7 +397,7 @@ class Ring:
                 found, number = path.stat(), _number(path) or 0
                 this_run = number in self._run.numbers
                 size, at_s = found.st_size, found.st_mtime
-                ended.append(Ended(path.name, number, _kind(path), size, at_s, this_run))
+                ended.append(FinishedFile(path.name, number, _kind(path), size, at_s, this_run))
         return ended
 
     def _disk(self) -> Disk:

@@ -77,7 +77,7 @@ CRASH_CUTS = frozenset({"bug", "crash"})
 """The keys of `CUT_TEXTS` that stand for a failure of the daemon or of its computer."""
 
 
-def how_it_ends(cut: str, why: str = "") -> str:
+def ending_text(cut: str, why: str = "") -> str:
     """Return a text that says how a recording was cut off; "" if the daemon ended normally.
 
     If another version of acsard recorded a cause that is not in `CUT_TEXTS`, the text contains only

@@ -409,7 +409,7 @@ def _write_steps(
         if not over:
             writer.skip(step, inside)
 
-    run.skipped = skip
+    run.on_skipped = skip
     for number, step in enumerate(run.steps()):
         if number % PROGRESS_STEPS == 0:
             progress(step.inputs.now.wall_ns)
@@ -428,7 +428,7 @@ def _gaps(run: RecordedRun, span: Span, about: About) -> list[Gap]:
     return [gap for gap in run.gaps if gap.begin_ns < end_ns and gap.end_ns > begin_ns]
 
 
-def measured(recording: Recording) -> bytes:
+def calibration_csv(recording: Recording) -> bytes:
     """Return the measured data of a recording as the CSV table that `acsard calibrate` reads.
 
     The table begins with the first step that can be replayed, and ends at the next gap of the

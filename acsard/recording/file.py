@@ -55,7 +55,7 @@ from acsard.recording.end_record import (
     Ns,
     as_metadata,
     end_in,
-    how_it_ends,
+    ending_text,
 )
 from acsard.recording.mcap_records import GROWING_HEAD, MAGIC, GrowingChunk, Message, encoded, walk
 from acsard.recording.recorded_steps import Unfinished, UnfinishedError, unfinished
@@ -225,7 +225,7 @@ class Index:
         return [self._totals, *self._places]
 
 
-class Writing:
+class RecordingWriter:
     """A recording file that is being written.
 
     If the disk refuses to write, a method raises `OSError`. After that, call only `close`.
@@ -427,7 +427,7 @@ class Recording:
         self.about = self._about()
 
     @property
-    def whole(self) -> bool:
+    def is_intact(self) -> bool:
         """True if the file is finished and undamaged.
 
         Use this property only after `messages()` has yielded the last message.
@@ -442,10 +442,10 @@ class Recording:
         """
         if not self.ended:
             return UNFINISHED
-        return how_it_ends(self.cut, self.why)
+        return ending_text(self.cut, self.why)
 
     @property
-    def missing(self) -> str:
+    def missing_text(self) -> str:
         """Text that tells the user about missing data: the number of damaged places, and `ending`.
 
         The text is "" if the file is undamaged and the daemon ended normally. Use this property
@@ -540,7 +540,7 @@ def rewrite(recording: Recording, path: Path, cut: str = "open") -> int:
         OSError: a file already exists at `path`, or the disk refuses to write.
         RecordingError: an event cannot be decoded.
     """
-    writing = Writing(path, recording.about)
+    writing = RecordingWriter(path, recording.about)
     try:
         count = 0
         for topic, wall_ns, data in recording.messages():

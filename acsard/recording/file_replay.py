@@ -133,7 +133,7 @@ def _items(
 
 # A genuine file stays below this limit. Without the limit, the replay of a forged file of 5 kB took
 # 4 s.
-MAX_STATE_BYTES = 8
+STATE_BYTES_PER_FILE_BYTE = 8
 """Factor in the limit on the total size of the robot states that are decoded after gaps. The limit
 is this factor times the size of the file, plus `MAX_BYTES`."""
 
@@ -148,12 +148,12 @@ class _Source:
         new robot."""
         self._place = "at the start of"
         """Words for the position of `_state` in the recording, for error messages."""
-        self._left = MAX_BYTES
+        self._state_bytes_left = MAX_BYTES
         """Total size of the robot states that may still be decoded after gaps, bytes."""
         for path in recording.paths:
             # The reader of the steps reports a missing file later.
             with suppress(OSError):
-                self._left += MAX_STATE_BYTES * path.stat().st_size
+                self._state_bytes_left += STATE_BYTES_PER_FILE_BYTE * path.stat().st_size
 
     @contextmanager
     def state_errors(self) -> Iterator[None]:
@@ -189,8 +189,8 @@ class _Source:
         """
         if saved is None or saved.number != number:
             return None
-        self._left -= len(saved.data)
-        if self._left < 0:
+        self._state_bytes_left -= len(saved.data)
+        if self._state_bytes_left < 0:
             return None
         try:
             state = thaw(saved.data)
@@ -235,7 +235,7 @@ class RecordedRun(_Source):
         """The gaps that `steps()` has found so far."""
         self.number: int | None = None
         """Number of the last step that `steps()` yielded; None before the first step."""
-        self.skipped: Callable[[Step], None] = lambda step: None
+        self.on_skipped: Callable[[Step], None] = lambda step: None
         """Function that is called with each step that can be read, but not replayed."""
         self._next, self._state = _first_state(recording)
         """`_next` is the number of the step that `robot` can replay next. `_state` is the recorded
@@ -277,7 +277,7 @@ class RecordedRun(_Source):
                     if not known:
                         gap.skipped += 1
                         gap.lines += step.recorded.line is not None
-                        self.skipped(step)
+                        self.on_skipped(step)
                         continue
                     gap = None
                 self.number, self._next, replayed_ns = step.number, step.number + 1, now_ns
@@ -528,7 +528,7 @@ class EventCopies:
         """
         recording = self._recording
         self._compare(last=True)
-        if self.difference or not recording.whole:
+        if self.difference or not recording.is_intact:
             return
         end = read_end(recording.path)
         said = recording.compute_end_record().said

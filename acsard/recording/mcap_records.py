@@ -338,7 +338,7 @@ def encoded(*records: McapRecord) -> bytes:
     return bytes(builder.end())
 
 
-class Found(NamedTuple):
+class FileItem(NamedTuple):
     """A record, a chunk or a damaged place of a file."""
 
     record: McapRecord | None
@@ -357,7 +357,7 @@ class Found(NamedTuple):
         return self.chunk.messages if self.chunk else []
 
 
-def walk(data: bytes) -> Iterator[Found]:
+def walk(data: bytes) -> Iterator[FileItem]:
     """Yield the records, chunks and damaged places of a file in order, up to the MCAP footer.
 
     A file without a footer is read to its end. If the work for damaged chunks exceeds `MAX_EFFORT`,
@@ -373,7 +373,7 @@ def walk(data: bytes) -> Iterator[Found]:
         chunk = chunks.read(at)
         found = _read(stream, at, opcode, claimed, len(data)) if chunk is None else None
         if chunk is not None and chunk.complete:
-            found = Found(None, chunk, chunk.end)
+            found = FileItem(None, chunk, chunk.end)
         elif found is None and opcode in SKIPPED_RECORDS and claimed <= len(data):
             at = claimed
             continue
@@ -386,14 +386,14 @@ def walk(data: bytes) -> Iterator[Found]:
                     after = claimed
             cut = after is None and not chunks.spent and (not opcode or claimed > len(data))
             end = len(data) if cut or chunks.spent else after or claimed
-            found = Found(None, chunk, end, not cut)
+            found = FileItem(None, chunk, end, not cut)
         yield found
         if isinstance(found.record, Footer):
             return
         at = found.end
 
 
-def _read(stream: io.BytesIO, at: int, opcode: int, claimed: int, size: int) -> Found | None:
+def _read(stream: io.BytesIO, at: int, opcode: int, claimed: int, size: int) -> FileItem | None:
     """Decode the record at the offset `at`, or return None if it is damaged or cut off.
 
     `claimed` is the offset at which the record ends according to its length field. `size` is the
@@ -410,7 +410,7 @@ def _read(stream: io.BytesIO, at: int, opcode: int, claimed: int, size: int) -> 
     end = stream.tell()
     if isinstance(record, Attachment) and not _is_intact(stream, at, end):
         return None
-    return Found(record, None, end) if end < size or end == claimed else None
+    return FileItem(record, None, end) if end < size or end == claimed else None
 
 
 def _is_intact(stream: io.BytesIO, at: int, end: int) -> bool:

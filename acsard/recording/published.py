@@ -13,11 +13,11 @@ from typing import Any, NamedTuple
 
 from msgspec.structs import replace
 
-from acsard.core.messages.report import Look, Report
+from acsard.core.messages.report import GetSnapshot, Report
 from acsard.core.messages.schema import DiagnosticArray, RobotState, TFMessage, Time
 from acsard.core.robot import Robot
 from acsard.core.ros.channels import BY_KEY, CMD_VEL_IN, LOG_CHANNEL, Channel, published_channels
-from acsard.core.ros.shapes import LEVELS, Log, asked
+from acsard.core.ros.shapes import LEVELS, Log, command_message
 from acsard.core.ros.transports import left_out
 from acsard.core.values import NS_PER_S, Command, Instant, Outputs
 from acsard.recording.recorded_steps import Step
@@ -114,7 +114,7 @@ class Publisher:
         line = Log(Time.from_ns(wall_ns), LEVELS[entry.level], entry.name, entry.sentence)
         return Published(LOG_CHANNEL, "", wall_ns, line)
 
-    def _snapshot(self, now: Instant) -> Look:
+    def _snapshot(self, now: Instant) -> GetSnapshot:
         return lambda: self.robot.snapshot(now.mono_ns)
 
     def _latched(self, now: Instant) -> Iterator[Published]:
@@ -128,7 +128,7 @@ class Publisher:
     def _received(self, command: Command, now: Instant) -> Published:
         arrived_ns = command.arrived_ns + now.wall_ns - now.mono_ns
         frame = self._config.odometry.base_frame
-        message = asked(command.twist, Time.from_ns(arrived_ns), frame)
+        message = command_message(command.twist, Time.from_ns(arrived_ns), frame)
         return Published(CMD_VEL_IN, command.source, arrived_ns, message)
 
 

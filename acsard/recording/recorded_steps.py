@@ -40,7 +40,7 @@ Micropose = tuple[int, int, int]
 _DOUBLES = struct.Struct("<9d")
 
 
-class Taken(NamedTuple):
+class FinishedStep(NamedTuple):
     """A finished step, as the control loop passes it to the recorder."""
 
     inputs: Inputs
@@ -49,7 +49,7 @@ class Taken(NamedTuple):
     """Line that the daemon wrote to the serial port, or None if it wrote no line."""
 
 
-class Start(NamedTuple):
+class StateBeforeStep(NamedTuple):
     """The robot's state before the step `number`, as the control loop passes it to the recorder.
 
     The recorder begins a new file with this state, or adds the state to the present file as a
@@ -63,17 +63,19 @@ class Start(NamedTuple):
     """Configuration before the step `number`, with all changes since the daemon's start."""
 
 
-def runs(items: list[Taken | Start]) -> Iterator[tuple[Start | None, list[Taken]]]:
-    """Split the items of the recorder's queue at each `Start`.
+def split_at_states(
+    items: list[FinishedStep | StateBeforeStep],
+) -> Iterator[tuple[StateBeforeStep | None, list[FinishedStep]]]:
+    """Split the items of the recorder's queue at each `StateBeforeStep`.
 
-    Yields pairs of a `Start` and the list of the steps that follow this `Start`. The first pair
-    contains None, and the steps before the first `Start`. These steps continue the steps that were
-    taken from the queue earlier.
+    Yields pairs of a `StateBeforeStep` and the list of the steps that follow it. The first pair
+    contains None, and the steps before the first `StateBeforeStep`. These steps continue the steps
+    that were taken from the queue earlier.
     """
-    start: Start | None = None
-    steps: list[Taken] = []
+    start: StateBeforeStep | None = None
+    steps: list[FinishedStep] = []
     for item in items:
-        if isinstance(item, Taken):
+        if isinstance(item, FinishedStep):
             steps.append(item)
             continue
         yield start, steps

@@ -18,7 +18,7 @@ from acsard.core.formatting import many
 from acsard.core.guard import Guard
 from acsard.core.robot import Robot
 from acsard.core.values import NS_PER_S, Event, Inputs, Outputs, Recording
-from acsard.recording.recorded_steps import Start, Taken, Unfinished
+from acsard.recording.recorded_steps import FinishedStep, StateBeforeStep, Unfinished
 from acsard.recording.state import freeze
 from acsard.recording.step_writer import Bug, StepWriter
 
@@ -69,7 +69,7 @@ class Recorder:
             started_ns: wall-clock time of the daemon's start, ns since 1970. An export uses this
                 time as the stamp of the messages that never change.
         """
-        self._queue: deque[Taken | Start] = deque()
+        self._queue: deque[FinishedStep | StateBeforeStep] = deque()
         self._report = report
         self._events: deque[Event] = deque()
         """Events from the recorder's thread. Each call of `step` passes one event to `report`."""
@@ -108,7 +108,7 @@ class Recorder:
         This call may be omitted. A replay of the first file then begins with a new robot and a new
         guard.
         """
-        self._queue.append(Start(0, freeze(robot, guard.memory), robot.config))
+        self._queue.append(StateBeforeStep(0, freeze(robot, guard.memory), robot.config))
 
     def step(
         self, inputs: Inputs, outputs: Outputs, sent: bytes | None, robot: Robot, guard: Guard
@@ -121,10 +121,10 @@ class Recorder:
         self._number += 1
         if self._events:
             self._report(self._events.popleft())
-        self._put(Taken(inputs, outputs, sent), robot, guard)
+        self._put(FinishedStep(inputs, outputs, sent), robot, guard)
         self._watch_disk(inputs.now.mono_ns)
 
-    def _put(self, taken: Taken, robot: Robot, guard: Guard) -> None:
+    def _put(self, taken: FinishedStep, robot: Robot, guard: Guard) -> None:
         queue = self._queue
         if self._full:
             self._lost += 1
@@ -143,7 +143,7 @@ class Recorder:
             queue.append(taken)
         if self._wants_state:
             self._wants_state = False
-            queue.append(Start(self._number, freeze(robot, guard.memory), robot.config))
+            queue.append(StateBeforeStep(self._number, freeze(robot, guard.memory), robot.config))
 
     def _watch_disk(self, now_ns: int) -> None:
         """Report when the disk begins to hang, and when it is fast enough again."""
@@ -237,6 +237,6 @@ class Recorder:
             over = self._over.wait(SYNC_PAUSE_S)
             self._writer.write(self._taken(), over)
 
-    def _taken(self) -> list[Taken | Start]:
+    def _taken(self) -> list[FinishedStep | StateBeforeStep]:
         queue = self._queue
         return [queue.popleft() for _ in range(len(queue))]

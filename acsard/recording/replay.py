@@ -109,9 +109,9 @@ class Comparison(Struct):
     fault: Difference | None = None
     """First step in which the replayed robot is in the mode `fault` and the recorded robot is not,
     or None."""
-    apart: float = 0.0
+    max_distance_m: float = 0.0
     """Largest distance so far between the recorded and the replayed position, m."""
-    fastest: tuple[int, int] = (0, 0)
+    max_wheel_speeds: tuple[int, int] = (0, 0)
     """Pair: the highest wheel speed in the recorded lines, and the highest wheel speed in the
     replayed lines, both in 0.01 rad/s."""
     end: tuple[Micropose, Micropose] | None = None
@@ -195,7 +195,7 @@ class Replay:
         self._names = input_names(step.inputs, self._names)
         if step.recorded.sent is not None:
             # The board obeyed the recorded line, even if the replayed robot decides another line.
-            self._guard.left(step.recorded.sent)
+            self._guard.record_written(step.recorded.sent)
         poses = tuple([micropose(estimate) for estimate in outputs.estimates])
         sent = line if step.recorded.sent is not None else None
         replayed = RecordedOutputs(outputs.line, sent, status_of(outputs), poses, outputs.events)
@@ -254,10 +254,10 @@ class Replay:
         comparison.poses += len(recorded.poses)
         pairs = zip(recorded.poses, replayed.poses, strict=False)
         comparison.poses_same += sum(a == b for a, b in pairs)
-        recorded_speed, replayed_speed = comparison.fastest
-        comparison.fastest = (
-            max(recorded_speed, fastest(recorded.line)),
-            max(replayed_speed, fastest(replayed.line)),
+        recorded_speed, replayed_speed = comparison.max_wheel_speeds
+        comparison.max_wheel_speeds = (
+            max(recorded_speed, max_wheel_speed(recorded.line)),
+            max(replayed_speed, max_wheel_speed(replayed.line)),
         )
         if outputs.estimates:
             self._pose = replayed.poses[-1]
@@ -266,7 +266,7 @@ class Replay:
             comparison.end = pose, self._pose
             if pose != self._pose:
                 apart = math.hypot(pose[0] - self._pose[0], pose[1] - self._pose[1]) / US_PER_S
-                comparison.apart = max(comparison.apart, apart)
+                comparison.max_distance_m = max(comparison.max_distance_m, apart)
 
 
 def _different_parts(
@@ -281,7 +281,7 @@ def _different_parts(
 
 
 @lru_cache(64)
-def fastest(line: bytes | None) -> int:
+def max_wheel_speed(line: bytes | None) -> int:
     """Return the highest absolute wheel speed in a line to the board, in 0.01 rad/s.
 
     Returns 0 without a line.

@@ -12,7 +12,7 @@ from acsard.core.formatting import listed, many, printable
 from acsard.core.values import NS_PER_S, Event
 from acsard.recording.file_replay import Gap
 from acsard.recording.recorded_steps import US_PER_S, RecordedOutputs
-from acsard.recording.replay import Comparison, Difference, fastest
+from acsard.recording.replay import Comparison, Difference, max_wheel_speed
 
 SPEED_DIVISOR = 100.0
 """Divisor that converts a wheel speed in 0.01 rad/s to rad/s."""
@@ -144,7 +144,7 @@ def explain_settings(
                 f"the first line to the board that differs is in step {first.number}, "
                 f"{seconds:.3f} s after the beginning of the recording"
             )
-        speeds = _speeds(fastest(first.recorded.line), fastest(first.replayed.line))
+        speeds = _speeds(max_wheel_speed(first.recorded.line), max_wheel_speed(first.replayed.line))
         shaping = [key for key in keys if key.startswith(LINE_SETTINGS)]
         because = f", because of {', '.join(shaping[:MAX_KEYS])}" if shaping else ""
         rows.append(f"the highest wheel speed in the first line that differs: {speeds}{because}")
@@ -184,7 +184,8 @@ def describe_outcome(comparison: Comparison) -> list[str]:
         f"{comparison.lines - comparison.lines_same} of {comparison.lines} lines to the board "
         f"differ from the recorded ones, and {comparison.steps - comparison.modes_same} of "
         f"{comparison.steps} steps have a different mode",
-        f"the highest wheel speed in any line to the board: {_speeds(*comparison.fastest)}",
+        "the highest wheel speed in any line to the board: "
+        f"{_speeds(*comparison.max_wheel_speeds)}",
     ]
     if comparison.end is not None:
         (x, y, _), (new_x, new_y, _) = comparison.end
@@ -192,6 +193,6 @@ def describe_outcome(comparison: Comparison) -> list[str]:
             f"the last odometry pose: x {x / US_PER_S:.3f} y {y / US_PER_S:.3f} recorded, "
             f"x {new_x / US_PER_S:.3f} y {new_y / US_PER_S:.3f} replayed; "
             "the recorded and the replayed path are at most "
-            f"{comparison.apart:.3f} m apart"
+            f"{comparison.max_distance_m:.3f} m apart"
         )
     return rows

@@ -82,7 +82,7 @@ class Disk(NamedTuple):
         return self.free < self.spare
 
 
-class Ended(NamedTuple):
+class FinishedFile(NamedTuple):
     """A recording file that is finished."""
 
     name: str
@@ -109,7 +109,7 @@ class Bounds(NamedTuple):
     the wall clock is not trusted."""
 
 
-def share(bound: int, own: int, disk: Disk) -> int:
+def file_size_limit(bound: int, own: int, disk: Disk) -> int:
     """Return the size limit of one recording file, bytes.
 
     Args:
@@ -121,12 +121,12 @@ def share(bound: int, own: int, disk: Disk) -> int:
 
 
 def to_delete(
-    ended: Sequence[Ended], bounds: Bounds, disk: Disk, freed: int | None = None
+    ended: Sequence[FinishedFile], bounds: Bounds, disk: Disk, freed: int | None = None
 ) -> set[str]:
     """Return the names of the recordings that must be deleted so that one more file fits.
 
     Args:
-        ended: all finished recordings, sorted by `Ended.number`.
+        ended: all finished recordings, sorted by `FinishedFile.number`.
         bounds: the limits on the total size and on the age.
         disk: the size and the free space of the disk.
         freed: None if the disk accepts data. If the disk refused the last write, the number of
@@ -145,7 +145,7 @@ def to_delete(
     names = {file.name for file in old}
     own = sum(file.size for file in ended if file.name not in names)
     free = disk.free + sum(file.size for file in old)
-    most = bounds.size - share(bounds.size, own, disk)
+    most = bounds.size - file_size_limit(bounds.size, own, disk)
     needed = int(disk.spare * NEEDED_FRACTION)
     for file in plain + [file for file in ended if file.name in protected]:
         if file.name in names:
@@ -160,7 +160,7 @@ def to_delete(
     return names
 
 
-def _protected(ended: Sequence[Ended]) -> set[str]:
+def _protected(ended: Sequence[FinishedFile]) -> set[str]:
     """Return the names of the protected recordings.
 
     These are the newest `MAX_KEPT_FILES` recordings of the class `kept`, and the `near` recordings
@@ -177,8 +177,8 @@ def _protected(ended: Sequence[Ended]) -> set[str]:
     }
 
 
-def _groups(ended: Sequence[Ended]) -> Iterator[list[Ended]]:
-    group: list[Ended] = []
+def _groups(ended: Sequence[FinishedFile]) -> Iterator[list[FinishedFile]]:
+    group: list[FinishedFile] = []
     for file in ended:
         if file.kind == "plain":
             continue

@@ -29,11 +29,11 @@ from acsard.core.values import (
     Request,
 )
 from acsard.recording.recorded_steps import (
+    FinishedStep,
     Micropose,
     RecordedOutputs,
     Status,
     Step,
-    Taken,
     checksum,
     input_names,
     micropose,
@@ -48,7 +48,8 @@ MAX_ROWS = 4096
 this number of steps."""
 
 MAX_TIME_NS = 1 << 61
-"""Limit on two durations in a recorded step, ns: the age of a serial read, and `Rare.late_ns`.
+"""Limit on two durations in a recorded step, ns: the age of a serial read, and
+`OccasionalFields.late_ns`.
 
 It is 73 years. The limit on a monotonic time is twice as large.
 """
@@ -65,7 +66,7 @@ class BatchError(AcsardError):
     """A recorded batch of steps is damaged, or contains values that no daemon records."""
 
 
-class Rare(Struct, frozen=True, omit_defaults=True):
+class OccasionalFields(Struct, frozen=True, omit_defaults=True):
     """The part of a row with the inputs and outputs that are absent or unchanged in most steps."""
 
     opened: int | None = None
@@ -85,7 +86,7 @@ class Rare(Struct, frozen=True, omit_defaults=True):
     events_out: tuple[Event, ...] = ()
 
 
-NO_RARE = Rare()
+NO_OCCASIONAL_FIELDS = OccasionalFields()
 
 
 class Read(NamedTuple):
@@ -122,7 +123,7 @@ class Row(Struct, frozen=True, array_like=True):
     poses: tuple[Micropose, ...]
     """Poses in um and urad. Each pose is stored as its difference from the previous pose of the
     batch. The first pose of the batch is stored unchanged."""
-    rare: Rare | None
+    rare: OccasionalFields | None
     """Further inputs and outputs; None if all of them are absent or unchanged."""
 
 
@@ -157,7 +158,7 @@ _decoder_of_first = msgspec.msgpack.Decoder(_First)
 # Encoding
 
 
-def encode(first: int, taken: Sequence[Taken]) -> bytes:
+def encode(first: int, taken: Sequence[FinishedStep]) -> bytes:
     """Encode successive steps as a batch.
 
     Args:
@@ -189,7 +190,7 @@ def encode(first: int, taken: Sequence[Taken]) -> bytes:
                 line=outputs.line,
                 sent=False if sent is None else (sent == outputs.line or sent),
                 poses=tuple(poses),
-                rare=None if rare == NO_RARE else rare,
+                rare=None if rare == NO_OCCASIONAL_FIELDS else rare,
             )
         )
     crc = checksum([e for t in taken for e in t.outputs.estimates], 0)
@@ -200,7 +201,7 @@ def encode(first: int, taken: Sequence[Taken]) -> bytes:
     return msgspec.msgpack.encode(batch)
 
 
-def _times(taken: Sequence[Taken], mono_ns: int, offset_ns: int) -> Iterator[list[int]]:
+def _times(taken: Sequence[FinishedStep], mono_ns: int, offset_ns: int) -> Iterator[list[int]]:
     """Yield for each row `Row.now`, `Row.offset`, and then age and offset of each read, ns."""
     tick_ns = mono_ns
     for inputs, _, _ in taken:
@@ -214,13 +215,13 @@ def _times(taken: Sequence[Taken], mono_ns: int, offset_ns: int) -> Iterator[lis
         yield times
 
 
-def _rares(taken: Sequence[Taken]) -> Iterator[Rare]:
+def _rares(taken: Sequence[FinishedStep]) -> Iterator[OccasionalFields]:
     opened: int | None = None
     trouble: str | None = None
     status: Status | None = None
     for inputs, outputs, _ in taken:
         now = status_of(outputs)
-        yield Rare(
+        yield OccasionalFields(
             opened=inputs.opened if inputs.opened != opened else None,
             trouble=inputs.port_trouble if inputs.port_trouble != trouble else None,
             status=now if now != status else None,
@@ -260,11 +261,11 @@ def first_of(data: bytes) -> int | None:
 
 
 def _steps(batch: Batch) -> Iterator[Step]:
-    first = batch.rows[0].rare or NO_RARE
+    first = batch.rows[0].rare or NO_OCCASIONAL_FIELDS
     opened, trouble, status = first.opened, first.trouble, first.status
     tick_ns, pose, last = batch.mono_ns, (0, 0, 0), len(batch.rows) - 1
     for index, row in enumerate(batch.rows):
-        rare = row.rare or NO_RARE
+        rare = row.rare or NO_OCCASIONAL_FIELDS
         _require_finite(rare)
         opened = opened if rare.opened is None else rare.opened
         trouble = trouble if rare.trouble is None else rare.trouble
@@ -333,7 +334,7 @@ def _instant(batch: Batch, mono_ns: int, offset: int) -> Instant:
     return Instant(mono_ns, mono_ns + ahead_ns)
 
 
-def _require_finite(rare: Rare) -> None:
+def _require_finite(rare: OccasionalFields) -> None:
     """Raise `ValueError` if a pose in a request, or a gyro sample, is not finite.
 
     The robot itself checks the numbers in commands.

@@ -70,7 +70,7 @@ class Series(Recording):
             self.unfinished = part.unfinished
 
 
-class Found(NamedTuple):
+class FoundRecording(NamedTuple):
     """A recording with steps in the searched range of time."""
 
     recording: Recording
@@ -81,7 +81,7 @@ class Found(NamedTuple):
 class Search(Struct):
     """Result of a search: the recordings in a range of time, and the gaps between them."""
 
-    found: list[Found] = field(default_factory=list)
+    found: list[FoundRecording] = field(default_factory=list)
     """The recordings that have steps in the range, the oldest first."""
     unreadable: list[str] = field(default_factory=list)
     """A sentence for each file that cannot be read."""
@@ -99,7 +99,7 @@ class NothingRecordedError(AcsardError):
     """
 
 
-class _Piece(NamedTuple):
+class _CoveredRange(NamedTuple):
     """A range of time for which a file contains steps."""
 
     begin: float
@@ -123,7 +123,7 @@ def search(files: Sequence[Path], first: float, last: float) -> Search:
     Raises:
         NothingRecordedError: no recording has a step in the range.
     """
-    result, pieces = Search(), list[_Piece]()
+    result, pieces = Search(), list[_CoveredRange]()
     chosen: dict[int, Contents] = {}
     for number, path in enumerate(files):
         try:
@@ -137,7 +137,7 @@ def search(files: Sequence[Path], first: float, last: float) -> Search:
             continue
         if contents is None:
             continue
-        pieces += [_Piece(one.begin, one.end, path) for one in contents.stretches]
+        pieces += [_CoveredRange(one.begin, one.end, path) for one in contents.stretches]
         if part_between(contents.stretches, first, last) is not None:
             chosen[number] = contents
     for group in _groups(files, chosen):
@@ -146,14 +146,14 @@ def search(files: Sequence[Path], first: float, last: float) -> Search:
         contents = chosen[group[0]] if len(paths) == 1 else read_contents(recording)
         part = part_between(contents.stretches, first, last) if contents else None
         if part is not None:
-            result.found.append(Found(recording, part))
+            result.found.append(FoundRecording(recording, part))
     if not result.found:
         raise NothingRecordedError(_nearest(pieces, first, last))
     result.gaps = _gaps(pieces, first, last)
     return result
 
 
-def _gaps(pieces: Sequence[_Piece], first: float, last: float) -> list[tuple[float, float]]:
+def _gaps(pieces: Sequence[_CoveredRange], first: float, last: float) -> list[tuple[float, float]]:
     inside = sorted(piece for piece in pieces if piece.begin <= last and first <= piece.end)
     ends = [first]
     for piece in inside:
@@ -203,10 +203,10 @@ def _continues(before: Contents, contents: Contents) -> bool:
     return follows and 0 <= mono_ns < TIME_TOLERANCE_S * NS_PER_S
 
 
-def _covered(path: Path) -> _Piece:
+def _covered(path: Path) -> _CoveredRange:
     end = read_end(path) or Recording(_present(path)).compute_end_record()
     earliest_ns = end.wall_ns if end.earliest_ns is None else end.earliest_ns
-    return _Piece(min(earliest_ns, end.wall_ns) / NS_PER_S, end.last_ns / NS_PER_S, path)
+    return _CoveredRange(min(earliest_ns, end.wall_ns) / NS_PER_S, end.last_ns / NS_PER_S, path)
 
 
 def _present(path: Path) -> Path:
@@ -217,7 +217,7 @@ def _present(path: Path) -> Path:
     return next((p for p in listed(path.parent) if p.name.partition(".")[0] == stem), path)
 
 
-def _nearest(pieces: Sequence[_Piece], first: float, last: float) -> str:
+def _nearest(pieces: Sequence[_CoveredRange], first: float, last: float) -> str:
     before = max([p for p in pieces if p.end < first], key=lambda p: p.end, default=None)
     after = min([p for p in pieces if p.begin > last], key=lambda p: p.begin, default=None)
     text = f"nothing was recorded {in_words(first, last)}"
@@ -226,7 +226,7 @@ def _nearest(pieces: Sequence[_Piece], first: float, last: float) -> str:
     return "; ".join(filter(None, [text, ends, begins]))
 
 
-def _described(piece: _Piece) -> str:
+def _described(piece: _CoveredRange) -> str:
     return f"{piece.path.name}, {clock(piece.begin, day=True)} to {clock(piece.end, day=True)}"
 
 

@@ -19,10 +19,10 @@ from acsard.core.config.toml_text import document
 from acsard.core.formatting import many
 from acsard.core.values import NS_PER_S, Event, Instant
 from acsard.host.version import version
-from acsard.recording.directory import Ring, Run, mark_cut
-from acsard.recording.file import About, Writing
+from acsard.recording.directory import RecordingDirectory, Run, mark_cut
+from acsard.recording.file import About, RecordingWriter
 from acsard.recording.mcap_records import MAX_DATA_BYTES
-from acsard.recording.recorded_steps import Start, Taken, runs
+from acsard.recording.recorded_steps import FinishedStep, StateBeforeStep, split_at_states
 from acsard.recording.recovery import DISK_FULL
 from acsard.recording.retention import IncidentWindow
 from acsard.recording.rows import encode
@@ -83,7 +83,7 @@ class StepWriter:
         Args:
             config: the configuration at the daemon's start.
             report: receives each event for the log.
-            request_state: asks the control loop to queue the robot's state (`Start`).
+            request_state: asks the control loop to queue the robot's state (`StateBeforeStep`).
             started_ns: wall-clock time of the daemon's start, ns since 1970.
         """
         self._started_ns = started_ns
@@ -102,9 +102,9 @@ class StepWriter:
         """Monotonic time of the last step that is synced to the disk, ns; None before the first
         sync."""
         self._config, self._report, self._request_state = config, report, request_state
-        self._ring: Ring | None = None
-        self._writing: Writing | None = None
-        self._start: Start | None = Start(0, b"", config)
+        self._directory: RecordingDirectory | None = None
+        self._writing: RecordingWriter | None = None
+        self._start: StateBeforeStep | None = StateBeforeStep(0, b"", config)
         """The robot's state with which the next file begins. None if a file is open, or if the
         state must be requested from the control loop."""
         self._incidents = IncidentWindow[Path]()
@@ -134,7 +134,7 @@ class StepWriter:
         write, all other steps of the call are lost.
         """
 
-    def write(self, items: list[Taken | Start], over: bool) -> None:
+    def write(self, items: list[FinishedStep | StateBeforeStep], over: bool) -> None:
         """Write the items of the recorder's queue, and sync the file to the disk.
 
         If the disk refuses to write, and during the pause after such an error, the steps are lost
@@ -143,15 +143,15 @@ class StepWriter:
         self._handed = self._safe = 0
         try:
             if self._pause == 0 or over:
-                ring = self._ring = self._ring or self._open_ring()
-                for start, steps in runs(items):
-                    self._write_group(ring, start, steps)
-                self._flush(ring, over)
+                directory = self._directory = self._directory or self._open_directory()
+                for start, steps in split_at_states(items):
+                    self._write_group(directory, start, steps)
+                self._flush(directory, over)
             else:
                 self._pause -= 1
         except OSError as error:
             self._fail(error)
-        lost = sum(isinstance(item, Taken) for item in items) - self._safe
+        lost = sum(isinstance(item, FinishedStep) for item in items) - self._safe
         if lost:
             self.lost += lost
             self._start = None
@@ -170,23 +170,28 @@ class StepWriter:
             with suppress(OSError):
                 mark_cut(writing.path, self._incidents.kind, cut)
 
-    def _open_ring(self) -> Ring:
-        ring = Ring(self._config.record, self._run, self._refused)
-        self._refused, self._cut_ns = False, ring.cut_ns or self._cut_ns
-        for text in ring.messages:
+    def _open_directory(self) -> RecordingDirectory:
+        directory = RecordingDirectory(self._config.record, self._run, self._refused)
+        self._refused, self._cut_ns = False, directory.cut_ns or self._cut_ns
+        for text in directory.messages:
             self._report(Event("recording", text, "warning"))
-        return ring
+        return directory
 
-    def _write_group(self, ring: Ring, start: Start | None, steps: list[Taken]) -> None:
+    def _write_group(
+        self,
+        directory: RecordingDirectory,
+        start: StateBeforeStep | None,
+        steps: list[FinishedStep],
+    ) -> None:
         """Write `steps` to the current file.
 
         `start` is the robot's state before these steps, or None. The state begins a new file, or
         becomes a checkpoint in the current file.
         """
-        if start is not None and self._writing is not None and self._goes_on(ring, start):
+        if start is not None and self._writing is not None and self._goes_on(directory, start):
             self._add_checkpoint(self._writing, start, self._last)
         elif start is not None:
-            self._finish(ring)
+            self._finish(directory)
             self._start, self._number = start, start.number
         if self._writing is None:
             if self._start is None or not steps:
@@ -194,30 +199,34 @@ class StepWriter:
                 self._handed += len(steps)
                 self._safe = self._handed
                 return
-            self._begin(ring, self._start, steps[0].inputs.now)
+            self._begin(directory, self._start, steps[0].inputs.now)
         assert self._writing is not None
         for at in range(0, len(steps), MAX_BATCH_STEPS):
-            self._add(ring, self._writing, steps[at : at + MAX_BATCH_STEPS])
+            self._add(directory, self._writing, steps[at : at + MAX_BATCH_STEPS])
 
-    def _goes_on(self, ring: Ring, start: Start) -> bool:
-        return start.number == self._number and not self._is_long_enough(ring)
+    def _goes_on(self, directory: RecordingDirectory, start: StateBeforeStep) -> bool:
+        return start.number == self._number and not self._is_long_enough(directory)
 
-    def _is_long_enough(self, ring: Ring) -> bool:
+    def _is_long_enough(self, directory: RecordingDirectory) -> bool:
         too_long = self._last.mono_ns - self._began_ns > MAX_FILE_NS
-        return too_long or (self._writing is not None and self._writing.size > ring.file_bytes)
+        return too_long or (self._writing is not None and self._writing.size > directory.file_bytes)
 
-    def _add_checkpoint(self, writing: Writing, start: Start, now: Instant) -> None:
+    def _add_checkpoint(
+        self, writing: RecordingWriter, start: StateBeforeStep, now: Instant
+    ) -> None:
         if start.state:
             writing.add("state", now.wall_ns, Checkpoint(start.number, start.state).encode())
         self._state_ns = now.mono_ns
 
-    def _add(self, ring: Ring, writing: Writing, batch: list[Taken]) -> None:
+    def _add(
+        self, directory: RecordingDirectory, writing: RecordingWriter, batch: list[FinishedStep]
+    ) -> None:
         data = encode(self._number, batch)
         # The reader refuses a larger message.
         if len(data) > MAX_DATA_BYTES and len(batch) > 1:
             half = len(batch) // 2
-            self._add(ring, writing, batch[:half])
-            self._add(ring, writing, batch[half:])
+            self._add(directory, writing, batch[:half])
+            self._add(directory, writing, batch[half:])
             return
         writing.add("steps", batch[0].inputs.now.wall_ns, data)
         self._number += len(batch)
@@ -227,12 +236,12 @@ class StepWriter:
             for event in outputs.events:
                 writing.event(entry_of(event, outputs.now.wall_ns))
                 if event.name in INCIDENTS:
-                    self._retain(ring, outputs.now)
+                    self._retain(directory, outputs.now)
 
-    def _begin(self, ring: Ring, start: Start, now: Instant) -> None:
-        ring.trim(now)
+    def _begin(self, directory: RecordingDirectory, start: StateBeforeStep, now: Instant) -> None:
+        directory.trim(now)
         if not self._looked_back:
-            self._look_back(ring, now)
+            self._look_back(directory, now)
         about = About(
             robot=self._config.robot.id,
             version=version(),
@@ -242,7 +251,7 @@ class StepWriter:
             started_ns=self._started_ns,
             config="\n".join(document(effective(start.config))) + "\n",
         )
-        self._writing, self._start = ring.begin(about), None
+        self._writing, self._start = directory.begin(about), None
         self._began_ns = now.mono_ns
         if self._cut_ns is not None:
             since_ns, self._cut_ns = now.wall_ns - self._cut_ns, None
@@ -250,36 +259,36 @@ class StepWriter:
         self._incidents.begin(now.mono_ns)
         self._add_checkpoint(self._writing, start, now)
 
-    def _look_back(self, ring: Ring, now: Instant) -> None:
+    def _look_back(self, directory: RecordingDirectory, now: Instant) -> None:
         """Register the last files of the previous run of the daemon in `_incidents`.
 
         An incident at the beginning of this run then protects those files. An incident in one of
         them protects the first file of this run.
         """
-        for path, kind, ended_ns in ring.just_ended(now):
+        for path, kind, ended_ns in directory.just_ended(now):
             self._incidents.earlier(path, kind, ended_ns)
         self._looked_back = True
 
-    def _retain(self, ring: Ring, now: Instant) -> None:
+    def _retain(self, directory: RecordingDirectory, now: Instant) -> None:
         for path in self._incidents.happened(now.mono_ns):
-            ring.retain(path)
+            directory.retain(path)
 
-    def _write_bug(self, ring: Ring, bug: Bug) -> None:
+    def _write_bug(self, directory: RecordingDirectory, bug: Bug) -> None:
         if bug.at is not None and self._writing is None and self._start is not None:
-            self._begin(ring, self._start, bug.at)
+            self._begin(directory, self._start, bug.at)
         if self._writing is None:
             return
         self._last = bug.at or self._last
         if bug.unfinished:
             self._writing.add("unfinished", self._last.wall_ns, bug.unfinished)
-        self._retain(ring, self._last)
+        self._retain(directory, self._last)
 
-    def _flush(self, ring: Ring, over: bool) -> None:
+    def _flush(self, directory: RecordingDirectory, over: bool) -> None:
         if over:
             if self.bug is not None:
-                self._write_bug(ring, self.bug)
-            self._finish(ring, *(("bug", self.bug.why) if self.bug else ()))
-            ring.close()
+                self._write_bug(directory, self.bug)
+            self._finish(directory, *(("bug", self.bug.why) if self.bug else ()))
+            directory.close()
         if self._writing is None:
             return
         self.syncs += 1
@@ -288,7 +297,7 @@ class StepWriter:
         finally:
             self.syncs += 1
         self._safe, self._run.freed = self._handed, 0
-        ring.tend(self._last)
+        directory.maintain(self._last)
         if self.trouble or not self._reported:
             missing = many(self.lost - self._lost_before, "step is", "steps are")
             if self.lost > self._lost_before and self._safe_ns is not None:
@@ -305,13 +314,13 @@ class StepWriter:
             self.trouble, self._reported = "", True
             self._report(Event("recording", f"the daemon records to {self.where}{since}"))
         self._safe_ns = self._last.mono_ns
-        if self._is_long_enough(ring) or self._last.mono_ns - self._state_ns > CHECKPOINT_NS:
+        if self._is_long_enough(directory) or self._last.mono_ns - self._state_ns > CHECKPOINT_NS:
             self._request_state()
 
-    def _finish(self, ring: Ring, cut: str = "", why: str = "") -> None:
+    def _finish(self, directory: RecordingDirectory, cut: str = "", why: str = "") -> None:
         if self._writing is None:
             return
-        path = ring.end(self._writing, self._incidents.kind, cut, why)
+        path = directory.end(self._writing, self._incidents.kind, cut, why)
         self._writing, self._safe = None, self._handed
         self._incidents.end(path, self._last.mono_ns)
 
@@ -326,9 +335,9 @@ class StepWriter:
             self._run.cut[self._writing.path.name] = self._incidents.kind
             if self.bug is None:
                 self.mark_cut("disk")
-        for resource in (self._writing, self._ring):
+        for resource in (self._writing, self._directory):
             if resource is not None:
                 resource.close()
         self._refused = error.errno in DISK_FULL
-        self._writing = self._ring = None
+        self._writing = self._directory = None
         self._pause = RETRY_ROUNDS

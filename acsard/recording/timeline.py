@@ -18,7 +18,7 @@ from msgspec.structs import replace
 
 from acsard.core.config.settings import Config
 from acsard.core.formatting import lasting, many, printable_bytes
-from acsard.core.link.link_diagnosis import is_ours
+from acsard.core.link.link_diagnosis import blames_host
 from acsard.core.link.session import IDENTITY
 from acsard.core.motion.arbiter_text import MAX_SENDER_LENGTH
 from acsard.core.ros.shapes import how_often
@@ -69,7 +69,7 @@ numbers count as equal."""
 
 
 class TimelineEntry(Struct, frozen=True, omit_defaults=True):
-    """Entry of the timeline."""
+    """An event of the daemon's log, or another entry of a recording's timeline."""
 
     seconds: Annotated[float, Meta(ge=-MAX_TIME_S, le=MAX_TIME_S)]
     """Wall-clock time, s since 1970."""
@@ -108,7 +108,7 @@ def entry_of(event: Event, wall_ns: int) -> TimelineEntry:
 
     `wall_ns` is the wall-clock time of the event, ns since 1970.
     """
-    late = event.name == "link_stale" and is_ours(event.text)
+    late = event.name == "link_stale" and blames_host(event.text)
     name = "link_late" if late else event.name
     return TimelineEntry(wall_ns / 1e9, name, event.text, event.level, event.by, event.count)
 

@@ -61,6 +61,15 @@ MAX_INT_BITS = 128
 MAX_KEY_PARTS = 4
 """Largest number of elements in a tuple that is a dict key or a set element."""
 
+MAX_TUPLE_KEY = 256
+"""Bound on each integer in a tuple that is a dict key or a set element.
+
+Python hashes the integers of a tuple without a secret key, so an attacker can compute tuples of
+large integers with equal hashes. There are only 2^32 tuples of up to four integers below this
+bound, and almost no two of them have the same hash of 64 bits. A real robot uses pairs of column
+numbers of the odometry's error model, which are below 10 (`core/motion/second_order.py`).
+"""
+
 FindClass = Callable[[str, str], type]
 """Function that takes the name of a module and the name of a class, and returns the class.
 
@@ -85,7 +94,7 @@ values."""
 
 KEY_TYPES = (str, int, float, bool, bytes, type(None))
 """Allowed types of dict keys and set elements. Members of an Enum are allowed too, and also short
-tuples of allowed values."""
+tuples of strings and small integers."""
 
 
 def unpickle(data: bytes, find: FindClass) -> object:
@@ -362,24 +371,33 @@ OPCODES: dict[str, Callable[[_Machine], None]] = {
 
 
 def _keys(entries: Sequence[_Entry]) -> None:
-    """Raise `ValueError` for a dict key or set element of a type or size that is not allowed.
+    """Raise `ValueError` for a dict key or set element that is not allowed.
 
-    A value that is not hashable or is slow to hash is not allowed, and neither is a large integer,
-    because an attacker can forge many large integers with equal hashes.
+    A value that is not hashable or is slow to hash is not allowed. A value is also not allowed if
+    an attacker can compute many such values with equal hashes.
     """
     for entry in entries:
         value = entry.value
-        parts = value if type(value) is tuple and len(value) <= MAX_KEY_PARTS else (value,)
-        if not all(type(part) in KEY_TYPES or isinstance(part, Enum) for part in parts):
+        if type(value) is tuple:
+            if len(value) > MAX_KEY_PARTS or not all(map(_is_tuple_key_part, value)):
+                raise ValueError(
+                    "the robot state uses a tuple as a key that has other parts than a few texts "
+                    "and small numbers, which this acsard never writes"
+                )
+        elif type(value) not in KEY_TYPES and not isinstance(value, Enum):
             raise ValueError(
                 f"the robot state uses a {type(value).__name__} as a key, which this acsard never "
                 "writes"
             )
-        if any(type(part) is int and abs(part) >= MAX_KEY for part in parts):
+        elif type(value) is int and abs(value) >= MAX_KEY:
             raise ValueError(
-                "the robot state uses a number of more than 60 bits as a key, which acsard never "
+                "the robot state uses a number of 2^61 - 1 or more as a key, which acsard never "
                 "writes"
             )
+
+
+def _is_tuple_key_part(part: object) -> bool:
+    return type(part) is str or (type(part) is int and 0 <= part < MAX_TUPLE_KEY)
 
 
 def _is_part(kind: Any) -> bool:

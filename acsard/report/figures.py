@@ -358,25 +358,25 @@ class TimeFigures:
         return self._stack("wheels", "The four wheels", caption, parts, 150)
 
     def serial(self) -> Figure:
-        """Return the picture of the numbers of sent, answered and lost serial lines."""
-        counts = self._data.serial
+        """Return the picture of the numbers of sent, received and lost serial lines."""
+        counts, good = self._data.serial, "received"
         bad = [Line("dropped", COLOURS["error"], counts.dropped.curve.points(), "hvh")]
+        caption = "Dropped lines arrived, but were unreadable or implausible."
+        # If `reply_period` is set, the board reports by its own clock and answers no line.
         if not self._data.config.mcu.reply_period:
+            good = "answered"
             bad.append(Line("no answer", COMMANDED, counts.unanswered.curve.points(), "hvh"))
+            caption += " If a line has no answer, the line or its answer was lost."
         parts = [
             Part(
                 "lines per second",
                 [
                     Line("sent", LIMITED, counts.sent.curve.points(), "hvh", UNDER_CURVE_PX),
-                    Line("answered", MEASURED, counts.good.curve.points(), "hvh"),
+                    Line(good, MEASURED, counts.good.curve.points(), "hvh"),
                 ],
             ),
             Part("lost per second", bad),
         ]
-        caption = (
-            "Dropped lines arrived, but were unreadable or implausible. If a line has no answer, "
-            "the line or its answer was lost."
-        )
         return self._stack("link", "The serial line", caption, parts, 170)
 
     def loop(self) -> Figure:
@@ -412,8 +412,8 @@ class TimeFigures:
             "annotations": [note(name, 0, at - 0.44) for at, (name, _) in enumerate(rows)],
         }
         caption = (
-            "Point at a band to read the reason. A source waits while a source with a higher "
-            "priority sends."
+            "Point at a band to read the reason. A source waits, for example, while a source with "
+            "a higher priority sends, or until it has sent a zero."
         )
         if silent:
             caption += f" These sources were silent all the time: {', '.join(silent)}."

@@ -123,7 +123,7 @@ addEventListener("afterprint", () => paper(false));
 """
 
 
-MAX_OPEN = 40
+MAX_UNFOLDED_EVENTS = 40
 """If the report has at most this number of events, the list of events is unfolded when the page
 loads."""
 
@@ -183,7 +183,7 @@ def page(
     )
 
 
-def drawn(
+def make_report(
     recording: Recording, library: str, span: Span = WHOLE_SPAN, progress: Progress = no_progress
 ) -> tuple[str, list[str]]:
     """Replay a recording, and make the report of a part of it.
@@ -207,7 +207,7 @@ def drawn(
         if number % PROGRESS_STEPS == 0:
             progress(step.inputs.now.wall_ns)
         data.step(step, outputs, robot)
-        if data.over:
+        if data.past_end:
             # Read the rest of the recording too, so that the notes count every damaged place.
             deque(recording.messages(), maxlen=0)
             break
@@ -216,8 +216,8 @@ def drawn(
             f"{recording.path} has no step in that span of time, so there is nothing to draw: "
             "correct --from and --to"
         )
-    data.end("" if data.over else recording.ending)
-    remarks = [*filter(None, [recording.missing]), *replayed.notes]
+    data.end("" if data.past_end else recording.ending)
+    remarks = [*filter(None, [recording.missing_text]), *replayed.notes]
     comparison = replayed.replay.comparison
     if not (comparison.same or replayed.notes or data.missing):
         what = "the texts of reasons or events" if comparison.only_words else "the results"
@@ -287,7 +287,7 @@ def _events(data: ReportData, clock: Clock) -> str:
         else ""
     )
     table = _table(["time", "event", "what", "by"], cells)
-    shown = " open" if len(marks) <= MAX_OPEN else ""
+    shown = " open" if len(marks) <= MAX_UNFOLDED_EVENTS else ""
     heading = f"<summary><h2>All {len(marks)} events</h2></summary>"
     return f"<details{shown}>{heading}{table}</details>{more}"
 

@@ -294,7 +294,7 @@ def _received(counters: Mapping[str, int]) -> tuple[int, int]:
 class ReportData:
     """Collects the data of a report from the steps of a recording in a range of time.
 
-    Call `step` for each step of the recording in order, until `over` is true. Then call `end`.
+    Call `step` for each step of the recording in order, until `past_end` is true. Then call `end`.
     """
 
     def __init__(
@@ -371,7 +371,7 @@ class ReportData:
         """Status of the robot at the last sample."""
 
     @property
-    def over(self) -> bool:
+    def past_end(self) -> bool:
         """True if the last step was after the end of the report."""
         return self._wall > self._window[1]
 

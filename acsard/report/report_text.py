@@ -216,15 +216,15 @@ def rows(data: ReportData, origin: Origin, clock: Clock) -> Iterator[tuple[str, 
         if count or name not in BOARD_INPUTS:
             yield title, f"{count}: {_first_of_each(marks, clock)}" if count else "none"
     lines = data.serial
-    told = (
-        f"{lines.sent.total} lines sent, {lines.good.total} answers, {lines.dropped.total} dropped"
+    # If `reply_period` is set, the board reports by its own clock and answers no line.
+    good, lost = "reports received", ""
+    if not config.mcu.reply_period:
+        good, lost = "answers", f", {lines.unanswered.total} sent lines without an answer"
+    yield (
+        "Serial line",
+        f"{lines.sent.total} lines sent, {lines.good.total} {good}, "
+        f"{lines.dropped.total} dropped{lost}",
     )
-    lost = (
-        ""
-        if config.mcu.reply_period
-        else f", {lines.unanswered.total} sent lines without an answer"
-    )
-    yield "Serial line", told + lost
     lateness = data.lateness
     yield (
         "Control loop",

@@ -109,7 +109,7 @@ class Prompt(Protocol):
         """Wait up to `wait_s` s for a key press. Return the pressed keys, or "" without a press."""
 
 
-END_SIGNALS = signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP
+PROMPT_END_SIGNALS = signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP
 """The signals that end a subcommand that moves something.
 
 The signal of Ctrl-Z (SIGTSTP) is one of them, because a suspended subcommand would leave a wheel
@@ -119,16 +119,16 @@ turning.
 
 @contextmanager
 def ended_by_signals(says: str = "", *, exits: bool = False) -> Iterator[None]:
-    """Raise `KeyboardInterrupt` in the `with` block when one of `END_SIGNALS` arrives.
+    """Raise `KeyboardInterrupt` in the `with` block when one of `PROMPT_END_SIGNALS` arrives.
 
     Further signals are then ignored until the end of the block, so that its cleanup can send zero
     speeds. `says` is printed when the signal arrives. If `exits` is true, a signal other than
     SIGINT raises `SystemExit` instead, with 128 plus the number of the signal.
     """
-    before = [signal.getsignal(number) for number in END_SIGNALS]
+    before = [signal.getsignal(number) for number in PROMPT_END_SIGNALS]
 
     def end(number: int, frame: FrameType | None) -> None:
-        for each in END_SIGNALS:
+        for each in PROMPT_END_SIGNALS:
             signal.signal(each, signal.SIG_IGN)
         # If the program that started this one is gone or does not read, printing would fail or
         # block. The zero speeds must not wait for that.
@@ -139,10 +139,10 @@ def ended_by_signals(says: str = "", *, exits: bool = False) -> Iterator[None]:
             raise SystemExit(128 + number)
         raise KeyboardInterrupt
 
-    for number in END_SIGNALS:
+    for number in PROMPT_END_SIGNALS:
         signal.signal(number, end)
     try:
         yield
     finally:
-        for number, handler in zip(END_SIGNALS, before, strict=True):
+        for number, handler in zip(PROMPT_END_SIGNALS, before, strict=True):
             signal.signal(number, handler)

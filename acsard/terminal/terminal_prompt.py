@@ -103,7 +103,7 @@ class NoPrompt(Screen):
     def number(self, ask: Ask) -> float:
         if ask.usual is None:
             raise NobodyError(
-                "this calibration method needs a person who measures: leave --yes out"
+                "this calibration method needs a person who measures: run it without --yes"
             )
         return ask.usual
 
@@ -118,8 +118,8 @@ class NoPrompt(Screen):
 class TerminalPrompt(Screen):
     """Prompt that asks a person on standard error and reads the answers from standard input.
 
-    Outside the context `host.terminal_modes.one_by_one`, a key press takes effect only after Enter.
-    Use that context if a single key press must stop the robot.
+    Outside the context `host.terminal_modes.single_key_mode`, a key press takes effect only after
+    Enter. Use that context if a single key press must stop the robot.
     """
 
     def ask(self, question: str, answers: Sequence[str]) -> str:

@@ -77,7 +77,7 @@ def lines(seen: Teleop, width: int, height: int | None = None) -> list[Text]:
     return shown
 
 
-def news(seen: Teleop, width: int) -> list[str]:
+def report_lines(seen: Teleop, width: int) -> list[str]:
     """Return the lines of a report about the robot, for a terminal that cannot show a screen.
 
     The report has the content of the screen, but not the help about the keys. A line has at most
@@ -92,7 +92,7 @@ def news(seen: Teleop, width: int) -> list[str]:
     return _words([why, *told], width, measured(seen.state))
 
 
-def parting(seen: Teleop, width: int) -> list[str]:
+def last_report_lines(seen: Teleop, width: int) -> list[str]:
     """Return the lines of the last report, which is printed when `acsard drive` ends.
 
     The report says whether the robot still moves, and contains its mode with the reason, its pose
@@ -100,7 +100,7 @@ def parting(seen: Teleop, width: int) -> list[str]:
     """
     if seen.state is None or seen.silent:
         return _words([f"drive ended: {silence(seen)}"], width)
-    what = "still moves" if moves(seen.state) else "stands"
+    what = "still moves" if moves(seen.state) else "stands still"
     if seen.state.linear is None:
         what = "reports no speed"
     why = f"{printable(seen.state.mode)}: {reason(seen.state)}"
@@ -126,7 +126,7 @@ def silence(seen: Teleop) -> str:
     """Return a sentence which says that the first state, or a new state, has not arrived."""
     if seen.state is None and not seen.silent:
         return "waiting for the first state message of the daemon"
-    return f"nothing received from the daemon for {seen.age:.0f} s: does it run?"
+    return f"nothing received from the daemon for {seen.age:.0f} s: is the daemon running?"
 
 
 def reason(state: RobotState) -> str:

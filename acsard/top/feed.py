@@ -33,7 +33,7 @@ class Feed:
         except DecodeError as error:
             self._watch.unreadable += 1
             raise ReplyError(
-                f"cannot read the daemon's state ({error}); does the daemon run another version of "
+                f"cannot read the daemon's state ({error}); is the daemon a different version of "
                 "acsard? Use the same version here"
             ) from None
         # First process the states that have arrived. One of them may be newer than the answer.

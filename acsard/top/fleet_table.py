@@ -12,7 +12,7 @@ from acsard.client.fleet import Fleet, Row
 from acsard.core.formatting import printable, rough, signed
 from acsard.core.messages.schema import RobotState
 from acsard.core.messages.state_warnings import brief, charge, warnings
-from acsard.daemon.bus.robot_discovery import ALL_ROBOTS, nobody, seen
+from acsard.daemon.bus.robot_discovery import ALL_ROBOTS, count_text, no_robot_text
 from acsard.top.drive_screen import reason
 
 COLUMN_HEADS = ("ROBOT", "MODE", "M/S", "LINK", "BATTERY", "PLACE", "VERSION", "SEEN", "WHY")
@@ -43,7 +43,7 @@ def table(rows: Sequence[Row], width: int, height: int | None = None) -> list[st
     There are at most `height` lines, or any number if `height` is None. If some robots do not fit,
     the last line says how many. A line has at most `width` characters.
     """
-    cells = [COLUMN_HEADS, *map(told, sorted(rows, key=_order))]
+    cells = [COLUMN_HEADS, *map(row_cells, sorted(rows, key=_order))]
     widest = [max(len(row[n]) for row in cells) for n in range(len(COLUMN_HEADS))]
     rooms = [min(room, most) for room, most in zip(widest, (*COLUMN_WIDTHS, WHY), strict=True)]
     powered = any(row[BATTERY_COLUMN] for row in cells[1:])
@@ -88,7 +88,7 @@ def shortened(names: Sequence[str], room: int) -> list[str]:
     return max(map(cut, from_the_middle), key=lambda found: len(set(found)))
 
 
-def told(row: Row) -> tuple[str, ...]:
+def row_cells(row: Row) -> tuple[str, ...]:
     """Return the texts of the table cells for a robot, in the order of the headings
     `COLUMN_HEADS`."""
     name = printable(row.robot_id)
@@ -161,7 +161,7 @@ class Roster(Fleet):
         first answer can be late on a busy computer. If no robot is present after 3 s, return [].
         """
         began, rows = time.monotonic(), self.rows()
-        while not self.whole:
+        while not self.all_reported:
             present = any(row.here or row.state for row in rows)
             if time.monotonic() - began >= (1.5 if present else 3.0):
                 return self.rows() if present else []
@@ -170,32 +170,37 @@ class Roster(Fleet):
         return self.rows()
 
     @property
-    def whole(self) -> bool:
+    def all_reported(self) -> bool:
         """Whether all robots that the user named have reported; False if the user named none."""
         with self._lock:
             known = list(self._known.values())
         named = ALL_ROBOTS not in self._ids
-        return named and all(one.here and one.version and one.follower.heard for one in known)
+        return named and all(
+            one.here and one.version and one.follower.is_confirmed for one in known
+        )
 
     @property
     def seen(self) -> str:
         """A sentence with the number of visible robots, or "" if the user named the robots."""
         with self._lock:
             here = sum(bool(one.here) for one in self._known.values())
-        return seen(self._robot.where.endpoint, here) if ALL_ROBOTS in self._ids else ""
+        return count_text(self._robot.where.endpoint, here) if ALL_ROBOTS in self._ids else ""
 
     @property
-    def more(self) -> str:
+    def left_out_text(self) -> str:
         """A sentence which says that the table leaves out some robots; "" if it leaves out none."""
         if not self.left_out:
             return ""
         return (
-            f"there are more than {self._most} robots, and this list leaves out the others: name "
-            "the robots to list with --id robot1,robot2"
+            f"there are more than {self._most} robots, and this list shows only {self._most} "
+            "of them: to choose the robots, use --id robot1,robot2"
         )
 
     def hint(self) -> str:
         """Return a sentence for an empty table. It explains why no robot is shown."""
         if ALL_ROBOTS in self._ids:
-            return nobody(self._robot.where.endpoint)
-        return "no robot that you named with --id is present: correct --id, or start their daemons"
+            return no_robot_text(self._robot.where.endpoint)
+        return (
+            "none of the robots named with --id is present: correct --id, or start the daemons of "
+            "these robots"
+        )

@@ -9,7 +9,7 @@ that time do not drive the robot.
 A key that was pressed before a stop must not drive the robot after the `clear`, even if an SSH
 connection pauses and the key seems to be released. So if the robot stops following while a key is
 held, this key no longer drives the robot. Driving keys work again after a key that stops the robot,
-or after 1.5 s without a driving key.
+unless something delayed that key, or after 1.5 s without a driving key.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from acsard.client import Client
 from acsard.client.commander import (
     GRACE_S,
     NEVER_DRIVING_MODES,
-    RELEASED_NS,
+    RELEASE_TIMEOUT_NS,
     ZEROS,
     Commander,
     Wish,
-    ends_hold,
+    must_release_key,
     objection,
 )
 from acsard.client.driving import SETTLED_S
@@ -85,7 +85,7 @@ class Keyboard:
         After a key that stops the robot, the time is minus infinity."""
         self._begun, self._over = 0.0, False
         """Monotonic time at which the present hold began, s, and whether `end_hold` has ended this
-        hold. A hold is a series of driving keys that are at most `RELEASED_NS` apart."""
+        hold. A hold is a series of driving keys that are at most `RELEASE_TIMEOUT_NS` apart."""
         self._until = 0.0
         self._old_until = 0.0
         """Monotonic time until which all keys count as delayed and only stop the robot, s."""
@@ -100,6 +100,8 @@ class Keyboard:
         together. Delayed keys do not show what the operator wants now, so they only stop the robot.
         If `waited` is above `GRACE_S`, an earlier press does not drive the robot any more either.
         """
+        # A delayed key that stops the robot does not let a held key drive again. A connection that
+        # stalled may deliver this key alone, and the keys that followed it in the stall later.
         keys = split(text)
         if len(keys) > MAX_BURST_KEYS or waited > GRACE_S:
             self._old_until = now + BURST_S
@@ -158,7 +160,7 @@ class Keyboard:
         return self._over and self._held(now)
 
     def _held(self, now: float) -> bool:
-        return now - self._pressed <= RELEASED_NS / NS_PER_S
+        return now - self._pressed <= RELEASE_TIMEOUT_NS / NS_PER_S
 
     def _stop(self, now: float) -> None:
         self._move, self._until, self._zeros = (0, 0), now, ZEROS
@@ -176,14 +178,14 @@ class Keyboard:
         return None
 
 
-class Ride:
+class KeyboardDrive:
     """Sends the commands of the typed keys to the robot, and receives the robot's state."""
 
     def __init__(self, robot: Client, keyboard: Keyboard) -> None:
         self._robot, self._keyboard = robot, keyboard
         # After a silence the robot may require a return to neutral, for example because it was
         # stopped and cleared during the silence.
-        self._commander = Commander(leads=True)
+        self._commander = Commander(sends_leading_zero=True)
         self._watch = Watch(robot, clock.steady_s())
         # Subscribing may take long. The terminal discards the keys that are typed until it is done.
         self._fine = self._stepped = clock.steady_s()
@@ -213,7 +215,7 @@ class Ride:
         """Process the states that have arrived. If no state has arrived for some time, query it."""
         now, before = clock.steady_s(), self._watch.state
         for state in self._watch.look(now):
-            if ends_hold(state, self._robot.source) or restarted(before, state):
+            if must_release_key(state, self._robot.source) or restarted(before, state):
                 self._keyboard.end_hold(now)
             before = state
 

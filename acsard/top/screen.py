@@ -110,9 +110,9 @@ def _split(words: str, room: int) -> tuple[str, str]:
 
 def _no_news(seen: ScreenData, width: int) -> list[Text]:
     since = lasting(int(min(seen.age, 1e9)))
-    words = f"NOTHING RECEIVED FOR {since}: does the daemon run?"
+    words = f"NOTHING RECEIVED FOR {since}: is the daemon running?"
     if seen.undecodable:
-        words = f"NOTHING READABLE FOR {since}: does the daemon have another version?"
+        words = f"NOTHING READABLE FOR {since}: is the daemon a different version?"
     told = Text(words.center(width), "bold white on red")
     blank = Text(" " * width, "on red")
     return [blank, told, blank.copy()]

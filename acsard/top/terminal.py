@@ -24,12 +24,20 @@ from rich.text import Text
 from acsard.core.messages.state_warnings import WARNING
 from acsard.core.values import AcsardError
 from acsard.host import clock
-from acsard.host.terminal_modes import one_by_one
+from acsard.host.terminal_modes import single_key_mode
 from acsard.terminal.output import has_screen, plain
-from acsard.top.drive_screen import HELP, Teleop, lines, moves, news, parting, released
+from acsard.top.drive_screen import (
+    HELP,
+    Teleop,
+    last_report_lines,
+    lines,
+    moves,
+    released,
+    report_lines,
+)
 from acsard.top.feed import Feed
 from acsard.top.fleet_table import Roster, table
-from acsard.top.keyboard import Ride
+from acsard.top.keyboard import KeyboardDrive
 from acsard.top.screen import screen
 
 DRAW_PERIOD_S = 0.25
@@ -38,19 +46,19 @@ DRAW_PERIOD_S = 0.25
 KEY_POLL_S = 0.05
 """Longest time for which `acsard drive` waits for a key before it does its other work, s."""
 
-NEWS_S, SAME_S, QUIET_S = 0.5, 1.0, 10.0
+CHANGED_REPORT_S, MOVING_REPORT_S, RESTING_REPORT_S = 0.5, 1.0, 10.0
 """Shortest time between two printed reports of `acsard drive`, s.
 
-If the content has changed since the last report, this time is `NEWS_S`. Otherwise it is `SAME_S`
-while the robot moves, and `QUIET_S` while the robot stands still.
+If the content has changed since the last report, this time is `CHANGED_REPORT_S`. Otherwise it is
+`MOVING_REPORT_S` while the robot moves, and `RESTING_REPORT_S` while the robot stands still.
 """
 
 NO_END = 10**9
 
-END_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
+SCREEN_END_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
 
 
-def once(feed: Feed) -> str:
+def one_screen(feed: Feed) -> str:
     feed.ask()
     time.sleep(0.5)  # rates are averaged over this time
     feed.ask()
@@ -73,7 +81,7 @@ def live(feed: Feed) -> None:
     _hold(lambda suspend: _watch(draw, console, suspend))
 
 
-def drive(ride: Ride) -> None:
+def drive(ride: KeyboardDrive) -> None:
     """Drive the robot with the typed keys, and show its state.
 
     The function returns when the input ends or a signal arrives.
@@ -85,7 +93,7 @@ def drive(ride: Ride) -> None:
         _drive_in_lines(ride)
 
 
-def part(ride: Ride) -> None:
+def print_last_report(ride: KeyboardDrive) -> None:
     """Wait until the robot has stopped, but at most 2 s, and print a last report.
 
     If standard input or output is not a terminal, do nothing.
@@ -99,7 +107,7 @@ def part(ride: Ride) -> None:
         rests = seen.age < took and released(seen)
         # A robot usually stops within 2 s, by its own deceleration ramp.
         if rests or took > 2.0:
-            print("\n".join(parting(seen, output_size().columns)), flush=True)
+            print("\n".join(last_report_lines(seen, output_size().columns)), flush=True)
             return
         time.sleep(KEY_POLL_S)
 
@@ -118,7 +126,7 @@ def roster(fleet: Roster) -> None:
                 line.stylize("bold red")
             elif WARNING in line.plain:
                 line.stylize("bold yellow")
-        below = f"q quits   {fleet.more or fleet.seen}" if rows else fleet.hint()
+        below = f"q quits   {fleet.left_out_text or fleet.seen}" if rows else fleet.hint()
         last = Text(below.rstrip(), "dim", no_wrap=bool(rows), overflow="ellipsis")
         return Group(*told, Text(), last)
 
@@ -154,13 +162,13 @@ def _hold(shows: Callable[[list[bool]], bool]) -> None:
     _be_lenient()
     suspend: list[bool] = []
     signal.signal(signal.SIGTSTP, lambda *_: suspend.append(True))
-    with until_told():
+    with until_signal():
         while shows(suspend):
             suspend.clear()
             os.kill(os.getpid(), signal.SIGSTOP)  # suspend as ^Z does; fg resumes here
 
 
-def _steer(ride: Ride, console: Console, suspend: list[bool]) -> bool:
+def _steer(ride: KeyboardDrive, console: Console, suspend: list[bool]) -> bool:
     """Drive the robot with the typed keys, and show the screen.
 
     Return True if the user pressed Ctrl-Z, and False at the end of the input.
@@ -186,23 +194,23 @@ def _be_lenient() -> None:
 
 
 @contextmanager
-def until_told() -> Iterator[None]:
-    """End the `with` block at the first signal in `END_SIGNALS`, or when the terminal closes.
+def until_signal() -> Iterator[None]:
+    """End the `with` block when a signal of `SCREEN_END_SIGNALS` arrives or the terminal closes.
 
     Further signals are ignored, even after the block, because two signals arrive when a terminal
-    with a shell closes.
+    with a shell closes. The second one must not interrupt the zero commands that end a drive.
     """
 
-    def deaf() -> None:
-        for number in END_SIGNALS:
+    def ignore_signals() -> None:
+        for number in SCREEN_END_SIGNALS:
             signal.signal(number, signal.SIG_IGN)
 
-    def leave(*_: object) -> None:
-        deaf()
+    def end_block(*_: object) -> None:
+        ignore_signals()
         raise KeyboardInterrupt
 
-    for number in END_SIGNALS:
-        signal.signal(number, leave)
+    for number in SCREEN_END_SIGNALS:
+        signal.signal(number, end_block)
     try:
         yield
     except KeyboardInterrupt:
@@ -213,7 +221,7 @@ def until_told() -> Iterator[None]:
         # The terminal was closed, so discard further output.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     finally:
-        deaf()
+        ignore_signals()
 
 
 @contextmanager
@@ -237,22 +245,22 @@ def keys() -> Iterator[Callable[[float], str | None]]:
     if not sys.stdin.isatty():
         yield nobody
         return
-    with one_by_one():
+    with single_key_mode():
         yield read
 
 
 # Without a screen
 
 
-def _drive_in_lines(ride: Ride) -> None:
-    due, page = News(), Page()
-    with until_told(), keys() as read:
+def _drive_in_lines(ride: KeyboardDrive) -> None:
+    due, page = ReportThrottle(), Page()
+    with until_signal(), keys() as read:
         while (typed := read(KEY_POLL_S)) is not None:
             ride.step(typed)
             seen = ride.seen()
             if due.tell(seen, time.monotonic()):
                 width, height = output_size()
-                print("\n".join(page.with_help(news(seen, width), height)), flush=True)
+                print("\n".join(page.with_help(report_lines(seen, width), height)), flush=True)
 
 
 def output_size() -> os.terminal_size:
@@ -264,12 +272,12 @@ def output_size() -> os.terminal_size:
     return shutil.get_terminal_size() if sys.stdout.isatty() else unlimited
 
 
-class News:
+class ReportThrottle:
     """Decides when `acsard drive` prints a report on a terminal that cannot show a screen."""
 
     def __init__(self) -> None:
         self._shown: tuple[object, ...] = ()
-        self._at = -QUIET_S
+        self._at = -RESTING_REPORT_S
 
     def tell(self, seen: Teleop, now: float) -> bool:
         """Return whether the caller must print a report now.
@@ -281,7 +289,9 @@ class News:
         words = ("", "") if state is None else (state.mode, state.reason)
         what = (*words, seen.objection, seen.linear, seen.angular, seen.silent)
         moving = state is not None and moves(state)
-        wait = NEWS_S if what != self._shown else SAME_S if moving else QUIET_S
+        wait = MOVING_REPORT_S if moving else RESTING_REPORT_S
+        if what != self._shown:
+            wait = CHANGED_REPORT_S
         if now - self._at < wait:
             return False
         self._shown, self._at = what, now

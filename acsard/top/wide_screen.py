@@ -31,7 +31,7 @@ LINK_STYLES = {"up": "green", "booting": "yellow"}
 LATENCY_ROWS = {
     "period_lateness": (
         "period due → step",
-        "from the (first missed) due time to the step's start",
+        "from the first unmet due time to the step's start",
     ),
     "step_time": ("work of one step", "from the start of a step to the end of its work"),
     "command_age": ("arrival → each line", "from a command's arrival to each line that carries it"),
@@ -245,7 +245,7 @@ def overrun(state: RobotState) -> Text:
 
 
 def _gyro(does: str) -> Text:
-    good = does in ("used", "waiting for rest")
+    good = does in ("used", "waiting for rest", "waiting for turn")
     told = next(
         (f"{name}: {words}" for name, words in STATUS_TEXTS.items() if name == does), clean(does)
     )

@@ -30,8 +30,14 @@ from aiohttp.web_protocol import RequestHandler
 from acsard.host import clock
 from acsard.host.rate_limits import Buckets
 from acsard.web.answers import HEADERS, cut, problem
-from acsard.web.callers import Who, is_loopback, network_of, unmapped
-from acsard.web.limits import HANDSHAKE_RATE, MAX_UNREAD_BYTES, SOCKETS_HERE, Sockets, sockets_for
+from acsard.web.callers import Identity, is_loopback, network_of, unmapped
+from acsard.web.limits import (
+    HANDSHAKE_RATE,
+    MAX_LOCAL_TCP_CONNECTIONS,
+    MAX_UNREAD_BYTES,
+    Sockets,
+    sockets_for,
+)
 from acsard.web.metrics import Counts
 
 HANDSHAKE_S, HANDSHAKES_AT_ONCE = 3.0, 32
@@ -71,7 +77,7 @@ class Acceptor:
     def __init__(self, counts: Counts) -> None:
         self._counts = counts
         files = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
-        self._here = Sockets["_Connection"](SOCKETS_HERE)
+        self._here = Sockets["_Connection"](MAX_LOCAL_TCP_CONNECTIONS)
         self._away = Sockets["_Connection"](sockets_for(files))
         self._listeners: list[socket.socket] = []
         self._waiting: dict[str, dict[_Connection, None]] = {}
@@ -119,7 +125,7 @@ class Acceptor:
         if (one := _connection(transport)) is not None:
             one.spoke(body)
 
-    def admitted(self, transport: asyncio.BaseTransport | None, who: Who) -> None:
+    def admitted(self, transport: asyncio.BaseTransport | None, who: Identity) -> None:
         """Record that the client of a connection has been identified as `who`.
 
         If the server must close connections to make room, it first closes connections whose client

@@ -25,10 +25,10 @@ from acsard.web.acceptor import Acceptor
 from acsard.web.answers import READ_TIMEOUT_S, STATUS_CODES, TroubleError, problem, secured
 from acsard.web.callers import (
     LOCAL_NAME,
-    Asked,
+    Identity,
     Reason,
     RefusedError,
-    Who,
+    RequestFacts,
     by_listed_page,
     network_of,
     place,
@@ -56,7 +56,7 @@ STATUS_TEXTS = {
     413: f"the request has more than {MAX_MESSAGE_BYTES} bytes: send less",
 }
 
-IDENTITY_KEY: web.RequestKey[Who] = web.RequestKey("who", Who)
+IDENTITY_KEY: web.RequestKey[Identity] = web.RequestKey("who", Identity)
 """Key under which a request object contains the client's identity. The request contains no identity
 if its path is open to every client."""
 
@@ -114,7 +114,7 @@ class Admission:
         `names` are the robot's host names and addresses, in lower case. `rules` is the section
         `web` of the configuration.
         """
-        self._local, self._origins = Who(rules.local, LOCAL_NAME), frozenset(rules.origins)
+        self._local, self._origins = Identity(rules.local, LOCAL_NAME), frozenset(rules.origins)
         self._robot, self._names, self._vault = robot, names, vault
         self._acceptor, self._counts = acceptor, counts
         self._guesses, self._strangers = Buckets(GUESSES_OF_ONE, GUESSES), Buckets(STRANGER_RATE)
@@ -136,7 +136,7 @@ class Admission:
                 self._rows[added] = row
         return app
 
-    async def owner(self, peer: str, shown: Sequence[str]) -> Who:
+    async def owner(self, peer: str, shown: Sequence[str]) -> Identity:
         """Return the owner of the first valid token in a request.
 
         `peer` is the client's IP address, and `shown` contains the tokens in the request. Raises
@@ -213,7 +213,7 @@ class Admission:
         Raises `RefusedError` if the client may not use the path, or exceeds its rate limit while
         `row.waits` is false. `row` is None for an unknown path.
         """
-        said = asked_of(request)
+        said = request_facts(request)
         here = place(said, self._names | {own_address(request)}) == "here"
         is_open = row is not None and row.least is None
         listed = by_listed_page(said, self._origins)
@@ -248,7 +248,7 @@ class Admission:
             who.require(row.least, f"{row.method} {row.path}")
         return fast
 
-    def _too_fast(self, who: Who, row: Route | None) -> bool:
+    def _too_fast(self, who: Identity, row: Route | None) -> bool:
         if not who.token:
             return False  # clients on the robot itself have no rate limit
         rate = row.rate if row else REQUEST_RATE
@@ -256,10 +256,10 @@ class Admission:
         return not self._paces.setdefault(rate, Buckets(rate)).take(name, clock.mono_ns())
 
     def _listed(self, request: web.Request) -> bool:
-        return by_listed_page(asked_of(request), self._origins)
+        return by_listed_page(request_facts(request), self._origins)
 
     def _preflight(self, request: web.Request) -> web.Response:
-        place(asked_of(request), self._names | {own_address(request)})
+        place(request_facts(request), self._names | {own_address(request)})
         return web.Response(
             status=204,
             headers={
@@ -279,9 +279,9 @@ class Admission:
             response.headers["Access-Control-Expose-Headers"] = "ETag, Age-Ms, Waited-Ms"
 
 
-def asked_of(request: web.Request) -> Asked:
+def request_facts(request: web.Request) -> RequestFacts:
     hosts = request.headers.getall("Host", [])
-    return Asked(
+    return RequestFacts(
         peer_of(request),
         request.secure,
         hosts[0] if len(hosts) == 1 and HOST.fullmatch(hosts[0]) else "",

@@ -44,7 +44,7 @@ from acsard.web.answers import (
 from acsard.web.callers import PROTOCOL, RefusedError, cookie_name, tokens_offered
 from acsard.web.camera import SEND_TIMEOUT_S, Camera
 from acsard.web.guide import SLOW_PORTS, Choices
-from acsard.web.limits import OPENINGS, PICTURES, STOPS, Seats
+from acsard.web.limits import OPENINGS, PICTURES, STOPS, WebSocketLimits
 from acsard.web.recordings import POLICY, BlackBox, Recording, Reports, ReportState, State
 from acsard.web.routes import FORM, JSON, RECORDINGS_ROLE, Body, Problem, Route, services, values
 from acsard.web.socket_messages import MAX_MESSAGE_BYTES, Begin
@@ -112,12 +112,14 @@ class Page:
         self._parts, self._vault, self._acceptor = parts, vault, acceptor
         self._robots, self._files, self._reports = parts.robots, Files(), Reports()
         self._box = BlackBox(parts.robots)
-        self._seats, self._camera = Seats(), Camera(rules.camera)
+        self._websocket_limits, self._camera = WebSocketLimits(), Camera(rules.camera)
         self._has_camera = bool(rules.camera)
         self._sent: dict[str, tuple[File, float]] = {}
         """Maps the name of each page file to a pair: the file, and the time of the last check
         whether the file has changed on the disk, s on the event loop's clock."""
         self._viewers: set[Viewer] = set()
+        self._token_read: asyncio.Future[frozenset[str]] | None = None
+        """The newest read of the digests of all valid tokens. It has no time limit."""
         self._admission = Admission(parts.robots.id, names, vault, acceptor, parts.counts, rules)
         self.app = self._admission.application(ROUTES, self)
 
@@ -140,16 +142,21 @@ class Page:
         no thread can be started to read the disk, all connections stay open.
         """
         self._reports.tidy()
+        # While the disk hangs, all calls wait for the same read. Otherwise, each call would leave
+        # one more blocked thread.
+        if self._token_read is None or self._token_read.done():
+            self._token_read = asyncio.ensure_future(in_thread(self._vault.valid_digests, None))
         try:
-            counting = await in_thread(self._vault.counting, READ_TIMEOUT_S)
+            async with asyncio.timeout(READ_TIMEOUT_S):
+                valid = await asyncio.shield(self._token_read)
         except NoThreadError:
             return  # the disk was not read, so all tokens stay valid
         except TimeoutError:
-            counting = frozenset()
+            valid = frozenset()
         for viewer in list(self._viewers):
-            if viewer.who.token and viewer.who.token not in counting:
+            if viewer.who.token and viewer.who.token not in valid:
                 viewer.end("your token has expired or was revoked: ask for a new one")
-        self._acceptor.tidy(counting)
+        self._acceptor.tidy(valid)
 
     # The page and its files.
 
@@ -214,7 +221,7 @@ class Page:
                 "malformed",
                 f"the WebSocket must offer the subprotocol {PROTOCOL} besides the token",
             )
-        if full := self._seats.enter(peer, who.token):
+        if full := self._websocket_limits.enter(peer, who.token):
             raise RefusedError("too_many", full)
         try:
             served = web.WebSocketResponse(
@@ -233,7 +240,7 @@ class Page:
             finally:
                 self._viewers.discard(viewer)
         finally:
-            self._seats.leave(peer, who.token)
+            self._websocket_limits.leave(peer, who.token)
         return served
 
     # The interface for programs.
@@ -253,7 +260,7 @@ class Page:
         who = request[IDENTITY_KEY]
         # A browser does not report to its page why a WebSocket was refused, so `full` reports it
         # here.
-        full = self._seats.missing(peer_of(request), who.token)
+        full = self._websocket_limits.refusal(peer_of(request), who.token)
         return reply(Caller(who.role, who.name, full))
 
     async def value(self, request: web.Request) -> web.StreamResponse:
@@ -287,8 +294,8 @@ class Page:
             )
             raise RefusedError("malformed", text)
         verb = request.path.removeprefix("/api/srv/")
-        told = await self._parts.calls.call(request[IDENTITY_KEY], verb, given, robot)
-        return reply(told, 200 if told.success else 409)
+        answer = await self._parts.calls.call(request[IDENTITY_KEY], verb, given, robot)
+        return reply(answer, 200 if answer.success else 409)
 
     async def picture(self, request: web.Request) -> web.StreamResponse:
         """Wait for a camera picture that the client does not have, and return the picture.
@@ -306,25 +313,27 @@ class Page:
             _limit_buffer(request)
             picture = self._camera.newest or picture  # a newer one may have arrived
             now_ns = clock.steady_ns()
-            told = {
+            headers = {
                 "Content-Type": "image/jpeg",
                 "ETag": f'"{picture.number}"',
                 "Age-Ms": str((now_ns - picture.at_ns) // 1_000_000),
                 "Waited-Ms": str((now_ns - begun_ns) // 1_000_000),
             }
-            return await sent_in_pieces(request, picture.body, told, SEND_TIMEOUT_S)
+            return await sent_in_pieces(request, picture.body, headers, SEND_TIMEOUT_S)
 
     async def recordings(self, request: web.Request) -> web.StreamResponse:
         return reply(await self._box.rows())
 
     async def recording(self, request: web.Request) -> web.StreamResponse:
         path, _ = await self._box.found(request.match_info["name"])
-        told = {"Content-Disposition": f'attachment; filename="{path.name}"'}
-        return web.FileResponse(path, headers=told | {"Content-Type": "application/octet-stream"})
+        disposition = {"Content-Disposition": f'attachment; filename="{path.name}"'}
+        return web.FileResponse(
+            path, headers=disposition | {"Content-Type": "application/octet-stream"}
+        )
 
     async def draw(self, request: web.Request) -> web.StreamResponse:
-        told = self._reports.ask(*await self._box.found(request.match_info["name"]))
-        return reply(told, DRAWING_STATUS[told.report])
+        progress = self._reports.ask(*await self._box.found(request.match_info["name"]))
+        return reply(progress, DRAWING_STATUS[progress.report])
 
     async def report(self, request: web.Request) -> web.StreamResponse:
         """Return the finished report of a recording as an HTML page in a sandboxed origin."""
@@ -359,9 +368,9 @@ def settings_in(config: Mapping[str, Any]) -> list[Setting]:
     `config` is the daemon's configuration.
     """
     return [
-        Setting(key, value, told.what, WHEN_TEXTS[told.when], **_allowed(key))
+        Setting(key, value, setting.what, WHEN_TEXTS[setting.when], **_allowed(key))
         for key, value in flat(config)
-        if (told := live(key)) is not None
+        if (setting := live(key)) is not None
     ]
 
 

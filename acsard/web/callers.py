@@ -18,7 +18,7 @@ from typing import Literal
 
 from msgspec import Struct
 
-from acsard.core.messages.permissions import USE_TEXTS, has
+from acsard.core.messages.permissions import ROLE_TEXTS, has
 from acsard.core.values import AcsardError, Role
 
 Reason = Literal[
@@ -53,7 +53,7 @@ class RefusedError(AcsardError):
         self.reason = reason
 
 
-class Who(Struct, frozen=True):
+class Identity(Struct, frozen=True):
     """The identity of an admitted client."""
 
     role: Role
@@ -76,9 +76,11 @@ class Who(Struct, frozen=True):
         `what` is the name of the action that requires the role `least`, for the error message.
         """
         if not self.may(least):
-            raise RefusedError("role", f"{what} is {self.barred(least)}: {USE_TEXTS[self.role]}")
+            raise RefusedError(
+                "role", f"{what} is {self.why_not_allowed(least)}: {ROLE_TEXTS[self.role]}"
+            )
 
-    def barred(self, least: Role) -> str:
+    def why_not_allowed(self, least: Role) -> str:
         """Return the reason why the client may not use an action that requires the role `least`.
 
         Call this only for a client whose role is lower.
@@ -86,7 +88,7 @@ class Who(Struct, frozen=True):
         return f"for {least}s; your role is {self.role}"
 
 
-class Asked(Struct, frozen=True):
+class RequestFacts(Struct, frozen=True):
     """The properties of a request that decide whether the server admits the request.
 
     A client may forge all headers.
@@ -106,25 +108,25 @@ class Asked(Struct, frozen=True):
     """True if a header says that a proxy forwarded the request."""
 
 
-def place(asked: Asked, names: Collection[str]) -> Place:
+def place(facts: RequestFacts, names: Collection[str]) -> Place:
     """Return "here" if the client is on the robot and requests a loopback name, otherwise "away".
 
     `names` are the robot's names and addresses, in lower case. Raises `RefusedError` for a request
     through a proxy. Otherwise, raises it for a request from "away" that uses plain HTTP, or that
     requests a host which is not in `names`.
     """
-    if asked.proxied:
+    if facts.proxied:
         raise RefusedError(
             "proxy",
             "the request came through a proxy, which hides the machine of the browser: open this "
             "page without a proxy, and with https if the browser runs on another machine",
         )
-    host = host_name(asked.host)
-    if is_loopback(asked.peer) and (host == "localhost" or is_loopback(host)):
+    host = host_name(facts.host)
+    if is_loopback(facts.peer) and (host == "localhost" or is_loopback(host)):
         return "here"
-    if not asked.secure:
+    if not facts.secure:
         raise RefusedError(
-            "plain" if not is_loopback(asked.peer) else "host",
+            "plain" if not is_loopback(facts.peer) else "host",
             f"the request is for {host or 'no host'!r}, but plain http is only for localhost: use "
             "http://localhost on the machine of the page's server, and https from another machine",
         )
@@ -137,10 +139,10 @@ def place(asked: Asked, names: Collection[str]) -> Place:
     return "away"
 
 
-def require_own_origin(asked: Asked) -> None:
+def require_own_origin(facts: RequestFacts) -> None:
     """Raise `RefusedError` if a web page of another origin made the browser send this request."""
-    strange = asked.origin is not None and asked.origin.lower() != _own_origin(asked)
-    if strange or asked.site not in (None, "same-origin", "none"):
+    strange = facts.origin is not None and facts.origin.lower() != _own_origin(facts)
+    if strange or facts.site not in (None, "same-origin", "none"):
         raise RefusedError(
             "origin",
             "the request comes from a page of another site: open the robot's own page, or list the "
@@ -148,20 +150,20 @@ def require_own_origin(asked: Asked) -> None:
         )
 
 
-def by_listed_page(asked: Asked, origins: Collection[str]) -> bool:
+def by_listed_page(facts: RequestFacts, origins: Collection[str]) -> bool:
     """Return whether a web page of an origin in `web.origins` made the browser send this request.
 
     `origins` are the origins in `web.origins`. Return False for the robot's own page, even if its
     origin is one of them: the server must accept the cookies of the robot's own page, but it
     ignores the cookies of the listed pages.
     """
-    if asked.origin is None or asked.origin.lower() == _own_origin(asked):
+    if facts.origin is None or facts.origin.lower() == _own_origin(facts):
         return False
-    return asked.origin.lower() in origins
+    return facts.origin.lower() in origins
 
 
-def _own_origin(asked: Asked) -> str:
-    return f"{'https' if asked.secure else 'http'}://{asked.host}".lower()
+def _own_origin(facts: RequestFacts) -> str:
+    return f"{'https' if facts.secure else 'http'}://{facts.host}".lower()
 
 
 def tokens_offered(protocols: str) -> list[str]:

@@ -23,13 +23,13 @@ from acsard.host import clock
 from acsard.host.errors import MendableError, UsageError
 from acsard.host.rate_limits import Buckets, Places
 from acsard.host.threads import in_thread
-from acsard.web.callers import RefusedError, Who
+from acsard.web.callers import Identity, RefusedError
 from acsard.web.limits import REMOTE_STOP_RATE
 from acsard.web.robots import Robots
 
-AT_ONCE, STOPS_AT_ONCE = 16, 32
-"""`AT_ONCE` is the maximum number of simultaneous service calls and queries, without stops.
-`STOPS_AT_ONCE` is the maximum number of simultaneous stops of the page's own robot."""
+MAX_CALLS, MAX_STOPS = 16, 32
+"""`MAX_CALLS` is the maximum number of simultaneous service calls and queries, without stops.
+`MAX_STOPS` is the maximum number of simultaneous stops of the page's own robot."""
 
 MAX_REMOTE_STOPS = 8
 """Maximum number of stops of other robots for whose replies the server waits at the same time.
@@ -62,27 +62,27 @@ class Calls:
     def __init__(
         self,
         robots: Robots,
-        ends: Callable[[], Awaitable[Ending]],
-        sees: Callable[[str], bool],
+        interrupt_guide: Callable[[], Awaitable[Ending]],
+        is_known: Callable[[str], bool],
     ) -> None:
         """Create the limits for calls, with none in use.
 
         Args:
             robots: object with the connection to the daemon.
-            ends: function that interrupts the running check or calibration, if any.
-            sees: function that returns whether the server has found the robot with the given id on
-                the bus.
+            interrupt_guide: function that interrupts the running check or calibration, if any.
+            is_known: function that returns whether the server has found the robot with the given
+                id on the bus.
         """
-        self._robots, self._ends, self._sees = robots, ends, sees
-        self._stops, self._merged = Stops(), Merged()
+        self._robots, self._interrupt_guide, self._is_known = robots, interrupt_guide, is_known
+        self._stops, self._merged = Stops(), StopMerger()
         self._unknown = Buckets(REMOTE_STOP_RATE)
         self._answered: set[str] = set()
         """Ids of other robots that have answered a stop, and therefore exist."""
-        self._asks = Places(AT_ONCE, AT_ONCE)
+        self._asks = Places(MAX_CALLS, MAX_CALLS)
         self._elsewhere = Places(MAX_REMOTE_STOPS, MAX_REMOTE_STOPS)
 
     async def call(
-        self, who: Who, verb: str, payload: Mapping[str, Any], robot: str = ""
+        self, who: Identity, verb: str, payload: Mapping[str, Any], robot: str = ""
     ) -> ServiceReply:
         """Call the service `verb` for the client `who`, and return the reply.
 
@@ -107,13 +107,15 @@ class Calls:
             return await self._called(who, verb, payload, other)
         # A running check turns the wheels, and has opened the serial port in place of the daemon.
         # The daemon cannot stop the wheels then, so interrupt the check too.
-        ending, reply = await asyncio.gather(self._ends(), self._called(who, verb, payload, other))
+        ending, reply = await asyncio.gather(
+            self._interrupt_guide(), self._called(who, verb, payload, other)
+        )
         if not ending.words:
             return reply
         return ServiceReply(reply.success and ending.ended, f"{ending.words}; {reply.message}")
 
     async def _called(
-        self, who: Who, verb: str, payload: Mapping[str, Any], other: str
+        self, who: Identity, verb: str, payload: Mapping[str, Any], other: str
     ) -> ServiceReply:
         client = self._robots.client
         if client is None:
@@ -127,7 +129,7 @@ class Calls:
                 return await self._stop(other, client, who, request)
             return await self._stops.ask(request)
 
-        if verb == "stop" and other and other not in self._answered and not self._sees(other):
+        if verb == "stop" and other and other not in self._answered and not self._is_known(other):
             self._require_few(who)
         try:
             if verb == "stop":
@@ -137,26 +139,26 @@ class Calls:
         except (MendableError, DecodeError, TimeoutError) as error:
             return ServiceReply(False, str(error) or "the robot did not answer in time: try again")
         if verb == "set" and reply.success:
-            self._robots.ask_anew()
+            self._robots.refresh_about()
         return reply
 
     async def get(self, robot: str, name: str) -> tuple[str, bytes]:
         """Query the last value of a robot's key as JSON, and return the pair (encoding, payload).
 
         `robot` is the robot's id, and `name` is the key without this id. Raises `MendableError` if
-        there is no connection to the bus, if no answer arrives, or if `AT_ONCE` calls and queries
+        there is no connection to the bus, if no answer arrives, or if `MAX_CALLS` calls and queries
         are running already. Raises `TimeoutError` if the bus is stuck for `ANSWER_TIMEOUT_S`.
         """
         client = self._robots.client
         if client is None:
             raise MendableError(self._robots.gone)
-        return await self._ask(lambda: client.like(robot).reply(f"{name}?fmt=json"))
+        return await self._ask(lambda: client.sibling(robot).reply(f"{name}?fmt=json"))
 
     async def _stop(
-        self, robot: str, client: Client, who: Who, request: Callable[[], ServiceReply]
+        self, robot: str, client: Client, who: Identity, request: Callable[[], ServiceReply]
     ) -> ServiceReply:
         # A robot that does not exist never replies, so the number of waiting calls is limited.
-        with self._elsewhere.held() as free:
+        with self._elsewhere.place() as free:
             if free:
                 reply = await in_thread(request, ANSWER_TIMEOUT_S)
                 if len(self._answered) < 200:
@@ -175,7 +177,7 @@ class Calls:
             "robot has stopped",
         )
 
-    def _require_few(self, who: Who) -> None:
+    def _require_few(self, who: Identity) -> None:
         """Raise `RefusedError` if a client exceeds the limit `REMOTE_STOP_RATE`.
 
         Call this for each stop of a robot that may not exist.
@@ -185,18 +187,18 @@ class Calls:
             raise RefusedError(
                 "too_fast",
                 "the stop was not sent: you have sent too many stops to robots that have not "
-                f"answered ({rate.most:g} at once and {rate.hz:g} a second are allowed); send it "
+                f"answered ({rate.burst:g} at once and {rate.hz:g} a second are allowed); send it "
                 "again",
             )
 
     async def _ask(self, call: Callable[[], T]) -> T:
-        with self._asks.held() as free:
+        with self._asks.place() as free:
             if not free:
                 raise MendableError(BUSY)
             return await in_thread(call, ANSWER_TIMEOUT_S)
 
 
-class Merged:
+class StopMerger:
     """Merges the stops that one client requests for one robot in quick succession.
 
     At most one stop per `MIN_STOP_INTERVAL_S` is sent for each client and robot. No stop is lost:
@@ -242,19 +244,19 @@ class Merged:
 
 
 class Stops:
-    """Limits the stops of the page's own robot to `STOPS_AT_ONCE` at the same time.
+    """Limits the stops of the page's own robot to `MAX_STOPS` at the same time.
 
     All callers beyond this limit share one stop, which is sent when an earlier stop has ended.
     """
 
     def __init__(self) -> None:
-        self._room = asyncio.Semaphore(STOPS_AT_ONCE)
+        self._room = asyncio.Semaphore(MAX_STOPS)
         self._next: asyncio.Task[ServiceReply] | None = None
 
     async def ask(self, call: Callable[[], ServiceReply]) -> ServiceReply:
         """Send a stop by calling `call`, and return the reply.
 
-        If `STOPS_AT_ONCE` stops are running, wait for the next stop, and return the reply to it.
+        If `MAX_STOPS` stops are running, wait for the next stop, and return the reply to it.
         All callers that wait get this reply.
         """
         if not self._room.locked():
@@ -271,7 +273,7 @@ class Stops:
             return await in_thread(call, ANSWER_TIMEOUT_S)
 
 
-def require(who: Who, verb: str) -> None:
+def require(who: Identity, verb: str) -> None:
     """Raise `RefusedError` unless the service `verb` exists and the client `who` may call it."""
     if verb not in SERVICES:
         raise RefusedError(
@@ -288,13 +290,13 @@ def _require_stop(verb: str, robot: str) -> None:
     if verb != "stop":
         raise RefusedError(
             "role",
-            f"{robot} is not this page's robot: here you can only see it and stop it; for {verb} "
-            "open that robot's own page",
+            f"{robot} is not this page's robot: here you can only see it and stop it; to call "
+            f"{verb}, open that robot's own page",
         )
 
 
-def _named(client: Client, robot: str, who: Who) -> Client:
+def _named(client: Client, robot: str, who: Identity) -> Client:
     """Return a bus client for a robot, which logs the calls under the name of the client `who`."""
-    other = client.like(robot)
+    other = client.sibling(robot)
     other.name = f"{who.name}@page"
     return other

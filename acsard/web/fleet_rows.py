@@ -71,7 +71,7 @@ class Fleet:
         the robot's key `state` and a state has arrived.
         """
         states = self._robots.streams.followed(robot, STATE_KEY)
-        here = self._tracked is not None and self._tracked.here(robot)
+        here = self._tracked is not None and self._tracked.is_present(robot)
         return here or bool(states and states.number)
 
     def _look(self) -> None:

@@ -109,7 +109,7 @@ class Guide:
         """
         self._reach, self._configured = reach, configured
         self._viewers: dict[object, Say] = {}
-        self._errand: _Errand | None = None
+        self._job: _Job | None = None
         self._task: asyncio.Task[None] | None = None
 
     async def choices(self, *, simulated: bool) -> Choices:
@@ -130,13 +130,13 @@ class Guide:
         the end of a check or calibration. `say` sends a message to the viewer.
         """
         self._viewers[viewer] = say
-        say(Guided(Running("")) if self._errand is None else self._errand.about(viewer))
+        say(Guided(Running("")) if self._job is None else self._job.about(viewer))
 
     def leave(self, viewer: object) -> None:
         """Remove a viewer whose connection has ended, and interrupt the child that it started."""
         self._viewers.pop(viewer, None)
-        if (errand := self._of(viewer)) is not None:
-            errand.leave()
+        if (job := self._of(viewer)) is not None:
+            job.leave()
 
     def begin(self, viewer: object, by: str, asked: Begin) -> str:
         """Start the check or calibration `asked` for a viewer, and return "".
@@ -144,14 +144,14 @@ class Guide:
         If another one is still running, return the reason for the refusal instead. `by` is the name
         of the viewer's user.
         """
-        if self._errand is not None:
+        if self._job is not None:
             return (
-                f"{self._errand.name} is already running (started by {self._errand.by}), and only "
-                "one check or calibration can run at a time: wait until it ends"
+                f"a {self._job.text} is already running (started by {self._job.by}), and "
+                "only one check or calibration can run at a time: wait until it ends"
             )
-        self._errand = _Errand(viewer, by, asked.begin, self._viewers[viewer])
+        self._job = _Job(viewer, by, asked.begin, self._viewers[viewer])
         self._tell_all()
-        self._task = asyncio.get_running_loop().create_task(self._live(self._errand, asked))
+        self._task = asyncio.get_running_loop().create_task(self._live(self._job, asked))
         return ""
 
     def reply(self, viewer: object, reply: Reply) -> str:
@@ -159,8 +159,8 @@ class Guide:
 
         If the child does not wait for this answer, return the reason for the refusal instead.
         """
-        errand = self._of(viewer)
-        if errand is None or not errand.answer(reply):
+        job = self._of(viewer)
+        if job is None or not job.answer(reply):
             return (
                 f"question {reply.reply} is not open on this page: answer the newest question that "
                 "this page shows"
@@ -173,12 +173,12 @@ class Guide:
         The field `press` of the message is "key" for the key press, and "leave" to interrupt. If
         the child has ended, do nothing.
         """
-        if (errand := self._of(viewer)) is None:
+        if (job := self._of(viewer)) is None:
             return
         if press.press == "key":
-            errand.key()
+            job.key()
         else:
-            errand.leave()
+            job.leave()
 
     async def stop(self) -> Ending:
         """Interrupt the running check or calibration, and return the result within about 1 s.
@@ -186,42 +186,41 @@ class Guide:
         Call this whenever any client stops the robot. The daemon alone cannot stop the wheels
         during a check, because the check has opened the serial port in place of the daemon.
         """
-        if self._errand is None or self._task is None:
+        if self._job is None or self._task is None:
             return Ending()
-        self._errand.leave()
-        name = {"calibrate": "calibration"}.get(self._errand.name, self._errand.name)
-        what = f"the {name} started by {self._errand.by}"
+        self._job.leave()
+        what = f"the {self._job.text} started by {self._job.by}"
         done, _ = await asyncio.wait([self._task], timeout=1.0)
         return Ending(f"{what} has ended" if done else f"{what} is being ended", bool(done))
 
-    def heard(self, viewer: object) -> None:
+    def on_message(self, viewer: object) -> None:
         """Send a sign of life to the child that the viewer started.
 
         Call this for each message of a viewer. While the robot may move, the child ends if no sign
         of life arrives for some time.
         """
-        if (errand := self._of(viewer)) is not None:
-            errand.relay()
+        if (job := self._of(viewer)) is not None:
+            job.relay()
 
     async def close(self) -> None:
         """Interrupt the running child, and kill it if it does not exit within 2 s."""
-        if self._task is None or self._errand is None:
+        if self._task is None or self._job is None:
             return
-        self._errand.leave()
+        self._job.leave()
         try:
             async with asyncio.timeout(2.0):
                 await asyncio.shield(self._task)
         except TimeoutError:
-            self._errand.kill()
+            self._job.kill()
             await self._task
 
-    def _of(self, viewer: object) -> _Errand | None:
-        errand = self._errand
-        return errand if errand is not None and errand.viewer is viewer else None
+    def _of(self, viewer: object) -> _Job | None:
+        job = self._job
+        return job if job is not None and job.viewer is viewer else None
 
-    async def _live(self, errand: _Errand, asked: Begin) -> None:
+    async def _live(self, job: _Job, asked: Begin) -> None:
         try:
-            code, text = await errand.run(words(asked, self._reach, await self._ports(asked)))
+            code, text = await job.run(arguments(asked, self._reach, await self._ports(asked)))
         # Python raises `RuntimeError` if it cannot start a thread for the child process.
         except (FrameError, OSError, TimeoutError, RuntimeError) as error:
             code, text = (
@@ -229,9 +228,9 @@ class Guide:
                 str(error) or SLOW_PORTS,
             )
         finally:
-            self._errand = None
-        meaning = EXIT_TEXTS.get(code, "ended") if not errand.left else "stopped"
-        errand.say(Guided(Ended(code, meaning, text)))
+            self._job = None
+        meaning = EXIT_TEXTS.get(code, "ended") if not job.left else "stopped"
+        job.say(Guided(Ended(code, meaning, text)))
         self._tell_all()
 
     async def _ports(self, asked: Begin) -> list[str]:
@@ -244,7 +243,7 @@ class Guide:
 
     def _tell_all(self) -> None:
         for viewer, say in self._viewers.items():
-            say(self._errand.about(viewer) if self._errand else Guided(Running("")))
+            say(self._job.about(viewer) if self._job else Guided(Running("")))
 
 
 def boards(configured: str) -> list[Board]:
@@ -257,9 +256,9 @@ def boards(configured: str) -> list[Board]:
     for device in serial_devices():
         name = device.names[0] if device.names else device.device
         own = configured in (device.device, *device.names)
-        told = [device.board or device.description, "configured" if own else ""]
-        told += [f"in use by {holder.name} (process {holder.pid})" for holder in device.holders]
-        found[configured if own else name] = ", ".join(filter(None, told))
+        notes = [device.board or device.description, "configured" if own else ""]
+        notes += [f"in use by {holder.name} (process {holder.pid})" for holder in device.holders]
+        found[configured if own else name] = ", ".join(filter(None, notes))
     if configured != SIMULATOR and configured not in found:
         found = {configured: "configured" if os.path.exists(configured) else ABSENT_PORT, **found}
     found[SIMULATOR] = "the simulator: no real robot moves"
@@ -269,7 +268,7 @@ def boards(configured: str) -> list[Board]:
     return [Board(port, found[port]) for port in ports]
 
 
-def words(begin: Begin, reach: Reach, ports: Collection[str]) -> list[str]:
+def arguments(begin: Begin, reach: Reach, ports: Collection[str]) -> list[str]:
     """Return the arguments with which `acsard` runs the check or calibration `begin`.
 
     A text from the browser becomes only the value of an option. `reach` contains the options that
@@ -308,7 +307,7 @@ def _method(begin: Begin) -> list[str]:
     return [f"--{name}={value}" for name, value in options.items() if value]
 
 
-class _Errand:
+class _Job:
     """A check or calibration in a child process, and the WebSocket that started it."""
 
     def __init__(self, viewer: object, by: str, name: str, say: Say) -> None:
@@ -317,10 +316,14 @@ class _Errand:
         self._process: Process | None = None
         self._question = 0
         """Number of the question for whose answer the child waits; 0 if it does not wait."""
-        self._leg = self._rides = False
+        self._leg = self._drive_running = False
         # The browser sends signs of life at about half this rate (page/guide.js), so none is lost.
         self._relayed = Bucket(Rate(20.0))
         self._last = b""
+
+    @property
+    def text(self) -> str:
+        return "calibration" if self.name == "calibrate" else self.name
 
     def about(self, viewer: object) -> Guided:
         return Guided(Running(self.name, self.by, viewer is self.viewer))
@@ -337,14 +340,14 @@ class _Errand:
             self._process = process
             if self.left:
                 self._interrupt()
-            await asyncio.gather(self._hear(process), self._overhear(process))
+            await asyncio.gather(self._read_output(process), self._read_errors(process))
             code = await process.wait()
         return code if code >= 0 else 128 - code, self._words()
 
     def answer(self, reply: Reply) -> bool:
         if not self._question or reply.reply != self._question:
             return False
-        self._question, self._rides = 0, self._leg
+        self._question, self._drive_running = 0, self._leg
         self._write({"answer": reply.reply, "value": reply.value})
         return True
 
@@ -353,8 +356,8 @@ class _Errand:
 
         Do nothing if no such drive is running.
         """
-        if self._rides:
-            self._rides = False
+        if self._drive_running:
+            self._drive_running = False
             self._write({"key": True})
 
     def relay(self) -> None:
@@ -387,7 +390,7 @@ class _Errand:
             assert self._process.stdin is not None
             self._process.stdin.write(msgspec.json.encode(message) + b"\n")
 
-    async def _hear(self, process: Process) -> None:
+    async def _read_output(self, process: Process) -> None:
         assert process.stdout is not None
         try:
             async for line in process.stdout:
@@ -403,12 +406,12 @@ class _Errand:
         except (msgspec.MsgspecError, ValueError):
             return  # not a protocol line: a library printed it
         if said.question:
-            self._question, self._leg, self._rides = said.question, said.leg, False
+            self._question, self._leg, self._drive_running = said.question, said.leg, False
         if said.progress >= 1.0:
-            self._rides = False
+            self._drive_running = False
         self.say(Guided(msgspec.Raw(line)))
 
-    async def _overhear(self, process: Process) -> None:
+    async def _read_errors(self, process: Process) -> None:
         assert process.stderr is not None
         while said := await process.stderr.read(4096):
             self._last = last_part(self._last + said)

@@ -12,20 +12,22 @@ from typing import Generic, TypeVar
 from acsard.host.rate_limits import Places, Rate
 from acsard.web.callers import network_of
 
-SOCKETS, SOCKETS_HERE = 256, 96
-"""Maximum number of TCP connections from other machines (`SOCKETS`), and from the robot itself
-(`SOCKETS_HERE`). A browser opens six connections in addition to its WebSocket."""
+MAX_TCP_CONNECTIONS, MAX_LOCAL_TCP_CONNECTIONS = 256, 96
+"""Maximum number of TCP connections from other machines (`MAX_TCP_CONNECTIONS`), and from the robot
+itself (`MAX_LOCAL_TCP_CONNECTIONS`). A browser opens six connections in addition to its
+WebSocket."""
 
-SOCKETS_OF_ONE, SOCKETS_OF_TOKEN = 64, 64
+MAX_TCP_OF_NETWORK, MAX_TCP_OF_TOKEN = 64, 64
 """Maximum number of TCP connections from one network that have shown no valid token
-(`SOCKETS_OF_ONE`), and maximum number that have shown the same valid token (`SOCKETS_OF_TOKEN`).
-Any further connection with this token counts as a connection without a valid token."""
+(`MAX_TCP_OF_NETWORK`), and maximum number that have shown the same valid token
+(`MAX_TCP_OF_TOKEN`). Any further connection with this token counts as a connection without a valid
+token."""
 
-RESERVED_CONNECTIONS = 7
+RESERVED_TCP_OF_TOKEN = 7
 """Number of TCP connections that each token keeps even if the limit on all connections is reached.
 One browser needs this number."""
 
-MIN_CONNECTIONS = 16
+MIN_TCP_CONNECTIONS = 16
 """Number of TCP connections from other machines that the server always allows, even if the process
 may open only few files."""
 
@@ -41,12 +43,14 @@ for TLS is 512 KiB."""
 MAX_OVERRUNS = 600
 """Number of messages beyond the rate limit `MESSAGE_RATE` after which a WebSocket is closed."""
 
-CONNECTIONS, CONNECTIONS_OF_ONE, CONNECTIONS_OF_TOKEN, CONNECTIONS_ALIKE = 100, 20, 30, 6
-"""Maximum numbers of WebSockets from other machines: in total, per network, per token, and per
-token in one network. Because of the last limit, one program cannot lock out other tokens in its
-network."""
+MAX_WEBSOCKETS, MAX_WEBSOCKETS_OF_NETWORK, MAX_WEBSOCKETS_OF_TOKEN = 100, 20, 30
+"""Maximum numbers of WebSockets from other machines: in total, per network, and per token."""
 
-MAX_LOCAL_SOCKETS = 20
+MAX_WEBSOCKETS_OF_TOKEN_IN_NETWORK = 6
+"""Maximum number of WebSockets per token in one network. Because of this limit, one program cannot
+lock out other tokens in its network."""
+
+MAX_LOCAL_WEBSOCKETS = 20
 """Maximum number of WebSockets from the robot itself. WebSockets from other machines do not count
 here."""
 
@@ -105,7 +109,10 @@ def sockets_for(files: int) -> int:
     `files` is the number of files that this process may open.
     """
     # A connection needs two files while it fetches a recording.
-    return max(MIN_CONNECTIONS, min(SOCKETS, (files - RESERVED_FILES) // 2 - SOCKETS_HERE))
+    return max(
+        MIN_TCP_CONNECTIONS,
+        min(MAX_TCP_CONNECTIONS, (files - RESERVED_FILES) // 2 - MAX_LOCAL_TCP_CONNECTIONS),
+    )
 
 
 class Sockets(Generic[C]):
@@ -116,11 +123,11 @@ class Sockets(Generic[C]):
     1. If there are connections without a valid token, the network with the most of them loses its
        oldest connection without a valid token.
     2. If every connection has shown a valid token, the token with the most connections loses its
-       oldest connection. However, if this token has at most `RESERVED_CONNECTIONS` connections, the
-       new connection is refused instead.
+       oldest connection. However, if this token has at most `RESERVED_TCP_OF_TOKEN` connections,
+       the new connection is refused instead.
 
-    If a network has `SOCKETS_OF_ONE` connections without a valid token, each new connection from
-    this network displaces the oldest of them, even if the maximum is not reached.
+    If a network has `MAX_TCP_OF_NETWORK` connections without a valid token, each new connection
+    from this network displaces the oldest of them, even if the maximum is not reached.
     """
 
     def __init__(self, most: int) -> None:
@@ -129,10 +136,10 @@ class Sockets(Generic[C]):
         """The connections without a valid token, by network, oldest first."""
         self._networks: dict[C, str] = {}
         self._known: dict[C, str] = {}
-        """The token of each connection that is counted under a token (see `SOCKETS_OF_TOKEN`)."""
+        """The token of each connection that is counted under a token (see `MAX_TCP_OF_TOKEN`)."""
         self._shown: dict[C, str] = {}
         """The last valid token that each connection has shown. A connection beyond the limit
-        `SOCKETS_OF_TOKEN` is in this dict too."""
+        `MAX_TCP_OF_TOKEN` is in this dict too."""
         self._tokens: Counter[str] = Counter()
 
     def enter(self, network: str, one: C) -> C | None:
@@ -143,7 +150,7 @@ class Sockets(Generic[C]):
         """
         own = self._strangers.get(network, {})
         gone = None
-        if len(own) >= SOCKETS_OF_ONE:
+        if len(own) >= MAX_TCP_OF_NETWORK:
             gone = next(iter(own))
             self.leave(gone)
         elif len(self._networks) >= self._most and (gone := self.displaced()) is None:
@@ -156,14 +163,14 @@ class Sockets(Generic[C]):
         """Remove the connection that must make room for a new connection, and return it.
 
         Return None if every connection has shown a valid token, and no token has more than
-        `RESERVED_CONNECTIONS` connections.
+        `RESERVED_TCP_OF_TOKEN` connections.
         """
         if self._strangers:
             network = max(self._strangers, key=lambda name: len(self._strangers[name]))
             gone = next(iter(self._strangers[network]))
         else:
             token, count = max(self._tokens.items(), key=lambda item: item[1], default=("", 0))
-            if count <= RESERVED_CONNECTIONS:
+            if count <= RESERVED_TCP_OF_TOKEN:
                 return None
             gone = next(one for one, its in self._known.items() if its == token)
         self.leave(gone)
@@ -179,7 +186,7 @@ class Sockets(Generic[C]):
         if network is None:
             return
         self._shown[one] = token
-        if before == token or self._tokens[token] >= SOCKETS_OF_TOKEN:
+        if before == token or self._tokens[token] >= MAX_TCP_OF_TOKEN:
             return
         if before is None:
             self._forget(network, one)
@@ -222,19 +229,19 @@ class Sockets(Generic[C]):
             del self._strangers[network]
 
 
-class Seats:
+class WebSocketLimits:
     """Limits the number of open WebSockets.
 
     WebSockets from the robot itself are counted separately.
     """
 
     def __init__(self) -> None:
-        self._here = Places(MAX_LOCAL_SOCKETS, MAX_LOCAL_SOCKETS)
-        self._alike = Places(CONNECTIONS, CONNECTIONS_ALIKE)
-        self._tokens = Places(CONNECTIONS, CONNECTIONS_OF_TOKEN)
-        self._networks = Places(CONNECTIONS, CONNECTIONS_OF_ONE)
+        self._here = Places(MAX_LOCAL_WEBSOCKETS, MAX_LOCAL_WEBSOCKETS)
+        self._alike = Places(MAX_WEBSOCKETS, MAX_WEBSOCKETS_OF_TOKEN_IN_NETWORK)
+        self._tokens = Places(MAX_WEBSOCKETS, MAX_WEBSOCKETS_OF_TOKEN)
+        self._networks = Places(MAX_WEBSOCKETS, MAX_WEBSOCKETS_OF_NETWORK)
 
-    def missing(self, address: str, token: str) -> str:
+    def refusal(self, address: str, token: str) -> str:
         """Return "" if a client may open a WebSocket now, else the reason and the remedy.
 
         `address` is the client's IP address, and `token` is the client's token.
@@ -249,7 +256,7 @@ class Seats:
 
         `address` is the client's IP address, and `token` is the client's token.
         """
-        if full := self.missing(address, token):
+        if full := self.refusal(address, token):
             return full
         for places, name, _ in self._places(address, token):
             places.enter(name)
@@ -266,17 +273,17 @@ class Seats:
         text for the client if the limit is reached.
         """
         if not token:
-            here = f"{MAX_LOCAL_SOCKETS} pages are open on the robot itself: close some"
+            here = f"{MAX_LOCAL_WEBSOCKETS} pages are open on the robot itself: close some"
             return [(self._here, address, here)]
         network = network_of(address)
         alike = (
-            f"{CONNECTIONS_ALIKE} pages with this token are open at {network} already: close "
-            "some, or ask for a token of your own"
+            f"{MAX_WEBSOCKETS_OF_TOKEN_IN_NETWORK} pages with this token are open at {network} "
+            "already: close some, or ask for a token of your own"
         )
-        spread = f"{CONNECTIONS_OF_TOKEN} pages with this token are open already: close some"
+        spread = f"{MAX_WEBSOCKETS_OF_TOKEN} pages with this token are open already: close some"
         full = (
-            f"{CONNECTIONS} pages are open in total, or {CONNECTIONS_OF_ONE} from {network}: "
-            "close some of them"
+            f"{MAX_WEBSOCKETS} pages are open in total, or {MAX_WEBSOCKETS_OF_NETWORK} from "
+            f"{network}: close some of them"
         )
         return [
             (self._alike, f"{network} {token}", alike),

@@ -49,7 +49,7 @@ def own_name() -> str:
     return f"{socket.gethostname().partition('.')[0].lower()}.local"
 
 
-def listens(text: str) -> Listen:
+def parse_listen(text: str) -> Listen:
     """Parse an address such as `https://0.0.0.0:8443`.
 
     Raises `UsageError` if the address is not valid, or if it has the scheme `http` and is not a
@@ -79,7 +79,7 @@ def invitations(listen: Sequence[Listen], tls: str) -> list[str]:
     first.
     """
     found: list[str] = []
-    older_ports = _older_ports(listen)
+    ipv4_ports = _ipv4_ports(listen)
     for one in listen:
         if not one.secure:
             continue
@@ -89,7 +89,7 @@ def invitations(listen: Sequence[Listen], tls: str) -> list[str]:
             own = [at for at in own_addresses() if at in certified]
             # Not every network has IPv6, so IPv4 addresses come first. A socket at `::` does not
             # accept IPv4 connections if another socket has the same port on IPv4.
-            both = one.host != EVERYWHERE_6 or one.port not in older_ports
+            both = one.host != EVERYWHERE_6 or one.port not in ipv4_ports
             older = [at for at in own if ":" not in at and both]
             newer = [at for at in own if ":" in at and one.host == EVERYWHERE_6]
             hosts = [*older, *newer, own_name()]
@@ -97,7 +97,7 @@ def invitations(listen: Sequence[Listen], tls: str) -> list[str]:
     return list(dict.fromkeys(found))
 
 
-def opened_by(one: Listen, tls: str) -> list[str]:
+def page_urls(one: Listen, tls: str) -> list[str]:
     """Return the URLs of the page at the address `one`, the most reliable URL first.
 
     `tls` is the directory of the robot's certificate.
@@ -120,18 +120,18 @@ def require_certificate(listen: Sequence[Listen], tls: str) -> None:
         require_usable(tls)
 
 
-def bound(listen: Sequence[Listen], next_port: bool) -> list[tuple[Listen, socket.socket]]:
+def open_sockets(listen: Sequence[Listen], next_port: bool) -> list[tuple[Listen, socket.socket]]:
     """Open a listening socket at each address; return pairs of the used address and the socket.
 
     If `next_port` is true and a port is in use, try the next ports, `MAX_PORTS_TRIED` ports in
     total. The used address contains the port that was free. Raises `InUseError` if no socket can be
     opened at an address.
     """
-    older_ports = _older_ports(listen)
-    return [_bound(one, next_port, one.port not in older_ports) for one in listen]
+    ipv4_ports = _ipv4_ports(listen)
+    return [_open_socket(one, next_port, one.port not in ipv4_ports) for one in listen]
 
 
-def _older_ports(listen: Sequence[Listen]) -> set[int]:
+def _ipv4_ports(listen: Sequence[Listen]) -> set[int]:
     """Return the ports at which a socket at `::` must not accept IPv4 connections.
 
     These are the ports of the addresses in `listen` whose host is an IPv4 address or a name.
@@ -139,10 +139,10 @@ def _older_ports(listen: Sequence[Listen]) -> set[int]:
     return {one.port for one in listen if ":" not in one.host}
 
 
-def _bound(one: Listen, next_port: bool, both: bool) -> tuple[Listen, socket.socket]:
+def _open_socket(one: Listen, next_port: bool, both: bool) -> tuple[Listen, socket.socket]:
     """Open a listening socket at the address `one`; return the used address and the socket.
 
-    `next_port` is explained at `bound()`. If `both` is true, a socket at `::` accepts IPv4
+    `next_port` is explained at `open_sockets()`. If `both` is true, a socket at `::` accepts IPv4
     connections too.
     """
     ports = range(one.port, min(65536, one.port + MAX_PORTS_TRIED)) if next_port else [one.port]

@@ -12,7 +12,7 @@ from typing import Literal, get_args
 
 from acsard.core.link.link_state import State
 from acsard.core.messages.schema import RobotState
-from acsard.core.messages.state_warnings import WHATS, warnings
+from acsard.core.messages.state_warnings import WARNING_KINDS, warnings
 from acsard.core.motion.modes import Mode
 from acsard.core.values import WHEELS, Event
 from acsard.web.callers import Reason
@@ -28,7 +28,7 @@ def text(
     robot: str,
     version: str,
     state: RobotState | None,
-    heard: bool,
+    is_reachable: bool,
     viewers: int,
     counts: Mapping[str, int],
     refused: Mapping[str, int],
@@ -39,7 +39,8 @@ def text(
         robot: the robot's id.
         version: the version of the daemon.
         state: the newest state of the robot, or None before the first state.
-        heard: whether messages from the daemon arrive. If not, the robot's metrics are left out.
+        is_reachable: whether messages from the daemon arrive. If not, the robot's metrics are left
+            out.
         viewers: the number of open WebSockets.
         counts: the number of the server's actions, by name.
         refused: the number of the server's refusals, by reason.
@@ -49,8 +50,8 @@ def text(
     def add(name: str, kind: Kind, what: str, samples: Iterable[Sample]) -> None:
         lines.extend(_family(f"acsard_{name}", kind, what, robot, samples))
 
-    add("up", "gauge", "1 while the daemon's messages arrive, else 0", [({}, float(heard))])
-    if state is not None and heard:
+    add("up", "gauge", "1 while the daemon's messages arrive, else 0", [({}, float(is_reachable))])
+    if state is not None and is_reachable:
         add(
             "info",
             "gauge",
@@ -81,7 +82,7 @@ def _of_robot(state: RobotState) -> Iterator[tuple[str, Kind, str, Iterable[Samp
         links,
     )
     warned = {one.what for one in warnings(state)}
-    subjects = [({"what": what}, float(what in warned)) for what in WHATS]
+    subjects = [({"what": what}, float(what in warned)) for what in WARNING_KINDS]
     yield "warning", "gauge", "1 while the robot gives this warning, else 0", subjects
     if state.certificate_days is not None:
         left: list[Sample] = [({}, state.certificate_days * 86400.0)]
@@ -138,8 +139,8 @@ def _family(
     yield f"# HELP {name} {what}"
     yield f"# TYPE {name} {kind}"
     for labels, value in samples:
-        told = {"robot": robot, **labels}
-        inner = ",".join(f'{key}="{_escaped(word)}"' for key, word in told.items())
+        all_labels = {"robot": robot, **labels}
+        inner = ",".join(f'{key}="{_escaped(word)}"' for key, word in all_labels.items())
         yield f"{name}{{{inner}}} {value!r}"
 
 
@@ -162,9 +163,10 @@ class Counts:
         self._lock = threading.Lock()
         self._counts: Counter[str] = Counter()
         self._refused: Counter[str] = Counter()
-        self._told: Counter[str] = Counter()
+        self._reported: Counter[str] = Counter()
         self._origins: Counter[str] = Counter()
-        """Number of refusals since the last call of `news`, by the client's address and name."""
+        """Number of refusals since the last call of `new_refusals`, by the client's address and
+        name."""
 
     def add(self, name: str, more: int = 1) -> None:
         with self._lock:
@@ -189,14 +191,14 @@ class Counts:
         with self._lock:
             return dict(self._refused)
 
-    def news(self) -> Event | None:
+    def new_refusals(self) -> Event | None:
         """Return a log event about the refusals since the last call of this method.
 
         Return None if nothing was refused since then.
         """
         with self._lock:
-            new = self._refused - self._told
-            self._told = Counter(self._refused)
+            new = self._refused - self._reported
+            self._reported = Counter(self._refused)
             origins, self._origins = self._origins, Counter()
         if not new:
             return None

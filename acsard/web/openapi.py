@@ -131,23 +131,23 @@ def document(version: str, routes: Sequence[Route]) -> Described:
 def _operation(row: Route, refs: Refs) -> Described:
     errors = {status: Body(what, Problem) for status, what in ERRORS.items()}
     answers = {str(status): body for status, body in row.gives.items()} | errors
-    told: Described = {
+    operation: Described = {
         "summary": row.summary,
         # The first alternative is a client on the robot itself.
         "security": [{}] if row.least is None else [{}, {"token": [row.least]}],
         "responses": {status: _answer(body, refs) for status, body in answers.items()},
     }
     if row.parameters:
-        told["parameters"] = [
+        operation["parameters"] = [
             {"name": name, "in": "path", "required": True, "schema": {"type": "string"}}
             for name in row.parameters
         ]
     if row.takes is not None:
         content = {media: {"schema": _schema(row.takes, refs)} for media in row.forms}
-        told["requestBody"] = {"required": _needed(row.takes), "content": content}
+        operation["requestBody"] = {"required": _needed(row.takes), "content": content}
     if 101 in row.gives:
-        told["x-messages"] = {"to": _ref(TO_ROBOT), "from": _ref(FROM_ROBOT)}
-    return told
+        operation["x-messages"] = {"to": _ref(TO_ROBOT), "from": _ref(FROM_ROBOT)}
+    return operation
 
 
 def _answer(body: Body, refs: Refs) -> Described:

@@ -19,10 +19,9 @@ from msgspec import Meta, Struct
 from acsard.core.values import NS_PER_S
 from acsard.host import clock
 from acsard.host.child import Limits, acsard, how_it_ended, running
-from acsard.host.errors import RecordingError
 from acsard.host.threads import NoThreadError, in_thread
 from acsard.recording.directory import NAME_TIME_FORMAT, PART_SUFFIX, is_being_recorded, listed
-from acsard.recording.end_record import how_it_ends, read_end
+from acsard.recording.end_record import ending_text, read_end
 from acsard.web.answers import READ_TIMEOUT_S, TroubleError
 from acsard.web.callers import RefusedError, is_loopback
 from acsard.web.robots import Robots
@@ -186,23 +185,20 @@ def _row(path: Path) -> Recording:
             "being recorded" if is_being_recorded(path, time.time()) else "cut off: no end marker"
         )
         return Recording(path.name, _begun(path), None, size, words)
-    try:
-        last = read_end(path)
-    except RecordingError as error:
-        return Recording(path.name, _begun(path), None, size, str(error))
+    last = read_end(path)
     if last is None:
         return Recording(path.name, _begun(path), None, size, "cut off: no end marker")
-    events = "; ".join(filter(None, [last.said, how_it_ends(last.cut, last.why)]))
+    events = "; ".join(filter(None, [last.said, ending_text(last.cut, last.why)]))
     seconds = (last.last_ns - last.wall_ns) / NS_PER_S
     return Recording(path.name, last.wall_ns / NS_PER_S, round(seconds, 3), size, events)
 
 
 def _begun(path: Path) -> float | None:
     try:
-        told = time.strptime(path.name.partition("-")[2].partition(".")[0], NAME_TIME_FORMAT)
+        begun = time.strptime(path.name.partition("-")[2].partition(".")[0], NAME_TIME_FORMAT)
     except ValueError:
         return None
-    return float(calendar.timegm(told))
+    return float(calendar.timegm(begun))
 
 
 def _unread(place: Path, error: Exception) -> TroubleError:
@@ -239,7 +235,7 @@ class _Drawing:
         self.packed = b""
         """The report, compressed by gzip; empty until the report is finished."""
         self.failed = ""
-        self.told = False
+        self.result_delivered = False
         """True once a client has received the result of the drawing."""
 
     @property
@@ -283,10 +279,14 @@ class Reports:
             return ReportState(
                 "busy", f"the report of {one.path.name} is being drawn: wait until it is finished"
             )
-        if one is None or one.path != path or (one.told and (one.failed or one.stamp != stamp)):
+        if (
+            one is None
+            or one.path != path
+            or (one.result_delivered and (one.failed or one.stamp != stamp))
+        ):
             one = self._one = _Drawing(path, stamp)
             self._work = asyncio.get_running_loop().create_task(self._draw(one))
-        one.asked_ns, one.told = now_ns, one.ended
+        one.asked_ns, one.result_delivered = now_ns, one.ended
         if one.failed:
             return ReportState("failed", one.failed)
         if one.packed:
@@ -341,7 +341,7 @@ class Reports:
     async def _drawn(self, one: _Drawing) -> bytes:
         command, limits = [*self._command, str(one.path)], Limits(CHILD_NICE, MAX_CHILD_MEMORY)
         async with running(command, limits, stdout=PIPE, stderr=PIPE) as child:
-            listening = asyncio.create_task(_listened(child, one))
+            listening = asyncio.create_task(_read_errors(child, one))
             try:
                 body, said = await _body(child), await listening
             finally:
@@ -380,7 +380,7 @@ async def _body(child: Process) -> bytes:
     return bytes(body)
 
 
-async def _listened(child: Process, one: _Drawing) -> str:
+async def _read_errors(child: Process, one: _Drawing) -> str:
     """Read the child's standard error to its end, and return the error text.
 
     A line of digits is the progress in percent. It updates `one.percent`, and is not a part of the

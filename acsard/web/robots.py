@@ -32,9 +32,9 @@ PROCESS_PERIOD_S = 0.1
 RETRY_DELAY_S = 1.0
 """Delay before the next attempt to reach a daemon that does not answer, s."""
 
-ASK_S, ASK_SOON_S = 10.0, 1.0
+ABOUT_PERIOD_S, ABOUT_RETRY_S = 10.0, 1.0
 """Delay before the next query of the values of `About`, s: after a query that the daemon has
-answered (`ASK_S`), and after a query without an answer (`ASK_SOON_S`)."""
+answered (`ABOUT_PERIOD_S`), and after a query without an answer (`ABOUT_RETRY_S`)."""
 
 PATH_S, PATH_POINTS, PATH_STEP_M = 600.0, 5000, 0.02
 """Limits of the path that the page draws: maximum age of a point, s (`PATH_S`), maximum number of
@@ -110,7 +110,7 @@ class Robots:
         self._paths = {"path": _path(), "truth": _path()}
         self._minute = Minute()
         self._poses, self._wishes = Decoder(PoseStamped), Decoder(TwistStamped)
-        self._asks = asyncio.Event()
+        self._refresh_requested = asyncio.Event()
         self._watch: Watch | None = None
 
     async def run(self) -> None:
@@ -127,7 +127,7 @@ class Robots:
 
         try:
             await self._follow(
-                await self._insisted(lambda: in_thread(watch, DECLARE_TIMEOUT_S, Watch.end))
+                await self._retried(lambda: in_thread(watch, DECLARE_TIMEOUT_S, Watch.end))
             )
         finally:
             asking.cancel()
@@ -137,11 +137,11 @@ class Robots:
         """The newest state of the robot, or None before the first state."""
         return None if self._watch is None else self._watch.state
 
-    def ask_anew(self) -> None:
+    def refresh_about(self) -> None:
         """Query the values of `about` from the daemon now, before the next regular query."""
-        self._asks.set()
+        self._refresh_requested.set()
 
-    def way(self) -> dict[str, list[tuple[float, float]]]:
+    def paths(self) -> dict[str, list[tuple[float, float]]]:
         """Return the points (x, y) of two paths in the last ten minutes, m, by name of the path.
 
         "path" is the robot's path in the odom frame. "truth" is the true path of a simulated robot,
@@ -165,7 +165,7 @@ class Robots:
                 self.gone = f"{error}; the page tries again by itself"
             await asyncio.sleep(RETRY_DELAY_S)
 
-    async def _insisted(self, call: Callable[[], Awaitable[T]]) -> T:
+    async def _retried(self, call: Callable[[], Awaitable[T]]) -> T:
         while True:
             try:
                 return await call()
@@ -191,16 +191,16 @@ class Robots:
                     "the daemon's state cannot be read: does the daemon run another version of "
                     "acsard? Use the same version here"
                 )
-            elif quiet and (watch.heard or not self.gone):
+            elif quiet and (watch.is_confirmed or not self.gone):
                 self.gone = (
                     f"nothing is received from the daemon at {self.endpoint}: does the "
                     "daemon run? `acsard doctor` on the robot finds the cause"
                 )
-            elif watch.heard and not quiet and self.gone:
+            elif watch.is_confirmed and not quiet and self.gone:
                 self.gone = ""
-                self.ask_anew()
+                self.refresh_about()
             if self.about.simulated and truth is None:
-                truth = await self._insisted(self._truth)
+                truth = await self._retried(self._truth)
             if truth is not None:
                 self._take_truth(truth, now_ns)
             await asyncio.sleep(PROCESS_PERIOD_S)
@@ -244,11 +244,11 @@ class Robots:
 
     async def _ask_again_and_again(self) -> None:
         while True:
-            self._asks.clear()
-            told = await self._ask()
+            self._refresh_requested.clear()
+            answered = await self._ask()
             try:
-                async with asyncio.timeout(ASK_S if told else ASK_SOON_S):
-                    await self._asks.wait()
+                async with asyncio.timeout(ABOUT_PERIOD_S if answered else ABOUT_RETRY_S):
+                    await self._refresh_requested.wait()
             except TimeoutError:
                 pass
 

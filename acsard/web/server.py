@@ -25,20 +25,19 @@ from acsard.daemon.bus.tls import CERTIFICATE, KEY, files_in, names_in
 from acsard.daemon.bus.zenoh_sessions import client_session
 from acsard.host.child import HEARTBEAT_S, Parent, end_with_parent
 from acsard.host.logs import Log
-from acsard.host.threads import in_thread
+from acsard.host.threads import NoThreadError, in_thread
 from acsard.web.acceptor import READ_BYTES, Acceptor, Reader
-from acsard.web.answers import READ_TIMEOUT_S
 from acsard.web.app import Page
 from acsard.web.callers import is_loopback
 from acsard.web.guide import Guide, Reach
-from acsard.web.listen import Listen, bound, own_name, require_certificate
+from acsard.web.listen import Listen, open_sockets, own_name, require_certificate
 from acsard.web.metrics import Counts
 from acsard.web.robots import About, Robots
 from acsard.web.socket_messages import DEFAULT_SOURCE
 from acsard.web.tokens import Vault
 from acsard.web.viewer import Parts
 
-TIDY_S, TELL_S = 1.0, 1.0
+TIDY_S, REPORT_PERIOD_S = 1.0, 1.0
 
 FIELD_BYTES, FIELDS = 8190, 64
 """Maximum size of the request line and of each header, bytes (`FIELD_BYTES`), and maximum number of
@@ -50,7 +49,7 @@ SHUTDOWN_S = 0.3
 drive a robot. aiohttp also waits at most this long for running requests."""
 
 
-class Wanted(Struct, frozen=True):
+class ServerOptions(Struct, frozen=True):
     """The configuration and the options of the page's server."""
 
     config: Config
@@ -67,7 +66,9 @@ class Wanted(Struct, frozen=True):
     port is in use, and ends when its standard input closes."""
 
 
-async def serve(wanted: Wanted, announce: Callable[[Sequence[Listen]], None], log: Log) -> None:
+async def serve(
+    options: ServerOptions, announce: Callable[[Sequence[Listen]], None], log: Log
+) -> None:
     """Run the page's server until a signal arrives, or until the daemon that started it ends.
 
     `announce` is called with the addresses at which the server listens. Raises `MendableError` if
@@ -78,20 +79,20 @@ async def serve(wanted: Wanted, announce: Callable[[Sequence[Listen]], None], lo
     leaving = asyncio.Event()
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
         asyncio.get_running_loop().add_signal_handler(number, leaving.set)
-    if wanted.supervised:
+    if options.supervised:
         end_with_parent(signal.SIGTERM)
         # The daemon, which started this server, must have priority over it.
         os.nice(5)
     counts = Counts()
     # `CertificateFiles` records the state of the files. Create it before the files are read, so
     # that it notices every later change.
-    files = CertificateFiles(*files_in(wanted.tls))
-    secure, names = _certified(wanted)
-    robots = Robots(wanted.address, lambda: _connected(wanted.address), _about(wanted), counts)
-    guide = Guide(_reach(wanted), wanted.config.mcu.port)
+    files = CertificateFiles(*files_in(options.tls))
+    secure, names = _certified(options)
+    robots = Robots(options.address, lambda: _connected(options.address), _about(options), counts)
+    guide = Guide(_reach(options), options.config.mcu.port)
     parts = Parts(robots, guide, counts)
-    vault, acceptor = Vault(wanted.state, wanted.address.robot_id), Acceptor(counts)
-    page = Page(parts, vault, names, acceptor, wanted.config.web)
+    vault, acceptor = Vault(options.state, options.address.robot_id), Acceptor(counts)
+    page = Page(parts, vault, names, acceptor, options.config.web)
     runner = web.AppRunner(
         page.app, access_log=None, handle_signals=False, keepalive_timeout=20.0,
         shutdown_timeout=SHUTDOWN_S, max_line_size=FIELD_BYTES, max_field_size=FIELD_BYTES,
@@ -101,31 +102,31 @@ async def serve(wanted: Wanted, announce: Callable[[Sequence[Listen]], None], lo
         await runner.setup()
         stack.push_async_callback(runner.cleanup)
         stack.push_async_callback(guide.close)
-        places = bound(wanted.listen, wanted.supervised)
+        places = open_sockets(options.listen, options.supervised)
         for one, opened in places:
             tls = secure if one.secure else None
             acceptor.listen(opened, tls, lambda: Reader(counts, runner.server))
         stack.callback(acceptor.close)
         announce([one for one, _ in places])
-        stack.callback(asyncio.create_task(_tell(counts, log)).cancel)
+        stack.callback(asyncio.create_task(_report_refusals(counts, log)).cancel)
         if secure is not None:
-            renewing = _renew(secure, names, files, wanted.tls, log)
+            renewing = _renew(secure, names, files, options.tls, log)
             stack.callback(asyncio.create_task(renewing).cancel)
-        await _until(leaving, parts, page, wanted)
+        await _until(leaving, parts, page, options)
         page.end_all("the page's server ends")
         await asyncio.sleep(0)
         await asyncio.to_thread(parts.commands.outbox.flush, SHUTDOWN_S)
 
 
-async def _until(leaving: asyncio.Event, parts: Parts, page: Page, wanted: Wanted) -> None:
+async def _until(leaving: asyncio.Event, parts: Parts, page: Page, options: ServerOptions) -> None:
     work: list[asyncio.Future[Any]] = [
         asyncio.create_task(leaving.wait()),
         asyncio.create_task(parts.robots.run()),
         asyncio.create_task(_tidy(page)),
         asyncio.wrap_future(parts.commands.outbox.dead),
     ]
-    if wanted.supervised:
-        work.append(asyncio.create_task(_held(leaving)))
+    if options.supervised:
+        work.append(asyncio.create_task(_watch_parent(leaving)))
     try:
         done, _ = await asyncio.wait(work, return_when=asyncio.FIRST_COMPLETED)
         for task in done:
@@ -141,14 +142,14 @@ async def _tidy(page: Page) -> None:
         await page.tidy()
 
 
-async def _tell(counts: Counts, log: Log) -> None:
+async def _report_refusals(counts: Counts, log: Log) -> None:
     while True:
-        await asyncio.sleep(TELL_S)
-        if (news := counts.news()) is not None:
-            log.event(news)
+        await asyncio.sleep(REPORT_PERIOD_S)
+        if (refusals := counts.new_refusals()) is not None:
+            log.event(refusals)
 
 
-async def _held(leaving: asyncio.Event) -> None:
+async def _watch_parent(leaving: asyncio.Event) -> None:
     """Send signs of life to the parent process, the daemon, until this task is cancelled.
 
     Set `leaving` when the parent closes this process's standard input.
@@ -173,13 +174,13 @@ def _connected(address: Address) -> Client:
     return Client(session, address.robot_id, DEFAULT_SOURCE, address.tls, address.endpoint)
 
 
-def _reach(wanted: Wanted) -> Reach:
-    address = wanted.address
-    return Reach(wanted.file, address.endpoint, address.robot_id, address.tls)
+def _reach(options: ServerOptions) -> Reach:
+    address = options.address
+    return Reach(options.file, address.endpoint, address.robot_id, address.tls)
 
 
-def _about(wanted: Wanted) -> About:
-    config = wanted.config
+def _about(options: ServerOptions) -> About:
+    config = options.config
     return About(
         "",
         config.mcu.simulated,
@@ -191,19 +192,19 @@ def _about(wanted: Wanted) -> About:
     )
 
 
-def _certified(wanted: Wanted) -> tuple[ssl.SSLContext | None, set[str]]:
+def _certified(options: ServerOptions) -> tuple[ssl.SSLContext | None, set[str]]:
     """Return the TLS context, and the names and addresses of this machine for the network.
 
     Return None and an empty set if no address uses HTTPS. Raises `MendableError` if the certificate
     is not usable.
     """
-    if not any(one.secure for one in wanted.listen):
+    if not any(one.secure for one in options.listen):
         return None, set()
-    require_certificate(wanted.listen, wanted.tls)
+    require_certificate(options.listen, options.tls)
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.minimum_version = ssl.TLSVersion.TLSv1_2
-    _load(context, wanted.tls)
-    return context, _names(wanted.tls)
+    _load(context, options.tls)
+    return context, _names(options.tls)
 
 
 def _load(context: ssl.SSLContext, directory: str) -> None:
@@ -219,16 +220,12 @@ async def _renew(
     context: ssl.SSLContext, names: set[str], files: CertificateFiles, directory: str, log: Log
 ) -> None:
     renewed, reported = False, ""
-
-    def late(found: bool) -> None:
-        nonlocal renewed
-        renewed |= found
-
     while True:
         await asyncio.sleep(TIDY_S)
-        # A hanging disk must not hang the page.
-        with suppress(TimeoutError):
-            renewed |= await in_thread(files.renewed, READ_TIMEOUT_S, late)
+        # Wait without a time limit. With a limit, each attempt to read from a disk that hangs would
+        # leave one more blocked thread. Only this task waits, and not the page.
+        with suppress(NoThreadError):
+            renewed = await in_thread(files.renewed, None) or renewed
         if not renewed:
             continue
         try:

@@ -41,8 +41,8 @@ class Following:
         The client gets at most one value per `period` s. `own` is the id of the page's own robot.
         """
         self.robot, self.name, self.period = robot, name, period
-        told = {"key": name} if robot == own else {"key": name, "robot": robot}
-        self.head = msgspec.json.encode(told)[:-1] + b',"value":'
+        head = {"key": name} if robot == own else {"key": name, "robot": robot}
+        self.head = msgspec.json.encode(head)[:-1] + b',"value":'
         self.stream: Stream | None = None
         self.sent = 0
         self.due = 0.0
@@ -177,7 +177,7 @@ class Outgoing:
         return 0 if self._transport is None else self._transport.get_write_buffer_size()
 
 
-MAX_QUEUED = 32
+MAX_SUBSCRIBED_KEYS = 32
 
 MAX_FRAMES_HZ = 300.0
 """Maximum sum of the message rates of all keys of one WebSocket, Hz. A higher sum would take
@@ -225,16 +225,17 @@ class Keys:
             self._out.refuse(
                 "subscribe",
                 "too_many",
-                f"all keys together have over {MAX_FRAMES_HZ:g} messages a second: lower the rates",
+                f"the rates of your keys add up to more than {MAX_FRAMES_HZ:g} messages a second: "
+                "lower some of them",
             )
         elif known is not None:
             known.period, known.due = 1.0 / frame.rate, 0.0
             self._out.wake()
-        elif len(self._out.following) >= MAX_QUEUED:
+        elif len(self._out.following) >= MAX_SUBSCRIBED_KEYS:
             self._out.refuse(
                 "subscribe",
                 "too_many",
-                f"you already follow {MAX_QUEUED} keys: unsubscribe from some",
+                f"you already follow {MAX_SUBSCRIBED_KEYS} keys: unsubscribe from some",
             )
         elif robot != self._robots.id and not self._shares.enter(self._holder, (robot, key)):
             text = (

@@ -18,7 +18,7 @@ import zenoh
 from acsard.client import Client
 from acsard.core.messages.encodings import DecodeError, detect
 from acsard.core.messages.keys_and_roles import FOLLOWED
-from acsard.daemon.bus.subscription import encoded, on
+from acsard.daemon.bus.subscription import encoded, has_exact_key
 from acsard.host import clock
 from acsard.host.errors import UsageError
 from acsard.host.threads import in_thread
@@ -152,14 +152,14 @@ class Streams:
             task.add_done_callback(self._ending.discard)
 
     async def _declare(self, own: Client, robot: str, key: str, stream: Stream) -> Any:
-        client = own.like(robot)
+        client = own.sibling(robot)
         asks = key not in STORED_KEYS or own.key(key) == client.key(key)
 
         def late(subscriber: Any) -> None:
             subscriber.undeclare()
 
         def of_it(take: Take) -> Take:
-            return lambda sample: take(sample) if on(client.key(key), sample) else None
+            return lambda sample: take(sample) if has_exact_key(client.key(key), sample) else None
 
         def declare() -> Any:
             heard = client.listen(key, of_it(stream.take))
@@ -185,7 +185,7 @@ def as_json(encoding: str, payload: bytes) -> bytes:
     """Return a JSON or msgpack message as JSON, or as `null` if it cannot be decoded."""
     try:
         known = detect(encoding, payload) == "json"
-        told = msgspec.json.decode(payload) if known else msgspec.msgpack.decode(payload)
-        return payload if known else msgspec.json.encode(told)
+        value = msgspec.json.decode(payload) if known else msgspec.msgpack.decode(payload)
+        return payload if known else msgspec.json.encode(value)
     except (DecodeError, msgspec.MsgspecError, ValueError, RecursionError, TypeError):
         return b"null"

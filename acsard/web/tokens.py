@@ -22,7 +22,7 @@ from msgspec import Struct
 from acsard.core.values import Role
 from acsard.host.atomic_file import replace
 from acsard.host.errors import MSGSPEC_ERRORS, MendableError, NotPermittedError, UsageError
-from acsard.web.callers import Who
+from acsard.web.callers import Identity
 
 FILE, MODE = "tokens.json", 0o600
 
@@ -59,11 +59,11 @@ class Vault:
         last read, and all tokens in the file. They are in one tuple, because several threads
         replace them."""
 
-    def known(self, text: str) -> Who | None:
+    def known(self, text: str) -> Identity | None:
         """Return the owner of the token `text`, or None if the token is not valid.
 
         This method does not read the token file. It uses the tokens that the last call of `all()`,
-        `counting()` or `left_s()` has read.
+        `valid_digests()` or `left_s()` has read.
         """
         return owner_in(self._own(self._read[1]), text)
 
@@ -99,7 +99,7 @@ class Vault:
         self._read = read
         return read[1]
 
-    def counting(self) -> frozenset[str]:
+    def valid_digests(self) -> frozenset[str]:
         """Return the digests of the tokens that are valid now."""
         now_s = time.time()
         return frozenset(one.digest for one in self.all() if one.ends > now_s)
@@ -217,7 +217,7 @@ def place() -> Path:
     return Path(base) / "acsard-web"
 
 
-def owner_in(tokens: Sequence[Token], text: str) -> Who | None:
+def owner_in(tokens: Sequence[Token], text: str) -> Identity | None:
     """Return the owner of the token with the text `text`.
 
     Return None if the token has expired, or if `tokens` does not contain it.
@@ -230,7 +230,7 @@ def owner_in(tokens: Sequence[Token], text: str) -> Who | None:
             found = token
     if found is None or found.ends <= time.time():
         return None
-    return Who(found.role, found.name, found.digest)
+    return Identity(found.role, found.name, found.digest)
 
 
 def _digest(text: str) -> str:

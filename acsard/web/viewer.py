@@ -15,7 +15,7 @@ import aiohttp
 from aiohttp import web
 
 from acsard.client import Client
-from acsard.client.commander import MAX_OPEN_TIMEOUT_S, Commander, Sender, Wish
+from acsard.client.commander import MAX_SOURCE_TIMEOUT_S, Commander, Sender, Wish
 from acsard.client.outbox import Outbox
 from acsard.core.messages import schema
 from acsard.core.messages.permissions import COMMAND_ROLE, SERVICE_ROLES
@@ -25,7 +25,7 @@ from acsard.host import clock
 from acsard.host.own_identity import sender_id
 from acsard.host.rate_limits import Bucket, Buckets
 from acsard.web import socket_messages
-from acsard.web.callers import RefusedError, Who
+from acsard.web.callers import Identity, RefusedError
 from acsard.web.calls import Calls
 from acsard.web.fleet_rows import Fleet
 from acsard.web.guide import Guide
@@ -99,7 +99,7 @@ class ViewerCommands:
             sender: the signer of the viewer's commands.
             wish: the command.
         """
-        ends = wish.twist == REST and commander.moves
+        ends = wish.twist == REST and commander.last_is_nonzero
         if not self._rates.take(owner, clock.mono_ns()) and not ends:
             return False
         replaced = commander.replaced
@@ -141,7 +141,7 @@ class Viewer:
         self,
         socket: web.WebSocketResponse,
         request: web.Request,
-        who: Who,
+        who: Identity,
         parts: Parts,
         *,
         camera: bool,
@@ -169,7 +169,7 @@ class Viewer:
 
     async def run(self) -> None:
         self._greet()
-        self._out.say(socket_messages.DrivenPath(**self._robots.way()))
+        self._out.say(socket_messages.DrivenPath(**self._robots.paths()))
         self._out.say(socket_messages.LastMinute(self._robots.minute()))
         self._guide.join(self, self._out.say)
         pump = asyncio.create_task(self._out.pump(self._look_around))
@@ -245,7 +245,7 @@ class Viewer:
             self._out.pong(message.data)
 
     def _obey(self, frame: Frame) -> None:
-        self._guide.heard(self)
+        self._guide.on_message(self)
         try:
             self.who.require(frame.least, frame.kind)
         except RefusedError as error:
@@ -294,14 +294,14 @@ class Viewer:
         commander = self._commanders.setdefault(frame.source, Commander())
         owner = self.who.token or self.sender
         if not self._commands.give(owner, frame.source, commander, self._sender, wish):
-            text = f"more than {COMMAND_RATE.hz:g} commands a second with one token: send fewer"
+            text = f"you send more than {COMMAND_RATE.hz:g} commands a second: send fewer"
             self._out.refuse("cmd", "too_fast", text)
 
     def _release(self) -> None:
         """Queue a zero velocity for each source with which this viewer may still be driving."""
         timeouts = self._robots.about.timeouts
         for source, commander in self._commanders.items():
-            self._commands.outbox.release(commander, timeouts.get(source, MAX_OPEN_TIMEOUT_S))
+            self._commands.outbox.release(commander, timeouts.get(source, MAX_SOURCE_TIMEOUT_S))
 
     def _call(self, frame: Call) -> None:
         if frame.call == "stop":
@@ -367,7 +367,7 @@ class Viewer:
             about.simulated,
             about.state_hz,
             {
-                what: self.who.barred(least)
+                what: self.who.why_not_allowed(least)
                 for what, least in ACTIONS.items()
                 if not self.who.may(least)
             },

@@ -65,7 +65,7 @@ def rig(
         with Rig(
             one,
             file,
-            words=words,
+            command_line=words,
             port=port,
             free_running=free_running,
             wire_baud_rate=wire_baud_rate,

@@ -21,8 +21,8 @@ from acsard.core.config.toml_text import document
 from acsard.core.guard import Guard
 from acsard.core.robot import Robot
 from acsard.core.values import Inputs, Instant, Outputs, Recording
-from acsard.recording.file import About, Writing
-from acsard.recording.recorded_steps import Taken
+from acsard.recording.file import About, RecordingWriter
+from acsard.recording.recorded_steps import FinishedStep
 from acsard.recording.rows import encode
 from tests.scenarios.world import START, World
 from tests.system.harness import ROOT, finish
@@ -45,14 +45,14 @@ class Streamed:
     def __init__(self, path: Path, config: Config, start: Instant) -> None:
         text = "\n".join(document(effective(config))) + "\n"
         about = About(config.robot.id, "0.1.0", "3.11.0", start.mono_ns, start.wall_ns, text)
-        self.writing = Writing(path, about)
-        self._taken: list[Taken] = []
+        self.writing = RecordingWriter(path, about)
+        self._taken: list[FinishedStep] = []
         self._number = 0
 
     def step(
         self, inputs: Inputs, outputs: Outputs, left: bytes | None, robot: Robot, guard: Guard
     ) -> None:
-        self._taken.append(Taken(inputs, outputs, left))
+        self._taken.append(FinishedStep(inputs, outputs, left))
         if len(self._taken) == BATCH:
             at_ns = self._taken[0].inputs.now.wall_ns
             self.writing.add("steps", at_ns, encode(self._number, self._taken))

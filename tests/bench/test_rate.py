@@ -58,7 +58,7 @@ def missed_share(rate: float, realtime: bool) -> float:
         before = taken(running)
         used = running.follow(SECONDS)
         seconds, missed, lines = (b - a for a, b in zip(before, taken(running), strict=True))
-        running.leave()
+        running.end_program()
     share = missed / max(1.0, seconds * rate)
     print(
         f"  {rate:6.0f} Hz: {100 * share:5.2f} % missed, {rate * (1 - share):.0f} steps and "
@@ -92,7 +92,7 @@ def test_the_lateness_of_a_period_idle_and_busy(realtime: bool) -> None:
             scheduled(running, realtime)
             running.follow(10.0)
             state = running.state()
-            running.leave()
+            running.end_program()
         late = state.latencies["period_lateness"].since_start
         missed = state.counters.get("missed_periods", 0)
         print(

@@ -147,7 +147,7 @@ def test_a_faster_microcontroller_leaves_no_backlog_here_and_a_growing_one_there
         over = sum(count > 1 for count in waiting)
         print(
             f"\n{name}: microcontroller at {hz:g} Hz, host at {one.rate_hz:g} Hz, {seconds:g} s: "
-            f"{len(record.said)} lines, {len(fates)} told\n"
+            f"{len(record.feedback_lines)} lines, {len(fates)} told\n"
             f"  backlog by the second, lines: {' '.join(map(str, backlog[name]))}\n"
             f"  more than one newer line waiting: {over} of {len(fates)} samples; "
             f"the last line took {fates[-1].delay_ns / 1e6:.1f} ms"

@@ -71,7 +71,7 @@ def native(one: Config) -> tuple[str, ...]:
 def test_the_cost_of_each_transport() -> None:
     one = config()
     with rig(one) as running:
-        running.deaf()
+        running.unsubscribe()
 
         def cost(keys: tuple[str, ...]) -> float:
             with listening(one, keys, 1 if keys else 0):
@@ -99,7 +99,7 @@ def test_the_cost_of_each_transport() -> None:
 def test_the_cost_of_more_subscribers() -> None:
     one = config()
     with rig(one) as running:
-        running.deaf()
+        running.unsubscribe()
 
         def cost(sessions: int) -> float:
             with listening(one, native(one)[:1], sessions):
@@ -148,7 +148,7 @@ def test_the_cost_of_more_robots() -> None:
             ]
             after = [missed_and_due(robot) for robot in robots]
             for robot in robots:
-                robot.leave()
+                robot.end_program()
         missed = sum(b[0] - a[0] for a, b in zip(before, after, strict=True))
         periods = sum(b[1] - a[1] for a, b in zip(before, after, strict=True))
         shares[number] = median(costs)

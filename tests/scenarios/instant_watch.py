@@ -13,4 +13,4 @@ class InstantWatch(LateWatch):
     def period(self, now_ns: int, late_ns: int, missed: int) -> None:
         if missed:
             late = Lateness(late_ns, Scheduled(0, late_ns), Reading(), Reading())
-            self._news.put(event_of(late, causes(late)[1], news=True))
+            self._news.put(event_of(late, causes(late)[1], immediate=True))

@@ -17,8 +17,8 @@ from acsard.core.robot import Robot
 from acsard.core.simulator.fake_mcu import FakeMcu
 from acsard.core.simulator.faults import Fault
 from acsard.core.values import Inputs, Outputs, Recording
-from acsard.recording.file import About, Writing
-from acsard.recording.recorded_steps import Step, Taken
+from acsard.recording.file import About, RecordingWriter
+from acsard.recording.recorded_steps import FinishedStep, Step
 from acsard.recording.replay import Replay
 from acsard.recording.rows import decode, encode
 from acsard.recording.state import Checkpoint, freeze, thaw
@@ -55,7 +55,7 @@ class Tape:
     def __init__(self, every: int = 0) -> None:
         """`every` is the number of steps between two states that it records without being asked."""
         self._every = every
-        self.taken: list[Taken] = []
+        self.taken: list[FinishedStep] = []
         self.states: dict[int, bytes] = {}
         """The robot before the step of that number, for the steps that `cut` requests."""
         self.cut = False
@@ -64,7 +64,7 @@ class Tape:
     def step(
         self, inputs: Inputs, outputs: Outputs, left: bytes | None, robot: Robot, guard: Guard
     ) -> None:
-        self.taken.append(Taken(inputs, outputs, left))
+        self.taken.append(FinishedStep(inputs, outputs, left))
         if self.cut or (self._every and len(self.taken) % self._every == 0):
             self.cut = False
             self.states[len(self.taken)] = freeze(robot, guard.memory)
@@ -102,7 +102,7 @@ class Tape:
             text,
             started_ns=START.wall_ns,
         )
-        writing = Writing(path, about)
+        writing = RecordingWriter(path, about)
         if first:
             writing.add("state", now.wall_ns, Checkpoint(first, self.states[first]).encode())
         taken = self.taken[:end]

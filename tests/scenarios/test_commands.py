@@ -237,16 +237,16 @@ def test_failed_hardware_holds_the_robot_and_the_reason_is_reported(world: World
             world.send(0.0, source="ros2_control")
             world.send(0.3, source="nav")
             world.run(0.05)
-        assert ("held by ros2_control" in world.state.reason) == (second >= 3)
+        assert ("ros2_control keeps the robot at rest" in world.state.reason) == (second >= 3)
     # a person may hold the robot by these zeros, so no other client drives past them
     assert world.state.linear == 0.0
     assert world.state.reason == (
-        "driving: held by ros2_control, which has sent only zeros for over 10 s; nav sends "
-        "speeds and must wait"
+        "driving: ros2_control keeps the robot at rest: it has sent only zeros for over 10 s; the "
+        "speeds of nav have no effect"
     )
     (told,) = [event.text for event in world.events if event.name == "commands_without_effect"]
-    assert "held by ros2_control" in told
-    assert "nav sends speeds" in told
+    assert "ros2_control keeps the robot at rest" in told
+    assert "the speeds of nav have no effect" in told
     world.run(0.3)
     world.drive(0.3, seconds=0.5, source="nav")
     assert world.state.reason == "driving: commanded by nav"
@@ -445,7 +445,7 @@ def test_only_the_first_of_two_senders_on_a_key_is_obeyed_and_the_second_is_repo
     assert world.state.linear == pytest.approx(0.4, abs=0.03)
     assert (
         waits_for(world)
-        == "1 more of this source's senders must wait until the first one is silent"
+        == "1 other sender of this source must wait until the sender that drives falls silent"
     )
     for _ in range(40):
         second.send(-0.4)

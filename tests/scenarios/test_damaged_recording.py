@@ -15,7 +15,7 @@ from acsard.host.errors import Exit
 from acsard.recording import recorder as module
 from acsard.recording import step_writer
 from acsard.recording.directory import listed
-from acsard.recording.file import CHANNEL_NUMBERS, Recording, Writing, event_of, rewrite
+from acsard.recording.file import CHANNEL_NUMBERS, Recording, RecordingWriter, event_of, rewrite
 from acsard.recording.file_replay import EventCopies, RecordedRun, replay_file, steps
 from acsard.recording.mcap_records import walk
 from acsard.recording.recorder import Recorder
@@ -230,7 +230,7 @@ def test_a_lost_chunk_whose_events_begin_the_next_one_is_not_reported_as_a_forge
         n for n, (topic, _, data) in enumerate(messages) if topic == "events" and b"stop" in data
     )
     lost = max(number for number in batches if number < stop)
-    writing = Writing(tmp_path / "b.mcap", recording.about)
+    writing = RecordingWriter(tmp_path / "b.mcap", recording.about)
     for number, (topic, wall_ns, data) in enumerate(messages):
         if topic == "events":
             writing.event(event_of(recording, data))

@@ -17,8 +17,8 @@ from acsard.core.config.settings import Config
 from acsard.core.values import Event
 from acsard.host.errors import Exit
 from acsard.recording.end_record import read_end
-from acsard.recording.file import Recording, Topic, Writing
-from acsard.recording.rows import NO_RARE, Batch, Rare, Row
+from acsard.recording.file import Recording, RecordingWriter, Topic
+from acsard.recording.rows import NO_OCCASIONAL_FIELDS, Batch, OccasionalFields, Row
 from acsard.recording.timeline import TimelineEntry
 from tests.each import each, more
 from tests.scenarios.taped import happenings, recorded_world
@@ -43,14 +43,16 @@ def forged_word(word: str, dice: random.Random) -> str:
 
 
 def forge_row(
-    messages: Messages, dice: random.Random, forge: Callable[[Rare], Rare | None]
+    messages: Messages,
+    dice: random.Random,
+    forge: Callable[[OccasionalFields], OccasionalFields | None],
 ) -> None:
     """Forge one row, out of those for which `forge` returns other values than None."""
-    places: list[tuple[int, int, Rare]] = []
+    places: list[tuple[int, int, OccasionalFields]] = []
     for number, (topic, _, data) in enumerate(messages):
         if topic == "steps":
             for index, row in enumerate(BATCH.decode(data).rows):
-                forged = forge(row.rare or NO_RARE)
+                forged = forge(row.rare or NO_OCCASIONAL_FIELDS)
                 if forged is not None:
                     places.append((number, index, forged))
     number, index, rare = dice.choice(places)
@@ -65,7 +67,7 @@ def forge_row(
 def forge_status(messages: Messages, dice: random.Random, place: int) -> None:
     """Forge the reason or the source that a row holds; `place` is its index in the status."""
 
-    def forge(rare: Rare) -> Rare | None:
+    def forge(rare: OccasionalFields) -> OccasionalFields | None:
         if rare.status is None:
             return None
         status = list(rare.status)
@@ -148,7 +150,7 @@ def input_name(field: str, part: str) -> Forge:
     """
 
     def forge(messages: Messages, dice: random.Random) -> None:
-        def forged(rare: Rare) -> Rare | None:
+        def forged(rare: OccasionalFields) -> OccasionalFields | None:
             if not (inputs := getattr(rare, field)):
                 return None
             first, *others = inputs
@@ -196,7 +198,7 @@ def forged_files(original: Path, path: Path, forge: Forge, count: int) -> Iterat
         messages = list(recording.messages())
         forge(messages, random.Random(seed))
         path.unlink(missing_ok=True)
-        writing = Writing(path, recording.about)
+        writing = RecordingWriter(path, recording.about)
         for topic, wall_ns, data in messages:
             if topic == "events":
                 writing.event(msgspec.json.decode(data, type=TimelineEntry))

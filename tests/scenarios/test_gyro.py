@@ -131,7 +131,7 @@ def test_a_gyro_that_dies_is_reported_and_the_wheels_go_on() -> None:
     made.gyro_dead = False
     made.hold(0.3, 0.5, 1.0)
     told = [event.text.partition(":")[0] for event in made.events if event.name == "gyro"]
-    assert told == ["waiting for rest", "used", "silent", "used"]
+    assert told == ["waiting for rest", "waiting for turn", "silent", "used"]
 
 
 @pytest.mark.slow
@@ -174,7 +174,7 @@ def test_an_implausible_gyro_sample_is_counted_and_changes_nothing() -> None:
     made.run(1.0)
     assert made.state.counters["imu_out_of_range"] == 1
     assert made.state.counters["imu_malformed"] == 1
-    assert made.state.gyro == "used"
+    assert made.state.gyro == "waiting for turn"
     assert made.state.yaw == 0.0
 
 

@@ -70,10 +70,7 @@ def test_a_clear_read_before_a_later_stop_and_delivered_after_it_is_refused(worl
     world.run(3.0)
     reply = call(world, "clear", "ann", seen)
     assert (reply.success, world.state.mode) == (False, "stopped")
-    assert (
-        f"would release another latch; the robot is still stopped by {JOE} (native)"
-        in reply.message
-    )
+    assert f"would release now; the robot is still stopped by {JOE} (native)" in reply.message
     assert call(world, "clear", "ann", world.state.latch).success
     assert world.state.mode == "ready"
 
@@ -191,7 +188,7 @@ def test_an_activate_read_before_a_later_deactivate_and_delivered_after_it_is_re
     world.run(3.0)
     reply = call(world, "activate", "eve", seen)
     assert (reply.success, world.state.mode) == (False, "inactive")
-    told = f"would release another latch; the robot is still switched off by {JOE} (native)"
+    told = f"would release now; the robot is still switched off by {JOE} (native)"
     assert told in reply.message
     assert call(world, "activate", "ann", world.state.latch).success
     assert world.state.mode == "ready"
@@ -235,7 +232,8 @@ def test_a_fault_does_not_overwrite_a_stop(world: World) -> None:
     reply = call(world, "clear", "ann", world.state.latch)
     assert (reply.success, reply.message) == (
         True,
-        f"fault cleared, but the robot is still stopped by {JOE} (native): call srv/clear again",
+        f"fault cleared, but the robot is still stopped by {JOE} (native): call srv/clear again "
+        "in 2 s",
     )
     assert world.state.mode == "stopped"
     world.drive(0.5, seconds=1.0)
@@ -269,8 +267,10 @@ def test_a_stop_during_a_fault_is_latched_as_well(world: World) -> None:
     runaway(world)
     fault = world.state.latch
     reply = call(world, "stop", "joe")
-    twice = "call srv/clear twice: the first call releases the fault, the second the stop"
-    assert reply.message == f"stopped and latched; {twice}"
+    assert reply.message == (
+        "stopped and latched; call srv/clear twice, 2 s apart: the first call releases the fault, "
+        "the second call releases the stop"
+    )
     assert world.state.latch == fault
     assert call(world, "clear", "ann", fault).success
     assert world.state.mode == "stopped"
@@ -285,10 +285,7 @@ def test_two_clears_of_one_fault_do_not_release_the_stop_under_it(world: World) 
     assert call(world, "clear", "ann", fault).success
     reply = call(world, "clear", "eve", fault)
     assert (reply.success, world.state.mode) == (False, "stopped")
-    assert (
-        f"would release another latch; the robot is still stopped by {JOE} (native)"
-        in reply.message
-    )
+    assert f"would release now; the robot is still stopped by {JOE} (native)" in reply.message
 
 
 # a restart

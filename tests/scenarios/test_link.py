@@ -469,7 +469,7 @@ def test_the_mcu_stops_the_motors_by_itself_when_the_host_dies(world: World) -> 
 @pytest.mark.parametrize("fault", ["lost_replies", "lost_commands"])
 def test_a_link_that_loses_lines_is_reported_once(fault: str) -> None:
     world = World()
-    with world.mcu.having(named(fault)):
+    with world.mcu.switched_on(named(fault)):
         world.run(25.0)
     told = [event for event in world.events if event.name == "lines_lost"]
     assert [event.level for event in told] == ["warning"]
@@ -486,7 +486,7 @@ def test_a_sound_link_is_not_reported_to_lose_lines() -> None:
 
 def test_each_silence_of_a_board_is_counted() -> None:
     world = World()
-    with world.mcu.having(named("stalls=1:0.3")):
+    with world.mcu.switched_on(named("stalls=1:0.3")):
         world.run(5.5)
     assert world.state.counters["link_lost"] == 5
 
@@ -515,7 +515,7 @@ def test_a_silent_or_garbled_board_is_diagnosed_by_the_received_bytes(
     fault: str, heard: str, mend: str
 ) -> None:
     world = World(wanted={"state"})
-    with world.mcu.having(named(fault)):
+    with world.mcu.switched_on(named(fault)):
         world.run(2.9)
         assert "first good lines" in world.state.reason
         states = len(world.bus.published["state"])

@@ -89,7 +89,7 @@ def test_a_new_mcu_is_driven_with_checked_lines(check: str) -> None:
     assert texts(world, "link_check") == ["the lines on the serial port are now checked"]
     heard = moving(world.lines())
     assert len(heard) > 150
-    assert all(protocol.whole(line) and b"#" in line for line in heard)
+    assert all(protocol.reference(line) and b"#" in line for line in heard)
     world.run(1.5)
     assert stopped(world)
     assert world.state.x == pytest.approx(world.mcu.vehicle.pose.x, abs=0.005)
@@ -303,7 +303,7 @@ def flips(line: bytes) -> Iterator[bytes]:
             yield b"%b%c%b" % (line[:place], line[place] ^ 1 << bit, line[place + 1 :])
 
 
-def accepted_by_the_mcu(data: bytes, understand: object = protocol.whole) -> list[object]:
+def accepted_by_the_mcu(data: bytes, understand: object = protocol.reference) -> list[object]:
     """Return the commands that an MCU reads from these bytes if it cuts its input at line feeds."""
     assert callable(understand)
     found = [understand(piece + b"\n") for piece in data.split(b"\n")[:-1]]
@@ -334,7 +334,7 @@ def test_no_single_bit_error_changes_a_value_on_a_checked_link(count: int) -> No
         text = plain[:-2]
         reply = text + protocol.suffix(text, sequence, sample) + b"\r\n"
         command = text + protocol.suffix(text, sequence, ()) + b"\r\n"
-        said, meant = codec.decode(text), protocol.whole(plain)
+        said, meant = codec.decode(text), protocol.reference(plain)
         assert meant is not None
         # There is one line end more, so that no damage reaches the next line.
         for data in flips(reply):
@@ -545,7 +545,7 @@ def test_whatever_happens_no_unchecked_line_moves_a_wheel_and_the_pose_never_jum
             line = outputs.line
             if line is not None and not line.startswith(ZERO):
                 assert outputs.linked
-                assert protocol.whole(line)
+                assert protocol.reference(line)
                 assert b"#" in line
                 assert world.loop.robot.session.negotiation.checked
             for estimate in outputs.estimates:

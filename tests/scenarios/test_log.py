@@ -161,7 +161,7 @@ def test_a_drive_is_reported_as_changes_of_mode_and_commander(world: World) -> N
         "driving -> ready: waiting for a command: no source has sent one within its timeout",
     ]
     assert [event.text for event in told(world, "commander")] == [
-        f"nobody -> app ({public_name('somebody')})"
+        f"no sender -> app ({public_name('somebody')})"
     ]
 
 
@@ -227,7 +227,7 @@ def test_the_cause_of_a_late_period_is_in_the_line_that_follows() -> None:
     world.stall(0.05)
     world.run(1.1)
     number, cause = told(world, "missed_periods")
-    assert number.text == "4 x missed: 4 control periods in a row"
+    assert number.text == "4 x missed: no control step ran in 4 successive control periods"
     assert cause.text.startswith("late: by 0.04 s, because other programs used the processor for")
 
 

@@ -16,7 +16,7 @@ from typing import Literal
 import msgspec
 import pytest
 
-from acsard.client.commander import Commander, Wish, ends_hold
+from acsard.client.commander import Commander, Wish, must_release_key
 from acsard.core.config.parsing import parse
 from acsard.core.messages.encodings import encode
 from acsard.core.messages.schema import Header, JointState, Time, Twist, TwistStamped, Vector3
@@ -704,13 +704,15 @@ class Panel(Speaker):
 
     def __init__(self, world: World, stamped: bool = False) -> None:
         super().__init__(world, "signed")
-        self._server = Commander(leads=True, gathers=True)
+        self._server = Commander(sends_leading_zero=True, detects_bursts=True)
         self._stamped = stamped
 
     def connect(self) -> None:
         """Connect again, as a new sender."""
         self.name += "+"
-        self._server = Commander(leads=True, gathers=True, since_ns=self.world.now_ns)
+        self._server = Commander(
+            sends_leading_zero=True, detects_bursts=True, connected_ns=self.world.now_ns
+        )
 
     def button(self, linear: float, seconds: float, period: float = 0.1) -> None:
         """Hold a button."""
@@ -739,10 +741,10 @@ def test_the_foxglove_panel_drives_when_its_button_is_released_and_pressed_again
     drives(world, lambda: panel.button(FAST, 1.0))
     stop_and_clear(world, lambda: panel.button(FAST, CLEAR_S))
     stands(world, lambda: panel.button(FAST, 2.0))
-    assert ends_hold(world.state, "app")
+    assert must_release_key(world.state, "app")
     panel.release(2.0)
     drives(world, lambda: panel.button(FAST, 0.5))
-    assert not ends_hold(world.state, "app")
+    assert not must_release_key(world.state, "app")
 
 
 def test_a_new_connection_does_not_arm_a_panel_whose_button_is_held(world: World) -> None:

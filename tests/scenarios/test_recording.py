@@ -48,7 +48,7 @@ def lives_again(tape: Tape, config: Config, first: int = 0, least: int = 100) ->
     assert comparison.poses == comparison.poses_same == poses >= least
     assert comparison.end is not None
     assert comparison.end[0] == comparison.end[1]
-    assert comparison.apart == 0.0
+    assert comparison.max_distance_m == 0.0
 
 
 @pytest.mark.slow
@@ -67,7 +67,7 @@ def test_a_recording_that_begins_in_a_ramp_stores_when_the_ramp_was_commanded(af
     guard = late._guard
     assert late.outputs is not None
     moving = replace(late.outputs, line=b"ap01.00,bp01.00,cp01.00,dp01.00\r\n")
-    guard.left(b"ap01.00,bp01.00,cp01.00,dp01.00\r\n")
+    guard.record_written(b"ap01.00,bp01.00,cp01.00,dp01.00\r\n")
     assert "ramp to zero has ended" in guard.check(moving)[1]
 
 
@@ -193,7 +193,7 @@ def test_a_replay_with_other_limits_reports_the_first_line_that_differs() -> Non
     assert first is not None
     assert first.what == ("line", "sent line")
     assert first.recorded.status[0] == first.replayed.status[0] == "driving"
-    assert comparison.fastest == (1000, 600)  # 0.5 and 0.3 m/s on wheels of 0.05 m
+    assert comparison.max_wheel_speeds == (1000, 600)  # 0.5 and 0.3 m/s on wheels of 0.05 m
 
 
 @pytest.mark.slow

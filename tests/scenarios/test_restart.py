@@ -60,7 +60,7 @@ class MemoryFile:
         self.waited.append(seconds)
         self.slow = self.slow and self.hangs
 
-    def news(self) -> list[Event]:
+    def take_events(self) -> list[Event]:
         return [self.told.pop() for _ in range(len(self.told))]
 
     def read(self, now: Instant) -> Latches:

@@ -294,7 +294,7 @@ def test_no_hand_latches_a_fault_whatever_the_mode(count: int, world: World) -> 
         shove(world, mode, dice)
         latched = told(world, "fault")
         assert (world.state.mode, latched) == (mode, []), f"push {trial} in {mode}: {latched}"
-        held = mode == "driving" and world.state.reason.startswith("driving: held by app")
+        held = mode == "driving" and world.state.reason.startswith("driving: app keeps")
         assert mode == "ready" or held or world.state.reason == reason
         kinds[mode] += 1
         world.run(0.5)

@@ -266,7 +266,7 @@ def test_setting_the_present_value_is_answered_with_nothing_changes(world: World
     reply = sets(world, limits__linear_speed=1.0)
     assert (reply.success, reply.message) == (
         True,
-        "nothing changes: all settings have these values already",
+        "nothing changed: all settings already have these values",
     )
 
 

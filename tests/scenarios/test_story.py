@@ -144,9 +144,9 @@ class Host:
         """End the process without notice: the kernel closes its files."""
         writer = self.recorder._writer
         assert writer._writing is not None
-        assert writer._ring is not None
+        assert writer._directory is not None
         writer._writing.close()
-        writer._ring.close()
+        writer._directory.close()
 
 
 def identity(counts: int, watchdog_ms: int, sample: bool) -> bytes:
@@ -366,7 +366,7 @@ def second_run(host: Host) -> None:
     host.note(
         "ordinary end",
         "^end: the daemon received the request to end",
-        "^mode: driving -> shutdown: the daemon is going down",
+        "^mode: driving -> shutdown: the daemon is shutting down",
         r"^drive: drove \d\.\d\d m in \d\.\d s \(by nav\)",
     )
     host.world.loop.shutting_down = True

@@ -23,7 +23,7 @@ from acsard.core.messages.keys_and_roles import PUBLISHED
 from acsard.core.messages.schema import Info, Message, Odometry, RobotState, ServiceReply
 from acsard.core.messages.signature import Signature
 from acsard.core.simulator.fake_mcu import FakeMcu
-from acsard.core.simulator.simulated_robot import Sight, WatchedMcu
+from acsard.core.simulator.simulated_robot import Observation, WatchedMcu
 from acsard.core.simulator.true_messages import turn_rate
 from acsard.core.values import NS_PER_S, Event, Instant, Latches, Outputs, Pose, Received
 from acsard.daemon.control_loop import ControlLoop
@@ -99,7 +99,7 @@ class VirtualPort:
         part, self.takes = data[: self.takes], None
         self.mcu.receive(now_ns, part)
         self.sent.append((now_ns, part.removeprefix(b"\r\n")))
-        return self._output.took(line, data, len(part), now_ns)
+        return self._output.record_write(line, data, len(part), now_ns)
 
 
 class MemoryBus:
@@ -203,7 +203,7 @@ class World:
         """Time to which the alarm was last set. It may have rung since then."""
         self._missed = 0
 
-    def _see(self, sight: Sight) -> None:
+    def _see(self, sight: Observation) -> None:
         self.truth = sight.pose
         if not self.gyro_dead:
             wall_ns = sight.at_ns + self.wall_offset_ns - int(self.config.sim.gyro_delay * NS_PER_S)
@@ -216,7 +216,7 @@ class World:
     @property
     def _listens(self) -> bool:
         """Whether a command that arrives now gets a step of its own."""
-        return self.steps > 0 and self.loop.listens
+        return self.steps > 0 and self.loop.accepts_early_command
 
     @property
     def instant(self) -> Instant:

@@ -349,7 +349,7 @@ class Run:
                 case "deactivate":
                     witness.offs.append(true_ns)
                 case "set":
-                    if not text.startswith("nothing changes"):
+                    if not text.startswith("nothing changed"):
                         witness.set_limits(self.true_ns, event["settings"], true_ns)
                 case "set_pose" | "reset_odometry":
                     x, y, yaw = event.get("pose", (0.0, 0.0, 0.0))

@@ -477,6 +477,21 @@ FAULTS = (
         "        if latch is None:\n",
     ),
     fault(
+        "lifecycle second",
+        "a further cause of a fault does not get a number of its own",
+        LIFECYCLE,
+        '        self._latch(fault=with_causes(self._made(now, "", why), latch))\n',
+        '        made = with_causes(self._made(now, "", why), latch)\n'
+        "        self._latch(fault=replace(made, number=latch.number) if latch else made)\n",
+    ),
+    fault(
+        "lifecycle unseen",
+        "a clear without a number releases a fault at once",
+        LIFECYCLE,
+        "            self._require_seen(was,",
+        "            latches.fault or self._require_seen(was,",
+    ),
+    fault(
         "lifecycle off",
         "deactivate answers, but does nothing",
         LIFECYCLE,
@@ -537,7 +552,7 @@ FAULTS = (
         "robot waits",
         "`state` names no source whose commands are late or not proved yet",
         ARBITER,
-        "return source.doubted(now_ns) or COMMAND",
+        "return source.doubt_wait(now_ns) or COMMAND",
         "return COMMAND",
     ),
     fault(
@@ -587,9 +602,9 @@ FAULTS = (
         "        if self.silent(now_ns):\n",
         Edit(
             SESSION,
-            '        self._link.sign("opened" if port_open else "closed")',
+            '        self._link.apply("opened" if port_open else "closed")',
             "        self._opened_ns = now_ns\n"
-            '        self._link.sign("opened" if port_open else "closed")',
+            '        self._link.apply("opened" if port_open else "closed")',
         ),
     ),
     fault(

@@ -24,14 +24,14 @@ from acsard.core.incoming.queries import Query
 from acsard.core.messages.encodings import encode as encode_message
 from acsard.core.simulator.baud_mismatch import garbled
 from acsard.core.simulator.fake_mcu import FakeMcu
-from acsard.core.simulator.simulated_robot import Sight, WatchedMcu
+from acsard.core.simulator.simulated_robot import Observation, WatchedMcu
 from acsard.core.values import Estimate as Measured
 from acsard.core.values import Event, Instant, Latches, Outputs, Received
 from acsard.daemon.latch_rules import (
     LatchFileError,
+    after_failed_write,
     at_start,
     decode,
-    doubted,
     encode,
     stopped,
     unreadable,
@@ -144,7 +144,7 @@ class Disk:
 
     def wait(self, latches: Latches, seconds: float) -> None: ...
 
-    def news(self) -> list[Event]:
+    def take_events(self) -> list[Event]:
         return []
 
     def read(self, now: Instant) -> Latches:
@@ -159,7 +159,7 @@ class Disk:
             self._data = encode("acsar", found)  # the daemon tries out whether it can write
         if self.full:
             self.trouble = unwritable("FILE", "no space left on device")
-            self._newest = doubted(found, at_start(self.trouble), now)
+            self._newest = after_failed_write(found, at_start(self.trouble), now)
         return self._newest
 
 
@@ -199,7 +199,7 @@ class Product:
 
         world.port.feed = noticed  # type: ignore[method-assign]
 
-    def _sight(self, sight: Sight) -> None:
+    def _sight(self, sight: Observation) -> None:
         self._world._see(replace(sight, gyro=self.gyro.reported(sight.gyro)))
 
     def _watch(self, outputs: Outputs) -> None:

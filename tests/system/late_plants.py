@@ -148,7 +148,7 @@ def main() -> None:
                 now_ns = clock.mono_ns()
                 watch.period(now_ns, now_ns - began_ns, 1)
                 time.sleep(0.4)
-                print(json.dumps([event.text for event in watch.news()]), flush=True)
+                print(json.dumps([event.text for event in watch.take_events()]), flush=True)
     finally:
         if name == "quota":
             (CGROUP.parent / "cgroup.procs").write_text(str(os.getpid()))

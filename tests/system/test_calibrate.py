@@ -31,7 +31,7 @@ from acsard.calibration.guided.robot_on_bus import (
 from acsard.client import Client
 from acsard.core.config.parsing import parse
 from acsard.core.config.settings import Config, JointsConfig
-from acsard.core.link.link_diagnosis import is_ours
+from acsard.core.link.link_diagnosis import blames_host
 from acsard.core.messages.encodings import FORMATS, encode
 from acsard.core.messages.schema import Odometry, PoseStamped
 from acsard.daemon.bus.zenoh_sessions import client_session
@@ -155,7 +155,7 @@ def tried(bus: Bus, drive: Callable[[], T]) -> T:
         except AssertionError as error:
             why = " ".join(str(error).split())
             if not left or not (
-                is_ours(why) or STALL_REASON in why or lost(time.monotonic() - 5.0) > 0.2
+                blames_host(why) or STALL_REASON in why or lost(time.monotonic() - 5.0) > 0.2
             ):
                 raise
             bus.at_rest()

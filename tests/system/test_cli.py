@@ -715,7 +715,7 @@ def test_drive_without_a_screen_ends_with_a_line_that_the_robot_is_at_rest(
             until(lambda: (bus.state()["linear"] or 0.0) > 0.2, 5.0, "moving")
         terminal.press("\x03")
         assert program.ended(5.0) == 0
-        words = "drive ended: the robot stands; ready: "
+        words = "drive ended: the robot stands still; ready: "
         until(lambda: words in terminal.screen, 2.0, "the last word")
     assert "forward +0.00 m/s" in terminal.screen.partition("drive ended: ")[2]
 

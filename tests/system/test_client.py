@@ -345,7 +345,10 @@ def test_a_drive_of_a_stopped_robot_raises_the_daemon_s_reason(shared: Daemon, f
         seen = robot.get("state").latch
         robot.call("stop")
         refused = robot.call("clear", latch=seen)
-        assert (refused.success, "would release another latch" in refused.message) == (False, True)
+        assert (
+            refused.success,
+            "is not the latch that srv/clear would release now" in refused.message,
+        ) == (False, True)
         assert robot.call("clear").success
         robot.call("deactivate")
         with pytest.raises(NotDrivenError, match="srv/activate"):

@@ -20,7 +20,7 @@ from mcap.reader import make_reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from websockets.exceptions import InvalidStatus
 
-from acsard.client.commander import RELEASED_NS
+from acsard.client.commander import RELEASE_TIMEOUT_NS
 from acsard.core.config.settings import JointsConfig
 from acsard.core.messages.encodings import FORMATS, encode, encoding_name
 from acsard.core.messages.schema import Header, JointState, Twist, TwistStamped, Vector3
@@ -105,7 +105,7 @@ def speed(linear: float, angular: float = 0.0) -> bytes:
     return json.dumps({"linear": axes | {"x": linear}, "angular": axes | {"z": angular}}).encode()
 
 
-CONNECTED_S = RELEASED_NS / NS_PER_S + 0.1
+CONNECTED_S = RELEASE_TIMEOUT_NS / NS_PER_S + 0.1
 """Time after which a new channel that was silent may drive, s."""
 
 

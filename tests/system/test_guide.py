@@ -93,7 +93,7 @@ async def test_a_key_stops_the_leg_and_other_clients_see_the_procedure_and_canno
         # Only one runs at a time, and no other client answers, presses or ends it.
         await other.begin("check", port="sim")
         refused = await other.ours.find(lambda said: said.get("refused") == "begin")
-        assert "calibrate is already running (started by here)" in refused["reason"]
+        assert "a calibration is already running (started by here)" in refused["reason"]
         await other.ours.say(press="key")
         await other.ours.say(press="leave")
         for number in range(100):

@@ -74,7 +74,7 @@ def test_the_log_describes_a_run_from_its_start_to_its_totals(tmp_path: Path, pe
     assert modes[:2] == ["waiting -> ready", "ready -> driving"]
     assert modes[-2] in ("driving -> stopped", "ready -> stopped")
     assert modes[-1] == "stopped -> shutdown"
-    assert commander["text"].startswith("nobody -> app (")
+    assert commander["text"].startswith("no sender -> app (")
     assert refused["text"].startswith("wrong_shape: cmd/app: the message needs both")
     assert refused["level"] == "warning"
     assert '"ended"' in last

@@ -351,11 +351,11 @@ def test_set_ends_with_1_if_one_robot_refuses_and_with_69_if_one_does_not_answer
     with fake(robots, refusal.encode()):
         ended = robots.tool("set", "rates.state", "10.0", who=f"{ONE},fake")
     assert ended.code == 1
-    assert re.search(rf"^{ONE}: nothing changes", ended.out, re.M)
+    assert re.search(rf"^{ONE}: nothing changed", ended.out, re.M)
     assert re.search(r"^fake: not now$", ended.out, re.M)
     ended = robots.tool("set", "rates.state", "10.0", who=f"{ONE},robot9")
     assert ended.code == 69
-    assert re.search(rf"^{ONE}: nothing changes", ended.out, re.M)
+    assert re.search(rf"^{ONE}: nothing changed", ended.out, re.M)
     assert re.search(r"^robot9: NO ANSWER: ", ended.out, re.M)
 
 

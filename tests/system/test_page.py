@@ -19,7 +19,7 @@ import aiohttp
 import pytest
 
 from acsard.machine.authority import Authority
-from acsard.web.limits import MAX_LOCAL_SOCKETS
+from acsard.web.limits import MAX_LOCAL_WEBSOCKETS
 from acsard.web.viewer import PING_INTERVAL_S
 from tests import pictures
 from tests.pictures import VIEWS
@@ -1013,13 +1013,13 @@ async def test_a_page_beyond_the_connection_limit_says_why_and_can_still_stop(pa
 
     def look() -> None:
         page.browser.open(page.server.here)
-        page.shows("reason", f"{MAX_LOCAL_SOCKETS} pages are open on the robot itself")
+        page.shows("reason", f"{MAX_LOCAL_WEBSOCKETS} pages are open on the robot itself")
         page.browser.tap("stop")
         until(lambda: page.bus.state()["mode"] == "stopped", 5.0, "it stops all the same")
 
     page.browser.open("about:blank")
     async with AsyncExitStack() as stack:
-        left = MAX_LOCAL_SOCKETS
+        left = MAX_LOCAL_WEBSOCKETS
         while left:  # the page that was open here disappears once the server notices
             with suppress(aiohttp.WSServerHandshakeError):
                 other = await stack.enter_async_context(hands(page.server))

@@ -27,7 +27,7 @@ from acsard.core.values import NS_PER_S, STILL, Event, Instant
 from acsard.daemon.serial.device import open_raw
 from acsard.daemon.serial.port import DRIVER_HUNG, SerialPort
 from acsard.host import clock
-from acsard.host.clock import Asleep
+from acsard.host.clock import SuspendDetector
 from tests.system.harness import until
 
 PERIOD_NS = 10_000_000
@@ -49,7 +49,7 @@ class Line(NamedTuple):
         self,
         tell: Callable[[Event], None] = lambda event: None,
         wake: Callable[[], None] = lambda: None,
-        asleep: Asleep | None = None,
+        asleep: SuspendDetector | None = None,
     ) -> SerialPort:
         return SerialPort(self.path, 115200, STOP, PERIOD_NS, wake, tell, asleep)
 
@@ -84,7 +84,7 @@ async def test_a_line_made_before_the_process_was_suspended_is_not_sent_after_it
 async def test_the_port_is_reopened_after_a_suspend(line: Line) -> None:
     """The clock simulates the suspend, because this machine cannot be suspended."""
     slept, told = [0], list[Event]()
-    async with line.port(told.append, asleep=Asleep(lambda: slept[0])) as port:
+    async with line.port(told.append, asleep=SuspendDetector(lambda: slept[0])) as port:
         port.take()
         assert port.opened == 1
         slept[0] = 8 * 3600 * 10**9

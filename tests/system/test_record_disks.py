@@ -17,9 +17,9 @@ from pathlib import Path
 import pytest
 
 from acsard.core.config.settings import RecordConfig
-from acsard.recording.directory import Ring, Run
+from acsard.recording.directory import RecordingDirectory, Run
 from acsard.recording.end_record import read_end
-from acsard.recording.file import About, Recording, Writing
+from acsard.recording.file import About, Recording, RecordingWriter
 from acsard.recording.recovery import recover
 from acsard.recording.step_writer import INCIDENTS
 from acsard.web.recordings import rows
@@ -201,7 +201,7 @@ def test_a_recording_that_was_cut_on_a_disk_without_room_for_its_end_keeps_every
     with disk(tmp_path, "size=64k") as path:
         part = path / "000001-20260101T000000Z.mcap.part"
         whole = part.with_suffix("")
-        writing = Writing(part, About("acsar", "0.1.0", "3.11.0", 1, 2))
+        writing = RecordingWriter(part, About("acsar", "0.1.0", "3.11.0", 1, 2))
         for size in (1000, 2000):
             before = writing.size
             writing.add("steps", 2, os.urandom(size))
@@ -226,14 +226,14 @@ def test_a_lack_of_inodes_deletes_at_most_one_recording_if_that_does_not_help(
         settings = RecordConfig(str(path / "record"))
         about = About("acsar", "0.1.0", "3.11.0", 1, 2)
         run = Run()
-        ring = Ring(settings, run=run)
+        ring = RecordingDirectory(settings, run=run)
         kept = [ring.end(ring.begin(about), "kept") for _ in range(4)]
         fill(path, b"", (f"{number}" for number in range(100)))
         for more in ("more", "most"):  # other writers use the space that is freed
             with pytest.raises(OSError, match="No space left on device"):
                 ring.begin(about)
             ring.close()
-            ring = Ring(settings, run=run, refused=True)
+            ring = RecordingDirectory(settings, run=run, refused=True)
             assert [one.exists() for one in kept] == [False, True, True, True]
             with suppress(OSError):
                 (path / more).touch()

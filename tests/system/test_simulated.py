@@ -83,12 +83,13 @@ def test_the_simulated_gyro_corrects_the_odometry_and_is_published_as_imu(tmp_pa
     tables: dict[str, dict[str, object]] = {"odometry": {"gyro": True}}
     tables["sim"] = {"track_multiplier": 1.6, "gyro_bias": 0.02}
     with Daemon(tmp_path, config=tables) as daemon, Bus(daemon.endpoint) as bus:
-        until(lambda: bus.state()["gyro"] == "used", 10.0, "the gyro is used")
+        until(lambda: bus.state()["gyro"] == "waiting for turn", 10.0, "the gyro knows its bias")
         with bus.follow("imu") as said, bus.commanding(0.0, 1.0):
             until(lambda: bus.state()["yaw"] > 1.0, 10.0, "a turn")
         bus.at_rest()
         believed = yaw(bus.get("odom")["pose"]["pose"])
         assert yaw(bus.get("sim/pose")["pose"]) == pytest.approx(believed, rel=0.03)
+        assert bus.state()["gyro"] == "used"
         assert said.seen[0].encoding == "application/msgpack;acsard.Imu.v1"
 
 
@@ -136,7 +137,7 @@ def test_a_gyro_on_the_bus_is_used_and_its_invalid_samples_are_counted(
 
         def used() -> bool:
             bus.put("imu", TURNING)
-            return bool(bus.state()["gyro"] == "used")
+            return bool(bus.state()["gyro"] == "waiting for turn")
 
         until(used, 20.0, "the gyro is used")
 

@@ -76,7 +76,7 @@ def test_top_shows_the_robot_in_a_pipe_and_at_a_terminal_and_outlives_its_daemon
 
         daemon.signal(signal.SIGKILL)
         daemon.ended(5.0)
-        told = shows(terminal, "s: does the daemon run?", 5.0)
+        told = shows(terminal, "s: is the daemon running?", 5.0)
         assert len(told) == SIZE[1]
         with Daemon(tmp_path, endpoint=daemon.endpoint, name="again"):
             shows(terminal, " READY ", 5.0)

@@ -28,9 +28,9 @@ from acsard.web.acceptor import REQUEST_TIMEOUT_S, UNREAD_TIMEOUT_S
 from acsard.web.app import BODY_TIMEOUT_S
 from acsard.web.limits import (
     HANDSHAKE_RATE,
+    MAX_TCP_OF_NETWORK,
     OPENINGS,
     REFUSAL_DELAY_S,
-    SOCKETS_OF_ONE,
     STOPS,
     STRANGER_RATE,
 )
@@ -353,7 +353,7 @@ async def test_a_thousand_connections_do_not_disconnect_the_page_that_drives(
     place = page.here.removeprefix("http://").split(":")
     async with hands(page) as ours:
         await ours.say(subscribe="state", rate=50)
-        few = 1000 - SOCKETS_OF_ONE
+        few = 1000 - MAX_TCP_OF_NETWORK
         with table.attack("1000 connections", "64 have places", "crowded", few, stands=False):
             await ours.until_driving(0.3)
             holding = asyncio.create_task(ours.hold(0.3, PATIENCE_S))
@@ -362,9 +362,9 @@ async def test_a_thousand_connections_do_not_disconnect_the_page_that_drives(
             await ours.find(lambda said: said.get("pong") == 7)
             await ours.state(lambda s: s["mode"] == "driving")
             async with asyncio.timeout(PATIENCE_S):
-                while (left := sum(map(_waits, idle))) > SOCKETS_OF_ONE:
+                while (left := sum(map(_waits, idle))) > MAX_TCP_OF_NETWORK:
                     await asyncio.sleep(0.01)
-            assert left == SOCKETS_OF_ONE
+            assert left == MAX_TCP_OF_NETWORK
             holding.cancel()
             for one in idle:
                 one.close()
@@ -561,7 +561,7 @@ async def test_a_client_that_pipelines_requests_without_end_is_delayed_and_not_r
     print(f"\n{what}: {answers.total() / lasts_s:.0f} answers a second to {clients} clients")
     assert set(answers) == {status}
     lasts_s += REFUSAL_DELAY_S  # an answer may come after the end
-    assert answers.total() <= rate.most + (rate.hz + clients / REFUSAL_DELAY_S) * lasts_s
+    assert answers.total() <= rate.burst + (rate.hz + clients / REFUSAL_DELAY_S) * lasts_s
 
 
 async def test_a_stop_beyond_the_rate_is_sent_immediately_and_only_its_answer_waits(
@@ -619,7 +619,7 @@ async def test_handshakes_from_one_network_are_delayed_beyond_their_rate(
     end = time.monotonic() + lasts_s
     await asyncio.gather(*(shakes(end) for _ in range(30)))
     print(f"\n{done / lasts_s:.0f} handshakes a second")
-    assert done <= HANDSHAKE_RATE.most + HANDSHAKE_RATE.hz * lasts_s + 5
+    assert done <= HANDSHAKE_RATE.burst + HANDSHAKE_RATE.hz * lasts_s + 5
 
 
 async def test_a_connection_with_a_valid_cookie_is_kept_from_its_first_file_on(
@@ -647,7 +647,7 @@ async def test_a_connection_with_a_valid_cookie_is_kept_from_its_first_file_on(
             return head
 
         assert b" 200 " in await fetches("/")
-        idle = await _idle("127.0.0.1", place.port or 0, SOCKETS_OF_ONE + 10)
+        idle = await _idle("127.0.0.1", place.port or 0, MAX_TCP_OF_NETWORK + 10)
         await asyncio.sleep(0.3)
         assert b" 200 " in await fetches("/page/main.js")
         for one in idle:

@@ -24,7 +24,7 @@ from acsard.web.guide import Guide, Reach
 from acsard.web.limits import MAX_OVERRUNS, MAX_UNREAD_BYTES
 from acsard.web.metrics import Counts
 from acsard.web.robots import About, Robots
-from acsard.web.server import Wanted, _until
+from acsard.web.server import ServerOptions, _until
 from acsard.web.tokens import Vault
 from acsard.web.viewer import Parts
 from tests.system.browser import Hands
@@ -242,10 +242,10 @@ async def test_a_robot_with_a_closed_session_is_reported_as_gone_and_the_server_
 
 async def test_a_failed_command_outbox_ends_the_server(inside: Inside, tmp_path: Path) -> None:
     address = Address("tcp/127.0.0.1:1", "acsar", "")
-    wanted = Wanted(Config(), address, (), "", tmp_path)
+    options = ServerOptions(Config(), address, (), "", tmp_path)
     inside.parts.commands.outbox.dead.set_exception(MemoryError("no room"))
     with pytest.raises(MemoryError):
-        await _until(asyncio.Event(), inside.parts, inside.page, wanted)
+        await _until(asyncio.Event(), inside.parts, inside.page, options)
 
 
 async def test_a_client_on_the_robot_has_the_role_of_the_configuration(tmp_path: Path) -> None:

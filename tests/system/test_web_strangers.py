@@ -23,9 +23,9 @@ from acsard.core.values import ROLES, Role
 from acsard.daemon.bus.tls import peer_ends_ns
 from acsard.machine.authority import Authority
 from acsard.web.limits import (
-    CONNECTIONS_ALIKE,
-    CONNECTIONS_OF_ONE,
-    MAX_LOCAL_SOCKETS,
+    MAX_LOCAL_WEBSOCKETS,
+    MAX_WEBSOCKETS_OF_NETWORK,
+    MAX_WEBSOCKETS_OF_TOKEN_IN_NETWORK,
 )
 from acsard.web.server import TIDY_S
 from tests.system.browser import NAME, Page, hands, run
@@ -234,7 +234,7 @@ async def test_a_client_with_too_many_connections_shuts_out_no_other_at_its_addr
     page: Page, bus: Bus
 ) -> None:
     """All of them come from 127.0.0.1, including the robot's own browser."""
-    few = CONNECTIONS_OF_ONE // CONNECTIONS_ALIKE + 1
+    few = MAX_WEBSOCKETS_OF_NETWORK // MAX_WEBSOCKETS_OF_TOKEN_IN_NETWORK + 1
     broken, *others = (page.invite("viewer", f"one{n}") for n in range(few))
     counted = page.refused().get("too_many", 0)
 
@@ -242,7 +242,7 @@ async def test_a_client_with_too_many_connections_shuts_out_no_other_at_its_addr
         """Open more connections than one client may have; return how many succeed."""
         session = await stack.enter_async_context(page.client(token))
         got = 0
-        for _ in range(CONNECTIONS_OF_ONE):
+        for _ in range(MAX_WEBSOCKETS_OF_NETWORK):
             with suppress(aiohttp.WSServerHandshakeError):
                 await stack.enter_async_context(session.ws_connect(f"{page.away}/ws"))
                 got += 1
@@ -251,14 +251,14 @@ async def test_a_client_with_too_many_connections_shuts_out_no_other_at_its_addr
         return got
 
     async with AsyncExitStack() as stack:
-        assert await taken(stack, broken) == CONNECTIONS_ALIKE
+        assert await taken(stack, broken) == MAX_WEBSOCKETS_OF_TOKEN_IN_NETWORK
         rest = [await taken(stack, one) for one in others]
-        assert rest[:-1] == [CONNECTIONS_ALIKE] * (few - 2)
-        assert sum(rest) == CONNECTIONS_OF_ONE - CONNECTIONS_ALIKE
-        for _ in range(MAX_LOCAL_SOCKETS):
+        assert rest[:-1] == [MAX_WEBSOCKETS_OF_TOKEN_IN_NETWORK] * (few - 2)
+        assert sum(rest) == MAX_WEBSOCKETS_OF_NETWORK - MAX_WEBSOCKETS_OF_TOKEN_IN_NETWORK
+        for _ in range(MAX_LOCAL_WEBSOCKETS):
             ours = await stack.enter_async_context(hands(page))
         assert (await ours.call("stop"))["ok"]
-    refused = few * CONNECTIONS_OF_ONE - CONNECTIONS_OF_ONE
+    refused = few * MAX_WEBSOCKETS_OF_NETWORK - MAX_WEBSOCKETS_OF_NETWORK
     assert page.refused()["too_many"] == counted + refused
 
 
@@ -267,7 +267,7 @@ async def test_a_client_with_the_most_subscriptions_does_not_take_those_of_other
 ) -> None:
     async with AsyncExitStack() as stack:
         refused = 0
-        for n in range(CONNECTIONS_ALIKE):
+        for n in range(MAX_WEBSOCKETS_OF_TOKEN_IN_NETWORK):
             greedy = await stack.enter_async_context(hands(page, viewer))
             for k in range(30):
                 await greedy.say(subscribe="state", robot=f"r{n}_{k}", rate=1)
@@ -275,7 +275,8 @@ async def test_a_client_with_the_most_subscriptions_does_not_take_those_of_other
             await greedy.say(ping=n)
             await greedy.find(lambda said: "pong" in said)
             refused += any(one.get("refused") == "subscribe" for one in greedy.heard)
-        assert refused == CONNECTIONS_ALIKE - 1  # of 50, the second connection had the last 20
+        # Of 50, the second connection had the last 20.
+        assert refused == MAX_WEBSOCKETS_OF_TOKEN_IN_NETWORK - 1
         ours = await stack.enter_async_context(hands(page, operator))
         await ours.say(subscribe="state", robot="r9")
         await ours.say(subscribe="state")

@@ -130,7 +130,7 @@ def test_a_wildcard_with_an_unlisted_certificate_suggests_whoami(
 ) -> None:
     ended = robot.tool("unlisted", "call", "stop", "--id", "*")
     assert (ended.code, ended.out) == (69, "")
-    assert "`acsard whoami --id robot1` shows its role" in ended.err
+    assert "`acsard whoami --id robot1` checks this" in ended.err
 
 
 @pytest.mark.slow

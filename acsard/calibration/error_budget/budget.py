@@ -174,7 +174,7 @@ class Received(Struct, frozen=True):
     lines: list[Line]
     sent: list[float]
     """Times at which the daemon sent lines to the microcontroller, s."""
-    whole: bool = True
+    complete: bool = True
     """True if `lines` contains nearly every feedback line that the daemon received."""
     counted: bool = False
     """True if feedback lines carry encoder counts and the microcontroller's time."""
@@ -200,7 +200,7 @@ def budget(received: Received, config: Config, metres: float = BUDGET_DISTANCE_M
     still = _standing(received, config, model)
     if len(lines) < MIN_LINES:
         return still
-    moved = motion(lines, np.array(received.sent), model.kinematics, received.whole)
+    moved = motion(lines, np.array(received.sent), model.kinematics, received.complete)
     rolled, turned = float(np.abs(moved.distance).sum()), float(np.abs(moved.turn).sum())
     if rolled < LEAST_M and turned < LEAST_RAD:
         return still
@@ -256,14 +256,14 @@ def _causes(received: Received, model: _Model, driving: Driving, counts: int) ->
 
     # Encoder counts are cumulative, so late and lost feedback lines cause no error.
     counted = received.counted
-    basis: Basis = "measured" if counted or received.whole else "unknown"
+    basis: Basis = "measured" if counted or received.complete else "unknown"
     yield share("time", basis, plain if counted else driving.late())
     yield share("quantization", basis, plain if counted else driving.rounded(), counts=counts)
     yield share("gaps", basis, plain if counted else driving.missed())
 
     declared = share("slip", "settings", plain, _only(odometry, *NOISE))
     seen = share("slip", "measured", driving.contradicted())
-    yield max(declared, seen, key=_millimetres)
+    yield max(declared, seen, key=lambda candidate: (_millimetres(candidate), _degrees(candidate)))
 
     kind = _only(odometry, *PARAMETERS)
     basis = "settings" if model.declares_parameters else "unknown"

@@ -91,7 +91,7 @@ def advice(budget: Budget) -> str:
             f"the largest measured cause of errors is {measured.cause}: "
             f"{_advice_on(measured, budget)}"
         )
-    return "; ".join(advice) or "the odometry shows no error on this drive"
+    return "; ".join(advice) or "no cause of errors was measured on this drive"
 
 
 def _driven(budget: Budget) -> str:

@@ -133,7 +133,7 @@ class Feed:
         return Received(
             list(self._lines),
             [(at - self._start_ns) / NS_PER_S for at in self._sent],
-            whole=self._whole(last),
+            complete=self._complete(last),
             counted=self._config.mcu.wants_samples
             and _value(diagnostics, "check") == SAMPLED_CHECK,
             gyro=last.gyro in ("used", "disagrees"),
@@ -166,7 +166,7 @@ class Feed:
         self._lines.append(Line(at, (a, b, c, d), (e, f, g, h), yaw, covariance[35]))
         self._count += 1
 
-    def _whole(self, last: RobotState) -> bool:
+    def _complete(self, last: RobotState) -> bool:
         """Return whether this program received nearly every feedback line of the daemon."""
         rates, before = self._config.rates, self._first.counters
         if rates.odom or rates.wheel_states:

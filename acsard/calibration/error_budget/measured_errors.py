@@ -357,7 +357,7 @@ class Rounding(Struct, frozen=True):
     """Variance of the error of the angle that a wheel rolled since the previous line, rad2."""
     offset: Floats
     """Computed error of the angle that a wheel rolled since the previous line, rad."""
-    alike: Floats
+    equal_errors: Floats
     """Matrix of pairs of wheels, shape (4, 4).
 
     An element is 1 if the two wheels have equal rounding errors, and 0 otherwise.
@@ -376,16 +376,16 @@ def rounding(speeds: Floats, period: float) -> Rounding:
     """
     moving = np.any(speeds != 0.0, axis=1)
     same = speeds[moving][:, :, None] == speeds[moving][:, None, :]
-    alike = (
+    equal_errors = (
         (same.mean(axis=0) >= EQUAL_SPEEDS_FRACTION).astype(float) if moving.any() else np.eye(4)
     )
     quantum = _quantum(speeds)
     if quantum:
         off = (speeds - quantum * np.round(speeds / quantum)) * period
-        return Rounding(np.zeros_like(speeds), off, alike, quantum, quantum * period)
+        return Rounding(np.zeros_like(speeds), off, equal_errors, quantum, quantum * period)
     variance = np.column_stack([_runs(column) for column in speeds.T])
     scale = (SPEED_RESOLUTION * period) ** 2 / 12
-    return Rounding(variance * scale, np.zeros_like(speeds), alike, SPEED_RESOLUTION, 0.0)
+    return Rounding(variance * scale, np.zeros_like(speeds), equal_errors, SPEED_RESOLUTION, 0.0)
 
 
 def _runs(values: Floats) -> Floats:
@@ -447,7 +447,7 @@ class Driving:
         step_s: float, gyro: bool,
     ) -> None:  # fmt: skip
         self._lines, self._motion, self._rounding, self._gyro = lines, motion, rounding, gyro
-        self._each = max(1, round(step_s / motion.period))
+        self._lines_per_step = max(1, round(step_s / motion.period))
         twists = [kinematics.twist(WheelSpeeds(*row)) for row in np.eye(4).tolist()]
         self._weights = np.array([[t.linear for t in twists], [t.angular for t in twists]])
         """Motion of the robot if only one wheel rolls, by 1 rad, with a column for each wheel.
@@ -487,7 +487,8 @@ class Driving:
             return self._steps(missed=self._of_wheels(found.offset[1:]))
         roots = np.sqrt(found.variance[1:])
         variances = [
-            np.einsum("ki,ij,kj->k", roots * row, found.alike, roots * row) for row in self._weights
+            np.einsum("ki,ij,kj->k", roots * row, found.equal_errors, roots * row)
+            for row in self._weights
         ]
         return self._steps(np.column_stack(variances))
 
@@ -524,5 +525,5 @@ class Driving:
             errors[0] = errors[0] * (1, 0)
             errors[1] = errors[1] * (1, 0, 1, 0)
         rows = np.column_stack([moved.distance, moved.turn, *errors])
-        starts = np.arange(0, count, self._each)
+        starts = np.arange(0, count, self._lines_per_step)
         return Steps(np.add.reduceat(rows, starts, axis=0), self._gyro)

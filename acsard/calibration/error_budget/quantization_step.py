@@ -50,20 +50,20 @@ def quantization_step(speeds: Floats) -> float:
     anchor = float(speeds[-1 - spare])
     for part in range(1, int(anchor / MIN_STEP) + 1):
         # The anchor is rounded too, so the error of each multiple is proportional to its size.
-        if _strays(speeds, anchor / part, ROUNDING / anchor) <= spare:
+        if _non_multiples(speeds, anchor / part, ROUNDING / anchor) <= spare:
             step = _fitted(speeds, anchor / part, spare, part)
             if step:
                 return step
     return 0.0
 
 
-def _strays(speeds: Floats, step: float, doubt: float) -> int:
+def _non_multiples(speeds: Floats, step: float, relative_error: float) -> int:
     """Return how many speeds are not multiples of `step`.
 
-    `doubt` is the largest relative error of `step`.
+    `relative_error` is the largest relative error of `step`.
     """
     off = np.abs(speeds - step * np.round(speeds / step))
-    return int(np.count_nonzero(off > ROUNDING + doubt * speeds))
+    return int(np.count_nonzero(off > ROUNDING + relative_error * speeds))
 
 
 def _fitted(speeds: Floats, rough: float, spare: int, tries: int) -> float:
@@ -80,7 +80,7 @@ def _fitted(speeds: Floats, rough: float, spare: int, tries: int) -> float:
         return 0.0
     step, deviation = float(whole @ speeds[near]) / squares, ROUNDING_STD / math.sqrt(squares)
     # A multiple j of the step is wrong by j times the error of the step.
-    if step < MIN_STEP or _strays(speeds, step, 4 * deviation / step) > spare:
+    if step < MIN_STEP or _non_multiples(speeds, step, 4 * deviation / step) > spare:
         return 0.0
     by_chance = tries * (MIN_STEP / step) ** (len(np.unique(whole)) - 1)
     return 0.0 if step < COARSE_STEP and by_chance > MAX_CHANCE else step

@@ -211,9 +211,9 @@ class Setup(Struct, frozen=True):
     """Length of the straight drive, m."""
     reach: float
     """Distance from the robot's middle to its outermost point, m."""
-    turning: float
+    max_command_rate: float
     """Largest turn rate that the robot's limits permit in a command, rad/s."""
-    wheel: float
+    max_rolling_speed: float
     """Largest rolling speed of the wheels while the robot turns, m/s."""
     odometry: OdometryConfig = OdometryConfig()
     feedback: FeedbackConfig = FeedbackConfig()
@@ -274,7 +274,10 @@ class Setup(Struct, frozen=True):
         limits, the result is the largest command within these limits.
         """
         per_command = self.rate_per_command
-        most = min(2 * self.wheel / self.drive.wheel_separation, self.turning * per_command)
+        most = min(
+            2 * self.max_rolling_speed / self.drive.wheel_separation,
+            self.max_command_rate * per_command,
+        )
         return max(-most, min(most, rate)) / per_command
 
     @property

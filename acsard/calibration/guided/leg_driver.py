@@ -10,9 +10,9 @@ from enum import StrEnum
 
 from acsard.calibration.guided.drive_plan import Leg
 from acsard.client.commander import NEVER_DRIVING_MODES, OPEN_TIMEOUT_S, OPENING_S, objection
-from acsard.client.follower import QUIET_S
+from acsard.client.follower import MAX_STATE_AGE_S
 from acsard.core.config.settings import DriveConfig
-from acsard.core.link.link_diagnosis import is_ours
+from acsard.core.link.link_diagnosis import blames_host
 from acsard.core.messages.schema import RobotState
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.values import REST, Twist, WheelSpeeds
@@ -108,8 +108,8 @@ class LegDriver:
             return 1.0
         if self._number < 0:
             return 0.0
-        behind = sum(move.seconds for move in self._leg.moves[: self._number + 1])
-        return min(0.99, max(0.0, (behind - self._ends + now) / self._leg.seconds))
+        planned_s = sum(move.seconds for move in self._leg.moves[: self._number + 1])
+        return min(0.99, max(0.0, (planned_s - self._ends + now) / self._leg.seconds))
 
     def key(self, pressed: str, now: float) -> None:
         """Process a key press. It halts the leg, with two exceptions.
@@ -120,7 +120,7 @@ class LegDriver:
         """
         if self.phase is Phase.OPENING and pressed in ENTER:
             return
-        if self.phase is Phase.MOVING and now - self._stepped > QUIET_S / 2:
+        if self.phase is Phase.MOVING and now - self._stepped > MAX_STATE_AGE_S / 2:
             # This process was paused, and the robot stopped during the pause. The person may have
             # pressed a key only because the robot stopped.
             self._halt(STALL_REASON)
@@ -135,7 +135,7 @@ class LegDriver:
         self._received = now
         why = self._objection(state)
         if state.mode in (*NEVER_DRIVING_MODES, "waiting"):
-            late = state.mode == "waiting" and is_ours(state.reason)
+            late = state.mode == "waiting" and blames_host(state.reason)
             self._halt(f"the robot is {state.mode}: {state.reason}", disturbed=late)
         elif state.source not in ("", self._source):
             self._halt(
@@ -169,10 +169,10 @@ class LegDriver:
         # The next move would then begin at the wrong place. The pause also hides whether the daemon
         # was silent. If the pause came before the first move, the person who started the leg may
         # have left in the meantime.
-        if held_up > QUIET_S / 2 and self.phase in (Phase.OPENING, Phase.MOVING):
+        if held_up > MAX_STATE_AGE_S / 2 and self.phase in (Phase.OPENING, Phase.MOVING):
             self._halt(STALL_REASON, disturbed=True)
-        elif now - self._received > QUIET_S:
-            late = held_up > QUIET_S / 2
+        elif now - self._received > MAX_STATE_AGE_S:
+            late = held_up > MAX_STATE_AGE_S / 2
             self.silent = self.silent or not (late or self.over)
             silence = "no messages of the daemon arrive: does the daemon run (`acsard doctor`)?"
             self._halt(STALL_REASON if late else silence, disturbed=late)

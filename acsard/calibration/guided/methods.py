@@ -26,7 +26,7 @@ from acsard.calibration.guided.drive_plan import (
 from acsard.calibration.multipliers import MIN_TAPE_M
 from acsard.terminal.prompt import Ask
 
-TAPE_STD_M = 0.005
+STRAIGHT_LEG_STD_M = 0.005
 """Standard deviation of the length of a straight drive that a person measures by tape, m.
 
 It covers the errors at both ends of the tape.
@@ -67,7 +67,7 @@ FROM_MARK = Ask(
     "m", MIN_TAPE_M, 2 * FLOOR_M,
     name="metres",
 )  # fmt: skip
-DISTANCE = Mean("distance", ("metres",), TAPE_STD_M)
+DISTANCE = Mean("distance", ("metres",), STRAIGHT_LEG_STD_M)
 
 
 def _at_the_edge(setup: Setup) -> str:

@@ -19,7 +19,7 @@ from msgspec import Struct
 from acsard.calibration.guided.drive_plan import DisturbedError, GuideError, Leg
 from acsard.calibration.guided.leg_driver import LegDriver
 from acsard.calibration.log_table import APPLIED, FOUR, Floats, Table
-from acsard.calibration.runs import Log, Run, on_arrival_clock, runs
+from acsard.calibration.runs import NEW_RUN_AFTER_S, Log, Run, on_arrival_clock, runs
 from acsard.client.commander import OPENING_PERIOD_S, OPENING_S, SEND_PERIOD_S, ZEROS
 from acsard.client.follower import FIRST_STATE_TIMEOUT_S, Watch
 from acsard.client.synchronous import Client, decoder_of
@@ -112,7 +112,7 @@ class Sensor:
         )
 
 
-STREAMS = {
+COLUMNS_BY_STREAM = {
     "wheels": FOUR, "gyro": ("yaw_rate",), "places": ("x", "y"), "commands": APPLIED,
 }  # fmt: skip
 """Columns of a log that the values of each kind of recorded message fill."""
@@ -121,61 +121,67 @@ STREAMS = {
 class Sample(Struct, frozen=True):
     """The values of one message, with its time of arrival and its stamp."""
 
-    came: float
+    arrival: float
     """Time of arrival on this computer's clock, s."""
-    made: float | None
+    stamp: float | None
     """Stamp of the sender's clock, s; None if the message has no stamp."""
     values: tuple[float, ...]
-    """Values of the columns that `STREAMS` lists for this kind of message."""
+    """Values of the columns that `COLUMNS_BY_STREAM` lists for this kind of message."""
 
 
 class Recorder:
     """Collects the samples of one leg, which is one drive of a guided calibration.
 
-    Every argument `came` is the time of arrival of the message, s. `joints` contains the names of
-    the wheel joints: front right, front left, rear left, rear right.
+    Every argument `arrival` is the time of arrival of the message, s. `joints` contains the names
+    of the wheel joints: front right, front left, rear left, rear right.
     """
 
     def __init__(self, joints: Sequence[str]) -> None:
         self._joints = joints
-        self.samples: dict[str, list[Sample]] = {name: [] for name in STREAMS}
+        self.samples: dict[str, list[Sample]] = {name: [] for name in COLUMNS_BY_STREAM}
 
-    def wheels(self, message: JointState, came: float) -> float:
+    def wheels(self, message: JointState, arrival: float) -> float:
         """Add a sample of the wheel speeds, and return the speed of the fastest wheel, rad/s."""
         speeds = dict(zip(message.name, message.velocity, strict=False))
-        self._add("wheels", message.header.stamp, came, tuple(speeds[j] for j in self._joints))
+        self._add("wheels", message.header.stamp, arrival, tuple(speeds[j] for j in self._joints))
         return max(map(abs, speeds.values()))
 
-    def gyro(self, message: Imu, came: float) -> None:
-        self._add("gyro", message.header.stamp, came, (message.angular_velocity.z,))
+    def gyro(self, message: Imu, arrival: float) -> None:
+        self._add("gyro", message.header.stamp, arrival, (message.angular_velocity.z,))
 
-    def place(self, message: PoseStamped | Odometry, came: float) -> None:
+    def place(self, message: PoseStamped | Odometry, arrival: float) -> None:
         """Add a position. The heading of the message is ignored."""
         pose = message.pose if isinstance(message, PoseStamped) else message.pose.pose
         spot = pose.position
-        self._add("places", message.header.stamp, came, (spot.x, spot.y))
+        self._add("places", message.header.stamp, arrival, (spot.x, spot.y))
 
-    def command(self, message: TwistStamped, came: float) -> None:
+    def command(self, message: TwistStamped, arrival: float) -> None:
         """Add the twist that the daemon commands to the wheels."""
         values = message.twist.linear.x, message.twist.angular.z
-        self._add("commands", message.header.stamp, came, values)
+        self._add("commands", message.header.stamp, arrival, values)
 
-    def _add(self, stream: str, stamp: Time, came: float, values: tuple[float, ...]) -> None:
-        made = stamp.to_ns() / NS_PER_S if stamp.sec else None
-        self.samples[stream].append(Sample(came, made, values))
+    def _add(self, stream: str, stamp: Time, arrival: float, values: tuple[float, ...]) -> None:
+        stamp_s = stamp.to_ns() / NS_PER_S if stamp.sec else None
+        self.samples[stream].append(Sample(arrival, stamp_s, values))
 
     def log(self) -> Log:
         """Return the samples of the leg as a log.
 
-        Raises `LogError` if there are too few wheel samples, or if two wheels of a side contradict
-        each other.
+        Raises:
+            DisturbedError: the wheel samples have a gap, which divides the leg into several runs.
+            LogError: there are too few wheel samples, or two wheels of a side contradict each
+                other.
         """
         sensors: list[dict[str, Floats]] = []
-        for stream, names in STREAMS.items():
+        for stream, names in COLUMNS_BY_STREAM.items():
             samples = self.samples[stream]
             values = np.array([sample.values for sample in samples]).reshape(-1, len(names)).T
             sensors.append({"t": times(samples)} | dict(zip(names, values, strict=True)))
-        return runs(Table.joined(sensors))
+        log = runs(Table.joined(sensors))
+        if len(log.runs) > 1:
+            why = f"no wheel speeds arrived for {NEW_RUN_AFTER_S:g} s"
+            raise DisturbedError(why, f"{why}. The tool did not change any file")
+        return log
 
 
 def times(samples: Sequence[Sample]) -> Floats:
@@ -184,9 +190,13 @@ def times(samples: Sequence[Sample]) -> Floats:
     The times are computed from the stamps (`on_arrival_clock`). If any sample has no stamp, the
     times are the times of arrival.
     """
-    came = np.array([sample.came for sample in samples])
-    made = np.array([math.nan if s.made is None else s.made for s in samples])
-    return came if not len(came) or np.isnan(made).any() else on_arrival_clock(came, made)
+    arrivals = np.array([sample.arrival for sample in samples])
+    stamps = np.array([math.nan if s.stamp is None else s.stamp for s in samples])
+    return (
+        arrivals
+        if not len(arrivals) or np.isnan(stamps).any()
+        else on_arrival_clock(arrivals, stamps)
+    )
 
 
 class RobotOnBus:
@@ -220,7 +230,8 @@ class RobotOnBus:
         """Drive a leg and return its recording.
 
         Raises:
-            DisturbedError: the leg was halted, and can be repeated.
+            DisturbedError: the leg was halted, or the wheel samples have a gap of
+                `NEW_RUN_AFTER_S`. The leg can be repeated.
             GuideError: the leg was halted for another reason.
             LogError: there are too few wheel samples, or two wheels of a side contradict each
                 other.
@@ -241,7 +252,7 @@ class RobotOnBus:
             )
         if driver.halted:
             end = "" if driver.halted.endswith("?") else "."
-            text = f"{driver.halted}{end} The tool commanded zero speed, and writes no file"
+            text = f"{driver.halted}{end} The tool commanded zero speed and did not change any file"
             if driver.disturbed or (driver.silent and self._returns()):
                 raise DisturbedError(driver.halted, text)
             raise GuideError(text)
@@ -280,8 +291,8 @@ class RobotOnBus:
         for state in self._watch.look(now):
             driver.state(state, now)
 
-        def wheels(message: JointState, came: float) -> None:
-            driver.wheels(recorder.wheels(message, came), came)
+        def wheels(message: JointState, arrival: float) -> None:
+            driver.wheels(recorder.wheels(message, arrival), arrival)
 
         self._wheels.receive(wheels, now)
         for sensor, name in self._sensors:

@@ -87,8 +87,8 @@ def guide(
     longest = method.longest_s(setup)
     prompt.say(
         f"Calibration with {NEEDS[name]}. The robot drives for at most {longest:.0f} s in total, "
-        "in several legs. The robot repeats a leg that is disturbed. Stay near the robot: any key "
-        "stops the robot immediately."
+        "in several legs. If a leg is disturbed, the drive continues with that leg or an earlier "
+        "one. Stay near the robot: any key stops the robot immediately."
     )
     rides: dict[str, Run] = {}
     answers: Answers = {}

@@ -16,7 +16,14 @@ import numpy as np
 from msgspec import Struct
 
 from acsard.calibration import heading
-from acsard.calibration.fit import PARAMETER_COUNT, PRIOR_STD, Base, P, condition, student_factor
+from acsard.calibration.fit import (
+    PARAMETER_COUNT,
+    PRIOR_STD,
+    Base,
+    Parameter,
+    condition,
+    student_factor,
+)
 from acsard.calibration.guided.drive_plan import (
     MAX_TRACK_RATIO,
     GuideError,
@@ -35,7 +42,7 @@ from acsard.calibration.improvement import (
 from acsard.calibration.log_table import Floats, RefusedError
 from acsard.calibration.multipliers import SEPARATION, configured, multipliers
 from acsard.calibration.odometry_noise import settings
-from acsard.calibration.plausibility import in_range, remarks, unsure
+from acsard.calibration.plausibility import in_range, remarks, too_inaccurate
 from acsard.calibration.positions import WheelSteps, extent, path, wheel_steps
 from acsard.calibration.runs import Run, blocks
 from acsard.calibration.solve import Calibration, Drives
@@ -67,7 +74,12 @@ CONVERGED = 1e-9
 MAX_CONDITION = 1e8
 """Largest condition number of normal equations from which the parameters can be computed."""
 
-FITTED_PARAMETERS = [P.LEFT, P.RIGHT, P.INVERSE_TRACK, P.TRACK_GROWTH]
+FITTED_PARAMETERS = [
+    Parameter.LEFT,
+    Parameter.RIGHT,
+    Parameter.INVERSE_TRACK,
+    Parameter.TRACK_GROWTH,
+]
 
 MAX_STARTING_STD = 0.2
 """Largest relative standard deviation of a `turned` reading with which the fit may start.
@@ -132,7 +144,9 @@ def joined(rides: Sequence[Run]) -> WheelSteps:
     ends = np.cumsum([0.0] + [float(part.t[-1]) for part in parts])
     later = [part.t[1:] + end for part, end in zip(parts, ends, strict=False)]
     t = np.concatenate([parts[0].t[:1], *later])
-    columns = zip(*((part.left, part.right, part.fast) for part in parts), strict=True)
+    columns = zip(
+        *((part.left, part.right, part.signed_square_integral) for part in parts), strict=True
+    )
     return WheelSteps(t, *(np.concatenate(column) for column in columns))
 
 
@@ -172,7 +186,8 @@ def fit_readings(readings: Sequence[Reading], base: Base) -> TapeFit:
     Raises `RefusedError` if the readings contradict each other or do not determine the parameters.
     """
     parameters, normal = _solved(readings, base, _starting_parameters(readings, base))
-    in_range(np.array([1 / parameters[P.INVERSE_TRACK], parameters[P.LEFT], parameters[P.RIGHT]]))
+    left, right, inverse = parameters[[Parameter.LEFT, Parameter.RIGHT, Parameter.INVERSE_TRACK]]
+    in_range(np.array([1 / inverse, left, right]))
     compared = [(found, weight) for _, found, weight in _compared(readings, base, parameters)]
     residuals, weights = np.array(compared).T
     # Combine the scatter of these readings with the assumed noise. If there are few readings, the
@@ -204,7 +219,7 @@ def _starting_parameters(readings: Sequence[Reading], base: Base) -> Floats:
                     f"but you measured {math.degrees(reading.value):.0f} deg: start again, and "
                     "let the robot turn one full circle to the left"
                 )
-            start[P.INVERSE_TRACK] *= reading.value / by_wheels
+            start[Parameter.INVERSE_TRACK] *= reading.value / by_wheels
             break
     return start
 
@@ -230,10 +245,14 @@ def _solved(readings: Sequence[Reading], base: Base, start: Floats) -> tuple[Flo
         for prediction, residual, weight in _compared(readings, base, parameters):
             normal += weight * np.outer(prediction.derivatives, prediction.derivatives)
             score += weight * prediction.derivatives * residual
-        normal[P.TRACK_GROWTH, P.TRACK_GROWTH] += PRIOR_STD[P.TRACK_GROWTH] ** -2
-        score[P.TRACK_GROWTH] -= parameters[P.TRACK_GROWTH] * PRIOR_STD[P.TRACK_GROWTH] ** -2
+        normal[Parameter.TRACK_GROWTH, Parameter.TRACK_GROWTH] += (
+            PRIOR_STD[Parameter.TRACK_GROWTH] ** -2
+        )
+        score[Parameter.TRACK_GROWTH] -= (
+            parameters[Parameter.TRACK_GROWTH] * PRIOR_STD[Parameter.TRACK_GROWTH] ** -2
+        )
         both = np.zeros(PARAMETER_COUNT)
-        both[[P.LEFT, P.RIGHT]] = 0.5
+        both[[Parameter.LEFT, Parameter.RIGHT]] = 0.5
         normal += np.outer(both, both) / PRIOR_RADIUS_STD**2
         score += both * float(both @ (configured - parameters)) / PRIOR_RADIUS_STD**2
         inner = normal[np.ix_(FITTED_PARAMETERS, FITTED_PARAMETERS)]
@@ -264,7 +283,7 @@ def _held_out_residual(
     return residual
 
 
-TAPE_STD_M = 0.002
+LINE_DISTANCE_STD_M = 0.002
 """Standard deviation of a distance that a person measures by tape, m.
 
 It is also the standard deviation of the position of a robot that a person places at a line.
@@ -303,9 +322,9 @@ def reading(measure: Measure, leg: str, rides: Mapping[str, Run], answers: Answe
         return slant(answers[leg, measure.near], answers[leg, measure.far], apart)
 
     turned = angle(leg) - (angle(measure.since) if measure.since else 0.0)
-    # The turn is the difference of two angles, each from two distances: four errors of `TAPE_STD_M`
-    # combine to twice `TAPE_STD_M`.
-    return Reading(driven, measure.quantity, measure.plus + turned, 2 * TAPE_STD_M / apart)
+    # The turn is the difference of two angles, each from two distances. Four errors of
+    # `LINE_DISTANCE_STD_M` combine to twice `LINE_DISTANCE_STD_M`.
+    return Reading(driven, measure.quantity, measure.plus + turned, 2 * LINE_DISTANCE_STD_M / apart)
 
 
 def track_ratio(reading: Reading, drive: DriveConfig) -> float:
@@ -351,7 +370,7 @@ def slant(near: float, far: float, apart: float) -> float:
     return math.asin(sine)
 
 
-MAX_STDS = 0.1, 0.02
+MAX_TAPE_STDS = 0.1, 0.02
 """Largest accepted relative standard deviations of the track and of the ratio of the radii."""
 
 ADVICE = (
@@ -383,9 +402,9 @@ def calibrated(
     by_wheels = heading.turned(rows, base, fit.parameters)
     rate = rates(rows, by_wheels)
     result = multipliers(fit.parameters, fit.covariance, rate)
-    inverse_track, std = fit.parameters[P.INVERSE_TRACK], np.sqrt(np.diag(fit.covariance))
-    chance = float(std[P.INVERSE_TRACK] / abs(inverse_track))
-    for name, deviation in unsure(result, chance, MAX_STDS).items():
+    inverse_track, std = fit.parameters[Parameter.INVERSE_TRACK], np.sqrt(np.diag(fit.covariance))
+    chance = float(std[Parameter.INVERSE_TRACK] / abs(inverse_track))
+    for name, deviation in too_inaccurate(result, chance, MAX_TAPE_STDS).items():
         raise RefusedError(
             f"these readings determine {name} only to {deviation:.1%}, which is too inaccurate: "
             f"{ADVICE}"
@@ -394,11 +413,13 @@ def calibrated(
     notes = remarks({}, 0.0, by_wheels, result.values, base, sized=True)
     return Calibration(
         reference=tool, drives=drives, configured=configured(base), multipliers=result,
-        scale="distance", growth=float(fit.parameters[P.TRACK_GROWTH]),
-        growth_std=float(std[P.TRACK_GROWTH]), improvement=_improvement(readings, base, fit, rate),
+        scale="distance", growth=float(fit.parameters[Parameter.TRACK_GROWTH]),
+        growth_std=float(std[Parameter.TRACK_GROWTH]),
+        improvement=_improvement(readings, base, fit, rate),
         delays={}, gyro_bias=0.0, notes=tuple(notes),
         odometry=settings(
-            result.own(), float(result.values[SEPARATION]), (), odometry, scaled=True
+            result.relative_deviations(), float(result.values[SEPARATION]), (), odometry,
+            scaled=True,
         ),
     )  # fmt: skip
 
@@ -410,7 +431,7 @@ def _improvement(readings: Sequence[Reading], base: Base, fit: TapeFit, rate: Ra
     """
     sums = {name: np.zeros(3) for name in ("turn", "straight", "place")}
     present = fit.parameters.copy()
-    present[: P.DELAY] = base.start()[: P.DELAY]
+    present[: Parameter.DELAY] = base.start()[: Parameter.DELAY]
     constant = with_constant_track(fit.parameters, rate)
     for number, reading in enumerate(readings):
         steps = reading.steps

@@ -172,7 +172,7 @@ def _count_problems(config: Config) -> list[str]:
         return []
     return [
         f"mcu.encoder_counts = {counts}: at feedback.wheel_speed = {config.feedback.wheel_speed:g} "
-        "rad/s a wheel's counter could wrap round within "
+        "rad/s a wheel's counter could change by half of its range within "
         f"{FIELD_VALUES / 2 / fastest / counts * 1000:.0f} ms, which is less than "
         f"{MIN_WRAP_PERIODS} control periods ({lasts * 1000:.0f} ms); write mcu.encoder_counts = "
         f"{int(FIELD_VALUES / 2 / fastest / lasts)} or less and make the firmware count fewer "

@@ -240,7 +240,10 @@ def _must_stand(key: str, before: object, after: object) -> str:
     if row.when == "raised":
         if not (isinstance(before, float) and isinstance(after, float) and after < before):
             return ""
-        words = f"lower than {show(before)}, and may be lowered only while the robot stands"
+        words = (
+            f" is lower than the present {show(before)}; this setting may be lowered only while "
+            "the robot stands"
+        )
     else:
-        words = "may be changed only while the robot stands"
-    return f"{key} = {show(after)}: {words}; stop the robot first"
+        words = ": may be changed only while the robot stands"
+    return f"{key} = {show(after)}{words}; stop the robot first"

@@ -18,7 +18,7 @@ from acsard.core.values import Event
 LIMITS_PREFIX = "limits."
 
 
-def stays(key: str) -> bool:
+def survives_restart(key: str) -> bool:
     """Return whether a lowered value of the setting `key` is kept over a restart of the daemon.
 
     `key` is the dotted key of the setting.
@@ -35,7 +35,7 @@ def lowered(file: LimitsConfig, now: LimitsConfig) -> dict[str, float]:
     return {
         LIMITS_PREFIX + name: getattr(now, name)
         for name in file.__struct_fields__
-        if stays(LIMITS_PREFIX + name)
+        if survives_restart(LIMITS_PREFIX + name)
         and _rank(name, getattr(now, name)) < _rank(name, getattr(file, name))
     }
 
@@ -56,7 +56,7 @@ def with_lowered(config: Config, kept: Mapping[str, float]) -> tuple[Config, lis
     wishes: dict[str, object] = {
         key: value
         for key, value in kept.items()
-        if stays(key)
+        if survives_restart(key)
         and (name := key.removeprefix(LIMITS_PREFIX)) in limits.__struct_fields__
         and _rank(name, value) < _rank(name, getattr(limits, name))
     }

@@ -111,10 +111,10 @@ class GatewayFollower:
         return report.certificate_ends or None
 
 
-PEER = (
-    "is not a router but another peer, perhaps a robot's daemon. A peer does not forward "
-    "messages, so a client of one robot sees only that robot, and `acsard call stop --id '*'` "
-    "stops only that robot; put a router between the robots (deploy/zenoh/README.md)"
+PEER_ADVICE = (
+    "A peer, such as a robot's daemon, does not forward messages, so a client of one robot sees "
+    "only that robot, and `acsard call stop --id '*'` stops only that robot; put a router between "
+    "the robots (deploy/zenoh/README.md)"
 )
 
 
@@ -143,7 +143,8 @@ class RouterFollower:
             events.append(Event("router_found", _words("connected to", made)))
         peers = [endpoint for endpoint in status.peers if endpoint not in before.peers]
         if peers:
-            events.append(Event("not_a_router", f"{', '.join(peers)} {PEER}", "warning"))
+            text = f"these endpoints are peers, not routers: {', '.join(peers)}. {PEER_ADVICE}"
+            events.append(Event("not_a_router", text, "warning"))
 
 
 def _words(what: str, endpoints: list[str]) -> str:

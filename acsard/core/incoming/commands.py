@@ -63,7 +63,7 @@ class Bindings:
         the monotonic time of its last command, ns. The certificate name is "" for a program on the
         robot itself. The oldest command is first."""
 
-    def other(self, sender: str, certificate: str, now_ns: int) -> str | None:
+    def bind(self, sender: str, certificate: str, now_ns: int) -> str | None:
         """Bind a sender id to a certificate, and return None.
 
         If the id is still bound to another certificate, change nothing and return the name of the
@@ -180,7 +180,7 @@ class Receiver:
             stamp_ns = header.stamp.to_ns()
             clock = f"{clock}, header on {arrival.via}/{arrival.key}"
         if identity.signed:
-            bound = self._bindings.other(identity.signed, certificate, arrival.arrived_ns)
+            bound = self._bindings.bind(identity.signed, certificate, arrival.arrived_ns)
             if bound is not None:
                 where = f"with the certificate {bound}" if bound else "on the robot's own machine"
                 raise DecodeError(

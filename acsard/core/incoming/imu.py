@@ -63,7 +63,7 @@ class GyroFollower:
         If `own` is true, accept only the simulated gyro of the built-in simulator of this daemon.
         """
         self._own = own
-        self._followed = public_name(SIMULATOR_SENDER) if own else ""
+        self._followed = public_name(SIMULATOR_SENDER) if own else None
         self._heard_ns = -SILENCE_TIMEOUT_NS
 
     def receive(
@@ -91,11 +91,16 @@ class GyroFollower:
         if other and (self._own or now_ns - self._heard_ns < SILENCE_TIMEOUT_NS):
             raise DecodeError(
                 "second_sender",
-                f"{who[:MAX_NAME_LENGTH]} also sends gyro samples: end it, or end the sender in "
-                f"use, {self._followed}",
+                f"{_named(who)} sends gyro samples, but the daemon already uses those of "
+                f"{_named(self._followed)}: end one of the two programs",
             )
         before, self._followed, self._heard_ns = self._followed, who, now_ns
-        return other and before != ""
+        return other and before is not None
+
+
+def _named(sender: str | None) -> str:
+    # A sample on an rmw key without a valid attachment has no sender id.
+    return (sender or "a sender without a name")[:MAX_NAME_LENGTH]
 
 
 def reading(arrival: Arrival) -> GyroSample:

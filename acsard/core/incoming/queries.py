@@ -53,7 +53,7 @@ from acsard.core.ros.parameters import (
     Parameters,
     failure,
     outcome,
-    wished,
+    requested_values,
 )
 from acsard.core.ros.transports import PARAMETERS_PREFIX, in_ros_words, left_out
 from acsard.core.values import ROLES, Answer, Outputs, Request
@@ -191,7 +191,7 @@ class Queries:
         try:
             service = query.topic.removeprefix(PARAMETERS_PREFIX)
             if service in SETTING_SERVICES:
-                wish = wished(query.payload)
+                wish = requested_values(query.payload)
                 self._waiting[query.ticket] = _Waiting(
                     query.topic, "cdr", asked, True, query.payload
                 )

@@ -81,7 +81,8 @@ def decode_limit(arrival: Arrival, configured: float) -> Limit:
         most = " to 100 %" if got.percentage else " m/s or more"
         raise DecodeError("out_of_range", f"{value:g}{unit}: send 0{most}; 0 lifts the limit")
     speed = value / 100.0 * configured if got.percentage else value
-    by = f"{SPEED_LIMIT}, {caller_name(arrival.via, arrival.attachment, arrival.sender)}"
+    name = caller_name(arrival.via, arrival.attachment, arrival.sender)
+    by = f"{name} on the key {SPEED_LIMIT}"
     return Limit(math.inf if value == NO_LIMIT_VALUE else speed, by, arrival.arrived_ns)
 
 
@@ -147,7 +148,7 @@ class SpeedLimiter:
         The argument `requests` contains the requests of the clients, and `now_ns` is the monotonic
         time of the step. The caller must call `settle` after the step.
         """
-        own = self._own(now_ns)
+        own = self._limit_request(now_ns)
         if self._limit is NO_LIMIT and not self._held:
             return (*own, *requests), []
         found, refused, taken = list(own), list[Answer](), False
@@ -180,7 +181,7 @@ class SpeedLimiter:
             return request
         return replace(request, settings=request.settings | {LOWERED_SETTING: self._limit.speed})
 
-    def _own(self, now_ns: int) -> tuple[Request, ...]:
+    def _limit_request(self, now_ns: int) -> tuple[Request, ...]:
         if self._waiting is None or now_ns - self._changed_ns < MIN_INTERVAL_NS:
             return ()
         new, self._waiting = self._waiting, None
@@ -211,7 +212,7 @@ class SpeedLimiter:
             if answer is not None and answer.success:
                 speed = wanted
                 if wanted > self._limit.speed:
-                    text = f"{LOWERED_SETTING} = {wanted:g} {self._until}"
+                    text = f"{LOWERED_SETTING} = {wanted:g} {self._pending_text}"
                     events.append(Event("set", text, by=request.by, kind="waits"))
                     if len(request.settings) > 1:
                         text = f"{answer.message}; {text}"
@@ -225,6 +226,6 @@ class SpeedLimiter:
         return answers
 
     @property
-    def _until(self) -> str:
+    def _pending_text(self) -> str:
         limit = self._limit
         return f"will apply when the limit of {limit.speed:.3g} m/s ends ({limit.by})"

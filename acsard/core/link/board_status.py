@@ -69,7 +69,7 @@ def merged(status: BoardStatus, newer: BoardStatus) -> BoardStatus:
     return BoardStatus(*[old if new is None else new for old, new in pairs])
 
 
-def shown(status: BoardStatus) -> dict[str, str]:
+def as_text(status: BoardStatus) -> dict[str, str]:
     """Return the fields of `status` as text, under the names that users see.
 
     The result maps names such as "motor_driver" to words or numbers such as "fault" or "24.31". It

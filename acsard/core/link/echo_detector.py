@@ -106,7 +106,7 @@ class EchoDetector:
         self._last: deque[_Wheels] = deque(maxlen=MAX_OTHER_REPORTS + 1)
         """Wheel speeds in the last reports, rad/s."""
 
-    def left(self, line: bytes) -> None:
+    def written(self, line: bytes) -> None:
         """Record that `line`, with its line end, was written to the port."""
         self._sent.append(line.removesuffix(b"\r\n"))
         self._runs.append(None)

@@ -125,20 +125,20 @@ class ReplyStyle:
     compares the number of received lines with both numbers.
     """
 
-    def __init__(self, speaks: bool) -> None:
+    def __init__(self, free_running: bool) -> None:
         """Start before the first read of the port.
 
-        `speaks` is true if `mcu.reply_period` is set, so that the board certainly reports by its
-        own clock. If `speaks` is false, the kind of the board is unknown at first.
+        `free_running` is true if `mcu.reply_period` is set, so that the board certainly reports by
+        its own clock. If `free_running` is false, the kind of the board is unknown at first.
         """
-        self.speaks: bool | None = speaks or None
+        self.speaks: bool | None = free_running or None
         """True if the board reports by its own clock, False if it answers each command, None while
         unknown."""
-        self._known = speaks
+        self._known = free_running
         self._left = self._after = 0
         self._came = self._periods = self._asked = 0.0
 
-    def left(self) -> None:
+    def written(self) -> None:
         """Count a command that was written to the port."""
         self._left += 1
 
@@ -178,7 +178,7 @@ class Timeline:
     """Assigns a sample time to each good line, in order.
 
     For each read of the port, call `read`. Then, for each line of the read in order, call `place`
-    if the line is good and `spoilt` if it is bad.
+    if the line is good and `skip_bad` if it is bad.
     """
 
     def __init__(
@@ -230,13 +230,13 @@ class Timeline:
         self._prompts.forget()
         self._forgotten = True
 
-    def left(self, at_ns: int, moves: bool = True) -> None:
+    def written(self, at_ns: int, moves: bool = True) -> None:
         """Record that a command was written at the monotonic time `at_ns`, ns.
 
         `moves` is true if the command contains a speed other than zero.
         """
-        self._prompts.left(at_ns)
-        self._style.left()
+        self._prompts.written(at_ns)
+        self._style.written()
         self._rest_ns = at_ns + WATCHDOG_NS if moves else min(self._rest_ns, at_ns)
 
     def read(self, at: Instant, size: int, lines: int, following: int) -> None:
@@ -264,7 +264,7 @@ class Timeline:
                 self._prompts.restart()
         self._prompts.read(end_ns, lines, following > 0)
 
-    def spoilt(self) -> None:
+    def skip_bad(self) -> None:
         """Skip the next line of the read, because this line is bad.
 
         Also skip the command that this line may answer, unless the board reports by its own clock.
@@ -333,7 +333,7 @@ class Timeline:
         speaks, answered = self._style.speaks, None
         if asked_ns is not None or not speaks:
             answered = self._prompts.place(asked_ns)
-            ours = asked_ns is not None or speaks is False or self._prompts.thinks
+            ours = asked_ns is not None or speaks is False or self._prompts.varies_delay
             if ours and answered is not None:
                 if asked_ns is None and answered.due_ns - came_ns > self._usual_ns / 2:
                     # The usual delay is too long: it was measured on the first reply, which a stall

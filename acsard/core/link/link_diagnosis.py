@@ -31,8 +31,8 @@ BUSY_ADVICE = (
 
 HOST_STALL = "this computer did not run the daemon for"
 SIMULATOR_FAULT = (
-    "a fault in sim.faults silences the built-in simulator, or the simulator, which is a part of "
-    "the daemon, is late"
+    "the built-in simulator is silent because of a fault in sim.faults, or because the daemon, "
+    "which runs the simulator, is late"
 )
 
 FIRST_DIAGNOSIS_NS = 3 * NS_PER_S
@@ -42,7 +42,7 @@ this time."""
 MAX_SHOWN_BYTES = 64
 """Largest number of bytes that a diagnosis shows: enough for a complete line and some noise."""
 
-Look = Literal["nothing", "statuses", "cut", "foreign", "garbage", "few", "sparse"]
+ReceivedClass = Literal["nothing", "statuses", "cut", "foreign", "garbage", "few", "sparse"]
 """The class of the bytes that the board sent while the link was not up.
 
 - nothing: no byte at all
@@ -54,7 +54,7 @@ Look = Literal["nothing", "statuses", "cut", "foreign", "garbage", "few", "spars
 - sparse: only good lines, but too few of them
 """
 
-LOOK_MENDS: dict[Look, str] = {
+RECEIVED_ADVICE: dict[ReceivedClass, str] = {
     "nothing": "does the board have power, is mcu.port its port, is mcu.baud_rate right, are TX "
     "and RX swapped?",
     "statuses": "is TX of this computer connected to RX of the board?",
@@ -83,7 +83,7 @@ MAX_UNANSWERED_FRACTION = 0.02
 """Share of unanswered lines above which `UnansweredLines` warns. A good link loses no answer."""
 
 
-def is_ours(words: str) -> bool:
+def blames_host(words: str) -> bool:
     """Return whether the text `words` blames this computer or the built-in simulator for a silence.
 
     `words` is the text of an event of the link, or the `reason` in `state`.
@@ -139,7 +139,7 @@ class Lateness:
         """
         if link == "stale" and self.late_s:
             return (
-                f"{HOST_STALL} {self.late_s:.2f} s, so it received nothing from the "
+                f"{HOST_STALL} {self.late_s:.2f} s, so the daemon received nothing from the "
                 f"microcontroller: {BUSY_ADVICE}"
             )
         if link == "stale" and self._simulated:
@@ -177,8 +177,8 @@ class Heard(Struct):
             self.last = line
 
     @property
-    def looks(self) -> Look:
-        """The class of the received bytes. `Look` explains the classes."""
+    def looks(self) -> ReceivedClass:
+        """The class of the received bytes. `ReceivedClass` explains the classes."""
         if self.statuses and not self.lines:
             return "statuses"
         if not self.size:
@@ -215,10 +215,10 @@ class Heard(Struct):
         """The complete diagnosis as a sentence for the message `state`."""
         if self.looks == "sparse" and self.late_s:
             return (
-                f"{HOST_STALL} {self.late_s:.2f} s, so it received too little for a link: "
-                f"{BUSY_ADVICE}"
+                f"{HOST_STALL} {self.late_s:.2f} s, so the daemon received too few lines for a "
+                f"link: {BUSY_ADVICE}"
             )
-        mend = f"{LOOK_MENDS[self.looks]} `acsard mcu check` finds out more"
+        mend = f"{RECEIVED_ADVICE[self.looks]} `acsard mcu check` finds out more"
         return f"no link to the microcontroller: {self.counted}; {mend}"
 
 
@@ -245,8 +245,8 @@ class SilenceDiagnosis:
 
         A new diagnosis is made every 3 s (`FIRST_DIAGNOSIS_NS`), from the bytes received in these 3
         s. The result is True if this step makes the first diagnosis, or a diagnosis whose class of
-        received bytes (`Look`) differs from that of the previous diagnosis. `late_s` is the time
-        since the previous step, s, if this step is late; otherwise 0.
+        received bytes (`ReceivedClass`) differs from that of the previous diagnosis. `late_s` is
+        the time since the previous step, s, if this step is late; otherwise 0.
         """
         if self._since_ns is None:
             # The interval begins with this step, so the time before it does not belong to it.
@@ -315,18 +315,18 @@ def damaged(link: Link, check: Negotiation) -> bool:
 def words(
     link: Link,
     check: Negotiation,
-    hearing: SilenceDiagnosis,
+    silence: SilenceDiagnosis,
     lateness: Lateness,
     longest_reply: float,
 ) -> str:
     """Return a sentence for the operator about the state of the link while the port is open.
 
-    `check` is the negotiation of the checksum, `hearing` is the diagnosis of a silence, and
+    `check` is the negotiation of the checksum, `silence` is the diagnosis of a silence, and
     `lateness` is the detector of late control steps. `longest_reply` is the highest value that the
     setting `mcu.reply_period` may have, s.
     """
     if link.state in ("booting", "stale"):
-        heard = hearing.heard
+        heard = silence.heard
         if check.trouble:
             return ADVICE[check.trouble]
         if heard is not None and not heard.good:

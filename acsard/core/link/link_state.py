@@ -21,9 +21,9 @@ from typing import Literal
 from acsard.core.values import NS_PER_S
 
 State = Literal["down", "booting", "up", "stale"]
-Sign = Literal["closed", "opened", "restarted", "trusted", "silent", "damaged", "blocked", "echo"]
+Input = Literal["closed", "opened", "restarted", "trusted", "silent", "damaged", "blocked", "echo"]
 
-TRANSITIONS: dict[tuple[State, Sign], State] = {
+TRANSITIONS: dict[tuple[State, Input], State] = {
     ("down", "opened"): "booting",
     ("booting", "closed"): "down",
     ("booting", "opened"): "booting",
@@ -39,13 +39,13 @@ TRANSITIONS: dict[tuple[State, Sign], State] = {
     ("stale", "opened"): "booting",
     ("stale", "trusted"): "up",
 }
-"""Maps each pair of a state and an input (`Sign`) to the next state. A pair without an entry does
+"""Maps each pair of a state and an input (`Input`) to the next state. A pair without an entry does
 not change the state."""
 
 STATE_TEXTS: dict[State, str] = {
     "down": "the serial port is closed; it is being reopened",
     "booting": "the port is open; waiting for the microcontroller's first good lines",
-    "up": "linked",
+    "up": "the link to the microcontroller is up",
     "stale": "the microcontroller has fallen silent",
 }
 
@@ -70,7 +70,10 @@ was lost for a moment."""
 
 
 class Link:
-    """The state of the link and its counts of good and bad lines. Only `sign` changes the state."""
+    """The state of the link, and its counts of good and bad lines.
+
+    Only `apply` changes the state.
+    """
 
     def __init__(self, quiet_ns: int) -> None:
         """Start with the port closed.
@@ -89,20 +92,20 @@ class Link:
         """`_waits_until_ns` is the monotonic time until which the board may answer late, ns.
         `_waited` is true if `wait` was called since the last good line."""
 
-    def sign(self, sign: Sign) -> None:
-        """Change the state as `TRANSITIONS` says for the input `sign`.
+    def apply(self, given: Input) -> None:
+        """Change the state as `TRANSITIONS` says for the input `given`.
 
         Every input except "trusted" resets the count of good lines in a row.
         """
-        self.state = TRANSITIONS.get((self.state, sign), self.state)
-        if sign == "trusted":
+        self.state = TRANSITIONS.get((self.state, given), self.state)
+        if given == "trusted":
             return
         self._good_in_row = 0
-        if sign in ("closed", "opened", "restarted"):
+        if given in ("closed", "opened", "restarted"):
             self._heard_ns = None
-        if sign in ("closed", "opened"):
+        if given in ("closed", "opened"):
             self._bad_in_row = 0
-            self.excuse()
+            self.reset_silences()
 
     def silent(self, now_ns: int) -> bool:
         """Return whether the last good line is older than `quiet_ns`.
@@ -123,9 +126,9 @@ class Link:
         """
         since_ns = None if self._heard_ns is None else at_ns - self._heard_ns
         if not self.silent(at_ns):
-            self.excuse()
+            self.reset_silences()
         else:
-            self.missed()
+            self.reset_good_lines()
             if since_ns is not None:
                 self._silences += 1
                 self.sparse_s = since_ns / NS_PER_S if self._silences >= SPARSE_SILENCES else 0.0
@@ -147,7 +150,7 @@ class Link:
             self._waited = True
             self._waits_until_ns = now_ns + self.quiet_ns // 3
 
-    def excuse(self) -> None:
+    def reset_silences(self) -> None:
         """Reset the count of silences in a row.
 
         The caller does this if a line came in time, or if the board is not the cause of the
@@ -155,7 +158,7 @@ class Link:
         """
         self._silences, self.sparse_s = 0, 0.0
 
-    def missed(self) -> None:
+    def reset_good_lines(self) -> None:
         """Reset the count of good lines in a row, because of a bad line or a silence.
 
         While the link is up, the count does not change.
@@ -168,7 +171,7 @@ class Link:
 
         On a checked link, the caller must then negotiate the check again.
         """
-        self.missed()
+        self.reset_good_lines()
         self._bad_in_row += 1
         return self._bad_in_row == BAD_LINES
 
@@ -185,6 +188,6 @@ class Link:
         silent = self.silent(now_ns)
         if self.state == "up":
             if silent:
-                self.sign("silent")
+                self.apply("silent")
         elif self._good_in_row >= GOOD_LINES and may_rise and not silent:
-            self.sign("trusted")
+            self.apply("trusted")

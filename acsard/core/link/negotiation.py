@@ -38,7 +38,7 @@ from acsard.core.link.link_state import WATCHDOG_S
 from acsard.core.values import NS_PER_S, WheelSpeeds
 
 State = Literal["off", "waking", "asking", "plain", "checked", "sampled"]
-Sign = Literal["gap", "heard", "answer", "sample", "refusal", "samples_end"]
+Input = Literal["gap", "heard", "answer", "sample", "refusal", "samples_end"]
 """The inputs of the state machine that negotiates the check.
 
 - gap: the negotiation starts again, because the port was opened or lines were missing or damaged
@@ -49,7 +49,7 @@ Sign = Literal["gap", "heard", "answer", "sample", "refusal", "samples_end"]
 - samples_end: the replies no longer contain samples
 """
 
-TRANSITIONS: dict[tuple[State, Sign], State] = {
+TRANSITIONS: dict[tuple[State, Input], State] = {
     ("waking", "gap"): "waking",
     ("waking", "heard"): "asking",
     ("waking", "answer"): "checked",
@@ -63,7 +63,7 @@ TRANSITIONS: dict[tuple[State, Sign], State] = {
     ("sampled", "gap"): "waking",
     ("sampled", "samples_end"): "checked",
 }
-"""Maps each pair of a state and an input (`Sign`) to the next state. A pair without an entry does
+"""Maps each pair of a state and an input (`Input`) to the next state. A pair without an entry does
 not change the state."""
 
 IN_FORCE: dict[State, str] = {
@@ -205,7 +205,7 @@ class Negotiation:
         If `fresh` is true, also forget all facts about the board, because another board may be
         connected now.
         """
-        self._sign("gap")
+        self._apply("gap")
         self._begin(fresh)
         if fresh:
             self.trouble, self._knows, self._question = "", False, b""
@@ -220,8 +220,8 @@ class Negotiation:
         # a plain stop here too.
         self._plain_turn = 0 if fresh else 1
 
-    def _sign(self, sign: Sign) -> None:
-        self.state = TRANSITIONS.get((self.state, sign), self.state)
+    def _apply(self, given: Input) -> None:
+        self.state = TRANSITIONS.get((self.state, given), self.state)
 
     # Lines to the board.
 
@@ -254,9 +254,9 @@ class Negotiation:
         self._question = line.removesuffix(b"\r\n") if letters else b""
         return line
 
-    def left(self, line: bytes) -> None:
+    def written(self, line: bytes) -> None:
         """Record that `line`, with its line end, was written to the port, to detect its echo."""
-        self._echo.left(line)
+        self._echo.written(line)
 
     def settle(self, went: bool, late_ns: int = 0) -> None:
         """Record whether the port wrote the line that `seal` or `question` returned last.
@@ -280,7 +280,7 @@ class Negotiation:
 
     # Lines from the board.
 
-    def echoed(self, line: bytes) -> bool:
+    def check_question_echo(self, line: bytes) -> bool:
         """Test a received line, and return whether this line or an earlier one is an echo.
 
         `line` has no line end. After an echo, the caller rejects every received line until the port
@@ -295,7 +295,7 @@ class Negotiation:
         """Whether an echo was detected. Then all lines are rejected until the port is reopened."""
         return self.trouble == "echo"
 
-    def repeated(self, line: bytes, speeds: WheelSpeeds) -> bool:
+    def check_reply_echo(self, line: bytes, speeds: WheelSpeeds) -> bool:
         """Process a reply without a sample, and return whether the last replies are an echo.
 
         `line` is the reply without its line end, and `speeds` are the speeds in the reply.
@@ -304,12 +304,12 @@ class Negotiation:
             self.trouble = "echo"
         return self.echoes
 
-    def heard_plain(self) -> None:
+    def record_plain_reply(self) -> None:
         """Record that a valid plain line came while the daemon was asking for the check.
 
         This line shows that the board is awake, so unanswered questions are counted from now on.
         """
-        self._sign("heard")
+        self._apply("heard")
 
     def answered(self, reply: Checked, at_ns: int) -> int:
         """Process a correct checked reply, and return the time at which its command was written.
@@ -331,11 +331,11 @@ class Negotiation:
         if self.asking:
             self.settled_ns, self._without = at_ns, 0
             self.trouble, self._knows = "", True
-            self._sign("sample" if has_sample else "answer")
+            self._apply("sample" if has_sample else "answer")
             return left_ns
         self._without = 0 if has_sample else self._without + 1
         if self._without >= MAX_REPLIES_WITHOUT_SAMPLE:
-            self._sign("samples_end")
+            self._apply("samples_end")
         return left_ns
 
     def judge(self, now_ns: int) -> None:
@@ -360,6 +360,6 @@ class Negotiation:
         self._unanswered = 0
         if self._wanted == "auto" and not self._knows:
             self.settled_ns = now_ns
-            self._sign("refusal")
+            self._apply("refusal")
         else:
             self.trouble = "forgotten" if self._knows else "unknown"

@@ -102,21 +102,21 @@ class Coarseness:
         """`_jumps` is the mean jump of each wheel, rad per line. `_wheel` is the index of the wheel
         that was examined in the last line."""
 
-    def add(self, speeds: Motors, own: float) -> bool:
+    def add(self, speeds: Motors, elapsed_s: float) -> bool:
         """Process the speeds of a line, and return whether the examined encoder is coarse.
 
         Each call examines the encoder of one wheel, and the wheels take turns. `speeds` are the
-        speeds of the four wheels, rad/s. `own` is the time since the previous line, s. Return False
-        without an examination if `own` exceeds `MAX_INTERVAL_S`, or if all speeds of this line and
-        of the previous line are 0.
+        speeds of the four wheels, rad/s. `elapsed_s` is the time since the previous line. Return
+        False without an examination if `elapsed_s` exceeds `MAX_INTERVAL_S`, or if all speeds of
+        this line and of the previous line are 0.
         """
         (older, before), self._rows = self._rows, (self._rows[1], speeds)
-        if speeds == NO_STEPS == before or own > MAX_INTERVAL_S:
+        if speeds == NO_STEPS == before or elapsed_s > MAX_INTERVAL_S:
             return False
         # Only one wheel is examined per line, to keep every control step short.
         wheel = self._wheel = (self._wheel + 1) % 4
         mean, jump = self._jumps[wheel], abs(older[wheel] - 2 * before[wheel] + speeds[wheel])
-        self._jumps[wheel] = mean = mean + JUMP_GAIN * (own / 2 * jump - mean)
+        self._jumps[wheel] = mean = mean + JUMP_GAIN * (elapsed_s / 2 * jump - mean)
         return mean > COARSE
 
 
@@ -158,15 +158,15 @@ class CountRecovery:
         `counted` is None if the angles in whole counts are unknown. If these angles include the
         motion of a missing line before this line, the field `bridged` becomes 0.
         """
-        own, speeds, counted = line.dt - line.bridged, line.speeds.as_tuple(), None
+        elapsed_s, speeds, counted = line.dt - line.bridged, line.speeds.as_tuple(), None
         if self._whole.angle:
-            if line.turned is None and own > 0.0:
-                counted = self._whole.turned(speeds, own, line.bridged)
+            if line.turned is None and elapsed_s > 0.0:
+                counted = self._whole.turned(speeds, elapsed_s, line.bridged)
                 if self._whole.covers_gap:
                     line = replace(line, bridged=0.0)
             else:
                 self._whole.pause()
-        elif own > 0.0 and self._coarseness.add(speeds, own):
+        elif elapsed_s > 0.0 and self._coarseness.add(speeds, elapsed_s):
             self.coarse_lines += 1
         a, b, c, d = self._wheels
         a.add(speeds[0])

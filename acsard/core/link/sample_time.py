@@ -87,12 +87,12 @@ for 16 ms. If a line comes later than this, `FreeRunningTimes` finds no clock. S
 answers a command that was sent between two periods, or comes from a slow board whose lines vary by
 more than this time."""
 
-EARLY_ALONE, ALONE = 0.55, 12
+MAX_CONFIRMING_LATENESS, READS_PER_CONFIRMATION = 0.55, 12
 """Limits for the reads that confirm a clock. A read confirms a clock if it comes at most
-`EARLY_ALONE` periods after its slot. The earliest read always confirms the clock.
+`MAX_CONFIRMING_LATENESS` periods after its slot. The earliest read always confirms the clock.
 `FreeRunningTimes` accepts the clock only if, in addition to the earliest read, more than one in
-`ALONE` reads confirm it. If fewer reads do, these reads probably contain answers to commands that
-were sent between two periods, and the clock is too early for all other lines."""
+`READS_PER_CONFIRMATION` reads confirm it. If fewer reads do, these reads probably contain answers
+to commands that were sent between two periods, and the clock is too early for all other lines."""
 
 COMPLETE_PERIODS = 1.4
 """Time between two reads with a single line each, in periods of the board, below which no line is
@@ -269,7 +269,8 @@ class FreeRunningTimes:
         for slots, most, guess in self._clocks(reads, gaps):
             first, late = _latest(reads, slots, guess)
             latest = min(most, MAX_ADAPTER_DELAY_NS / guess)
-            if max(late) <= latest and sorted(late)[1 + len(late) // ALONE] <= EARLY_ALONE:
+            confirming = sorted(late)[1 + len(late) // READS_PER_CONFIRMATION]
+            if max(late) <= latest and confirming <= MAX_CONFIRMING_LATENESS:
                 break
         else:
             del reads[: len(reads) // 4]
@@ -399,12 +400,12 @@ LEAST_DELAY_GAIN = 0.002
 """Gain per reply with which the long-term least reply delay rises toward the usual reply delay.
 With this gain, an outdated least delay is forgotten after about 500 replies."""
 
-CREEP, CREEPS_FOR = 0.05, 3
-"""`CREEP` is the rate at which the least delay of the last replies rises, so that `PromptedTimes`
-forgets older replies. With each read of the port, the least delay rises by `CREEP` times the time
-since the previous read. For this purpose, the time since the previous read counts as at least 1 and
-at most `CREEPS_FOR` times the usual time between two commands. The upper limit is for a board that
-stalls and then answers all lines."""
+LEAST_DELAY_RISE, MAX_RISE_PERIODS = 0.05, 3
+"""`LEAST_DELAY_RISE` is the rate at which the least delay of the last replies rises, so that
+`PromptedTimes` forgets older replies. With each read of the port, the least delay rises by
+`LEAST_DELAY_RISE` times the time since the previous read. For this purpose, the time since the
+previous read counts as at least 1 and at most `MAX_RISE_PERIODS` times the usual time between two
+commands. The upper limit is for a board that stalls and then answers all lines."""
 
 LOST_REPLY_PERIODS = 1.25
 """Largest excess of the least delay of the last replies over the long-term least delay, in usual
@@ -529,7 +530,7 @@ class PromptedTimes:
         scheduler cause, but less than an adapter causes."""
 
     @property
-    def thinks(self) -> bool:
+    def varies_delay(self) -> bool:
         """Whether the board itself varies the delay of its replies.
 
         The criterion: the delay varies by more than this computer and its USB adapter can cause.
@@ -552,7 +553,7 @@ class PromptedTimes:
             return 0
         return self._sent + int(self._delay)
 
-    def left(self, at_ns: int) -> None:
+    def written(self, at_ns: int) -> None:
         """Record that a command was written at the monotonic time `at_ns`, ns."""
         if self._sent is not None:
             apart, usual = at_ns - self._sent, self._apart
@@ -704,8 +705,8 @@ class PromptedTimes:
         # reply to the previous line.
         soonest = max(float(self._soonest), self._least)
         if left:
-            most = CREEPS_FOR * self._apart
-            rise = CREEP * min(max(self._since, self._apart), most)
+            most = MAX_RISE_PERIODS * self._apart
+            rise = LEAST_DELAY_RISE * min(max(self._since, self._apart), most)
             self._soon = min(self._soon + rise, at - left[0])
             if self._soon - soonest > LOST_REPLY_PERIODS * self._apart:
                 # All of the last replies are late by more than the time between two lines. So

@@ -90,7 +90,7 @@ class SerialOutput:
         # The additional line end ends a line of which the board has received only a part.
         return (b"\r\n" if self._torn else b"") + goes
 
-    def took(self, line: bytes, handed: bytes, taken: int, now_ns: int) -> Offered:
+    def record_write(self, line: bytes, handed: bytes, taken: int, now_ns: int) -> Offered:
         """Record that the kernel accepted `taken` bytes of `handed`, and return the result.
 
         `handed` are the bytes that `prepare` returned for `line`. The result is "superseded" if the

@@ -172,7 +172,7 @@ class McuSession:
                 self._reject("too_long", more=more)
                 self._bad()
             if self.lateness.look(now.mono_ns, good=bool(feedback)):
-                self._link.excuse()
+                self._link.reset_silences()
             if 0.0 < self.lateness.step_s < WATCHDOG_S and self._answers and not feedback:
                 # The board may have had nothing to answer, because this computer sent nothing. If
                 # its watchdog has not stopped the motors yet, a stop without a ramp would only
@@ -259,15 +259,15 @@ class McuSession:
         self._held_up = not went
         if went:
             line, left_ns = made[0], made[1] + late_ns
-            self.negotiation.left(line)
-            self._timeline.left(left_ns, moves=not line.startswith(self._rest))
+            self.negotiation.written(line)
+            self._timeline.written(left_ns, moves=not line.startswith(self._rest))
             self.restarted = self.blocked and left_ns - self._left_ns >= LONG_GAP_NS
             self._left_ns = left_ns
         elif blind and port_open:
             self._blind.undo()
 
     def _begin(self, port_open: bool, opened: int, now_ns: int) -> None:
-        self._link.sign("opened" if port_open else "closed")
+        self._link.apply("opened" if port_open else "closed")
         self.restarted = self.reopened = opened != self._opened
         if self.reopened:
             self._reported, self._awaiting = (BoardStatus(), None), True
@@ -288,7 +288,7 @@ class McuSession:
         """
         if self.link == "up":
             self.events.append(Event("mcu_restarted", f"the microcontroller {how}", "warning"))
-        self._link.sign("restarted")
+        self._link.apply("restarted")
         self.restarted = self._starting_over = True
         self._timeline.forget()
         self.count_recovery.forget()
@@ -302,7 +302,7 @@ class McuSession:
             # In a late step, the last written line is old because this computer did not run.
             self.blocked = True
         if self.blocked:
-            link.sign("blocked")
+            link.apply("blocked")
         # The link does not come up in the update that detected a restart, because the arbiter must
         # see a lost link first.
         link.judge(now_ns, may_rise=not self._starting_over)
@@ -346,7 +346,7 @@ class McuSession:
 
     def _bad(self) -> None:
         if self._link.bad() and self.negotiation.checked:
-            self._link.sign("damaged")
+            self._link.apply("damaged")
             self.negotiation.begin()
 
     def _announce(self) -> None:
@@ -383,7 +383,7 @@ class McuSession:
         for line, following in lines:
             got = self._line(line, piece.at, following)
             if got is None:
-                timeline.spoilt()
+                timeline.skip_bad()
             else:
                 feedback.append(got)
             if link.state != "up":
@@ -412,9 +412,9 @@ class McuSession:
             return None
         check = self.negotiation
         asking = check.asking
-        if check.echoes or (asking and check.echoed(line)):
+        if check.echoes or (asking and check.check_question_echo(line)):
             self._reject("echo")
-            self._link.missed()
+            self._link.reset_good_lines()
             return None
         reading, asked_ns = None, None
         try:
@@ -424,8 +424,8 @@ class McuSession:
                 asked_ns = check.answered(reply, read_at.mono_ns)
             else:
                 speeds = self.codec.decode(line)
-            if not asking and reading is None and check.repeated(line, speeds):
-                self._link.sign("echo")
+            if not asking and reading is None and check.check_reply_echo(line, speeds):
+                self._link.apply("echo")
                 self._reject("echo")
                 return None
         except FrameError as error:
@@ -433,7 +433,7 @@ class McuSession:
             self._bad()
             return None
         if asked_ns is None and asking:
-            check.heard_plain()
+            check.record_plain_reply()
             return None
         return self._good(speeds, reading, read_at, (following, len(line) + 2), asked_ns)
 

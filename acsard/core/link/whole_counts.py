@@ -52,9 +52,9 @@ follows from the speed and the host's estimate of the time. This limit applies i
 prove nothing, as with fine encoders. It also helps to decide whether the counts of a line include
 those of the missing line before it."""
 
-WIDE, WIDE_S = 0.6, 0.005
+MAX_TIME_ERROR, MAX_TIME_ERROR_S = 0.6, 0.005
 """Largest assumed error of the host's estimate of the time between two samples: the estimate times
-`WIDE`, plus `WIDE_S` s."""
+`MAX_TIME_ERROR`, plus `MAX_TIME_ERROR_S` s."""
 
 MAX_CARRIED_ERROR = 0.95
 """Largest share of the error of the host's estimate that is added to the estimate for the next
@@ -66,22 +66,24 @@ REPEATED_FRACTION = 0.65
 divided by the time over which the firmware last counted. Firmware that is asked again very soon has
 no new counts, and repeats the speeds of the previous line."""
 
-SOON, OFF = 0.45, 0.25
+REPEATED_LIMIT, REPEATED_COUNT_ERROR = 0.45, 0.25
 """Limits for a line with unchanged speeds. Let q be the time since the previous line, divided by
-the time over which the firmware last counted. If q is less than `SOON`, the line is a repetition of
-the previous line. If q lies between `SOON` and `REPEATED_FRACTION`, the line is a repetition in two
-cases. Either its speeds are not whole counts, or its counts and the host's estimate of the time
-differ by more than `OFF` counts of the fastest wheel."""
+the time over which the firmware last counted. If q is less than `REPEATED_LIMIT`, the line is a
+repetition of the previous line. If q lies between `REPEATED_LIMIT` and `REPEATED_FRACTION`, the
+line is a repetition in two cases. Either its speeds are not whole counts, or its counts and the
+host's estimate of the time differ by more than `REPEATED_COUNT_ERROR` counts of the fastest
+wheel."""
 
-UNSURE, SLOW = 0.2, 0.025
-"""`UNSURE` is a limit for the mean error of the host's estimate of the time, in counts of the
-fastest wheel. Above this limit, the nearest whole number of counts is often wrong. A random time
-has a mean error of 0.25. An encoder with 96 counts a turn reaches `UNSURE` behind a USB adapter
-that batches lines for 16 ms. `SLOW` is the gain of the filter for the mean."""
+MAX_MEAN_ERROR, MEAN_GAIN = 0.2, 0.025
+"""`MAX_MEAN_ERROR` is a limit for the mean error of the host's estimate of the time, in counts of
+the fastest wheel. Above this limit, the nearest whole number of counts is often wrong. A random
+time has a mean error of 0.25. An encoder with 96 counts a turn reaches `MAX_MEAN_ERROR` behind a
+USB adapter that batches lines for 16 ms. `MEAN_GAIN` is the gain of the filter for the mean."""
 
-GAIN, DOUBTFUL = 0.1, 0.3
-"""`GAIN` is the gain of the filter for the share of lines whose speeds are not whole counts. If
-this share reaches `DOUBTFUL`, no line is treated as whole counts."""
+SHARE_GAIN, MAX_BAD_SHARE = 0.1, 0.3
+"""`SHARE_GAIN` is the gain of the filters for two shares: the share of lines whose speeds are not
+whole counts, and the share of lines that include the counts of the missing line before them. If the
+first share reaches `MAX_BAD_SHARE`, no line is treated as whole counts."""
 
 
 class WholeCounts:
@@ -126,18 +128,18 @@ class WholeCounts:
     @property
     def believed(self) -> bool:
         """Whether the counts per turn are known, and few recent lines contradict whole counts."""
-        return self.angle > 0.0 and self._doubt < DOUBTFUL
+        return self.angle > 0.0 and self._doubt < MAX_BAD_SHARE
 
-    def turned(self, speeds: Motors, own: float, gap: float = 0.0) -> Motors | None:
+    def turned(self, speeds: Motors, elapsed_s: float, gap: float = 0.0) -> Motors | None:
         """Return the angle by which each wheel turned since the previous line, rad.
 
         The angles are whole counts. If the line does not show the counts, the angles are speed
         times time. Return None if the firmware does not report whole counts. Also return None if
         the wheels turn, but no speed exceeds its rounding error.
 
-        `speeds` are in rad/s. `own` is the host's estimate of the time since the previous line, s,
-        whether or not the host received that line. If that line is missing, `gap` is the time from
-        the last good line to the missing line, s. Otherwise `gap` is 0. If the call sets
+        `speeds` are in rad/s. `elapsed_s` is the host's estimate of the time since the previous
+        line, whether or not the host received that line. If that line is missing, `gap` is the time
+        from the last good line to the missing line, s. Otherwise `gap` is 0. If the call sets
         `covers_gap` to True, the angles also include the motion during `gap`.
         """
         self.covers_gap = False
@@ -148,52 +150,53 @@ class WholeCounts:
             # The line does not show the firmware's time, so the host's time is the best available.
             self.pause()
             return speeds if fastest == 0.0 else None
-        want = own + self._apart
-        number, shown = self._number(speeds, fastest, want)
+        expected_s = elapsed_s + self._apart
+        number, shown = self._number(speeds, fastest, expected_s)
         if gap:
-            longer, proved = self._number(speeds, fastest, want + gap)
-            fits = self._fits(number, fastest, want), self._fits(longer, fastest, want + gap)
+            longer_s = expected_s + gap
+            longer, proved = self._number(speeds, fastest, longer_s)
+            fits = self._fits(number, fastest, expected_s), self._fits(longer, fastest, longer_s)
             if (proved and fits == (False, True)) or (shown and fits == (True, False)):
-                self._cover += GAIN * (fits[1] - self._cover)
+                self._cover += SHARE_GAIN * (fits[1] - self._cover)
                 self.covers_gap = fits[1]
             else:
-                self.covers_gap = self._cover > 0.5 and gap < 1.5 * own
+                self.covers_gap = self._cover > 0.5 and gap < 1.5 * elapsed_s
             if self.covers_gap:
-                number, shown, want = longer, proved, want + gap
+                number, shown, expected_s = longer, proved, longer_s
         period = number * self.angle / fastest
         if (
             self.believed
             and speeds == before
-            and want < REPEATED_FRACTION * self._period
+            and expected_s < REPEATED_FRACTION * self._period
             and (
                 not number
-                or want < SOON * self._period
-                or abs(want - period) > OFF * self.angle / fastest
+                or expected_s < REPEATED_LIMIT * self._period
+                or abs(expected_s - period) > REPEATED_COUNT_ERROR * self.angle / fastest
             )
         ):
-            self._apart = want
+            self._apart = expected_s
             return 0.0, 0.0, 0.0, 0.0
         if shown is not None:
             # Only the other wheels can prove or refute whole counts.
-            self._doubt += GAIN * ((not shown) - self._doubt)
+            self._doubt += SHARE_GAIN * ((not shown) - self._doubt)
         if not self.believed:
             self.pause()
             self.covers_gap = False
             return None
         if number and shown is None:
-            off = abs(want - period) * fastest / self.angle
-            self._unsure += SLOW * (off - self._unsure)
-        if not number or (shown is None and self._unsure > UNSURE):
+            off = abs(expected_s - period) * fastest / self.angle
+            self._unsure += MEAN_GAIN * (off - self._unsure)
+        if not number or (shown is None and self._unsure > MAX_MEAN_ERROR):
             # Speed times time. The time includes the time carried from earlier lines.
             self.pause()
-            self._period = want
-            return a * want, b * want, c * want, d * want
+            self._period = expected_s
+            return a * expected_s, b * expected_s, c * expected_s, d * expected_s
         # After the first line, the error comes from two sample times in equal parts, so only half
         # of it is carried. With each further line the share grows.
         self._run += 1
         kept = min(MAX_CARRIED_ERROR, self._run / (self._run + 1))
-        self._period, self._apart = period, kept * (want - period)
-        if abs(want - period) <= period * ROUNDING / fastest:
+        self._period, self._apart = period, kept * (expected_s - period)
+        if abs(expected_s - period) <= period * ROUNDING / fastest:
             self._apart = 0.0  # the rounding of the speeds explains the difference
         size, count = self.angle, period / self.angle
         return (
@@ -203,20 +206,20 @@ class WholeCounts:
             round(d * count) * size,
         )
 
-    def _fits(self, number: int, fastest: float, want: float) -> bool:
-        return abs(number - want * fastest / self.angle) <= MAX_COUNT_ERROR
+    def _fits(self, number: int, fastest: float, expected_s: float) -> bool:
+        return abs(number - expected_s * fastest / self.angle) <= MAX_COUNT_ERROR
 
-    def _number(self, speeds: Motors, fastest: float, want: float) -> tuple[int, bool | None]:
+    def _number(self, speeds: Motors, fastest: float, expected_s: float) -> tuple[int, bool | None]:
         """Return the count n of the fastest wheel, 0 if unknown, and whether n is proved.
 
         The second value is True if the speeds prove that the wheels made whole counts, False if
         they prove the opposite, and None otherwise. `fastest` is the largest absolute value in
-        `speeds`, rad/s. `want` is the host's estimate of the time between the two samples plus the
-        addition from the previous line, s.
+        `speeds`, rad/s. `expected_s` is the host's estimate of the time between the two samples
+        plus the addition from the previous line.
         """
         count = fastest / self.angle
-        exact = want * count  # counts if the host's time were right
-        room = (WIDE * want + WIDE_S) * count
+        exact = expected_s * count  # counts if the host's time were right
+        room = (MAX_TIME_ERROR * expected_s + MAX_TIME_ERROR_S) * count
         number = max(1, round(exact))
         if abs(number - exact) > room:
             return 0, False

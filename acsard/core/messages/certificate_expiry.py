@@ -30,20 +30,22 @@ def expiry(ends: Mapping[str, int], now_ns: int) -> tuple[int, str]:
     if not ends:
         return (
             1,
-            "unknown, because the TLS gateway does not run, or the library that reads "
-            "certificates is missing (`acsard doctor` says which)",
+            "unknown: the TLS gateway is not running, or the library that reads certificates is "
+            "missing (`acsard doctor` says which)",
         )
-    whose, ends_ns = first(ends)
+    whose, ends_ns = first_expiry(ends)
     of = f" (certificate of {whose})" if whose else ""
     days = (ends_ns - now_ns) / DAY_NS
     if days < 0:
-        return 2, f"expired {-days:.0f} days ago{of}: TLS refuses every client"
+        # Zenoh ignores the dates of an authority, so not every expired certificate has this effect.
+        effect = "" if whose else ": TLS refuses every client"
+        return 2, f"expired {-days:.0f} days ago{of}{effect}"
     if days < EXPIRY_DAYS:
         return 1, f"expires in {days:.0f} days{of}"
     return 0, f"valid for {days:.0f} days{of}"
 
 
-def first(ends: Mapping[str, int]) -> tuple[str, int]:
+def first_expiry(ends: Mapping[str, int]) -> tuple[str, int]:
     """Return the certificate that expires first, as a pair: its owner and its expiry time.
 
     `ends` maps owners to expiry times, wall-clock ns since 1970. The time of the owner "" may come

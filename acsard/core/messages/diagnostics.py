@@ -23,7 +23,7 @@ from acsard.core.messages.schema import DiagnosticArray, DiagnosticStatus, Heade
 from acsard.core.motion import battery
 from acsard.core.motion.arbiter_text import waiting
 from acsard.core.motion.bumpers import SILENT_REASON as SILENT_BUMPERS
-from acsard.core.motion.bumpers import missing
+from acsard.core.motion.bumpers import missing_text
 from acsard.core.motion.emergency_stop import (
     DRIVER_FAULT_REASON,
     MISSING_REASON,
@@ -32,6 +32,7 @@ from acsard.core.motion.emergency_stop import (
 )
 from acsard.core.motion.gyro import STATUS_TEXTS
 from acsard.core.motion.learned_track import tracks
+from acsard.core.motion.wheel_faults import slow_text
 from acsard.core.values import (
     WHEELS,
     GyroStatus,
@@ -57,7 +58,7 @@ BOARD = {
 """Maps each state of the emergency-stop input to the diagnostic level and the text to show. The
 state "" means that the board has never reported the input."""
 
-WARNING_LEVELS = {"ok": OK, "warning": WARN, "return": WARN, "stop": ERROR, "unknown": WARN}
+BATTERY_LEVELS = {"ok": OK, "warning": WARN, "return": WARN, "stop": ERROR, "unknown": WARN}
 """Maps each battery level, such as "return", to the diagnostic level to show for it."""
 
 SHOW_REFUSAL_S = 2.0
@@ -170,7 +171,7 @@ def _commands(outputs: Outputs, snapshot: Snapshot, speed_limit: str) -> Row:
     for source in crowded:
         message = (
             f"{message}; {source.waits_for.senders + 1} programs send as {source.name}, and the "
-            "robot follows one of them: end the others, or give each a source of its own"
+            "robot follows one of them: end the other programs, or give each program its own source"
         )
     age_s = snapshot.refused_age_s
     refused = age_s is not None and age_s < SHOW_REFUSAL_S
@@ -188,7 +189,7 @@ def _wheels(doubt: WheelsStatus, counters: dict[str, int]) -> Row:
         "front_more_left": f"{left:.3f}",
         "front_more_right": f"{right:.3f}",
     }
-    trouble = doubt.text or (doubt.slow and f"wheels slower than commanded: {values['slow']}")
+    trouble = doubt.text or (doubt.slow and slow_text(doubt.slow))
     level, message = WARN if trouble else OK, trouble or "front and rear wheels agree"
     values |= _counted(counters, "wheel_fault") | _counted(counters, "uncommanded_motion")
     return Row("wheels", level, message, values)
@@ -207,7 +208,7 @@ def _board(config: Config, snapshot: Snapshot) -> list[Row]:
     elif bumpers is not None:
         found.append((OK, f"{many(len(bumpers), 'bumper')} released"))
     elif needed:
-        found.append((ERROR, missing(safety)))
+        found.append((ERROR, missing_text(safety)))
     if snapshot.board.get("motor_driver") == "fault":
         found.append((ERROR, DRIVER_FAULT_REASON))
     counted: dict[str, str] = {}
@@ -231,7 +232,7 @@ def _battery(config: Config, snapshot: Snapshot) -> list[Row]:
     shown |= {name: f"{value:.2f}" for name, value in numbers.items() if value is not None}
     shown |= {f"{level}_below": f"{below:g}" for level, below in bounds.items()}
     return [
-        Row("battery", WARNING_LEVELS[status.level], battery.words(config.battery, status), shown)
+        Row("battery", BATTERY_LEVELS[status.level], battery.words(config.battery, status), shown)
     ]
 
 
@@ -249,7 +250,7 @@ def _gyro(config: Config, gyro: GyroStatus) -> list[Row]:
         values["learned_multiplier_std"] = f"{learned * gyro.track_deviation:.3f}"
         values["multiplier_in_use"] = f"{learned if gyro.track_use == 'used' else configured:.3f}"
         track = f"; effective track: {tracks(gyro, configured)}"
-    level = OK if gyro.does in ("used", "waiting for rest") else WARN
+    level = OK if gyro.does in ("used", "waiting for rest", "waiting for turn") else WARN
     return [Row("gyro", level, STATUS_TEXTS[gyro.does] + track, values)]
 
 

@@ -18,7 +18,7 @@ Use = Literal["publish", "subscribe", "query"]
 
 USES: tuple[Use, ...] = get_args(Use)
 
-USE_TEXTS: dict[Role, str] = {
+ROLE_TEXTS: dict[Role, str] = {
     "viewer": "this role may read data and stop the robot, but not drive it",
     "operator": "this role may stop the robot, clear a stop or a fault, and drive as a source that "
     "commands.sources lists",

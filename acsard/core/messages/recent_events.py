@@ -14,7 +14,7 @@ from collections.abc import Iterable
 from msgspec import Struct
 
 from acsard.core.messages.schema import Events, LogEvent, Time
-from acsard.core.motion.event_throttle import together
+from acsard.core.motion.event_throttle import merge
 from acsard.core.values import NS_PER_S, Event, Instant
 
 MAX_ROWS = 20
@@ -48,10 +48,10 @@ class RecentEvents:
             same = None if event.news else self._same(event, now)
             if same is not None:
                 self._rows.remove(same)
-                event = together(same.event, event)
+                event = merge(same.event, event)
             self._rows.append(_Row(now, event))
 
-    def told(self) -> Events | None:
+    def message(self) -> Events | None:
         """Return the message `events` with all rows, or None before the first event."""
         if not self._rows:
             return None

@@ -12,7 +12,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 from msgspec.structs import asdict
 
 from acsard.core.config.settings import Config
-from acsard.core.messages.certificate_expiry import DAY_NS, expiry, first
+from acsard.core.messages.certificate_expiry import DAY_NS, expiry, first_expiry
 from acsard.core.messages.covariances import UNKNOWN_COVARIANCE, Covariances
 from acsard.core.messages.diagnostics import diagnostics
 from acsard.core.messages.recent_events import RecentEvents
@@ -55,7 +55,7 @@ from acsard.core.values import (
 from acsard.core.values import Spread as Measurements
 from acsard.core.values import Twist as BodyTwist
 
-Look = Callable[[], Snapshot]
+GetSnapshot = Callable[[], Snapshot]
 
 BATTERY_HZ = 1.0
 
@@ -116,7 +116,7 @@ class Report:
         self._covariances = Covariances(config.odometry)
 
     def due(
-        self, outputs: Outputs, wanted: Collection[str], look: Look
+        self, outputs: Outputs, wanted: Collection[str], look: GetSnapshot
     ) -> Iterator[tuple[str, Message]]:
         """Return an iterator over the pairs of key and message to publish after this step.
 
@@ -147,7 +147,7 @@ class Report:
         return iter(())
 
     def _due(
-        self, outputs: Outputs, wanted: Collection[str], look: Look
+        self, outputs: Outputs, wanted: Collection[str], look: GetSnapshot
     ) -> Iterator[tuple[str, Message]]:
         for estimate in outputs.estimates:
             if ("odom" in wanted or "tf" in wanted) and self._rates["odom"].due(
@@ -162,7 +162,7 @@ class Report:
         now_ns = outputs.now.mono_ns
         if outputs.due and "cmd_vel_out" in wanted and self._rates["cmd_vel_out"].due(now_ns):
             yield "cmd_vel_out", self._cmd_vel_out(outputs)
-        if outputs.events and "events" in wanted and (told := self._happened.told()):
+        if outputs.events and "events" in wanted and (told := self._happened.message()):
             yield "events", told
         for key, build in (
             ("state", self._state),
@@ -174,7 +174,7 @@ class Report:
                 if message is not None:
                     yield key, message
 
-    def current(self, key: str, look: Look) -> Message | None:
+    def current(self, key: str, look: GetSnapshot) -> Message | None:
         """Return the present message of a published key, or None if there is none.
 
         `look` is a function that returns the robot's `Snapshot`. It is called only if the message
@@ -201,7 +201,7 @@ class Report:
             case "battery":
                 return self._battery(outputs, look()) if outputs else None
             case "events":
-                return self._happened.told()
+                return self._happened.message()
             case _:
                 return None
 
@@ -301,7 +301,7 @@ class Report:
     def _certificate_days(self, now: Instant) -> float | None:
         if not (self._config.bus.tls and self.certificate_ends):
             return None
-        return round((first(self.certificate_ends)[1] - now.wall_ns) / DAY_NS, 2)
+        return round((first_expiry(self.certificate_ends)[1] - now.wall_ns) / DAY_NS, 2)
 
     def _battery(self, outputs: Outputs, snapshot: Snapshot) -> Battery | None:
         """Return the message `battery`, or None if no battery status is known.

@@ -340,7 +340,10 @@ class RobotState(Message, frozen=True):
     latencies: dict[str, Latency] = {}
     """Latencies of the daemon by name (`daemon/latencies.py`). They are up to one second old."""
     gyro: Annotated[str, one_of(get_args(GyroDoes))] = "off"
-    """State of the gyro. The heading comes from the gyro in the states `used` and `disagrees`."""
+    """State of the gyro. The heading comes from the gyro in the states `used` and `disagrees`.
+
+    In the state `waiting for turn`, the gyro has not agreed with the wheels in a turn yet.
+    """
     encoder_counts: list[int] = []
     """Configured encoder counts per wheel turn, in the order of `wheels`.
 

@@ -21,7 +21,7 @@ What = Literal[
     "settings",
 ]  # fmt: skip
 
-WHATS: tuple[What, ...] = get_args(What)
+WARNING_KINDS: tuple[What, ...] = get_args(What)
 """All values of `StateWarning.what`, from the most to the least urgent."""
 
 WARNING = "WARNING"

@@ -110,7 +110,7 @@ class _Source:
         for sender in self.senders.values():
             sender.cancel_zero(at_ns)
 
-    def doubt(self, command: Command, was_set: bool) -> None:
+    def undo_zeros(self, command: Command, was_set: bool) -> None:
         """Undo the effect of zeros of the sender of `command`, because its clock is in doubt.
 
         If `was_set` is true, the clock was set, and the sender must send a zero again. Otherwise
@@ -161,7 +161,7 @@ class _Source:
         pause = self.pause_ns / NS_PER_S
         return Wait("neutral", self.name, pause, lasts=lasts, ros=sender.ros, shared=sender.shared)
 
-    def doubted(self, now_ns: int) -> Wait | None:
+    def doubt_wait(self, now_ns: int) -> Wait | None:
         """Return the condition for a sender whose recent commands have doubtful stamps, or None.
 
         If the source has several of these senders, use the one that sent the newest message.
@@ -169,9 +169,9 @@ class _Source:
         doubtful = [sender for sender in self.senders.values() if sender.doubtful(now_ns)]
         if not doubtful:
             return None
-        return self.why(max(doubtful, key=lambda sender: sender.noticed_ns), now_ns)
+        return self.stale_wait(max(doubtful, key=lambda sender: sender.noticed_ns), now_ns)
 
-    def why(self, sender: Sender, now_ns: int) -> Wait:
+    def stale_wait(self, sender: Sender, now_ns: int) -> Wait:
         """Return the condition that `sender`, which is not live, waits for."""
         if not sender.doubtful(now_ns):
             return self.stalled
@@ -179,13 +179,13 @@ class _Source:
             return self.late
         return self.proof if sender.armed(now_ns) else self.neutral(sender)
 
-    def obstacle(self, sender: Sender, now_ns: int, lasting: bool = True) -> Wait:
+    def wait_of(self, sender: Sender, now_ns: int, lasting: bool = True) -> Wait:
         """Return the condition that keeps `sender` from driving.
 
         If `lasting` is true, the result says for how long an unarmed sender has sent speeds.
         """
         if not sender.live(now_ns):
-            return self.why(sender, now_ns)
+            return self.stale_wait(sender, now_ns)
         since_ns = sender.speeds_ns if lasting else None
         return self.neutral(sender, 0.0 if since_ns is None else _lasts(now_ns - since_ns))
 
@@ -263,7 +263,7 @@ class Arbiter:
         if verdict in ("set", "first"):
             # The doubt about a clock concerns its stamps on all sources.
             for other in self._ranking:
-                other.doubt(command, verdict == "set")
+                other.undo_zeros(command, verdict == "set")
         sender.take(command, self._since_ns, verdict, self._watched_ns)
         return "" if verdict in ("fresh", "set") else "unproven"
 
@@ -310,14 +310,14 @@ class Arbiter:
         if first is None:
             self._holder = self._followed = None
             for source in self._ranking:
-                if source.senders and (wait := source.doubted(now_ns)) is not None:
+                if source.senders and (wait := source.doubt_wait(now_ns)) is not None:
                     return Choice(wait=wait)
             return IDLE
         source, sender = first
         armed = sender.armed(now_ns)
         self._holder, self._followed = source, sender if armed or sender is kept else None
         if not (armed and sender.live(now_ns)):
-            return Choice(source.name, None, source.obstacle(sender, now_ns), sender=sender.name)
+            return Choice(source.name, None, source.wait_of(sender, now_ns), sender=sender.name)
         wait = NOTHING
         if sender.zeros_ns is not None and (lasts := _lasts(now_ns - sender.zeros_ns)):
             wait = Wait("zeros", source.name, lasts=lasts, kept=self._kept(source, now_ns))
@@ -332,7 +332,7 @@ class Arbiter:
         return ""
 
     @property
-    def forgiven_ns(self) -> int:
+    def clock_adjustment_ns(self) -> int:
         """Total increase of command delays that was attributed to adjusted clocks, ns.
 
         An increase does not count if the stamps of the sender show the adjustment. `freshness.py`
@@ -352,10 +352,10 @@ class Arbiter:
     def _waits_for(self, source: _Source, now_ns: int) -> Wait:
         holder, present = self._holder, source.present(now_ns)
         if not present:
-            return source.doubted(now_ns) or COMMAND
+            return source.doubt_wait(now_ns) or COMMAND
         first = self._followed if source is holder and self._followed else present[0]
         if not (first.armed(now_ns) and first.live(now_ns)):
-            return source.obstacle(first, now_ns, lasting=False)
+            return source.wait_of(first, now_ns, lasting=False)
         if holder is None or source is holder:
             return Wait("senders", senders=len(present) - 1) if len(present) > 1 else NOTHING
         return Wait("equal" if holder.priority == source.priority else "higher", holder.name)

@@ -6,7 +6,7 @@ limits the number of lines in the log.
 
 from __future__ import annotations
 
-from acsard.core.formatting import lasting
+from acsard.core.formatting import lasting, many
 from acsard.core.motion.arbiter import MAX_SENDERS, Choice
 from acsard.core.motion.modes import Mode
 from acsard.core.values import Event, Refusal, Wait
@@ -67,23 +67,23 @@ def waiting(wait: Wait) -> str:
                 f"{lasts}{ROS_NEVER if wait.ros else ''}"
             )
         case "zeros":
-            kept = f"; {wait.kept} sends speeds and must wait" if wait.kept else ""
+            kept = f"; the speeds of {wait.kept} have no effect" if wait.kept else ""
             zeros = f"only zeros for over {lasting(wait.lasts)}"
-            return f"held by {wait.source}, which has sent {zeros}{kept}"
+            return f"{wait.source} keeps the robot at rest: it has sent {zeros}{kept}"
         case "higher":
             return f"{wait.source} has priority: wait until it is silent"
         case "equal":
             return f"{wait.source} has the same priority and came first: wait until it is silent"
         case "senders":
             return (
-                f"{wait.senders} more of this source's senders must wait until the first one is "
-                "silent"
+                f"{many(wait.senders, 'other sender')} of this source must wait until the sender "
+                "that drives falls silent"
             )
 
 
 def missed(periods: int) -> Event:
     """Return the log event for `periods` successive control periods without a step of the robot."""
-    text = f"{periods} control periods in a row"
+    text = f"no control step ran in {many(periods, 'successive control period')}"
     return Event("missed_periods", text, "warning", kind="missed", count=periods, news=False)
 
 
@@ -143,4 +143,4 @@ class CommandEvents:
 
 def _name(commander: tuple[str, str]) -> str:
     source, sender = commander
-    return f"{source} ({sender[:MAX_SENDER_LENGTH]})" if source else "nobody"
+    return f"{source} ({sender[:MAX_SENDER_LENGTH]})" if source else "no sender"

@@ -35,7 +35,7 @@ SILENT_REASON = (
 )
 
 
-def missing(safety: SafetyConfig) -> str:
+def missing_text(safety: SafetyConfig) -> str:
     """Return the text which says that the board has not reported the configured bumpers."""
     count = len(safety.bumpers)
     return (

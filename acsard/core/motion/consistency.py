@@ -69,15 +69,15 @@ class ConsistencyChecks:
         status = GyroStatus() if self.gyro is None else self.gyro.status
         return status if self._track is None else replace(status, track_use=self._track.use)
 
-    def hear(self, samples: tuple[GyroSample, ...]) -> None:
+    def add_samples(self, samples: tuple[GyroSample, ...]) -> None:
         """Store the gyro `samples` since the last control step, in the order of arrival."""
         if self.gyro is not None:
-            self.gyro.hear(samples)
+            self.gyro.add_samples(samples)
 
-    def forgive(self) -> None:
+    def drop_corrections(self) -> None:
         """Drop the pending correction of the heading by the gyro, because a new pose was set."""
         if self.gyro is not None:
-            self.gyro.forgive()
+            self.gyro.drop_corrections()
 
     def look(self, line: Feedback, rolled: Rolled) -> bool:
         """Check a feedback line, and return whether it has proved a wheel faulty.
@@ -101,7 +101,7 @@ class ConsistencyChecks:
         self.slips = wheels.slips or (turn is not None and turn.slips)
         return found
 
-    def taken_back(self, turn: float) -> float:
+    def undo_recomputation(self, turn: float) -> float:
         """Return the angle that the caller must subtract from the heading, rad.
 
         Call this after the pose was recomputed over earlier feedback lines without a faulty wheel.
@@ -109,7 +109,7 @@ class ConsistencyChecks:
         for which `on_trial` was true. If the gyro is proven by now, the result is `turn`, because
         the heading was already corrected to the gyro's turn. Otherwise the result is 0.
         """
-        return 0.0 if self.gyro is None else self.gyro.taken_back(turn)
+        return 0.0 if self.gyro is None else self.gyro.undo_recomputation(turn)
 
     def learn(self, turned: float) -> Track | None:
         """Finish the checks of the last feedback line, and return the effective track to use next.
@@ -122,7 +122,7 @@ class ConsistencyChecks:
         if gyro is None:
             return None
         if self.on_trial and turned != self._by_wheels:
-            gyro.taken_back(turned - self._by_wheels)
+            gyro.undo_recomputation(turned - self._by_wheels)
         if track is None:
             if gyro.events:
                 self.events = gyro.events + self.events

@@ -96,7 +96,7 @@ class Noise:
 class ErrorModel:
     """The noise of an odometry step, and the effects of parameter errors on this step.
 
-    The results are for the effective track in use, which may change (`turn_by`).
+    The results are for the effective track in use, which may change (`use_track`).
     """
 
     def __init__(self, odometry: OdometryConfig, kinematics: Kinematics) -> None:
@@ -105,14 +105,14 @@ class ErrorModel:
         self.radius = kinematics.radius
         """Mean radius of the wheels, m."""
         self.settings = odometry
-        self.turn_by(CONFIGURED if odometry.learned_track else None)
+        self.use_track(CONFIGURED if odometry.learned_track else None)
 
     def use(self, odometry: OdometryConfig) -> None:
         """Use the noise settings in `odometry` from now on. Errors of parameters do not change."""
         self.settings = odometry
         self.noise = Noise(odometry, self.track)
 
-    def turn_by(self, learned: Track | None) -> None:
+    def use_track(self, learned: Track | None) -> None:
         """Use the effective track `learned` from now on.
 
         None means the configured track, without a column for the error of a learned track.
@@ -199,9 +199,9 @@ class TwistUncertainty:
         # The errors of the four wheels are independent, and each side is the mean of two wheels.
         self._to_linear = model.radius**2 / 4 / 12
         self._period = ASSUMED_PERIOD_S
-        self.bend()
+        self.update_track()
 
-    def bend(self) -> None:
+    def update_track(self) -> None:
         """Use the present effective track of the error model from now on.
 
         Call this after each change of the track.

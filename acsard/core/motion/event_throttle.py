@@ -102,7 +102,7 @@ COMBINED_TEXT = re.compile(r"\A\d+ (?:x [^:;]*|times)(?:; the last)?: ")
 """Pattern for the start of the text of a log line that combines several events."""
 
 
-def together(before: Event, line: Event) -> Event:
+def merge(before: Event, line: Event) -> Event:
     """Return one log line that replaces two lines of the same event name.
 
     `line` is later than `before`. The result has the total number of events, the higher level, the

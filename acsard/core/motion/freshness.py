@@ -56,16 +56,16 @@ MAX_JITTER_NS = NS_PER_S // 20
 """Largest decrease of the delay that can be jitter, ns. After a larger decrease, a backlog has
 ended or a clock was set."""
 
-WAVER_NS = NS_PER_S
+MAX_RISE_NS = NS_PER_S
 """Largest increase of the delay that can be jitter, ns. After a larger increase, the network has
 held commands back."""
 
-EVEN, CREPT = 200, 20
+EVEN_DIVISOR, CREEP_DIVISOR = 200, 20
 """Divisors for a proof (a test whether the delay is constant), which compares the minimum delays of
-its two halves. The two minima may differ by the duration of the proof divided by `EVEN`, or divided
-by `CREPT` if the delay creeps (see `CREEP`). The centers of the halves are half the duration apart,
-so the delay may change by 10 ms per second, or by 100 ms per second if it creeps. NTP slews a clock
-by up to 83 ms per second."""
+its two halves. The two minima may differ by the duration of the proof divided by `EVEN_DIVISOR`, or
+divided by `CREEP_DIVISOR` if the delay creeps (see `CREEP`). The centers of the halves are half the
+duration apart, so the delay may change by 10 ms per second, or by 100 ms per second if it creeps.
+NTP slews a clock by up to 83 ms per second."""
 
 CREEP, JITTER_NS = 10, NS_PER_S // 200
 """A delay creeps if it changes little between two commands: by at most the time between the two
@@ -129,7 +129,8 @@ class _Proof:
 
     The test compares the minimum delays of successive intervals. An interval is called a half,
     because it lasts half of the nominal duration of the test. The delays are constant if the minima
-    of the first two halves differ by little enough (`EVEN`, `CREPT`). Otherwise the test goes on.
+    of the first two halves differ by little enough (`EVEN_DIVISOR`, `CREEP_DIVISOR`). Otherwise the
+    test goes on.
     """
 
     def __init__(
@@ -154,7 +155,7 @@ class _Proof:
             at_ns: the monotonic time at which the command arrived, ns.
             timeout_ns: the timeout of the command's source, ns.
         """
-        if not -MAX_JITTER_NS <= delay - self._first <= WAVER_NS:
+        if not -MAX_JITTER_NS <= delay - self._first <= MAX_RISE_NS:
             return "failed"
         proven = False
         if at_ns - self._begun_ns >= self._length_ns and at_ns - self.last_ns > SAME_QUEUE_NS:
@@ -263,13 +264,13 @@ class _Clock:
             verdict = self._compare(delay, at_ns, silence, timeout_ns, command.steady)
         self.at_ns, self._stamp_ns, self._delay, self._number = at_ns, stamp_ns, delay, number
         mark = stamp_ns, number
-        if verdict == "fresh" and self._superseded(mark):
+        if verdict == "fresh" and self._already_accepted(mark):
             return "stale"
         if verdict in ("fresh", "set"):
             self._accepted = mark
         return verdict
 
-    def _superseded(self, mark: tuple[int, int]) -> bool:
+    def _already_accepted(self, mark: tuple[int, int]) -> bool:
         """Return whether the last accepted command is newer than this one, or is the same command.
 
         `mark` contains the stamp of this command, ns, and its sequence number, or -1 if it has no
@@ -328,12 +329,12 @@ class _Clock:
         if proof is not None and silence <= self.gap_ns:
             sign = proof.add(delay, at_ns, timeout_ns)
             if sign == "proven":
-                self._believe(proof)
+                self._trust(proof)
                 return "fresh"
             if sign == "open":
                 return "unproven"
         needed_ns = min(timeout_ns, MAX_PROOF_NS)
-        self._proof = _Proof(delay, at_ns, timeout_ns, needed_ns, EVEN, again=False)
+        self._proof = _Proof(delay, at_ns, timeout_ns, needed_ns, EVEN_DIVISOR, again=False)
         return "first"
 
     def _compare(
@@ -354,7 +355,7 @@ class _Clock:
         if steady:  # the known minimum was measured while a backlog arrived
             self.state, self._proof = "new", None
             return self._prove(delay, at_ns, silence, timeout_ns)
-        needed_ns, share = min(timeout_ns, MAX_PROOF_NS), CREPT
+        needed_ns, share = min(timeout_ns, MAX_PROOF_NS), CREEP_DIVISOR
         if proof is None:
             self._accrue(at_ns, FORGIVE_NS)
         elif at_ns - proof.last_ns <= self.gap_ns:
@@ -364,7 +365,7 @@ class _Clock:
             if sign == "proven":
                 return "set" if self._forgive(proof, at_ns) else "stale"
         if proof or abs(delay - self._delay) > silence // CREEP + JITTER_NS:
-            needed_ns, share = max(needed_ns, JUMP_PROOF_NS), EVEN
+            needed_ns, share = max(needed_ns, JUMP_PROOF_NS), EVEN_DIVISOR
         self._proof = _Proof(delay, at_ns, timeout_ns, needed_ns, share, again=True)
         return "stale"
 
@@ -383,7 +384,7 @@ class _Clock:
             return False
         self.forgiven_ns = max(0, hidden)
         self._budget = max(0, min(self._budget, FORGIVE_NS) - self.forgiven_ns)
-        self._believe(proof)
+        self._trust(proof)
         return True
 
     def _accrue(self, at_ns: int, most_ns: int) -> None:
@@ -393,7 +394,7 @@ class _Clock:
     def _forget_adjustments(self) -> None:
         self._before, self._shown, self._doubted, self._paused = None, 0, None, False
 
-    def _believe(self, proof: _Proof) -> None:
+    def _trust(self, proof: _Proof) -> None:
         self.state, self._least, self._proof = "known", proof.least, None
         self._early = 0
         self._forget_adjustments()

@@ -42,10 +42,10 @@ the default acceleration limits. Random driving rarely exceeds it."""
 ACCELERATION_SPAN_S = 0.2
 """Time over which the deviation from constant acceleration is measured, s."""
 
-FIRST, MOST = 4.0, 300.0
+INITIAL_WEIGHT, MAX_WEIGHT = 4.0, 300.0
 """Weights in the mean of the squared deviations from constant acceleration. Each measured span of
-`ACCELERATION_SPAN_S` s has the weight 1, and `ASSUMED_ACCELERATION` has the weight `FIRST`. The
-total weight is limited to `MOST` (a minute of driving)."""
+`ACCELERATION_SPAN_S` s has the weight 1, and `ASSUMED_ACCELERATION` has the weight
+`INITIAL_WEIGHT`. The total weight is limited to `MAX_WEIGHT` (a minute of driving)."""
 
 MAX_COMMANDED_S = 1.0
 """Longest time for which a command is assumed to have moved the robot in a gap, s. Without
@@ -337,7 +337,7 @@ class Gaps:
     def __init__(self) -> None:
         self._along = (ASSUMED_ACCELERATION.linear * ACCELERATION_SPAN_S**2 / 2) ** 2
         self._turning = (ASSUMED_ACCELERATION.angular * ACCELERATION_SPAN_S**2 / 2) ** 2
-        self._spans = FIRST
+        self._spans = INITIAL_WEIGHT
         self.interrupt(REST)
 
     def interrupt(self, twist: Twist) -> None:
@@ -365,12 +365,12 @@ class Gaps:
             off = self._distance - linear * dt - span * (first.linear + linear) / 2
             turned = self._turn - angular * dt - span * (first.angular + angular) / 2
             scale = (ACCELERATION_SPAN_S / span) ** VARIANCE_POWER
-            self._spans = min(self._spans + 1.0, MOST)
+            self._spans = min(self._spans + 1.0, MAX_WEIGHT)
             self._along += (off * off * scale - self._along) / self._spans
             self._turning += (turned * turned * scale - self._turning) / self._spans
         self._first, self._seconds, self._distance, self._turn = twist, 0.0, 0.0, 0.0
 
-    def bridge(
+    def fill(
         self,
         seconds: float,
         before: Twist,

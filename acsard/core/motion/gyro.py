@@ -102,6 +102,8 @@ STATUS_TEXTS: dict[GyroDoes, str] = {
     "off": "",
     "waiting for rest": "the gyro's bias is not known yet: the robot must stand for "
     f"{REST_S + LEARNING_TIME_S:.1f} s",
+    "waiting for turn": "the heading comes from the wheels until the gyro has agreed with them in "
+    "a turn",
     "used": "the heading comes from the gyro",
     "silent": "the gyro is silent: the heading comes from the wheels",
     "disagrees": "the wheels seem to slip: the gyro measures a different turn than the wheels",
@@ -140,7 +142,7 @@ class Turn(Struct, frozen=True, gc=False):
 class Gyro:
     """Computes the turns of the robot from the samples of one gyro.
 
-    The caller passes samples to `hear`, and calls `turn` for each feedback line.
+    The caller passes samples to `add_samples`, and calls `turn` for each feedback line.
     """
 
     def __init__(self) -> None:
@@ -219,7 +221,7 @@ class Gyro:
             return self._learned
         return Track(1.0 / match.ratio, max(MIN_TRACK_STD, match.spread / match.ratio))
 
-    def hear(self, samples: tuple[GyroSample, ...]) -> None:
+    def add_samples(self, samples: tuple[GyroSample, ...]) -> None:
         """Store the `samples` that arrived since the last control step, in the order of arrival.
 
         A sample with `anew` is the first one of another gyro. Everything that was learned from the
@@ -280,7 +282,7 @@ class Gyro:
         noise = self._noise + self._bias.variance
         if age_ns >= LOST_NS:
             self._end_contradiction()
-        if lost or tried or self._does not in ("used", "disagrees"):
+        if lost or tried or self._does not in ("used", "disagrees", "waiting for turn"):
             return self._doubted(ratio * wheels, dt, noise, lost)
         self._sum_up(angle, ratio * wheels, dt)
         rolled = angle / ratio
@@ -290,7 +292,7 @@ class Gyro:
         variance, self._doubt = variance + self._doubt, 0.0
         return Turn(angle, variance, self._rate, noise, rolled, self._does == "disagrees")
 
-    def forgive(self) -> None:
+    def drop_corrections(self) -> None:
         """Drop pending corrections and doubts of the heading, because a new pose was set."""
         self._contradicted = self._doubt = 0.0
         self._forget_owed()
@@ -312,7 +314,7 @@ class Gyro:
         - `_repeated_gaps`: the squares of the gyro's turns in gaps of the feedback, rad2.
         """
 
-    def taken_back(self, turn: float) -> float:
+    def undo_recomputation(self, turn: float) -> float:
         """Return the angle that the caller must subtract from the heading, rad.
 
         Call this after the pose was recomputed over feedback lines for which `owes` was true.
@@ -506,9 +508,12 @@ class Gyro:
             self._does = "waiting for rest"
         elif wrong or self._frozen or self._slipped_s > MAX_SLIP_S:
             self._does = "not believed"
+        elif self._trial.open:
+            self._does = "waiting for turn"
         else:
             self._does = "disagrees" if self._slip_s > 0.0 else "used"
-        if self._does != before:
-            good = self._does in ("used", "waiting for rest")
+        # The text of "waiting for turn" announces the change to "used", so no event reports it.
+        if self._does != before and (before, self._does) != ("waiting for turn", "used"):
+            good = self._does in ("used", "waiting for rest", "waiting for turn")
             level: Level = "info" if good else "warning"
             self.events.append(Event("gyro", STATUS_TEXTS[self._does], level, kind=self._does))

@@ -10,7 +10,8 @@ The fit forgets old data only while the robot turns.
 
 Rounding to encoder counts causes an error of w, and the same error appears again in dw/dt. On a
 straight drive with coarse counts, this would look like a delay of half a block. Therefore dw/dt
-counts as 0 unless the gyro's rate also changes at about the same time (`BEFORE`, `BEHIND`).
+counts as 0 unless the gyro's rate also changes at about the same time (`BLOCKS_BEFORE`,
+`BLOCKS_AFTER`).
 """
 
 from __future__ import annotations
@@ -35,20 +36,20 @@ FORGETTING_FACTOR = 0.995
 """Factor by which the weight of all earlier blocks is multiplied in each block of turning, so that
 the fit remembers 200 blocks (20 s of turning)."""
 
-ROUGH, FINE = 0.5, 0.1
-"""Standard deviations of the ratio of the gyro's turn to the wheels' turn. `ROUGH` is the value
-that is assumed before any data. `FINE` is the smallest value that is assumed, because floor and
-turn rate change the ratio."""
+INITIAL_RATIO_STD, MIN_RATIO_STD = 0.5, 0.1
+"""Standard deviations of the ratio of the gyro's turn to the wheels' turn. `INITIAL_RATIO_STD` is
+the value that is assumed before any data. `MIN_RATIO_STD` is the smallest value that is assumed,
+because floor and turn rate change the ratio."""
 
 STRETCH_ANGLE = 1.0
 """Size of a stretch, which is a turn of the robot to the left or to the right, rad. Each stretch
 yields one measurement of the error of the ratio (gyro's turn divided by wheels' turn). The delay of
 the gyro hardly matters over such a turn."""
 
-KEPT, PRIOR = 0.9, 0.1
-"""`KEPT` is the factor by which the weight of the earlier stretches is multiplied in each new
-stretch (a turn of `STRETCH_ANGLE`). `PRIOR` is the initial weight of `ROUGH`, as a number of
-stretches."""
+STRETCH_FORGETTING, PRIOR_STRETCHES = 0.9, 0.1
+"""`STRETCH_FORGETTING` is the factor by which the weight of the earlier stretches is multiplied in
+each new stretch (a turn of `STRETCH_ANGLE`). `PRIOR_STRETCHES` is the initial weight of
+`INITIAL_RATIO_STD`, as a number of stretches."""
 
 PRIOR_DELAY_STD_S = 0.2
 """Standard deviation of the gyro's delay before any data, s."""
@@ -56,9 +57,9 @@ PRIOR_DELAY_STD_S = 0.2
 INITIAL_DELAY_SUMS = 0.0, 0.0, 1.0 / PRIOR_DELAY_STD_S**2
 """Initial values of the three least-squares sums from which the delay is computed."""
 
-BEFORE, BEHIND = 2, 3
+BLOCKS_BEFORE, BLOCKS_AFTER = 2, 3
 """Numbers of blocks. If the wheels' rate changes in a block, the gyro may show that change up to
-`BEFORE` blocks earlier and up to `BEHIND` blocks later. This covers every delay in
+`BLOCKS_BEFORE` blocks earlier and up to `BLOCKS_AFTER` blocks later. This covers every delay in
 `gyro.DELAY_RANGE_NS`."""
 
 BLOCK_NOISE, BLOCK_SHARE = 0.01, 0.03
@@ -103,16 +104,16 @@ class Match:
     """Learns the ratio of the gyro's turns to the wheels' turns, and the delay of the gyro."""
 
     def __init__(self) -> None:
-        self._ww, self._wg = 1.0 / ROUGH**2, 1.0 / ROUGH**2
+        self._ww, self._wg = 1.0 / INITIAL_RATIO_STD**2, 1.0 / INITIAL_RATIO_STD**2
         """Sums of the least-squares fit. Their initial values stand for the ratio 1 with the
-        standard deviation `ROUGH`."""
+        standard deviation `INITIAL_RATIO_STD`."""
         self._wd, self._dg, self._dd = INITIAL_DELAY_SUMS
         self._off = self._way = 0.0
         """Sums over the present stretch (a turn of `STRETCH_ANGLE`), rad. `_way` is the turn of the
         wheels. `_off` is the gyro's turn minus the turn that the fit predicts for the gyro."""
-        self._ways = PRIOR * STRETCH_ANGLE**2
+        self._ways = PRIOR_STRETCHES * STRETCH_ANGLE**2
         """Weighted sum of `_way` squared over the completed stretches, rad2."""
-        self._offs = ROUGH**2 * self._ways
+        self._offs = INITIAL_RATIO_STD**2 * self._ways
         """Weighted sum of `_off` squared over the completed stretches, rad2."""
         self._lag = ASSUMED_DELAY_STD_S
         self.blocks = 0.0
@@ -125,7 +126,7 @@ class Match:
         self._rate = self._began = 0.0
         """Turn rates according to the wheels, rad/s: now (`_rate`), and at the start of the block
         (`_began`)."""
-        self._blocks: deque[Block] = deque(maxlen=BEFORE + 1 + BEHIND)
+        self._blocks: deque[Block] = deque(maxlen=BLOCKS_BEFORE + 1 + BLOCKS_AFTER)
         self._window: deque[tuple[float, float, float]] = deque()
         self._sums = [0.0, 0.0, 0.0]
 
@@ -145,7 +146,7 @@ class Match:
         """
         ratio, slope = self.ratio, self._slope
         spread = self._dd - self._wd * self._wd / self._ww
-        if ratio < ROUGH / 2 or spread * (MAX_DELAY_STD_S * ratio) ** 2 < 1.0:
+        if ratio < INITIAL_RATIO_STD / 2 or spread * (MAX_DELAY_STD_S * ratio) ** 2 < 1.0:
             return None
         self._blocks.clear()
         self._wd, self._dg, self._dd = INITIAL_DELAY_SUMS
@@ -201,7 +202,7 @@ class Match:
             sums[2] -= old[2]
 
     def _learn(self) -> None:
-        block = self._blocks[BEFORE]
+        block = self._blocks[BLOCKS_BEFORE]
         wheels, gyro, change = block.wheels / block.time, block.gyro / block.time, block.change
         # The blocks before and after this block show whether the gyro's rate changes, too.
         rates = [one.gyro / one.time for one in self._blocks]
@@ -213,8 +214,8 @@ class Match:
         self._way += block.wheels
         self._off += (gyro - self.ratio * wheels - self._slope * change) * block.time
         if abs(self._way) >= STRETCH_ANGLE:
-            self._offs = KEPT * self._offs + self._off * self._off
-            self._ways = KEPT * self._ways + self._way * self._way
+            self._offs = STRETCH_FORGETTING * self._offs + self._off * self._off
+            self._ways = STRETCH_FORGETTING * self._ways + self._way * self._way
             self._off = self._way = 0.0
         self._ww = FORGETTING_FACTOR * self._ww + weight * wheels * wheels
         self._wg = FORGETTING_FACTOR * self._wg + weight * wheels * gyro
@@ -230,5 +231,6 @@ class Match:
         self.ratio = (self._wg * self._dd - self._dg * self._wd) / det
         """The turn of the gyro divided by the turn of the wheels; a in the module's docstring."""
         self._slope = (self._dg * self._ww - self._wg * self._wd) / det
-        self.deviation = max(FINE, ROUGH / math.sqrt(1.0 + self.blocks))
-        """Assumed standard deviation of `ratio`. It falls from `ROUGH` to `FINE`."""
+        self.deviation = max(MIN_RATIO_STD, INITIAL_RATIO_STD / math.sqrt(1.0 + self.blocks))
+        """Assumed standard deviation of `ratio`. It falls from `INITIAL_RATIO_STD` to
+        `MIN_RATIO_STD`."""

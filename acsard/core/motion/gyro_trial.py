@@ -16,18 +16,18 @@ direction begins a new turn. A lower rate may come from a single encoder count. 
 smallest rate at which a gyro that reads zero is called dead, because wheels with unequal tires
 report a lower rate while the robot drives straight."""
 
-SLOWEST, STRETCH_S = 0.05, 0.5
-"""`SLOWEST` is the smallest mean turn rate according to the wheels that counts as a turn, rad/s.
-`STRETCH_S` is the duration of the intervals over which the mean is taken, s."""
+MIN_MEAN_RATE, STRETCH_S = 0.05, 0.5
+"""`MIN_MEAN_RATE` is the smallest mean turn rate according to the wheels that counts as a turn,
+rad/s. `STRETCH_S` is the duration of the intervals over which the mean is taken, s."""
 
 TURN_RATIO_RANGE = (0.25, 2.5)
 """Range of the ratio of the robot's true turn to its turn according to the wheels. On any floor,
 the ratio is within this range."""
 
-PROVED, REFUTED = 0.1, 0.4
-"""Smallest turns to one side according to the wheels, rad. A turn of `PROVED` can prove that the
-gyro is good, and a turn of `REFUTED` can show that it is not. The second one is larger, because the
-gyro may be late."""
+MIN_PROVING_TURN, MIN_REFUTING_TURN = 0.1, 0.4
+"""Smallest turns to one side according to the wheels, rad. A turn of `MIN_PROVING_TURN` can prove
+that the gyro is good, and a turn of `MIN_REFUTING_TURN` can show that it is not. The second one is
+larger, because the gyro may be late."""
 
 MIN_REFUTING_TURN_S = 0.3
 """Shortest time for which the robot must turn before the gyro can be refuted, s. No gyro has a
@@ -72,7 +72,7 @@ class Trial:
         self._stretch_gyro += gyro
         self._stretch_s += dt
         if self._stretch_s >= STRETCH_S:
-            if abs(self._stretch) < SLOWEST * self._stretch_s:
+            if abs(self._stretch) < MIN_MEAN_RATE * self._stretch_s:
                 self._begin()
             if abs(self._stretch) >= MIN_TURN_RATE * self._stretch_s:
                 self._fast += self._stretch
@@ -84,7 +84,7 @@ class Trial:
             return
         self._wheels += wheels
         self._gyro += gyro
-        self._seconds += dt if abs(wheels) >= SLOWEST * dt else 0.0
+        self._seconds += dt if abs(wheels) >= MIN_MEAN_RATE * dt else 0.0
         if self._wheels == 0.0:
             return
         verdict = self._verdict(self._gyro / self._wheels)
@@ -100,13 +100,13 @@ class Trial:
         fast, gyro = self._fast, self._fast_gyro
         if abs(self._stretch) >= MIN_TURN_RATE * self._stretch_s:
             fast, gyro = fast + self._stretch, gyro + self._stretch_gyro
-        return abs(fast) >= REFUTED and abs(gyro) < TURN_RATIO_RANGE[0] * abs(fast)
+        return abs(fast) >= MIN_REFUTING_TURN and abs(gyro) < TURN_RATIO_RANGE[0] * abs(fast)
 
     def _verdict(self, ratio: float) -> Verdict:
         least, most = TURN_RATIO_RANGE
-        if abs(self._wheels) >= PROVED and least <= ratio <= most:
+        if abs(self._wheels) >= MIN_PROVING_TURN and least <= ratio <= most:
             return "good"
-        if abs(self._wheels) < REFUTED or self._seconds < MIN_REFUTING_TURN_S:
+        if abs(self._wheels) < MIN_REFUTING_TURN or self._seconds < MIN_REFUTING_TURN_S:
             return "none yet"
         return _named(ratio)
 

@@ -15,8 +15,8 @@ from acsard.core.values import Event, GyroStatus, Level, TrackUse
 
 MIN_TRACK_STD = 0.05
 """Smallest relative standard deviation of a learned track. Floor and turn rate may change, so the
-track is never more certain. The value is half of `gyro_match.FINE`, because the mean error over a
-whole drive is smaller than the error at one moment."""
+track is never more certain. The value is half of `gyro_match.MIN_RATIO_STD`, because the mean error
+over a whole drive is smaller than the error at one moment."""
 
 CERTAIN, UNCERTAIN = 0.1, 0.2
 """Limits of the learned track's relative standard deviation. An uncertain track becomes certain
@@ -35,7 +35,7 @@ near a bound could alternate between use and non-use."""
 STATUS_TEXTS: dict[TrackUse, str] = {
     "shown": "(only reported)",
     "uncertain": "(uncertain)",
-    "too far off": "(implausible)",
+    "too far off": "(out of range, not used)",
     "used": "(in use)",
 }
 

@@ -179,8 +179,9 @@ class Lifecycle:
             return f"stopped and latched; {SHUTDOWN_REASON}"
         if self.latches.fault is not None:
             return (
-                "stopped and latched; call srv/clear twice: the first call releases the fault, the "
-                "second the stop"
+                "stopped and latched; call srv/clear twice, "
+                f"{LATCH_REQUIRED_S:g} s apart: the first call releases the fault, the second call "
+                "releases the stop"
             )
         return "stopped and latched; srv/clear releases it"
 
@@ -243,7 +244,10 @@ class Lifecycle:
         self._latch(fault=None)
         if latches.stop is None:
             return "cleared; each sender must send a zero before it drives"
-        return f"fault cleared, but the robot is still {_still(latches.stop)}: call srv/clear again"
+        return (
+            f"fault cleared, but the robot is still {_still(latches.stop)}: call srv/clear again "
+            f"in {LATCH_REQUIRED_S:g} s"
+        )
 
     def activate(self, number: int | None, asked_ns: int, now: Instant) -> bool:
         """Switch the robot on. Return True if it was off, and False if it was already on.
@@ -292,7 +296,7 @@ class Lifecycle:
         require_allowed(self.mode, "deactivate")
         self._off_ns = now.mono_ns
         self._latch(inactive=self._made(now, by, f"switched off by {by or 'request'}"))
-        return "inactive: the robot ramps to zero; srv/activate switches it on"
+        return "inactive: the robot brakes to rest; call srv/activate to switch it on again"
 
     def lower(self, limits: dict[str, float]) -> None:
         """Store the settings of `[limits]` that `set` has lowered, so that a restart keeps them."""
@@ -314,7 +318,7 @@ class Lifecycle:
                 parts.append(held)
             parts += [_said(cause) for cause in causes]
             before = f"{self._mend}, then " if held else ""
-            twice = " twice" if fault and stop else ""
+            twice = f" twice, {LATCH_REQUIRED_S:g} s apart" if fault and stop else ""
             return f"{'; also '.join(parts)}; {before}call srv/clear{twice}"
         if latches.inactive is not None:
             return f"{_said(latches.inactive)}; call srv/activate"
@@ -411,9 +415,8 @@ def number_after_restart(kept: int, now: Instant) -> int:
 
 def _not_in_force(number: int, still: str, call: str) -> str:
     return (
-        f"this call names latch {number}, but {call} would release another latch; the robot is "
-        f"still {still}: look at the robot, then call {call} again with the present `latch` in "
-        "`state`"
+        f"latch {number} is not the latch that {call} would release now; the robot is still "
+        f"{still}: look at the robot, then call {call} again with the present `latch` in `state`"
     )
 
 

@@ -1,6 +1,6 @@
 """Derives the robot's mode from the latches, the link and the commands, by one ordered list.
 
-    shutdown  the daemon is going down
+    shutdown  the daemon is shutting down
     fault     a fault is latched until `clear`
     stopped   a stop is latched until `clear`
     inactive  the robot is switched off until `activate`
@@ -65,7 +65,7 @@ def mode_of(
     return Mode.DRIVING if commanded else Mode.READY
 
 
-SHUTDOWN_REASON = "the daemon is going down"
+SHUTDOWN_REASON = "the daemon is shutting down"
 
 REFUSALS: dict[tuple[Mode, Verb], str] = {
     (Mode.SHUTDOWN, "clear"): SHUTDOWN_REASON,

@@ -251,7 +251,7 @@ class Sender:
         present = self.present(now_ns)
         if not present:
             self.came_ns = now_ns
-        self._tell_apart(zero, now_ns, present)
+        self._update_times(zero, now_ns, present)
         self.ros, self.name = command.ros, command.sender
         self.twist, self._doubted_ns = command.twist, None
         self.arrived_ns = self._present_ns = now_ns
@@ -266,7 +266,7 @@ class Sender:
             # leave out the stamp of this accepted zero.
             self._ended = replace(command, stamp_ns=None)
 
-    def _tell_apart(self, zero: bool, now_ns: int, present: bool) -> None:
+    def _update_times(self, zero: bool, now_ns: int, present: bool) -> None:
         """Update `zeros_ns` and `speeds_ns` with a command that arrived at `now_ns`.
 
         `zero` says whether the command is a zero. `present` is false if this command ends a silence
@@ -303,7 +303,7 @@ class Sender:
         present = self.present(command.arrived_ns)
         if present:
             self._present_ns = command.arrived_ns
-        self._tell_apart(is_zero(command), command.arrived_ns, present)
+        self._update_times(is_zero(command), command.arrived_ns, present)
         self._doubted_ns, self.doubt, self.ros = command.arrived_ns, why, command.ros
 
     def _settle(self, now_ns: int) -> None:

@@ -139,27 +139,29 @@ class Odometry:
         """
         self._errors.use(odometry)
 
-    def turn_by(self, track: Track) -> None:
+    def use_track(self, track: Track) -> None:
         """Use this effective track from now on to compute the robot's turns from the wheels."""
         if track != self._track:
             self._track = track
-            self._errors.turn_by(track)
-            self._uncertainty.bend()
-            self._twist_uncertainty.bend()
+            self._errors.use_track(track)
+            self._uncertainty.update_track()
+            self._twist_uncertainty.update_track()
 
     def set_pose(self, pose: Pose) -> None:
         """Set the pose of base_link in odom, with the uncertainty of an initial pose.
 
-        The angles of the wheels do not change. Motion in feedback lines that are held back or
-        implausible is not in the pose yet. This motion is dropped, because it happened before this
-        call.
+        Some motion is not in the pose yet, for example the motion in feedback lines that are held
+        back or implausible. This motion is dropped, because it happened before this call. The
+        angles of the wheels keep the small motion at rest (`_held`).
         """
+        self._positions = plus(self._positions, self._held)
+        self._held = AT_REST
         self._confirmation.forget()
         self._rolling.forget()
         self._path.set(pose)
         self._steps.clear()
         self._uncertainty.set(pose.yaw)
-        self.checks.forgive()
+        self.checks.drop_corrections()
 
     @property
     def pose(self) -> Pose:
@@ -252,7 +254,7 @@ class Odometry:
         self.twist, self.speeds, self._folded = twist, speeds, True
         track = checks.learn(turned)
         if track is not None:
-            self.turn_by(track)
+            self.use_track(track)
         return Estimate(
             feedback.at,
             self._path.pose,
@@ -299,7 +301,7 @@ class Odometry:
                 on_trial += math.fsum([angle for _, angle in arcs]) - step.turn
         self._steps.clear()
         if on_trial:
-            self._path.turn(-self.checks.taken_back(on_trial))
+            self._path.turn(-self.checks.undo_recomputation(on_trial))
 
     def _arcs(
         self, pieces: tuple[Motors, ...], gyro: Turn | None, share: float
@@ -346,7 +348,7 @@ class Odometry:
         bridged, doubtful = rolled.bridged, rolled.doubtful
         if bridged > 0.0:
             self.bridged += bridged
-            along, yaw = self._gaps.bridge(bridged, before, twist, self._highest, doubtful)
+            along, yaw = self._gaps.fill(bridged, before, twist, self._highest, doubtful)
             by_counts, turn_by_counts = self._rounded(bridged)
             self._uncertainty.doubt(along + by_counts, yaw + turn_by_counts)
         elif feedback.gap:

@@ -186,10 +186,12 @@ class Sanity:
             self._lines = self._dropped = 0
 
     def _words(self, why: str) -> str:
+        # Each reason ends with the name of the setting.
+        setting = why.rpartition(" over ")[2]
         return (
             f"{self._dropped} of {self._lines} lines were dropped, because no wheel can do "
-            f"what they report; the last: {why}. If a wheel really does that, raise the setting "
-            "named above. Otherwise lines arrive damaged: check cable and ground; firmware that "
+            f"what they report; the last: {why}. If a wheel really does that, raise {setting}. "
+            "Otherwise lines arrive damaged: check cable and ground; firmware that "
             'supports mcu.link_check = "auto" protects each line with a checksum'
         )
 

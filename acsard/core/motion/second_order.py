@@ -75,12 +75,12 @@ class SecondOrder:
         """C_ik (see the module) for each pair of parameters, m. In the key, the larger index comes
         first."""
         for _ in range(columns):
-            self.widen()
+            self.add_parameter()
         self.xx = self.xy = self.yy = 0.0
         """Second-order terms in the covariance of x and y, m2, in the axes of odom. A motion of the
         robot does not change these terms, because they have no yaw (`se2.seen_from`)."""
 
-    def widen(self) -> None:
+    def add_parameter(self) -> None:
         """Add one more parameter, which must not have affected the pose yet."""
         self._with_x.append((ORIGIN, ORIGIN))
         i = len(self._with_x) - 1

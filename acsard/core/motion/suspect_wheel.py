@@ -45,10 +45,10 @@ STUCK_TIME_S = 0.3
 """Time for which a wheel must repeat one speed before it is called stuck, s, if neither a command
 nor a gyro shows which wheel is right. A person cannot turn a wheel so evenly by hand."""
 
-DEAD, REVERSED = 0.1, 0.3
+DEAD_FRACTION, REVERSED_FRACTION = 0.1, 0.3
 """Fractions of the angle that the other wheel of the side rolled. A wheel is dead if its angle is
-at most the fraction `DEAD`. It is reversed if it rolled in the opposite direction, and if the
-magnitudes of the two angles differ by at most the fraction `REVERSED`."""
+at most the fraction `DEAD_FRACTION`. It is reversed if it rolled in the opposite direction, and if
+the magnitudes of the two angles differ by at most the fraction `REVERSED_FRACTION`."""
 
 MIN_STUCK_FRACTION = 0.3
 """Smallest difference between the two wheels of a side at which one wheel can be called stuck, as a
@@ -210,7 +210,7 @@ class Stuck:
         self._slow, self._command = slow, command
         self._seconds = self._followed = self._other = 0.0
 
-    def left_by(self, command: float) -> bool:
+    def command_changed(self, command: float) -> bool:
         """Return whether the command has changed since the wheel began to repeat its speed.
 
         `command` is the present command for the wheel, rad/s. A change below `MIN_COMMAND_CHANGE`
@@ -218,7 +218,7 @@ class Stuck:
         """
         return abs(command - self._command) >= MIN_COMMAND_CHANGE
 
-    def says(self, same: bool, apart: float, dt: float, count: float, expected: Expected) -> bool:
+    def add(self, same: bool, apart: float, dt: float, count: float, expected: Expected) -> bool:
         """Add a feedback line, and return whether the encoder of this wheel is stuck.
 
         Args:
@@ -252,7 +252,7 @@ def stands(own: float, other: float) -> bool:
 
     The wheel turned `own` rad, and the other wheel of its side turned `other` rad.
     """
-    return own == 0.0 or abs(own) <= DEAD * abs(other)
+    return own == 0.0 or abs(own) <= DEAD_FRACTION * abs(other)
 
 
 def reverses(own: float, other: float, count: float) -> bool:
@@ -261,7 +261,10 @@ def reverses(own: float, other: float, count: float) -> bool:
     The wheel turned `own` rad, and the other wheel of its side turned `other` rad. `count` is the
     angle of an encoder count, rad.
     """
-    return own * other < 0.0 and abs(own + other) <= REVERSED * abs(other) + FAULT_COUNTS * count
+    return (
+        own * other < 0.0
+        and abs(own + other) <= REVERSED_FRACTION * abs(other) + FAULT_COUNTS * count
+    )
 
 
 def was_faulty(fault: WheelFault, own: float, other: float, now: float) -> bool:

@@ -76,13 +76,13 @@ class PoseUncertainty:
         self._parameters = self._effects = model.columns
         self._counted = counts > 0
         self._count = 0.0
-        self._stand_within(math.tau / (counts or ASSUMED_COUNTS))
+        self._set_count_angle(math.tau / (counts or ASSUMED_COUNTS))
         self._dx = self._dy = self._rolled = 0.0
         """Motion since the last update of the second-order terms, m. `_dx` and `_dy` are the
         displacement in odom, and `_rolled` is the distance that the wheels rolled."""
         self.set(0.0)
 
-    def bend(self) -> None:
+    def update_track(self) -> None:
         """Read the effective track and the columns of the error model again.
 
         Call this when they have changed. The error model must have as many columns as before.
@@ -90,9 +90,9 @@ class PoseUncertainty:
         beside = self._effects[len(self._parameters) :]
         self._parameters = self._model.columns
         self._effects = (*self._parameters, *beside)
-        self._stand_within(self._count)
+        self._set_count_angle(self._count)
 
-    def _stand_within(self, angle: float) -> None:
+    def _set_count_angle(self, angle: float) -> None:
         """Set the angle of an encoder count, rad, within which a wheel's position is unknown."""
         self._count, count, track = angle, self._model.radius * angle, self._model.track
         self._play = count / track
@@ -141,7 +141,7 @@ class PoseUncertainty:
             scale: the relative standard deviation of the gyro's scale.
         """
         if self._lost:
-            self._forget_where(distance, turn)
+            self._mark_unknown(distance, turn)
             return
         c, s = self._cos, self._sin = math.cos(heading), math.sin(heading)
         along, yaw, both = self._model.noise.of(distance, turn, self._beyond_play(turn))
@@ -180,7 +180,7 @@ class PoseUncertainty:
             yaw: the variance of the turn, rad2.
         """
         if self._lost:
-            self._forget_where(distance, turn)
+            self._mark_unknown(distance, turn)
             return
         c, s = self._cos, self._sin
         if self._of_gaps < 0:
@@ -200,10 +200,10 @@ class PoseUncertainty:
         self._effects = (*self._effects, NO_EFFECT)
         self._columns = [*self._columns, ORIGIN]
         self._columns_before = [*self._columns_before, ORIGIN]
-        self._second.widen()
+        self._second.add_parameter()
         return len(self._columns) - 1
 
-    def _forget_where(self, distance: float, turn: float) -> None:
+    def _mark_unknown(self, distance: float, turn: float) -> None:
         """Set all variances to "unknown" after a motion of `distance` m and `turn` rad.
 
         Without a motion, nothing changes. Call this only if the position or the heading is already

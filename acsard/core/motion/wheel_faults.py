@@ -34,14 +34,14 @@ from acsard.core.motion.wheel_residual import TIME_CONSTANT_S, Residual
 from acsard.core.motion.wheel_witness import MIN_FAULT_SPEED, WITNESS_TEXTS, Expected, Witness
 from acsard.core.values import STILL, WHEELS, Event, WheelSpeeds, WheelsStatus
 
-COARSEST, FINEST = math.tau / 16, math.tau / 2000
+MAX_COUNT_ANGLE, MIN_COUNT_ANGLE = math.tau / 16, math.tau / 2000
 """Largest and smallest angle of one encoder count that the daemon learns if the number of counts is
 not configured, rad."""
 
-RECUR, SOUGHT = 3, 1000
+RECURRENCES, LEARNING_LINES = 3, 1000
 """Parameters for learning the angle of one encoder count, if the number of counts is not
-configured. The angle is the `RECUR`-th smallest angle that a front wheel rolled in a feedback line,
-within `SOUGHT` lines. The smallest angle alone may come from a damaged line."""
+configured. The angle is the `RECURRENCES`-th smallest angle that a front wheel rolled in a feedback
+line, within `LEARNING_LINES` lines. The smallest angle alone may come from a damaged line."""
 
 MIN_COMMANDED_SPEED = 0.005
 """Smallest commanded wheel speed that does not count as zero, rad/s. The line to the board has two
@@ -166,7 +166,7 @@ class _Side:
             self.event = Event("wheel_fault", again, kind="again")
             self.out, self._out_s, self.residual.learns = None, 0.0, True
 
-    def stands_still(self, turned: Motors, same: Same, dt: float, count: float) -> bool:
+    def finds_stuck(self, turned: Motors, same: Same, dt: float, count: float) -> bool:
         """Return whether this line proves an encoder stuck; the pose then ignores its wheel.
 
         `same` is whether each wheel repeats its previous speed. `count` is the angle of an encoder
@@ -177,9 +177,9 @@ class _Side:
         for i, stuck in enumerate(self._stuck):
             own, other = self.wheels[i], self.wheels[1 - i]
             turns, apart = same[own] and turned[own] != 0.0, 0.0
-            if turns and stuck.left_by(self.expected.commanded):
+            if turns and stuck.command_changed(self.expected.commanded):
                 apart = turned[other] - turned[own] * self.residual.stand_in(front=i == 1)
-            if stuck.says(turns, apart, dt, count, self.expected):
+            if stuck.add(turns, apart, dt, count, self.expected):
                 self._leave_out(i, "stuck")
                 return True
         return False
@@ -257,11 +257,11 @@ class WheelFaults:
         `counts` is the number of encoder counts per revolution of a wheel; 0 if it is unknown.
         """
         self._kinematics, self._settings = kinematics, feedback
-        self._count = math.tau / counts if counts else COARSEST
+        self._count = math.tau / counts if counts else MAX_COUNT_ANGLE
         self._seeking, self._period = not counts, ASSUMED_PERIOD_S
-        self._least, self._looked = [COARSEST] * RECUR, 0
-        """`_least` contains the `RECUR` smallest angles that a front wheel rolled in one of the
-        last `_looked` feedback lines, rad."""
+        self._least, self._looked = [MAX_COUNT_ANGLE] * RECURRENCES, 0
+        """`_least` contains the `RECURRENCES` smallest angles that a front wheel rolled in one of
+        the last `_looked` feedback lines, rad."""
         self._sides = self._left, self._right = _Side("left", LEFT), _Side("right", RIGHT)
         self._last = STILL
         self._busy = self._leaves_out = self._stands = False
@@ -434,17 +434,16 @@ class WheelFaults:
         return self._found is not None
 
     def _standing(self, turned: Motors, same: Same, dt: float) -> _Side | None:
-        left = self._left.stands_still(turned, same, dt, self._count)
-        right = self._right.stands_still(turned, same, dt, self._count)
+        left = self._left.finds_stuck(turned, same, dt, self._count)
+        right = self._right.finds_stuck(turned, same, dt, self._count)
         return self._right if right else self._left if left else None
 
     def _pace(self, slow: bool) -> Event:
         if not slow:
             return Event("wheel_fault", "every wheel follows its command again", kind="again")
         text = (
-            f"wheels slower than commanded: {', '.join(self.status.slow)} of the expected speed; "
-            "check the load, the battery, and the settings limits.wheel_speed and "
-            "feedback.response_time"
+            f"{slow_text(self.status.slow)}; check the load, the battery, and the settings "
+            "limits.wheel_speed and feedback.response_time"
         )
         return Event("wheel_fault", text, "warning", kind="slow")
 
@@ -456,17 +455,17 @@ class WheelFaults:
         return self._found is not None and self._found.was_faulty(before, self._last)
 
     def _seek(self, speeds: WheelSpeeds, dt: float) -> None:
-        """Learn the angle of a count: the smallest angle that recurs (`RECUR`, `SOUGHT`)."""
+        """Learn the angle of a count, which is the smallest angle that recurs (`RECURRENCES`)."""
         self._period += PERIOD_GAIN * (dt - self._period)
         self._looked += 1
-        if self._looked > SOUGHT:
-            self._least, self._looked = [COARSEST] * RECUR, 1
+        if self._looked > LEARNING_LINES:
+            self._least, self._looked = [MAX_COUNT_ANGLE] * RECURRENCES, 1
         for speed in (abs(speeds.front_right), abs(speeds.front_left)):
             if 0.0 < speed * self._period < self._least[-1]:
                 self._least[-1] = speed * self._period
                 self._least.sort()
-                self._count = min(self._count, max(FINEST, self._least[-1]))
-                self._seeking = self._count > FINEST
+                self._count = min(self._count, max(MIN_COUNT_ANGLE, self._least[-1]))
+                self._seeking = self._count > MIN_COUNT_ANGLE
 
     def _by_gyro(self, i: int, turned: Motors, turn: float) -> float:
         """Return the angle that one side rolled, rad, computed from the gyro and the other side.
@@ -487,3 +486,9 @@ class WheelFaults:
         self._leaves_out = left.out is not None or right.out is not None
         self.slips = left.slip_s > 0.0 or right.slip_s > 0.0
         self._busy = self.slips or self._leaves_out or left.suspected or right.suspected
+
+
+def slow_text(slow: tuple[str, ...]) -> str:
+    """Return a text about the wheels in `WheelsStatus.slow`."""
+    wheels = [f"{one.replace(' ', ' reaches ')} of its expected speed" for one in slow]
+    return f"wheels are slower than commanded: {', '.join(wheels)}"

@@ -117,12 +117,12 @@ def kind_of(name: str) -> inspect.Type:
 
 
 T = TypeVar("T")
-Some = Annotated[list[T], Meta(max_length=128)]
+ParameterList = Annotated[list[T], Meta(max_length=128)]
 """List with at most 128 items, for the parameters that a request sets. A longer request is refused,
 because its decoding would take too much of the time of a control step."""
-Many = Annotated[list[T], Meta(max_length=256)]
+NameList = Annotated[list[T], Meta(max_length=256)]
 """List with at most 256 items, for names of parameters. The limit is higher than the limit of
-`Some`, because a name is decoded faster than a parameter with its value."""
+`ParameterList`, because a name is decoded faster than a parameter with its value."""
 
 MAX_REQUEST_BYTES = 16384
 """Largest size of a request, bytes. A request with the names of all parameters is smaller."""
@@ -167,7 +167,7 @@ class SetParametersResult(Struct, frozen=True):
 class ListRequest(Struct, frozen=True):
     """Request of the service `list_parameters`."""
 
-    prefixes: Many[str]
+    prefixes: NameList[str]
     """Prefixes of the names to list. If the list is empty, all names are listed."""
     depth: Unsigned64
     """Largest number of parts, separated by dots, that a listed name may have after its prefix. 0
@@ -187,7 +187,7 @@ class ListReply(Struct, frozen=True):
 class Names(Struct, frozen=True):
     """Request with names of parameters, whose values, types or descriptors the reply contains."""
 
-    names: Many[str]
+    names: NameList[str]
 
 
 class Values(Struct, frozen=True):
@@ -211,7 +211,7 @@ class Descriptors(Struct, frozen=True):
 class SetRequest(Struct, frozen=True):
     """Request of `set_parameters` and of `set_parameters_atomically`."""
 
-    parameters: Some[Parameter]
+    parameters: ParameterList[Parameter]
 
 
 class SetReply(Struct, frozen=True):
@@ -303,7 +303,7 @@ class Parameters:
         return Descriptors([described(name, value.type) for name, value in self._of(asked)])
 
 
-def wished(payload: bytes) -> dict[str, Plain]:
+def requested_values(payload: bytes) -> dict[str, Plain]:
     """Decode a request to set parameters, and return the new values by parameter name.
 
     `payload` is the request in CDR. Raises `CdrError` if the request is not valid, or if it

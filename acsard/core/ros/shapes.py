@@ -62,7 +62,7 @@ def how_often(text: str, count: int) -> str:
     return "" if count == 1 or COUNT_PREFIX.match(text) else f" ({count} times)"
 
 
-def asked(twist: BodyTwist, arrived: Time, frame: str) -> TwistStamped:
+def command_message(twist: BodyTwist, arrived: Time, frame: str) -> TwistStamped:
     """Convert a received command to a message of the topic `cmd_vel_in/<source>`.
 
     Args:

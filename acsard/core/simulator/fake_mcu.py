@@ -91,8 +91,9 @@ class FakeMcu(Faults):
         self._counted = [0.0] * 4
         self._replied_ns = now_ns - NS_PER_S
         self.heard: deque[tuple[int, bytes]] = deque(maxlen=4096)
-        """The last received lines, valid or not. Each item is a pair: the monotonic time at which
-        the last byte of the line arrived, ns, and the line."""
+        """The last lines that the host sent, valid or not. Each item is a pair: the monotonic time
+        at which the last byte of the line arrived, ns, and the line. Lines that arrive while the
+        board boots, and lines that the fault `lost_commands` drops, are included."""
         self.valid_lines = 0
         self._watchdog_trips = 0
         self._checks = False
@@ -117,7 +118,7 @@ class FakeMcu(Faults):
             self._schedule(self._boot_until_ns, "booted", b"")
         self._lasting = ExitStack()
         for text in config.sim.faults:
-            self._lasting.enter_context(self.having(named(text)))
+            self._lasting.enter_context(self.switched_on(named(text)))
 
     @property
     def vehicle(self) -> Vehicle:
@@ -179,18 +180,18 @@ class FakeMcu(Faults):
             elif what == "act":
                 self._act(due_ns, data)
             elif what == "booted":
-                self._name_itself(due_ns)
+                self._send_identity(due_ns)
             elif what == "report" and data == self._clock:
                 if due_ns >= self._boot_until_ns:
                     self._reply(due_ns, protocol.Command({}))
                 self._schedule(due_ns + self.unprompted_ns, "report", data)
             elif what == "status":
-                self._tell_inputs(due_ns)
+                self._send_inputs(due_ns)
             elif what == "inputs" and data == self._inputs_clock:
-                self._tell_inputs(due_ns)
+                self._send_inputs(due_ns)
                 self._schedule(due_ns + STATUS_NS, "inputs", data)
             elif what == "battery" and data == self._battery_clock:
-                self._tell_battery(due_ns)
+                self._send_battery(due_ns)
                 self._schedule(due_ns + STATUS_NS, "battery", data)
         self._now_ns = now_ns
         return out
@@ -242,7 +243,7 @@ class FakeMcu(Faults):
 
     def _act(self, now_ns: int, line: bytes) -> None:
         if line.rstrip(b"\r\n") == b"?":
-            self._name_itself(now_ns)
+            self._send_identity(now_ns)
             return
         command = self.understand(line)
         if command is None:
@@ -253,16 +254,17 @@ class FakeMcu(Faults):
         # Reading the property `vehicle` first simulates the robot up to now with the old set
         # points.
         set_points = self.vehicle.set_points
-        for motor, value in command.values.items():
-            wheel, forward = self._wiring[self.drivers[motor]]
+        for output, value in command.values.items():
+            motor = self.drivers[output]
+            wheel, forward = self._wiring[motor]
             set_points[wheel] = forward * self.drives[motor] * value
         self.valid_lines += 1
         self._fed_ns = now_ns
         if not self.unprompted_ns:
             self._reply(now_ns, command)
 
-    def _name_itself(self, now_ns: int) -> None:
-        if self.understand is protocol.whole:
+    def _send_identity(self, now_ns: int) -> None:
+        if self.understand is protocol.reference:
             self._send(
                 now_ns, protocol.identity(self._counts, self.watchdog_ns // MS, self.samples)
             )
@@ -333,8 +335,8 @@ class FakeMcu(Faults):
                 return [0.0] * 4
             scale = math.tau / self._counts * NS_PER_S / (now_ns - since)
             every = [b - a for a, b in zip(before, counts, strict=True)]
-            read = zip(self.encoders, self.encoder_signs, strict=True)
-            moved = [every[encoder] * sign for encoder, sign in read]
+            signs = self.encoder_signs
+            moved = [every[encoder] * signs[encoder] for encoder in self.encoders]
             if self.frozen is not None:
                 moved[self.frozen] = self._moved[self.frozen]
             self._moved = moved
@@ -353,7 +355,7 @@ class FakeMcu(Faults):
         read_ns, _ = self._window
         return (read_ns - self._on_ns) // MS, *(round(count) for count in self._counted)
 
-    def _tell_inputs(self, now_ns: int) -> None:
+    def _send_inputs(self, now_ns: int) -> None:
         fields: dict[str, str] = {}
         for begin_ns, end_ns, name, value in self._inputs:
             before = fields.setdefault(name, self._bumpers if name == "bumpers" else "ok")
@@ -362,13 +364,13 @@ class FakeMcu(Faults):
                 fields[name] = "".join(map(max, value, before)) if both else value
         fields = {name: value for name, value in fields.items() if value != "silent"}
         if fields:
-            self._tell(now_ns, fields)
+            self._send_status(now_ns, fields)
 
-    def _tell(self, now_ns: int, fields: dict[str, str]) -> None:
+    def _send_status(self, now_ns: int, fields: dict[str, str]) -> None:
         if not self.muted and now_ns >= self._boot_until_ns:
             self._send(now_ns, self._damaged(protocol.status(fields, self._checks)))
 
-    def _tell_battery(self, now_ns: int) -> None:
+    def _send_battery(self, now_ns: int) -> None:
         seconds, self._drained_ns = (now_ns - self._drained_ns) / NS_PER_S, now_ns
         turning = sum(map(abs, self.vehicle.set_points))
         if not turning:
@@ -379,7 +381,8 @@ class FakeMcu(Faults):
         self._charge = max(0.0, self._charge - amps * seconds / self._capacity)
         volts = EMPTY_VOLTS + CHARGED_VOLTS * self._charge - RESISTANCE * amps
         charge = f"{100 * self._charge:.0f}%"
-        self._tell(now_ns, {"volts": f"{volts:.2f}", "amps": f"{-amps:.2f}", "charge": charge})
+        fields = {"volts": f"{volts:.2f}", "amps": f"{-amps:.2f}", "charge": charge}
+        self._send_status(now_ns, fields)
 
     def _schedule_changes(self, begin_ns: int, end_ns: int) -> None:
         for change_ns in (begin_ns, end_ns):

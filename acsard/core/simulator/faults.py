@@ -47,14 +47,16 @@ class Faults:
         self.drivers = [0, 1, 2, 3]
         """The motor that each output drives. The outputs 0 to 3 are a to d of the board."""
         self.drives = [1.0] * 4
-        """For each output a to d of the board, the factor from its command to the set point of its
-        motor: 1, or -1 if the motor is reversed, or 0 if the motor is dead."""
+        """For each of the motors a to d, the factor from its command to its set point: 1, or -1 if
+        the motor is reversed, or 0 if the motor is dead."""
         self.push: float | None = None
         """Speed at which a person pushes the robot, m/s, or None if nobody pushes it."""
         self.encoders = [0, 1, 2, 3]
         """The motor whose encoder is connected to each of the board's inputs a to d."""
         self.encoder_signs = [1, 1, 1, 1]
-        self.understand: Callable[[bytes], protocol.Command | None] = protocol.whole
+        """For the encoder of each of the motors a to d, the sign of its counts: 1, or -1 if the
+        encoder is reversed."""
+        self.understand: Callable[[bytes], protocol.Command | None] = protocol.reference
         self.samples = True
         self.latency_ns = 0
         """Interval of the USB adapter's timer, ns. When the timer expires, the adapter sends its
@@ -95,13 +97,16 @@ class Faults:
         place, bit = divmod(self._passed["bit"] * 59 % (8 * len(data)), 8)
         return b"%b%c%b" % (data[:place], data[place] ^ 1 << bit, data[place + 1 :])
 
-    def having(self, fault: NamedFault) -> Fault:
+    def switched_on(self, fault: NamedFault) -> Fault:
         """Return the context manager that switches on a fault from `[sim] faults` or `--fault`."""
         block: Fault = getattr(self, fault.name)(*fault.values)
         return block
 
     def mute(self) -> Fault:
-        """Make the board obey lines but send no replies and no status lines."""
+        """Make the board obey lines but send no replies and no status lines.
+
+        The board still identifies itself after a boot, and when the host asks it to.
+        """
         return self._with(muted=True)
 
     def noise(self, data: bytes = b"\x00\xff~") -> Fault:
@@ -237,10 +242,11 @@ class Faults:
         return self._with(lose_command=every)
 
     def bit_errors(self, every: int = 7) -> Fault:
-        """Flip one bit in one of every `every` lines.
+        """Flip one bit in one of every `every` transmissions.
 
-        Lines in both directions are counted together. The position of the bit in the line changes
-        each time.
+        A transmission is one line from the board, or all bytes of one write by the host.
+        Transmissions in both directions are counted together. The position of the bit changes each
+        time.
         """
         return self._with(bit_error=every)
 

@@ -1,8 +1,8 @@
 """The serial protocol on the side of the board: the commands that it obeys, and its replies.
 
-There is one decoder for each kind of firmware. `whole` is the decoder of the reference firmware. A
-checked line is a plain line with a suffix that contains a sequence number and a checksum. The
-module shares no code with the host.
+There is one decoder for each kind of firmware. `reference` is the decoder of the reference
+firmware. A checked line is a plain line with a suffix that contains a sequence number and a
+checksum. The module shares no code with the host.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class Command(Struct, frozen=True):
     """True if the reply must contain the board's time and its encoder counts."""
 
 
-def whole(line: bytes) -> Command | None:
+def reference(line: bytes) -> Command | None:
     """Decode a line as the reference firmware does.
 
     The line may be plain or checked (with a sequence number and a checksum). Return None if it is

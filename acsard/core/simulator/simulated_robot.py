@@ -20,7 +20,7 @@ OBSERVATION_PERIOD_NS = NS_PER_S // 100
 """Interval at which the simulated robot is observed, ns. The gyro has the same interval."""
 
 
-class Sight(Struct, frozen=True):
+class Observation(Struct, frozen=True):
     """An observation of the simulated robot's true motion."""
 
     at_ns: int
@@ -32,9 +32,9 @@ class Sight(Struct, frozen=True):
 
 
 class WatchedMcu(FakeMcu):
-    """A `FakeMcu` that passes a `Sight` to the callback `see` every 10 ms of simulated time."""
+    """A `FakeMcu` that passes an `Observation` to a callback every 10 ms of simulated time."""
 
-    def __init__(self, config: Config, now_ns: int, see: Callable[[Sight], None]) -> None:
+    def __init__(self, config: Config, now_ns: int, see: Callable[[Observation], None]) -> None:
         super().__init__(config, now_ns)
         self._sim, self._see = config.sim, see
         self._delay_ns = int(config.sim.gyro_delay * NS_PER_S)
@@ -71,7 +71,7 @@ class WatchedMcu(FakeMcu):
         rate = turned * NS_PER_S / OBSERVATION_PERIOD_NS + sim.gyro_bias
         rate += sim.gyro_noise * gauss(sim.seed, self._looks)
         self._looks += 1
-        self._see(Sight(now_ns, self.vehicle.pose, rate))
+        self._see(Observation(now_ns, self.vehicle.pose, rate))
 
     def _turned(self, at_ns: int) -> float:
         before_ns, before = self._history[0]

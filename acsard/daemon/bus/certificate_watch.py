@@ -14,7 +14,7 @@ from pathlib import Path
 
 from acsard.core.config.settings import TLS_PREFIX, BusConfig
 from acsard.core.values import NS_PER_S
-from acsard.daemon.bus.tls import ends, peer_ends_ns, unusable
+from acsard.daemon.bus.tls import expiry_times, peer_ends_ns, unusable
 from acsard.daemon.bus.zenoh_sessions import certificate_trouble
 from acsard.host import clock
 from acsard.host.threads import NoThreadError, in_thread
@@ -86,7 +86,7 @@ connections. If a router did not answer, all routers are tried again at the next
 robot's certificates."""
 
 
-def ends_of(routers: Iterable[str], directory: str) -> dict[str, int]:
+def router_expiry_times(routers: Iterable[str], directory: str) -> dict[str, int]:
     """Return the expiry time of each router's certificate, ns since 1970.
 
     A router that does not answer is left out. The keys of the returned dict are texts for messages,
@@ -111,7 +111,7 @@ async def watch_certificates(bus: BusConfig, known: MutableMapping[str, int]) ->
     Args:
         bus: the settings with the certificate directory and the routers.
         known: maps the name of each certificate to its expiry time, ns since 1970. The names are
-            the dict keys of `tls.ends` and `ends_of`.
+            the dict keys of `tls.expiry_times` and `router_expiry_times`.
     """
     routers = [endpoint for endpoint in bus.connect if endpoint.startswith(TLS_PREFIX)]
     answered, look = 0, 0
@@ -121,9 +121,9 @@ async def watch_certificates(bus: BusConfig, known: MutableMapping[str, int]) ->
             # Wait without a time limit. With a limit, each attempt to read from a disk that hangs
             # would leave one more blocked thread.
             if answered < len(routers) or look % ROUTER_CHECK_EVERY == 0:
-                found |= await in_thread(lambda: ends_of(routers, bus.tls), None)
+                found |= await in_thread(lambda: router_expiry_times(routers, bus.tls), None)
                 answered = len(found)
-            found |= await in_thread(lambda: ends(bus.tls), None)
+            found |= await in_thread(lambda: expiry_times(bus.tls), None)
         except NoThreadError:
             pass  # the next round tries again
         if bus.outside:

@@ -17,7 +17,7 @@ import zenoh
 from msgspec import Struct
 
 from acsard.core.messages.keys_and_roles import full_key, whoami_key
-from acsard.core.messages.permissions import USE_TEXTS, has, least_role
+from acsard.core.messages.permissions import ROLE_TEXTS, has, least_role
 from acsard.core.values import NS_PER_S, ROLES, Role
 from acsard.daemon.bus.tls import common_name
 from acsard.host import clock
@@ -97,7 +97,7 @@ class Identity(Struct, frozen=True):
             if self.certificate
             else "you connect without a certificate and have the role"
         )
-        return f"{owner} {self.role}: {USE_TEXTS[self.role]}"
+        return f"{owner} {self.role}: {ROLE_TEXTS[self.role]}"
 
 
 def identity(ask: Ask, tls: str, sender: str, robot: str = "", endpoint: str = "") -> Identity:

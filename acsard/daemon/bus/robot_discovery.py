@@ -26,7 +26,7 @@ DISCOVERY_S = 2.0
 """Longest wait for the liveliness tokens of the daemons, s."""
 
 
-def named(text: str) -> tuple[str, ...]:
+def parse_ids(text: str) -> tuple[str, ...]:
     """Return the robot ids in the text of an option `--id` that names several robots.
 
     Return ("*",) for all robots, and () if the text names only one robot. Raises `UsageError` for a
@@ -48,7 +48,7 @@ def named(text: str) -> tuple[str, ...]:
     return ids
 
 
-def present(session: zenoh.Session, ids: Sequence[str], endpoint: str) -> list[str]:
+def running_robots(session: zenoh.Session, ids: Sequence[str], endpoint: str) -> list[str]:
     """Return the sorted ids of those robots in `ids` whose daemon is running.
 
     An id "*" stands for all robots. If `ids` contains "*" and no robot is visible, raise
@@ -60,7 +60,7 @@ def present(session: zenoh.Session, ids: Sequence[str], endpoint: str) -> list[s
         found |= {robot_of(str(reply.ok.key_expr)) for reply in replies if reply.ok is not None}
     found.discard("")
     if not found and ALL_ROBOTS in ids:
-        raise NoAnswerError(nobody(endpoint))
+        raise NoAnswerError(no_robot_text(endpoint))
     return sorted(found)
 
 
@@ -72,9 +72,9 @@ def presence(session: zenoh.Session, robot_id: str, endpoint: str) -> Presence |
     try:
         if not session.info.links():
             return Presence(linked=False, here=False)
-        if present(session, (robot_id,), endpoint):
+        if running_robots(session, (robot_id,), endpoint):
             return Presence(linked=True, here=True)
-        return Presence(True, False, tuple(present(session, (ALL_ROBOTS,), endpoint)))
+        return Presence(True, False, tuple(running_robots(session, (ALL_ROBOTS,), endpoint)))
     except NoAnswerError:
         return Presence(linked=True, here=False)
     except zenoh.ZError:
@@ -93,18 +93,18 @@ def stop(session: zenoh.Session, ids: Sequence[str], sender: str) -> None:
         session.put(full_key(robot_id, "stop"), b"", attachment=by, express=True)
 
 
-def seen(endpoint: str, robots: int) -> str:
+def count_text(endpoint: str, robots: int) -> str:
     """Return a text that says how many robots are visible at `endpoint`."""
     return f"all robots visible at {endpoint}: {many(robots, 'robot')}"
 
 
-def nobody(endpoint: str) -> str:
+def no_robot_text(endpoint: str) -> str:
     """Return a message that explains why no robot is visible at an endpoint."""
     if endpoint.startswith(TLS_PREFIX):
         return (
             "no robot is visible. Over TLS, name the robots (--id robot1,robot2), or set [access] "
-            "wildcards = true on the robots. If that does not help, your certificate has no role "
-            "at any robot: `acsard whoami --id robot1` shows its role"
+            "wildcards = true on the robots. If that does not help, your certificate may have no "
+            "role at any robot; `acsard whoami --id robot1` checks this"
         )
     return (
         f"no robot is visible at {endpoint}; is a daemon running there, or is a daemon connected "

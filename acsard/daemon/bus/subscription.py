@@ -61,7 +61,7 @@ class Subscription:
         # The loop is bounded, because a flood of samples on other keys must not block the caller.
         for _ in range(MAX_QUEUED_SAMPLES):
             sample: zenoh.Sample | None = self._queue.try_recv()
-            if sample is None or not self._key or on(self._key, sample):
+            if sample is None or not self._key or has_exact_key(self._key, sample):
                 return sample
         return None
 
@@ -130,7 +130,7 @@ class Subscription:
             pass  # closing the session has undeclared them
 
 
-def on(key: str, sample: zenoh.Sample) -> bool:
+def has_exact_key(key: str, sample: zenoh.Sample) -> bool:
     """Return whether a sample was put on exactly `key`, and not on a key with a wildcard."""
     return str(sample.key_expr) == key
 

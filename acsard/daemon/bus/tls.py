@@ -146,10 +146,10 @@ NO_CHECK_TIME = 0x200000
 """OpenSSL's flag X509_V_FLAG_NO_CHECK_TIME, which Python's `ssl` does not name."""
 
 AUTHORITY = "the authority"
-"""Key of the authority's certificate in the dict that `ends()` returns."""
+"""Key of the authority's certificate in the dict that `expiry_times()` returns."""
 
 
-def ends(directory: str) -> dict[str, int]:
+def expiry_times(directory: str) -> dict[str, int]:
     """Return the expiry times of the certificates in a TLS directory, ns since 1970.
 
     In the returned dict, the key "" stands for `certificate.pem`, and `AUTHORITY` for `ca.pem`.
@@ -301,13 +301,13 @@ def _tls_trouble(plain: socket.socket, host: str, directory: str) -> str:
         with context.wrap_socket(plain, server_hostname=host) as link:
             shaken = True
             if outdated and (code := _wrong_date(link.getpeercert() or {})):
-                return _server_rejected(code, "", host, directory)
+                return _server_certificate_error(code, "", host, directory)
             link.settimeout(REFUSAL_WAIT_S)
             link.recv(1)
     except ssl.SSLCertVerificationError as error:
-        return _server_rejected(error.verify_code, error.verify_message, host, directory)
+        return _server_certificate_error(error.verify_code, error.verify_message, host, directory)
     except ssl.SSLError as error:
-        return _client_rejected(error.reason or str(error), host, directory)
+        return _client_certificate_error(error.reason or str(error), host, directory)
     except TimeoutError:
         # If the handshake is over, the server waits for data: both ends have accepted the
         # certificates.
@@ -329,7 +329,7 @@ def _wrong_date(certificate: Mapping[str, Any]) -> int:
     return NOT_YET if now < ssl.cert_time_to_seconds(certificate["notBefore"]) else 0
 
 
-def _server_rejected(code: int, reason: str, host: str, directory: str) -> str:
+def _server_certificate_error(code: int, reason: str, host: str, directory: str) -> str:
     """Return the error message for a certificate of the server that this client rejects.
 
     `code` and `reason` are OpenSSL's error code and its text.
@@ -371,7 +371,7 @@ def _server_rejected(code: int, reason: str, host: str, directory: str) -> str:
     return f"the certificate of {host} is not valid ({reason}); to make another one, {RENEW_ADVICE}"
 
 
-def _client_rejected(reason: str, host: str, directory: str) -> str:
+def _client_certificate_error(reason: str, host: str, directory: str) -> str:
     """Return the error message for a TLS handshake that the server ends.
 
     `reason` is OpenSSL's name of the error, usually of an alert that the server sent.

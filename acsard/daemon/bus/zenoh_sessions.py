@@ -26,8 +26,14 @@ from acsard.daemon.bus.tls import (
     require_usable,
     trouble,
 )
-from acsard.host.errors import CertificateError, InUseError, UnreachableError, UsageError
-from acsard.host.terminal_modes import coloured
+from acsard.host.errors import (
+    CertificateError,
+    InUseError,
+    MendableError,
+    UnreachableError,
+    UsageError,
+)
+from acsard.host.terminal_modes import may_use_color
 
 COMMAND_RATE_HZ = 1000.0
 """Largest number of commands per second that a session accepts on each key. The limit is high
@@ -49,7 +55,8 @@ def daemon_session(config: Config) -> zenoh.Session:
 
     In client mode this call blocks until the router answers, so call it in a thread. Raises
     `InUseError` if the session cannot listen, for example on an address that is in use. Raises
-    `CertificateError` if Zenoh refuses the certificate files that a TLS router requires.
+    `MendableError` if Zenoh cannot open the session in client mode. Raises `CertificateError` if
+    Zenoh refuses the certificate files that a TLS router requires.
     """
     bus = config.bus
     settings = _base(bus.mode) | {
@@ -68,7 +75,15 @@ def daemon_session(config: Config) -> zenoh.Session:
         settings |= _tls(bus.tls)
     if bus.connect:
         settings |= RETRY_SETTINGS
-    return _opened(settings, bus.plain)
+    if bus.mode == "peer":
+        return _opened(settings, bus.plain)
+    try:
+        return zenoh.open(_config(settings))
+    except zenoh.ZError as error:
+        raise MendableError(
+            f"cannot open the Zenoh session to {', '.join(bus.connect)}: {first_line(error)}; "
+            "check bus.connect, then start acsard again"
+        ) from error
 
 
 def gateway_session(config: Config) -> zenoh.Session:
@@ -318,7 +333,7 @@ def log_from_environment() -> None:
         return
     before = os.environ.get("NO_COLOR")
     # Zenoh reads only NO_COLOR, and would write colors to pipes and files too.
-    if not coloured(sys.stdout):
+    if not may_use_color(sys.stdout):
         os.environ["NO_COLOR"] = "1"
     zenoh.try_init_log_from_env()
     if before is None:

@@ -20,7 +20,7 @@ from acsard.core.messages.keys_and_roles import full_key
 from acsard.core.messages.schema import GatewayState
 from acsard.core.values import NS_PER_S
 from acsard.daemon.bus.certificate_watch import CertificateFiles
-from acsard.daemon.bus.tls import ends, files_in, require_usable
+from acsard.daemon.bus.tls import expiry_times, files_in, require_usable
 from acsard.daemon.bus.zenoh_sessions import MAX_SESSIONS, gateway_session, reachable
 from acsard.daemon.gateway.listener_process import (
     GATEWAY_EVENTS,
@@ -96,7 +96,7 @@ class Gateway(Listener):
         which all connections were in use.
         """
         if self._publisher is None:
-            self._ends_ns = min(ends(self._config.bus.tls).values(), default=0)
+            self._ends_ns = min(expiry_times(self._config.bus.tls).values(), default=0)
             key, kind = full_key(self._config.robot.id, "gateway"), "GatewayState"
             encoding = encoding_name("msgpack", kind)
             self._publisher = session.declare_publisher(key, encoding=encoding)

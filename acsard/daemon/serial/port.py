@@ -22,7 +22,7 @@ from acsard.core.link.serial_output import Offered, SerialOutput
 from acsard.core.values import Event, Instant, Received
 from acsard.daemon.serial.device import close, draining, open_raw, refusal, unsent
 from acsard.host import clock
-from acsard.host.clock import Asleep
+from acsard.host.clock import SuspendDetector
 from acsard.host.errors import InUseError, MendableError, NotPermittedError
 from acsard.host.threads import NoThreadError, in_thread
 
@@ -64,7 +64,7 @@ class SerialPort:
         period_ns: int,
         wake: Callable[[], None],
         log: Callable[[Event], None],
-        asleep: Asleep | None = None,
+        asleep: SuspendDetector | None = None,
     ) -> None:
         """Prepare the port.
 
@@ -78,7 +78,7 @@ class SerialPort:
             asleep: detector of a suspend of this computer.
         """
         self.is_open = False
-        self._asleep = asleep or Asleep()
+        self._asleep = asleep or SuspendDetector()
         self.opened = 0
         """Number of times that the port was opened."""
         self._path, self._baud_rate, self._stop = path, baud_rate, stop
@@ -113,7 +113,7 @@ class SerialPort:
                 None. In such a step, this method also reads the bytes that wait in the kernel.
                 Otherwise the delay of the step would look like silence of the board.
         """
-        if self._asleep.was():
+        if self._asleep.detect():
             self._leave(OSError(errno.EIO, "this computer was suspended"))
         if late is not None and self._transport is not None:
             # If the port is lost, the reader notices and reports it.
@@ -150,7 +150,7 @@ class SerialPort:
             self._leave(error)
             return "down"
         # The wire is busy from the moment of the write, not from the start of the step.
-        return self._output.took(line, data, taken, clock.mono_ns())
+        return self._output.record_write(line, data, taken, clock.mono_ns())
 
     # Opening and reopening.
 

@@ -21,7 +21,7 @@ from acsard.core.messages.keys_and_roles import IMU
 from acsard.core.messages.schema import Message
 from acsard.core.simulator.baud_mismatch import garbled
 from acsard.core.simulator.fake_mcu import FakeMcu
-from acsard.core.simulator.simulated_robot import Sight, WatchedMcu
+from acsard.core.simulator.simulated_robot import Observation, WatchedMcu
 from acsard.core.simulator.true_messages import true_pose, turn_rate
 from acsard.core.values import NS_PER_S
 from acsard.daemon.serial.device import unlock
@@ -144,9 +144,9 @@ class Simulated(SimPty):
         self._gyro = config.odometry.gyro
         self._delay_ns = int(config.sim.gyro_delay * NS_PER_S)
         self._bus: Bus | None = None
-        self._last: tuple[Sight, int] | None = None
+        self._last: tuple[Observation, int] | None = None
 
-    def tell(self, bus: Bus) -> None:
+    def publish_on(self, bus: Bus) -> None:
         """Publish the robot's true pose and the gyro's samples on `bus` from now on."""
         self._bus = bus
 
@@ -154,7 +154,7 @@ class Simulated(SimPty):
         """Return the newest true pose, or None if no pose is known or `key` is not `sim/pose`."""
         return true_pose(*self._last) if key == TRUE_POSE_KEY and self._last is not None else None
 
-    def _see(self, sight: Sight) -> None:
+    def _see(self, sight: Observation) -> None:
         now, bus = clock.now(), self._bus
         wall_ns = now.wall_ns - (now.mono_ns - sight.at_ns)
         self._last = sight, wall_ns

@@ -12,7 +12,7 @@ from acsard.bench.far_end import NumberedMcu
 from acsard.bench.matching import (
     CYCLE_LENGTH,
     LOSS_TIMEOUT_NS,
-    Fed,
+    MatchedLine,
     Record,
     Sample,
     Seen,
@@ -82,27 +82,35 @@ def test_a_command_without_a_line_in_time_is_left_out() -> None:
 
 def test_a_sample_is_timed_from_the_line_with_its_speed() -> None:
     said = [(10, 0.25), (20, 0.251), (30, 0.252)]
-    assert lines_to_samples(said, [(15, 0.25), (25, 0.251)]) == [Fed(5, 0), Fed(5, 0)]
+    assert lines_to_samples(said, [(15, 0.25), (25, 0.251)]) == [
+        MatchedLine(5, 0),
+        MatchedLine(5, 0),
+    ]
 
 
 def test_newer_lines_are_counted_as_waiting() -> None:
     said = [(10, 0.25), (20, 0.251), (30, 0.252)]
-    assert lines_to_samples(said, [(35, 0.25), (36, 0.252)]) == [Fed(25, 2), Fed(6, 0)]
+    assert lines_to_samples(said, [(35, 0.25), (36, 0.252)]) == [
+        MatchedLine(25, 2),
+        MatchedLine(6, 0),
+    ]
 
 
 def test_a_sample_that_repeats_a_line_or_matches_no_line_is_left_out() -> None:
     said = [(10, 0.25), (20, 0.251)]
-    assert lines_to_samples(said, [(12, 0.25), (14, 0.25), (22, 0.7), (5, 0.251)]) == [Fed(2, 0)]
+    assert lines_to_samples(said, [(12, 0.25), (14, 0.25), (22, 0.7), (5, 0.251)]) == [
+        MatchedLine(2, 0)
+    ]
 
 
 def test_the_same_speed_a_round_later_is_another_line() -> None:
     said = [(number * 10, staircase(number) / 20) for number in range(2 * CYCLE_LENGTH)]
     samples = [(at_ns + 3, speed) for at_ns, speed in said]
-    assert lines_to_samples(said, samples) == [Fed(3, 0)] * (2 * CYCLE_LENGTH)
+    assert lines_to_samples(said, samples) == [MatchedLine(3, 0)] * (2 * CYCLE_LENGTH)
 
 
 def test_a_speed_is_recognised_in_spite_of_rounding() -> None:
-    assert lines_to_samples([(0, 0.1 + 0.2)], [(1, 0.3)]) == [Fed(1, 0)]
+    assert lines_to_samples([(0, 0.1 + 0.2)], [(1, 0.3)]) == [MatchedLine(1, 0)]
 
 
 def test_percentiles_are_durations_that_were_measured() -> None:
@@ -148,20 +156,22 @@ def test_only_lines_between_start_and_end_count() -> None:
         Sample(Instant(at_ns + 5, 0), 0, staircase(number) * config.drive.wheel_radius)
         for number, (at_ns, _) in enumerate(said, 1)
     ]
-    record = Record(0, (first_ns, last_ns), Seen(said=said), [], samples)
-    assert record.said == [(at_ns, line.strip()) for at_ns, line in said[3:7]]
-    assert feedback_fates(config, record) == [Fed(5, 0)] * 4
+    record = Record(0, (first_ns, last_ns), Seen(to_daemon=said), [], samples)
+    assert record.feedback_lines == [(at_ns, line.strip()) for at_ns, line in said[3:7]]
+    assert feedback_fates(config, record) == [MatchedLine(5, 0)] * 4
 
 
 def test_a_command_is_found_on_the_wire() -> None:
-    record = Record(0, (0, 100), Seen(heard=[(5, b"\r\nap"), (9, b"1\r\n")]), [Sent(4, b"x")], [])
+    record = Record(
+        0, (0, 100), Seen(from_daemon=[(5, b"\r\nap"), (9, b"1\r\n")]), [Sent(4, b"x")], []
+    )
     assert command_waits(record) == []
-    heard = Seen(heard=[(5, b"\r\n"), (7, b"ap1,\r\n")])
+    heard = Seen(from_daemon=[(5, b"\r\n"), (7, b"ap1,\r\n")])
     assert command_waits(Record(0, (0, 100), heard, [Sent(4, b"ap1")], [])) == [3]
 
 
 def test_a_record_of_a_real_port_has_no_lines_and_no_delays() -> None:
     record = Record(0, (0, 100), None, [Sent(4, b"x")], [])
-    assert not record.said
+    assert not record.feedback_lines
     assert not command_waits(record)
     assert not feedback_fates(Config(), record)

@@ -42,7 +42,8 @@ def test_the_text_states_the_improvement_and_the_remaining_error() -> None:
     told = plain(*parts(REPORT, FOUND, "acsard.toml", guided=False), width=MAX_TEXT_WIDTH)
     assert "wheel_separation_multiplier   " in told
     assert f"heading error after a turn of 360 deg: {REPORT.turn_error_before:.0f} deg now" in told
-    assert "remaining error" in told
+    assert "remaining error: skidding changes the effective track. This log determines " in told
+    assert "with the new values\n(errors on drives that the fit did not use)\nrandom " in told
     assert "give --distance METRES" in told
 
 

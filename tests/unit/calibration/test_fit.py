@@ -5,7 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from acsard.calibration.fit import PARAMETER_COUNT, PRIOR_STD, Base, Fit, P, fit, huber, of_rows
+from acsard.calibration.fit import (
+    PARAMETER_COUNT,
+    PRIOR_STD,
+    Base,
+    Fit,
+    Parameter,
+    evidence_from_measurements,
+    fit,
+    huber,
+)
 from acsard.calibration.heading import Rates, rates
 from acsard.calibration.multipliers import Multipliers, configured, multipliers
 from tests.unit.calibration.cut import BASE, ideal, ready, table
@@ -29,7 +38,7 @@ def fitted(rng: np.random.Generator, shared: float, own: float, blocks: int = 20
         jacobian = np.zeros((len(block), PARAMETER_COUNT))
         jacobian[:, :3] = columns
         residual = seen - columns @ parameters[:3]
-        return of_rows(jacobian, residual, np.ones(len(block)), block, blocks)
+        return evidence_from_measurements(jacobian, residual, np.ones(len(block)), block, blocks)
 
     return fit([source], START, places=True)
 
@@ -62,7 +71,7 @@ def test_errors_that_last_for_a_whole_run_widen_the_deviations_by_run() -> None:
         errors = np.random.default_rng(seed).normal(0.0, 0.02, (6, 3))[runs]
         mean = errors.mean(axis=0)
         score = np.pad(errors - mean, ((0, 0), (0, PARAMETER_COUNT - 3)))
-        found = Fit(START, normal, score, known, tuple(P)[:3], True, {})
+        found = Fit(START, normal, score, known, tuple(Parameter)[:3], True, {})
         for by_run, told in z.items():
             std = np.sqrt(np.diag(found.covariance(runs.tolist() if by_run else ())))
             told += (mean / std[:3]).tolist()
@@ -75,9 +84,9 @@ def test_removing_a_block_gives_the_parameters_of_a_fit_without_it() -> None:
     out = np.arange(20) == 4
     normal = found.normal[~out].sum(axis=0)[:3, :3]
     score = (found.score + found.normal @ found.parameters)[~out].sum(axis=0)[:3]
-    assert found.without(out)[[P.LEFT, P.RIGHT, P.INVERSE_TRACK]] == pytest.approx(
-        np.linalg.solve(normal, score)
-    )
+    assert found.without(out)[
+        [Parameter.LEFT, Parameter.RIGHT, Parameter.INVERSE_TRACK]
+    ] == pytest.approx(np.linalg.solve(normal, score))
 
 
 def test_the_normal_equations_of_the_three_parameters_are_well_conditioned() -> None:
@@ -90,7 +99,7 @@ def fit_of(rate: float) -> Fit:
     parameters = np.array([0.99, 1.01, 0.625, rate, *[0.0] * (PARAMETER_COUNT - 4)])
     normal = np.tile(np.eye(PARAMETER_COUNT) * 1e12, (12, 1, 1))
     known, score = np.zeros((PARAMETER_COUNT, PARAMETER_COUNT)), np.zeros((12, PARAMETER_COUNT))
-    return Fit(parameters, normal, score, known, tuple(P)[:4], True, PRIOR_STD)
+    return Fit(parameters, normal, score, known, tuple(Parameter)[:4], True, PRIOR_STD)
 
 
 def multipliers_of(fitted: Fit, rate: Rates) -> Multipliers:
@@ -124,7 +133,7 @@ def test_the_errors_of_track_ratio_and_scale_are_separated() -> None:
     # The scale is off by 1 %, each radius by another 0.1 %, the track by 2 %. All are independent.
     values = np.array([1.6, 1.1, 1.0])
     shares = np.diag([0.02, 0.001, 0.001]) ** 2 + 0.01**2
-    own = Multipliers(values, shares * np.outer(values, values)).own()
+    own = Multipliers(values, shares * np.outer(values, values)).relative_deviations()
     assert own.scale == pytest.approx(0.01, rel=0.01)
     assert own.ratio == pytest.approx(0.001 * np.sqrt(2), rel=0.01)
     assert own.track == pytest.approx(0.02, rel=0.01)
@@ -134,7 +143,7 @@ def test_blocks_add_up_to_the_normal_equations_of_all_rows() -> None:
     rng = np.random.default_rng(1)
     jacobian, residual = rng.normal(size=(50, PARAMETER_COUNT)), rng.normal(size=50)
     weight, block = rng.uniform(size=50), rng.integers(0, 6, 50)
-    made = of_rows(jacobian, residual, weight, block, 7)
+    made = evidence_from_measurements(jacobian, residual, weight, block, 7)
     assert np.allclose(made.normal.sum(axis=0), jacobian.T @ np.diag(weight) @ jacobian)
     assert np.allclose(made.score.sum(axis=0), jacobian.T @ (weight * residual))
     assert made.squares.sum() == pytest.approx(float(weight @ residual**2))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from acsard.calibration import heading
-from acsard.calibration.fit import PARAMETER_COUNT, P, huber
+from acsard.calibration.fit import PARAMETER_COUNT, Parameter, huber
 from acsard.calibration.heading import of_gyro, of_yaw, rows
 from acsard.calibration.log_table import LogError
 from acsard.calibration.runs import blocks
@@ -52,7 +52,7 @@ def test_the_standard_deviation_of_the_bias_covers_the_truth(noise: float, walk:
         walked = np.cumsum(rng.normal(0, walk * np.sqrt(step), len(drive.gyro_t)))
         noisy = drive.gyro + walked + rng.normal(0, noise, len(walked))
         _, headings = headings_of(replace(drive, gyro=noisy))
-        heading = headings.of[0]
+        heading = headings.per_run[0]
         turned = np.interp(heading.t - 0.02, drive.t, drive.yaw)
         off = (heading.angle - turned)[[0, -1]] @ [-1, 1] / np.ptp(heading.t)
         z.append(off / headings.bias_std)
@@ -114,7 +114,7 @@ AT = np.array([0.9, 1.1, 0.6, 0.05, *[0.0] * (PARAMETER_COUNT - 4)])
 
 def test_least_squares_find_both_sides_whatever_their_sign() -> None:
     rows = ready(table(ideal(), places=False)).rows
-    left, right = heading.first(rows, BASE)
+    left, right = heading.side_factors(rows, BASE)
     assert left == pytest.approx(0.998 / 1.6, rel=1e-3)
     assert right == pytest.approx(1.002 / 1.6, rel=1e-3)
     assert np.allclose(
@@ -137,4 +137,4 @@ def test_the_score_has_the_derivatives_of_the_turn_of_the_wheels() -> None:
         weight = huber(residual / usual, 1.0)
         # The other parameters also change the rate term, but only to second order.
         assert score[index] == pytest.approx(float(slope @ (weight * residual)), rel=0.15)
-    assert not score[[P.DELAY, P.SENSOR_X, P.SENSOR_Y]].any()
+    assert not score[[Parameter.DELAY, Parameter.SENSOR_X, Parameter.SENSOR_Y]].any()

@@ -97,13 +97,13 @@ def test_one_track_for_all_rates_gives_the_same_turn_at_the_mean_rate() -> None:
 
 
 @pytest.mark.parametrize(
-    ("gain", "chance", "sure"),
+    ("gain", "gain_std", "sure"),
     [(0.3, 0.1, True), (0.15, 0.1, False), (0.8, 1.0, True), (0.6, 1.0, False), (-0.1, 0.0, False)],
 )
 def test_a_gain_is_sure_beyond_two_deviations_or_if_the_error_is_halved(
-    gain: float, chance: float, sure: bool
+    gain: float, gain_std: float, sure: bool
 ) -> None:
-    assert replace(UNMEASURED, gain=gain, chance=chance).sure == sure
+    assert replace(UNMEASURED, log_improvement=gain, gain_std=gain_std).sure == sure
 
 
 @pytest.mark.parametrize(
@@ -114,4 +114,4 @@ def test_a_gain_is_sure_beyond_two_deviations_or_if_the_error_is_halved(
 def test_multipliers_that_are_far_from_the_configured_ones_need_less_gain(
     apart: float, gain: float, sure: bool
 ) -> None:
-    assert replace(UNMEASURED, gain=gain, chance=0.1, apart=apart).sure == sure
+    assert replace(UNMEASURED, log_improvement=gain, gain_std=0.1, apart=apart).sure == sure

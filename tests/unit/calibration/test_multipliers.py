@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from acsard.calibration.log_table import RefusedError
-from acsard.calibration.multipliers import TAPE_STD_M, Extent, Multipliers, Tape, scaled
+from acsard.calibration.multipliers import RUN_LENGTH_STD_M, Extent, Multipliers, Tape, scaled
 
 FOUND = Multipliers(np.array([1.6, 1.0, 1.0]), np.diag([0.02, 1e-3, 1e-3]) ** 2)
 NAMES = ("turns", "straight")
@@ -22,7 +22,9 @@ def test_the_tape_changes_only_the_scale() -> None:
     made, run = scaled(FOUND, Tape(5.1), NAMES, follow, known=False)
     assert run == "straight"
     assert made.values == pytest.approx(FOUND.values * 1.02, rel=1e-4)
-    assert made.std[1] / made.values[1] == pytest.approx(np.hypot(TAPE_STD_M / 5.1, 7e-4), rel=0.2)
+    assert made.std[1] / made.values[1] == pytest.approx(
+        np.hypot(RUN_LENGTH_STD_M / 5.1, 7e-4), rel=0.2
+    )
 
 
 def test_a_tape_hardly_changes_the_scale_of_accurate_positions() -> None:

@@ -25,9 +25,11 @@ from msgspec import Struct, structs
 
 from acsard.calibration import odometry_noise, ros_bag_log
 from acsard.calibration.calibration_report import keys, parts, report
+from acsard.calibration.fit import Parameter
 from acsard.calibration.log_table import LogError, RefusedError, Table
 from acsard.calibration.odometry_noise import INITIAL_NOISE, SOURCE_COUNT, Source, Windows
 from acsard.calibration.plausibility import RATIO, TRACK
+from acsard.calibration.positions import path, wheel_steps
 from acsard.calibration.ros_bag_log import Choice
 from acsard.calibration.solve import Calibration, calibrate
 from acsard.core.config.settings import DriveConfig, JointsConfig, OdometryConfig
@@ -37,7 +39,7 @@ from acsard.core.motion.odometry import Odometry
 from acsard.core.values import WheelSpeeds
 from acsard.terminal.output import MAX_TEXT_WIDTH, plain
 from tests.unit.calibration.bags import imu, in_order, joint_states
-from tests.unit.calibration.cut import log_of_runs, table
+from tests.unit.calibration.cut import BASE, log_of_runs, table
 from tests.unit.calibration.robots import (
     RADIUS,
     SEPARATION,
@@ -284,9 +286,9 @@ def measured(kind: Set, way: str, robots: int) -> Row:
             continue
         robot, made, counts = configs(found), found.multipliers, kind.robot.counts
         track, left, right = made.values
-        if TRACK not in found.kept:
+        if TRACK not in found.stays_configured:
             tracks.append((track - kind.track(log)) / made.std[0])
-        if RATIO not in found.kept:
+        if RATIO not in found.stays_configured:
             true = kind.robot.right / kind.robot.left
             ratios.append(math.log(right / left / true) / made.ratio_std)
         # No other sensor shows the scale of this gyro: the best odometry turns as far as it says.
@@ -396,12 +398,37 @@ def test_noise_of_a_robot_whose_geometry_is_right_is_written_alone(found: Calibr
     present = OdometryConfig(left_wheel_radius_multiplier_std=0.002)
     log = log_of_runs(LOG)
     again = calibrate(log, geometry, None, present)
-    assert set(again.kept) == {TRACK, RATIO}
+    assert set(again.stays_configured) == {TRACK, RATIO}
     assert configs(again)[0] == geometry
     written = structs.replace(present, **again.odometry)
     assert written.yaw_variance_per_radian < present.yaw_variance_per_radian / 10
     assert written.left_wheel_radius_multiplier_std == 0.0
     assert written.wheel_radius_ratio_std >= 0.002
+
+
+def test_positions_that_are_recorded_a_second_later_give_the_same_window() -> None:
+    seen = LOG[0]
+    run = log_of_runs([seen], gyro=False).runs[0]
+    early = BASE.start()
+    way = path(wheel_steps(run), BASE, early)
+    times = np.linspace(2.0, 20.0, 6)
+    within = (run.place_t >= 2.0) & (run.place_t <= 20.0)
+    late = early.copy()
+    late[Parameter.DELAY] = 1.0
+    one, other = (
+        next(
+            odometry_noise._by_places(
+                times + p[Parameter.DELAY], run.place_t[within] + p[Parameter.DELAY],
+                run.place[within], way, 0.3, p,
+            )
+        )
+        for p in (early, late)
+    )  # fmt: skip
+    assert other.residual == pytest.approx(one.residual)
+    assert other.motion.distance == pytest.approx(one.motion.distance)
+    assert other.motion.turn == pytest.approx(one.motion.turn)
+    assert other.yaw == pytest.approx(one.yaw)
+    assert other.along == pytest.approx(one.along)
 
 
 def test_a_log_with_only_a_gyro_gives_no_distance_noise() -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace as replace_fit
 
-from acsard.calibration.fit import P, fit
+from acsard.calibration.fit import Parameter, fit
 from acsard.calibration.heading import Rows
 from acsard.calibration.log_table import RefusedError
 from acsard.calibration.multipliers import Multipliers
@@ -20,12 +20,13 @@ from acsard.calibration.plausibility import (
     TRACK,
     drives_enough,
     in_range,
+    inaccuracy,
     remarks,
     rolls_enough,
     separates_track,
+    too_inaccurate,
     turn_units,
     turns_enough,
-    unsure,
 )  # fmt: skip
 from acsard.calibration.runs import Block
 from tests.unit.calibration.cut import BASE, calibrated, ready, table, usual
@@ -191,8 +192,8 @@ def test_sides_of_different_size_are_reported() -> None:
 def test_the_starting_point_is_near_the_truth(gyro: bool, places: bool) -> None:
     made = ready(table(usual(), gyro=gyro, places=places))
     assert len(made.sources) == gyro + places
-    assert made.start[[P.LEFT, P.RIGHT]] == pytest.approx([1.0, 1.0], abs=0.05)
-    assert 1 / made.start[P.INVERSE_TRACK] == pytest.approx(1.66, abs=0.15)
+    assert made.start[[Parameter.LEFT, Parameter.RIGHT]] == pytest.approx([1.0, 1.0], abs=0.05)
+    assert 1 / made.start[Parameter.INVERSE_TRACK] == pytest.approx(1.66, abs=0.15)
 
 
 def test_positions_from_another_time_are_refused() -> None:
@@ -211,7 +212,7 @@ def test_turns_and_straight_drives_are_enough() -> None:
     rolls_enough(rows([9, -9, 9, -9], [9, -9, -9, 9]))
     turns_enough(np.full(10, 1.0))
     drives_enough([Block(0, 0, 4)] * 5)
-    assert not unsure(Multipliers(np.array([1.6, 1, 1]), np.eye(3) * 1e-5), 0.01)
+    assert not too_inaccurate(Multipliers(np.array([1.6, 1, 1]), np.eye(3) * 1e-5), 0.01)
 
 
 @pytest.mark.parametrize(
@@ -240,10 +241,25 @@ def test_turns_on_the_spot_are_enough_for_a_heading_sensor() -> None:
         rolls_enough(spins)
 
 
+def test_turns_on_the_spot_are_enough_if_one_side_always_rolls_a_little_further() -> None:
+    rolls_enough(rows([-8.91, 8.91, -8.91], [9, -9, 9]), spins=True)
+    with pytest.raises(RefusedError, match="in opposite directions"):
+        rolls_enough(rows([0.1, -0.1], [0.1, -0.1]), spins=True)
+
+
 def test_an_uncertain_parameter_is_named_with_its_deviation() -> None:
     apart = Multipliers(np.array([1.6, 1, 1]), np.diag([0, 1e-3, 1e-3]))
-    assert unsure(apart, 0.01) == {RATIO: pytest.approx(0.0447, abs=1e-4)}
-    assert TRACK in unsure(Multipliers(np.array([1.6, 1, 1]), np.eye(3) * 1e-6), np.nan)
+    assert too_inaccurate(apart, 0.01) == {RATIO: pytest.approx(0.0447, abs=1e-4)}
+    assert TRACK in too_inaccurate(Multipliers(np.array([1.6, 1, 1]), np.eye(3) * 1e-6), np.nan)
+
+
+def test_the_text_names_the_deviation_and_its_limit_or_says_that_there_is_no_value() -> None:
+    told = inaccuracy({RATIO: 0.05, TRACK: np.inf}, (0.2, 0.03))
+    assert told.startswith(
+        "this log is too inaccurate: the standard deviation of the ratio of the right to the left "
+        "wheel radius is 5.0%, but at most 3% is accepted, and the effective track cannot be "
+        "determined: record a drive of 60 s"
+    )
 
 
 def test_equal_columns_of_the_fit_do_not_separate_the_track() -> None:

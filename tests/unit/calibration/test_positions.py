@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from acsard.calibration import positions
-from acsard.calibration.fit import PARAMETER_COUNT, Base, P
+from acsard.calibration.fit import PARAMETER_COUNT, Base, Parameter
 from acsard.calibration.positions import StartingPoint, search, segments
 from acsard.calibration.runs import Block, blocks
 from tests.unit.calibration.cut import BASE, ideal, log_of, table, usual
@@ -96,8 +96,8 @@ def begun(seen: Drive, base: Base = BASE, sides: Floats | None = None) -> Starti
 def test_the_search_finds_a_starting_point_near_the_truth(separation: float, radius: float) -> None:
     found = begun(usual(), Base(radius, separation, 1.0, 1.0, 1.0))
     assert found.unexplained < 0.05
-    assert found.parameters[P.LEFT] == pytest.approx(0.05 / radius, rel=0.1)
-    assert found.parameters[P.INVERSE_TRACK] == pytest.approx(separation / 0.5, rel=0.15)
+    assert found.parameters[Parameter.LEFT] == pytest.approx(0.05 / radius, rel=0.1)
+    assert found.parameters[Parameter.INVERSE_TRACK] == pytest.approx(separation / 0.5, rel=0.15)
 
 
 @pytest.mark.slow
@@ -105,15 +105,15 @@ def test_a_reversed_side_and_a_mirrored_path_show_in_the_signs() -> None:
     seen = usual()
     left, mirrored = replace(seen, left=-seen.left), replace(seen, place=seen.place.conj())
     found = begun(left).parameters
-    one = np.sign(found[[P.LEFT, P.RIGHT]] * found[P.INVERSE_TRACK])
+    one = np.sign(found[[Parameter.LEFT, Parameter.RIGHT]] * found[Parameter.INVERSE_TRACK])
     assert one.tolist() == [-1.0, 1.0]
-    assert begun(mirrored).parameters[P.INVERSE_TRACK] < 0
+    assert begun(mirrored).parameters[Parameter.INVERSE_TRACK] < 0
 
 
 def test_the_delay_of_late_positions_is_found() -> None:
     seen = usual()
     late = replace(seen, place_t=seen.place_t + 0.9)
-    assert begun(late).parameters[P.DELAY] == pytest.approx(0.9, abs=0.15)
+    assert begun(late).parameters[Parameter.DELAY] == pytest.approx(0.9, abs=0.15)
 
 
 def squares(chi: float) -> Plan:
@@ -134,9 +134,9 @@ def test_an_ambiguous_turn_in_place_is_taken_for_the_likeliest_angle(
     """Positions alone cannot distinguish turns of 90 deg left, 270 deg right and 450 deg left."""
     robot = Robot(chi=chi, rate=0.0, lever=lever, slip=0.02)
     seen = drive(robot, squares(chi))
-    assert begun(seen).parameters[P.INVERSE_TRACK] == pytest.approx(1 / chi, rel=0.05)
+    assert begun(seen).parameters[Parameter.INVERSE_TRACK] == pytest.approx(1 / chi, rel=0.05)
     mirrored = replace(seen, place=seen.place.conj())
     sides = np.array([1.0, 1.0]) / chi
-    assert begun(mirrored, sides=-sides).parameters[P.INVERSE_TRACK] == pytest.approx(
+    assert begun(mirrored, sides=-sides).parameters[Parameter.INVERSE_TRACK] == pytest.approx(
         -1 / chi, rel=0.05
     )

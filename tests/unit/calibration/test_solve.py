@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from msgspec import structs
 
+from acsard.calibration import solve
 from acsard.calibration.calibration_report import keys
 from acsard.calibration.log_table import RefusedError
 from acsard.calibration.multipliers import Tape
@@ -125,7 +126,7 @@ def test_standard_deviations_are_as_wide_as_the_errors(kind: str, way: str) -> N
         turns = np.abs(np.concatenate([np.diff(one.yaw) for one in seen])) / 0.01
         true = chi * (1 + rate * float(turns @ turns / turns.sum()))
         tracks.append((found.multipliers.values[0] - true) / found.multipliers.std[0])
-        if RATIO not in found.kept:
+        if RATIO not in found.stays_configured:
             off = np.log(found.multipliers.values[2] / found.multipliers.values[1] * 0.99 / 1.01)
             ratios.append(off / found.multipliers.ratio_std)
     track, ratio = (float(np.sqrt(np.mean(np.square(z)))) for z in (tracks, ratios))
@@ -218,10 +219,10 @@ def turned_wrong(drives: Sequence[Drive], track: float) -> float:
 def test_ten_manoeuvres_of_a_skidding_robot_give_its_track(seed: int) -> None:
     """The drives determine the ratio of the radii only to 6 to 8 %, so it stays as configured."""
     found = calibrated(log_of_runs(manoeuvres(seed, 10, 0.1), places=False))
-    assert found.kept == (RATIO,)
+    assert found.stays_configured == (RATIO,)
     assert found.multipliers.values[1:].tolist() == pytest.approx([1.0, 1.0], abs=1e-6)
     assert any(
-        "the left to the right wheel radius stays as configured" in note for note in found.notes
+        "the right to the left wheel radius stays as configured" in note for note in found.notes
     )
     elsewhere = manoeuvres(seed + 1000, 40, 0.1)
     best = min(turned_wrong(elsewhere, track) for track in np.arange(1.0, 3.0, 0.02))
@@ -233,7 +234,29 @@ def test_ten_manoeuvres_of_a_skidding_robot_give_its_track(seed: int) -> None:
 def test_turns_on_the_spot_give_the_track_by_a_gyro() -> None:
     seen = drive(Robot(rng=np.random.default_rng(0)), [(3, 0, 0), (20, 0, 1), (20, 0, -1)])
     found = calibrated(table(seen, places=False))
-    assert found.kept == (RATIO,)
+    assert found.stays_configured == (RATIO,)
+    assert found.multipliers.values[0] == pytest.approx(1.6 * (1 + 0.08 / 1.73), rel=0.02)
+
+
+def test_a_log_is_refused_with_the_quantities_that_are_too_inaccurate(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Turns on the spot do not determine the ratio of the radii at all."""
+    monkeypatch.setattr(solve, "MAX_LOG_STDS", (1e-9, 0.03))
+    plan: Plan = [(3, 0, 0), (20, 0, 1), (20, 0, -1)]
+    with pytest.raises(RefusedError) as refused:
+        calibrated(table(drive(Robot(rng=np.random.default_rng(0)), plan), places=False))
+    told = str(refused.value)
+    assert "this log is too inaccurate: " in told
+    assert f"{RATIO} cannot be determined" in told
+    assert "inf" not in told
+
+
+def test_turns_on_the_spot_with_one_faster_side_give_the_track_by_a_gyro() -> None:
+    """The left wheels always roll 1 % less far than the right wheels."""
+    plan: Plan = [(3, 0, 0), (20, 0.00075, 1), (20, -0.00075, -1)]
+    found = calibrated(table(drive(Robot(rng=np.random.default_rng(0)), plan), places=False))
+    assert found.stays_configured == (RATIO,)
     assert found.multipliers.values[0] == pytest.approx(1.6 * (1 + 0.08 / 1.73), rel=0.02)
 
 
@@ -247,7 +270,7 @@ def test_a_tape_measures_the_wheels_of_a_robot_whose_track_is_right() -> None:
     )  # fmt: skip
     log = log_of_runs([seen, ahead], places=False)
     found = calibrate(log, right, Tape(1.1 * float(abs(ahead.where[-1])), "2"))
-    assert set(found.kept) == {TRACK, RATIO}
+    assert set(found.stays_configured) == {TRACK, RATIO}
     assert found.multipliers.values / first == pytest.approx([1.1] * 3, rel=0.01)
     given = keys(found)
     assert given["odometry.distance_scale_std"] == pytest.approx(0.0025, abs=0.001)
@@ -265,7 +288,7 @@ def test_a_tape_measures_the_wheels_if_positions_are_too_coarse_to_improve_them(
     found = calibrate(
         log_of_runs([seen, ahead], gyro=False), large, Tape(abs(ahead.where[-1]), "2")
     )
-    assert set(found.kept) == {TRACK, RATIO}
+    assert set(found.stays_configured) == {TRACK, RATIO}
     assert found.multipliers.values[1:] == pytest.approx([0.998, 1.002], abs=0.01)
     assert found.scale == "distance"
     assert found.odometry["distance_scale_std"] == pytest.approx(0.004, abs=0.002)

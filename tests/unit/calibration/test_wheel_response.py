@@ -84,6 +84,13 @@ def test_a_slow_robot_that_reverses_would_be_faulty_and_its_response_time_is_pro
     assert not found(REVERSING, 2.0, response_time=made.proposed).false_fault
 
 
+@pytest.mark.parametrize("seconds", [1.0, 1.1, 1.2, 1.3, 1.4])
+def test_the_proposed_response_time_is_at_least_the_one_that_fits_best(seconds: float) -> None:
+    made = found(REVERSING, seconds, fault_time=0.3)
+    assert made.proposed is not None
+    assert made.proposed >= made.seconds
+
+
 def test_if_no_response_time_leaves_a_reserve_the_sentence_names_the_fault_time() -> None:
     """Something holds the wheels for 1.5 s in the middle of the drive."""
     rest, ahead = (3.0, 0.0, 0.0), (4.0, 0.5, 0.0)

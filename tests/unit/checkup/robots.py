@@ -54,7 +54,7 @@ class Robot(VirtualWire):
     def faulty(self) -> Iterator[None]:
         with ExitStack() as stack:
             for text in self.faults:
-                stack.enter_context(self.mcu.having(named(text)))
+                stack.enter_context(self.mcu.switched_on(named(text)))
             yield
 
     @contextmanager

@@ -90,6 +90,50 @@ def test_a_motor_that_zeros_do_not_stop_ends_the_check() -> None:
     assert len(robot.sent) == sent
 
 
+def test_a_message_names_the_motors_that_turn_after_the_second_attempt_to_stop() -> None:
+    class Blocked(Robot):
+        """A robot on which a hand stops motor b after 3 s, while motor a turns on."""
+
+        def listen(self, until_ns: int) -> list[tuple[int, bytes]]:
+            super().listen(until_ns)
+            b = "bp03.00" if until_ns < 3e9 else "bp00.00"
+            return [(until_ns, f"ap03.00,{b},cp00.00,dp00.00\r\n".encode())]
+
+    with Board(Blocked("mute"), McuConfig(), 100.0) as board, pytest.raises(StoppedError) as end:
+        board.rest()
+    assert end.value.finding.name == "stop"
+    assert "motor a (front right)" in end.value.finding.text
+    assert "motor b" not in end.value.finding.text
+
+
+def test_a_board_that_falls_silent_while_its_motors_must_stop_is_reported_as_silent() -> None:
+    robot = Robot("plain_only")
+    with robot.board() as board:
+        board.drive((SPEED, 0.0, 0.0, 0.0), 0.3)
+        with robot.mcu.mute(), pytest.raises(StoppedError) as end:
+            board.rest()
+        assert not board.runaway_seen
+        assert board.silent_s == pytest.approx(2 * MOTOR_TIMEOUT_S, abs=0.1)
+    assert end.value.finding.name == "link"
+    assert end.value.finding.figure == f"silent for {2 * MOTOR_TIMEOUT_S:.1f} s"
+    assert "while this computer sent it only zeros" in end.value.finding.text
+
+
+def test_a_board_that_ignores_lines_with_the_other_ending_is_not_reported_as_silent() -> None:
+    class Picky(Robot):
+        """A robot that does not stop, and sends no replies after 2 s."""
+
+        def listen(self, until_ns: int) -> list[tuple[int, bytes]]:
+            super().listen(until_ns)
+            line = b"ap03.00,bp00.00,cp00.00,dp00.00\r\n"
+            return [(until_ns, line)] if until_ns < MOTOR_TIMEOUT_S * 1e9 else []
+
+    with Board(Picky("mute"), McuConfig(), 100.0) as board, pytest.raises(StoppedError) as end:
+        board.rest()
+    assert end.value.finding.name == "stop"
+    assert "motor a (front right)" in end.value.finding.text
+
+
 def test_one_damaged_reply_is_not_a_runaway_but_three_are() -> None:
     robot = Robot("mute")
     wild = b"ap80.00,bp00.00,cp00.00,dp00.00\r\n"
@@ -123,6 +167,7 @@ def test_silence_ends_the_check_only_during_a_drive() -> None:
         with robot.mcu.mute(), pytest.raises(StoppedError) as end:
             board.drive((SPEED, 0.0, 0.0, 0.0), 2.0)
     assert end.value.finding.name == "link"
+    assert "while it had to turn motor a" in end.value.finding.text
     assert robot.later() == [0.0] * 4
 
 
@@ -140,6 +185,8 @@ def test_short_drives_without_a_reply_add_up_unless_a_reply_arrives_between_them
             with pytest.raises(StoppedError) as end:
                 board.drive(ZERO, 0.14)
     assert end.value.finding.figure == "silent for 0.3 s"
+    assert "while this computer sent it only zeros" in end.value.finding.text
+    assert "motor" not in end.value.finding.mend
 
 
 @pytest.mark.parametrize("sent", [False, True])

@@ -12,11 +12,11 @@ from acsard.checkup.lateness import (
     MIN_DELAY_S,
     Lateness,
     finding,
+    is_doubtful,
     judged,
-    spoilt,
 )
 from acsard.checkup.motion import LINE_PERIOD_S
-from acsard.checkup.outcomes import Unsure, find
+from acsard.checkup.outcomes import TimingFinding, find
 from tests.each import each
 from tests.unit.checkup.robots import Busy, Robot, Starved
 
@@ -52,7 +52,7 @@ def test_only_outcomes_that_a_late_computer_can_cause_are_doubted(
     seen |= {"error": 1.0, "tolerance": 0.25, "speed": 3.0}
     seen["margin_s"] = 0.5 if outcome == "motor: size" else 0.0
     found = find(outcome, **seen)
-    assert (isinstance(found, Unsure) and spoilt(found, late_s)) is doubted
+    assert (isinstance(found, TimingFinding) and is_doubtful(found, late_s)) is doubted
 
 
 def test_a_step_that_is_not_judged_is_a_warning_without_keys() -> None:

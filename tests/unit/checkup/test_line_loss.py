@@ -86,7 +86,7 @@ def test_a_silence_is_reported_as_a_silence() -> None:
         known(board)
         found = line_loss.finding(board)
     assert found.verdict == "WARN"
-    assert "silent for" in found.figure
+    assert "but nothing arrived for" in found.figure
     assert "USB" in found.mend
 
 

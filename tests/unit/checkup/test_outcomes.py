@@ -6,13 +6,13 @@ import re
 from typing import Any
 
 from acsard.checkup.motion import MAX_WATCHDOG_S
-from acsard.checkup.outcomes import MANUAL, OUTCOMES, find
+from acsard.checkup.outcomes import OUTCOMES, OUTCOMES_BY_NAME, find
 from acsard.checkup.procedure import STEPS
 from acsard.core.link.link_state import WATCHDOG_S
 from tests.each import each
 
 
-@each("outcome", MANUAL)
+@each("outcome", OUTCOMES_BY_NAME)
 def test_every_outcome_has_complete_texts(outcome: str) -> None:
     found = find(outcome, {"mcu.baud_rate": 9600}, **dict.fromkeys(SEEN, Seen()))
     assert found.name == outcome.partition(":")[0]
@@ -39,7 +39,7 @@ SEEN = {part.partition("}")[0].partition(":")[0].partition("!")[0]
 
 
 def test_the_advised_watchdog_time_is_that_of_the_contract() -> None:
-    entries = [entry for name, entry in MANUAL.items() if name.startswith("watchdog:")]
+    entries = [entry for name, entry in OUTCOMES_BY_NAME.items() if name.startswith("watchdog:")]
     told = " ".join(part for entry in entries for part in (entry.text, entry.mend))
     times = {f"{1000 * seconds:g}" for seconds in (WATCHDOG_S, MAX_WATCHDOG_S)}
     assert set(re.findall(r"(\d+) ms", told)) == times
@@ -48,7 +48,7 @@ def test_the_advised_watchdog_time_is_that_of_the_contract() -> None:
 def test_every_step_can_pass_or_be_skipped_and_can_fail_or_warn() -> None:
     for step in STEPS:
         name = "motor" if step == "motors" else step
-        verdicts = {o.verdict for key, o in MANUAL.items() if key.startswith(f"{name}:")}
+        verdicts = {o.verdict for key, o in OUTCOMES_BY_NAME.items() if key.startswith(f"{name}:")}
         assert verdicts & {"PASS", "SKIPPED"}, step
         assert verdicts & {"FAIL", "WARN"}, step
 

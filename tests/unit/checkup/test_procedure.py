@@ -133,7 +133,7 @@ def test_every_step_has_a_finding() -> None:
 
 TEN: list[tuple[str, str, str, str, str, dict[str, object]]] = [
     ("swapped_motors=a:b", "motor a", "FAIL", "encoder b", "swap", {}),
-    ("reversed_motor=c", "motor c", "FAIL", "counts against", "swap", {}),
+    ("reversed_motor=c", "motor c", "FAIL", "counts backward when", "swap", {}),
     ("comma_latched", "trailing comma", "FAIL", "motor d (rear right) still turns after zeros",
      "trailing_comma = true", {"mcu.trailing_comma": True}),
     ("no_watchdog", "watchdog", "FAIL", "run on", "300 ms", {}),
@@ -286,7 +286,7 @@ def test_the_check_asks_about_a_wheel_with_a_coarse_encoder_only_when_it_stands(
 def test_old_firmware_with_its_comma_configured_fails_only_on_broken_lines() -> None:
     checked = check("comma_latched", trailing_comma=True)
     assert checked.failed == ["watchdog", "damaged lines"]
-    assert "fed by broken lines" in checked["watchdog"].figure
+    assert "damaged lines keep it from acting" in checked["watchdog"].figure
 
 
 def test_several_faults_at_once_are_all_found() -> None:
@@ -609,7 +609,7 @@ class Regulates(Robot):
         self.mcu.understand = self._regulated
 
     def _regulated(self, line: bytes) -> protocol.Command | None:
-        command = protocol.whole(line)
+        command = protocol.reference(line)
         if command is None:
             return None
         for motor, told in command.values.items():
@@ -784,7 +784,7 @@ def test_no_motor_is_commanded_above_3_rad_s_or_for_4_s() -> None:
 def test_a_last_motor_that_obeys_zeros_only_with_a_comma_needs_the_trailing_comma() -> None:
     def obeys(line: bytes) -> protocol.Command | None:
         """Parse plain lines; a zero for motor d is accepted only with a comma after it."""
-        command = None if b"#" in line else protocol.whole(line)
+        command = None if b"#" in line else protocol.reference(line)
         if command and not command.values[3] and not line.endswith(b",\r\n"):
             command.values.pop(3)
         return command
@@ -968,7 +968,7 @@ def test_a_later_step_reports_a_fault_that_an_earlier_step_could_not_judge() -> 
             return self.looked and super().wakes_late()
 
     def obeys(line: bytes) -> protocol.Command | None:
-        command = None if b"#" in line else protocol.whole(line)
+        command = None if b"#" in line else protocol.reference(line)
         if command and not line.endswith(b",\r\n"):
             if robot.looked:
                 return None

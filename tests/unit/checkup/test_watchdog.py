@@ -11,7 +11,7 @@ from acsard.checkup import dialect, watchdog
 from acsard.checkup.board import Board
 from acsard.checkup.findings import StoppedError
 from acsard.checkup.motion import SPEED
-from acsard.checkup.watchdog import NOT_MEASURED, Between, run
+from acsard.checkup.watchdog import NOT_MEASURED, Bounds, run
 from acsard.checkup.wheels import turn
 from acsard.core.config.settings import Config, SimConfig
 from acsard.core.simulator import protocol
@@ -105,13 +105,13 @@ def test_only_a_watchdog_that_broken_lines_feed_fails(kind: tuple[str, ...], lag
         assert measured(robot(*kind, config=config))[0] == "PASS"
         verdict, figure = measured(robot(*kind, "watchdog_fed_by_bad_lines", config=config))
         assert verdict == "FAIL"
-        assert figure.endswith("fed by broken lines")
+        assert figure.endswith("damaged lines keep it from acting")
 
 
 def test_firmware_that_obeys_broken_lines_never_gets_more_than_the_commanded_speed() -> None:
     robot = Robot("comma_latched", trailing_comma=True)
     with robot.board() as board:
-        assert watchdog.finding(board, ALL).figure.endswith("fed by broken lines")
+        assert watchdog.finding(board, ALL).figure.endswith("damaged lines keep it from acting")
     told = [protocol.latched(line).values.values() for _, line in robot.mcu.heard]
     assert max(abs(value) for values in told for value in values) == SPEED
 
@@ -143,7 +143,7 @@ SLACK_S = 0.02
 """Delay of a reply, which the interval does not include."""
 
 
-def silence(robot: Robot) -> Between:
+def silence(robot: Robot) -> Bounds:
     with turned(robot) as board:
         return watchdog.measured(board, ALL, run(board, ALL, 0.0))
 
@@ -167,7 +167,7 @@ def test_the_watchdog_time_of_motors_that_never_stop_is_unknown(kind: str) -> No
 
 def test_motors_that_turn_alone_but_not_together_end_the_check() -> None:
     def gives_in(line: bytes) -> protocol.Command | None:
-        command = protocol.whole(line)
+        command = protocol.reference(line)
         if command and sum(map(bool, command.values.values())) > 1:
             return protocol.Command(dict.fromkeys(command.values, 0.0))
         return command

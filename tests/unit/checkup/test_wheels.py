@@ -104,7 +104,7 @@ def test_the_speed_is_ramped() -> None:
     robot = Robot("plain_only")
     with robot.board() as board:
         before = len(robot.sent)
-        wheels.run_up(board, wheels.one(0, SPEED))
+        wheels.run_up(board, wheels.only_motor(0, SPEED))
         told = [float(line[2:7]) for line in robot.sent[before:]]
     assert told[:9] == sorted(told[:9])
     assert told[0] <= SPEED / 5
@@ -115,7 +115,7 @@ def test_a_motor_without_measured_speed_is_driven_only_briefly() -> None:
     robot = Robot("plain_only", "stuck_encoder=1".replace("1", "b"))
     with robot.board() as board:
         began = robot.now_ns()
-        wheels.run_up(board, wheels.one(1, SPEED))
+        wheels.run_up(board, wheels.only_motor(1, SPEED))
         assert robot.now_ns() - began < 1e9
 
 
@@ -160,5 +160,5 @@ def test_a_motor_that_still_accelerates_is_driven_on_for_a_limited_time() -> Non
         robot = Robot("plain_only", config=Config(sim=SimConfig(motor_time_constant=lag)))
         with robot.board() as board:
             began = robot.now_ns()
-            assert wheels.run_up(board, wheels.one(0, SPEED))[0] > speed
+            assert wheels.run_up(board, wheels.only_motor(0, SPEED))[0] > speed
             assert robot.now_ns() - began < 1.2e9 * SLOWING_TIMEOUT_S

@@ -88,7 +88,7 @@ def test_a_result_that_cannot_be_written_is_printed_before_the_error(
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(os, "replace", full)
-    with pytest.raises(MendableError, match=r"was not changed.*write the lines by hand"):
+    with pytest.raises(MendableError, match=r"was not changed.*edit the file by hand"):
         called(tmp_path, GOOD, "--write")
     assert "wheel_separation_multiplier = " in capsys.readouterr().out
     assert (tmp_path / "acsard.toml").read_text() == "# mine\n"
@@ -203,6 +203,18 @@ def test_a_bag_that_was_cut_off_is_read_up_to_the_cut(
     log.write_bytes(log.read_bytes()[: log.stat().st_size * 8 // 10])
     assert of_bag(tmp_path, log) == 0
     assert "bag.mcap is cut off" in json.loads(capsys.readouterr().out)["notes"][0]
+
+
+def test_a_bag_with_an_impossible_time_is_read_up_to_that_time(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    seen = usual(plan=GUIDED[:10])
+    messages = in_order(joint_states(seen), imu(seen))
+    last = messages[-1]._replace(wall_ns=1 << 63)
+    log = write_mcap(tmp_path / "bag.mcap", [*messages, last])
+    assert of_bag(tmp_path, log) == 0
+    note = json.loads(capsys.readouterr().out)["notes"][0]
+    assert note.endswith("are used: the time of a message is 9223372036854775808 ns")
 
 
 @pytest.mark.slow

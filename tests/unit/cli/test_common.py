@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from acsard.cli import main, parser
-from acsard.cli.common import OPTIONS, count, load, recorded
+from acsard.cli.common import OPTIONS, count, load, with_record_directory
 from acsard.cli.connection import require_asked, require_followed, robot_address
 from acsard.cli.run import options
 from acsard.core.config.parsing import parse
@@ -294,9 +294,9 @@ def test_the_record_directory_is_from_the_option_the_file_or_the_service_in_this
 ) -> None:
     said = b'[record]\ndirectory = "/file"'
     named, in_file = parse(said, {"record": {"directory": "/option"}}), parse(said)
-    assert recorded(Config()).record.directory == ""
+    assert with_record_directory(Config()).record.directory == ""
     monkeypatch.setenv("ACSARD_RECORD", "/service")
-    found = [recorded(one).record.directory for one in (named, in_file, Config())]
+    found = [with_record_directory(one).record.directory for one in (named, in_file, Config())]
     assert found == ["/option", "/file", "/service"]
 
 
@@ -304,7 +304,7 @@ def test_a_relative_record_directory_becomes_an_absolute_path(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    named = recorded(parse(b"", {"record": {"directory": "box"}}))
+    named = with_record_directory(parse(b"", {"record": {"directory": "box"}}))
     assert named.record.directory == str(tmp_path / "box")
 
 

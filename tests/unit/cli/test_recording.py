@@ -18,9 +18,9 @@ from acsard.cli.recording import SERVICE_DIRECTORY
 from acsard.core.config.settings import Config, RecordConfig
 from acsard.core.values import NS_PER_S, Event
 from acsard.host.errors import Exit
-from acsard.recording.directory import Ring
-from acsard.recording.file import About, Recording, Writing
-from acsard.recording.recorded_steps import Taken, Unfinished
+from acsard.recording.directory import RecordingDirectory
+from acsard.recording.file import About, Recording, RecordingWriter
+from acsard.recording.recorded_steps import FinishedStep, Unfinished
 from acsard.recording.recovery import recover
 from acsard.recording.timeline import is_serious
 from tests.scenarios.taped import Tape, chunks, recorded_world
@@ -83,7 +83,9 @@ def set_age(where: Path, seconds: float) -> None:
 @pytest.mark.parametrize("cut", ["crash", "bug", "disk"])
 def test_the_list_marks_a_crash(cut: str, tmp_path: Path) -> None:
     """A full disk leaves the robot with its daemon."""
-    writing = Writing(tmp_path / "000001-20270115T080000Z.mcap", About("acsar", "1", "3", 1, 2))
+    writing = RecordingWriter(
+        tmp_path / "000001-20270115T080000Z.mcap", About("acsar", "1", "3", 1, 2)
+    )
     writing.finish(cut, "why")
     (row,) = log(tmp_path)[1].splitlines()
     assert ("  ! [cut" in row) is (cut != "disk")
@@ -101,7 +103,7 @@ def test_the_list_can_be_restricted_to_a_range_of_time(tmp_path: Path) -> None:
         noon_ns = int(time.mktime((2027, 1, 14 + number, 12, 0, 0, 0, 0, -1))) * NS_PER_S
         name = f"00000{number}-20270115T080000Z.mcap{'.part' if number == 3 else ''}"
         path, about = tmp_path / name, About("acsar", "1", "3", 1, noon_ns)
-        writing = Writing(path, about)
+        writing = RecordingWriter(path, about)
         writing.add("events", noon_ns, b"")
         if number == 3:
             writing.flush()
@@ -282,7 +284,7 @@ def test_a_recording_that_a_kill_truncated_is_reported_as_such(
     if not cut:
         part.unlink()
         (tmp_path / part.stem).write_bytes(data)
-    Ring(RecordConfig(str(tmp_path))).close()
+    RecordingDirectory(RecordConfig(str(tmp_path))).close()
     told = "cut: the daemon or the computer stopped suddenly"
     _, out, _ = log(tmp_path)
     assert (told in out) is cut
@@ -305,7 +307,7 @@ def test_recorded_texts_cannot_send_control_characters_to_the_terminal(tmp_path:
     World(recorder=tape).run(0.3)
     inputs, outputs, left = tape.taken[5]
     event = Event("stop", "\x1b[2J\u202egone", by="\x1b]0;title\x07")
-    tape.taken[5] = Taken(inputs, replace(outputs, events=(event,)), left)
+    tape.taken[5] = FinishedStep(inputs, replace(outputs, events=(event,)), left)
     tape.write(tmp_path / "000001-20270115T080000Z.mcap", Config())
     for words in ((), ("show", "1"), ("show", "1", "--json")):
         code, out, _ = log(tmp_path, *words)
@@ -418,13 +420,13 @@ def test_recover_writes_a_whole_file_or_none_and_overwrites_no_recording(
     new = tmp_path / "new.mcap"
     (cut,) = where.glob("*.part")
     seen: list[bool] = []
-    finish = Writing.finish
+    finish = RecordingWriter.finish
 
-    def looked(writing: Writing, *how: str) -> None:
+    def looked(writing: RecordingWriter, *how: str) -> None:
         seen.append(new.exists())
         finish(writing, *how)
 
-    monkeypatch.setattr(Writing, "finish", looked)
+    monkeypatch.setattr(RecordingWriter, "finish", looked)
     assert log(where, "recover", str(cut), str(new))[0] == 0
     assert seen == [False]
     (other,) = where.glob("*.mcap")
@@ -498,7 +500,7 @@ def test_no_verb_raises_on_truncated_or_damaged_recordings(tmp_path: Path) -> No
     for first, path in zip((0, 200), sound, strict=False):
         tape.write(path, Config(), first)
     begun, last = Recording(sound[0]), tape.taken[-1].inputs
-    ended = Writing(sound[2], begun.about)
+    ended = RecordingWriter(sound[2], begun.about)
     for topic, wall_ns, data in begun.messages():
         ended.add(topic, wall_ns, data)
     ended.add("unfinished", last.now.wall_ns, Unfinished(len(tape.taken), last).encode())

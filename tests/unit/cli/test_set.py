@@ -66,7 +66,7 @@ def test_the_help_and_the_ros_page_say_what_write_does_not_write(
     with pytest.raises(SystemExit):
         parser().parse_args(["set", "--help"])
     page = (Path(__file__).parents[3] / "deploy" / "ros2" / "README.md").read_text()
-    exception = r"--write`?[^.]*file[^.]* a source's timeout[^.]*\[\[commands\.sources"
+    exception = r"--write`? cannot write a source's timeout: edit `?\[\[commands\.sources\]\]"
     for told in (capsys.readouterr().out, page):
         assert re.search(exception, " ".join(told.split()))
 
@@ -105,7 +105,7 @@ ENDS = "; in force until the daemon's next start"
             f"{ENDS}, except limits.linear_speed: a lowered limit survives a restart. On the "
             "simulator, no setting survives a restart",
         ),
-        ("nothing changes: all settings have these values already", ""),
+        ("nothing changed: all settings already have these values", ""),
     ],
 )
 def test_the_answer_says_how_long_the_setting_lasts(

@@ -5,11 +5,11 @@ from __future__ import annotations
 import pytest
 
 from acsard.client.commander import (
+    BRAKING_AFTER_NS,
     BURST_WINDOW_NS,
     DRIVING_TIMEOUT_NS,
-    MAX_OPEN_TIMEOUT_S,
-    RELEASED_NS,
-    SILENCE_NS,
+    MAX_SOURCE_TIMEOUT_S,
+    RELEASE_TIMEOUT_NS,
     STALE_NS,
     Commander,
     Sender,
@@ -25,7 +25,10 @@ class Panel:
     """A commander with a clock and a record of the twists it sent."""
 
     def __init__(self) -> None:
-        self.commander, self.now = Commander(leads=True, gathers=True), 10 * NS_PER_S
+        self.commander, self.now = (
+            Commander(sends_leading_zero=True, detects_bursts=True),
+            10 * NS_PER_S,
+        )
         self.gone: list[Twist] = []
 
     def wait(self, span_ns: int) -> None:
@@ -54,13 +57,15 @@ def test_each_wish_is_sent_once_after_one_zero(panel: Panel) -> None:
     assert panel.gone == [REST, *[AHEAD] * 5]
 
 
-@pytest.mark.parametrize("leads", [False, True])
-def test_a_button_that_may_be_held_since_before_the_connection_gets_no_zero(leads: bool) -> None:
+@pytest.mark.parametrize("sends_zero", [False, True])
+def test_a_button_that_may_be_held_since_before_the_connection_gets_no_zero(
+    sends_zero: bool,
+) -> None:
     since_ns = 10 * NS_PER_S
-    commander = Commander(leads=True, since_ns=since_ns)
-    now_ns = since_ns + RELEASED_NS + leads
+    commander = Commander(sends_leading_zero=True, connected_ns=since_ns)
+    now_ns = since_ns + RELEASE_TIMEOUT_NS + sends_zero
     assert commander.take(Wish(AHEAD), now_ns) is None
-    assert commander.send(now_ns) == Wish(REST if leads else AHEAD)
+    assert commander.send(now_ns) == Wish(REST if sends_zero else AHEAD)
 
 
 def test_no_command_is_sent_without_a_new_wish(panel: Panel) -> None:
@@ -73,12 +78,12 @@ def test_no_command_is_sent_without_a_new_wish(panel: Panel) -> None:
 
 def test_the_first_command_after_a_release_is_preceded_by_a_zero(panel: Panel) -> None:
     panel.press(AHEAD)
-    panel.wait(RELEASED_NS)
+    panel.wait(RELEASE_TIMEOUT_NS)
     panel.press(LEFT)
     assert panel.gone == [REST, AHEAD, REST, LEFT]
 
 
-@pytest.mark.parametrize("every_ns", [SILENCE_NS + 50 * MS, NS_PER_S, 1400 * MS])
+@pytest.mark.parametrize("every_ns", [BRAKING_AFTER_NS + 50 * MS, NS_PER_S, 1400 * MS])
 def test_no_zero_is_added_to_the_commands_of_a_held_button_that_come_with_pauses(
     panel: Panel, every_ns: int
 ) -> None:
@@ -165,7 +170,7 @@ def test_a_sender_that_leaves_while_not_driving_sends_no_zero(panel: Panel) -> N
     panel.press(REST)
     assert panel.commander.end(panel.now) is None
     panel.press(AHEAD, times=2)
-    assert panel.commander.end(panel.now + int((MAX_OPEN_TIMEOUT_S + 1.0) * NS_PER_S)) is None
+    assert panel.commander.end(panel.now + int((MAX_SOURCE_TIMEOUT_S + 1.0) * NS_PER_S)) is None
 
 
 def test_a_sender_that_leaves_after_its_timeout_stops_no_other_driver(panel: Panel) -> None:
@@ -175,12 +180,12 @@ def test_a_sender_that_leaves_after_its_timeout_stops_no_other_driver(panel: Pan
 
 
 def test_a_sender_drives_while_its_newest_wish_has_a_speed(panel: Panel) -> None:
-    assert not panel.commander.drives(panel.now)
+    assert not panel.commander.is_driving(panel.now)
     panel.press(AHEAD)
-    assert panel.commander.drives(panel.now)
-    assert not panel.commander.drives(panel.now + DRIVING_TIMEOUT_NS)
+    assert panel.commander.is_driving(panel.now)
+    assert not panel.commander.is_driving(panel.now + DRIVING_TIMEOUT_NS)
     panel.press(REST)
-    assert not panel.commander.drives(panel.now)
+    assert not panel.commander.is_driving(panel.now)
 
 
 def test_a_wish_keeps_its_stamp_and_the_zero_before_it_is_stamped_earlier(panel: Panel) -> None:
@@ -195,7 +200,7 @@ def test_a_wish_keeps_its_stamp_and_the_zero_before_it_is_stamped_earlier(panel:
 
 
 def test_a_zero_is_stamped_earlier_than_a_command_that_need_not_wait() -> None:
-    commander = Commander(leads=True)
+    commander = Commander(sends_leading_zero=True)
     commander.take(Wish(AHEAD, 1000), NS_PER_S)
     assert commander.send(NS_PER_S + 3) == Wish(REST, 999)
     assert commander.send(NS_PER_S + 3) == Wish(AHEAD, 1000)

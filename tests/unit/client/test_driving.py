@@ -15,7 +15,7 @@ from msgspec.structs import replace
 
 from acsard.client.commander import GRACE_S, OPEN_TIMEOUT_S, objection
 from acsard.client.driving import SETTLED_S, UnheardError, drive
-from acsard.client.follower import FIRST_STATE_TIMEOUT_S, SILENT_S
+from acsard.client.follower import FIRST_STATE_TIMEOUT_S, ROBOT_SILENCE_TIMEOUT_S
 from acsard.core.messages.schema import RobotState, SourceState, Time
 from acsard.core.values import NS_PER_S
 from acsard.host import clock
@@ -239,7 +239,8 @@ AGAINST: list[tuple[str, Says, type[Exception], str, float, bool]] = [
     ("another sender", after(0, replace(FOLLOWED, sender=OTHER)), NotDrivenError, OTHER,
      OPEN_TIMEOUT_S, False),
     ("dead", after(0, None), NoAnswerError, "nothing received", FIRST_STATE_TIMEOUT_S, False),
-    ("killed on the way", after(1.0, None), NoAnswerError, "nothing", 0.9 + SILENT_S, True),
+    ("killed on the way", after(1.0, None), NoAnswerError, "nothing",
+     0.9 + ROBOT_SILENCE_TIMEOUT_S, True),
 ]  # fmt: skip
 
 
@@ -358,7 +359,7 @@ def test_a_stored_state_of_a_dead_robot_does_not_keep_a_drive_running(
     with pytest.raises(NoAnswerError, match="nothing received"):
         world.drive(monkeypatch, seconds)
     assert world.asked
-    assert world.now - 100.0 <= dies + SILENT_S + 0.3
+    assert world.now - 100.0 <= dies + ROBOT_SILENCE_TIMEOUT_S + 0.3
     assert world.sent[-1] == 0.0
 
 
@@ -444,7 +445,7 @@ def test_a_drive_without_a_positive_duration_is_refused_before_a_command_is_sent
     [
         (FOLLOWED, ""),
         (replace(FOLLOWED, sender=""), ""),  # an older daemon does not name the sender
-        (replace(FOLLOWED, sources=[source("1 more of this source's senders must wait")]), ""),
+        (replace(FOLLOWED, sources=[source("1 other sender of this source must wait")]), ""),
         (
             replace(FOLLOWED, sender=OTHER),
             f"another program, {OTHER}, drives the robot as source app",

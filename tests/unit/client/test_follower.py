@@ -13,7 +13,7 @@ from acsard.client.follower import (
     FIRST_STATE_TIMEOUT_S,
     FLEET_QUERY_PERIOD_S,
     QUERY_PERIOD_S,
-    SILENT_S,
+    ROBOT_SILENCE_TIMEOUT_S,
     Follower,
     Watch,
     restarted,
@@ -32,7 +32,7 @@ def at(sec: int) -> RobotState:
 def asked(follower: Follower, since: float, until: float) -> list[float]:
     """Return the times at which the follower queries the state."""
     times = [since + n * TICK for n in range(round((until - since) / TICK))]
-    return [now for now in times if follower.asks(now)]
+    return [now for now in times if follower.query_is_due(now)]
 
 
 def test_the_age_of_a_state_is_the_time_since_its_arrival() -> None:
@@ -63,8 +63,8 @@ def test_a_robot_that_never_sent_a_state_is_reported_silent_after_a_longer_time(
     assert not follower.silent(FIRST_STATE_TIMEOUT_S - TICK)
     assert follower.silent(FIRST_STATE_TIMEOUT_S + TICK)
     follower.published(STATE, 10.0)
-    assert not follower.silent(10.0 + SILENT_S - TICK)
-    assert follower.silent(10.0 + SILENT_S + TICK)
+    assert not follower.silent(10.0 + ROBOT_SILENCE_TIMEOUT_S - TICK)
+    assert follower.silent(10.0 + ROBOT_SILENCE_TIMEOUT_S + TICK)
 
 
 def test_a_robot_that_is_rarely_queried_is_not_silent_between_its_answers() -> None:
@@ -79,13 +79,13 @@ def test_a_robot_that_is_rarely_queried_is_not_silent_between_its_answers() -> N
 
 def test_the_first_answer_is_no_sign_of_life_and_a_second_query_follows_immediately() -> None:
     follower = Follower(0.0)
-    assert follower.asks(1.0)
+    assert follower.query_is_due(1.0)
     assert not follower.answered(at(5), 1.1)
     assert follower.state == at(5)
-    assert not follower.heard
-    assert follower.asks(1.1)
+    assert not follower.is_confirmed
+    assert follower.query_is_due(1.1)
     assert follower.answered(at(6), 1.2)
-    assert follower.heard
+    assert follower.is_confirmed
     assert follower.age(1.2) == 0.0
 
 
@@ -207,7 +207,7 @@ def test_commands_have_no_effect_on_a_daemon_that_is_silent_or_objects() -> None
     watch.look(0.0)
     assert watch.objection("app", STATE.sender, 0.0) == ""
     assert "nothing received from the daemon" in watch.objection(
-        "app", STATE.sender, SILENT_S + 0.01
+        "app", STATE.sender, ROBOT_SILENCE_TIMEOUT_S + 0.01
     )
     stopped = replace(STATE, mode="stopped", reason="stopped by request")
     robot.queue.append(sample_of(stopped))

@@ -81,7 +81,7 @@ def test_a_speed_that_waited_for_a_burst_during_a_suspend_is_dropped(
     asleep_ns = 0
     monkeypatch.setattr(clock, "asleep_ns", lambda: asleep_ns)
     dropped: list[bool] = []
-    outbox, one = Outbox(lambda: dropped.append(True)), Commander(gathers=True)
+    outbox, one = Outbox(lambda: dropped.append(True)), Commander(detects_bursts=True)
     with outbox._news:  # the thread cannot send the command before the suspend
         outbox.take(one, bus.put, AHEAD)
         asleep_ns = 3600 * NS_PER_S

@@ -12,9 +12,9 @@ import pytest
 import zenoh
 
 from acsard import client
-from acsard.client import Client, NoAnswerError
+from acsard.client import AcsardError, Client, NoAnswerError, asynchronous
 from acsard.client.asynchronous import AsyncClient
-from acsard.client.commander import MAX_OPEN_TIMEOUT_S, MIN_SPACING_S, no_command
+from acsard.client.commander import MAX_SOURCE_TIMEOUT_S, MIN_SPACING_S, no_command
 from acsard.client.driving import UnheardError
 from acsard.client.synchronous import decoder
 from acsard.core.config.settings import DriveConfig, JointsConfig
@@ -94,7 +94,7 @@ def test_each_command_has_its_sender_its_sequence_number_and_its_time(session: S
 def test_two_clients_of_one_connection_keep_the_spacing_between_commands(session: Session) -> None:
     """The daemon drops a command that arrives within a millisecond of another one on its key."""
     one = client_of(session)
-    other = one.like("acsar")
+    other = one.sibling("acsar")
     begun = time.monotonic()
     for sender in (one, other) * 5:
         sender.send(0.0)
@@ -148,8 +148,8 @@ def test_the_end_of_a_connection_sends_a_zero_to_each_robot_that_may_still_move(
     session: Session,
 ) -> None:
     robot = client_of(session)
-    other = robot.like("acsar", "other")
-    resting = robot.like("acsar", "resting")
+    other = robot.sibling("acsar", "other")
+    resting = robot.sibling("acsar", "resting")
     for sender in (robot, other, resting):
         sender.send(0.0)
         sender.send(0.3)
@@ -172,7 +172,9 @@ def test_after_the_longest_timeout_the_end_of_a_connection_sends_no_zero(
     robot.send(0.0)
     robot.send(0.3)
     sent, asleep_ns = len(session.heard), clock.asleep_ns()
-    monkeypatch.setattr(clock, "asleep_ns", lambda: asleep_ns + int(MAX_OPEN_TIMEOUT_S * NS_PER_S))
+    monkeypatch.setattr(
+        clock, "asleep_ns", lambda: asleep_ns + int(MAX_SOURCE_TIMEOUT_S * NS_PER_S)
+    )
     robot.end()
     assert len(session.heard) == sent
 
@@ -226,6 +228,38 @@ async def test_a_cancelled_async_drive_whose_connection_is_closed_is_cancelled(
         await driving
 
 
+@pytest.mark.parametrize("method", ["pose", "whoami", "call", "get", "set"])
+async def test_an_async_call_that_takes_too_long_raises_a_documented_error(
+    session: Session, monkeypatch: pytest.MonkeyPatch, method: str
+) -> None:
+    robot, released = AsyncClient(client_of(session)), threading.Event()
+    monkeypatch.setattr(asynchronous, "CALL_TIMEOUT_S", 0.05)
+    monkeypatch.setattr(session, "get", lambda *_, **__: [released.wait(20.0)][:0])
+    fields: dict[str, Any] = {"call": {"service": "stop"}, "get": {"name": "odom"}}
+    fields["set"] = {"settings": {}}
+    try:
+        with pytest.raises(NoAnswerError, match="did not end within"):
+            await getattr(robot, method)(**fields.get(method, {}))
+    finally:
+        released.set()
+
+
+async def test_an_async_call_raises_the_error_of_the_call_itself(session: Session) -> None:
+    with pytest.raises(NoAnswerError, match="no answer on the Zenoh key"):
+        await AsyncClient(client_of(session)).get("odm")
+
+
+async def test_an_async_call_without_a_new_thread_raises_a_documented_error(
+    session: Session,
+) -> None:
+    usual = threading.stack_size(1 << 46)  # no machine can provide a stack of this size
+    try:
+        with pytest.raises(AcsardError, match="cannot start another thread"):
+            await AsyncClient(client_of(session)).pose()
+    finally:
+        threading.stack_size(usual)
+
+
 def test_two_sessions_of_one_process_are_two_senders(session: Session) -> None:
     other = Session("fedcba9876543210")
     for one in (session, other):
@@ -258,7 +292,7 @@ def test_over_tls_the_error_names_the_role_only_if_no_command_arrived(
     ours = client_of(session)
     ours.where = ours.where._replace(tls="certificates")
     monkeypatch.setattr(ours, "whoami", lambda: Identity("operator", "anna", "anna/1"))
-    found = ours.unheard(UnheardError(objection))
+    found = ours.explain_error(UnheardError(objection))
     assert type(found) is client.NotDrivenError
     assert str(found).startswith(objection)
     assert ("your certificate anna has the role operator" in str(found)) == names_role
@@ -270,14 +304,14 @@ def test_over_tls_a_viewer_gets_a_permission_error_whatever_the_robot_reports(
     ours = client_of(session)
     ours.where = ours.where._replace(tls="certificates")
     monkeypatch.setattr(ours, "whoami", lambda: Identity("viewer", "anna", "anna/1"))
-    found = ours.unheard(UnheardError("fault: rear_left wheel is stuck"))
+    found = ours.explain_error(UnheardError("fault: rear_left wheel is stuck"))
     assert isinstance(found, client.NotPermittedError)
 
 
 def test_a_drive_without_arriving_commands_ends_with_a_documented_error(
     session: Session,
 ) -> None:
-    found = client_of(session).unheard(UnheardError(no_command("app")))
+    found = client_of(session).explain_error(UnheardError(no_command("app")))
     assert type(found).__name__ in client.__doc__.split()
     assert isinstance(found, client.NotDrivenError)
 

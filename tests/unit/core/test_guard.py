@@ -126,7 +126,7 @@ class Guarded:
         return line
 
     def note_sent(self) -> None:
-        self.guard.left(self._passed)
+        self.guard.record_written(self._passed)
 
 
 @pytest.fixture
@@ -400,7 +400,7 @@ class Clocked:
         passed, trip = self.guard.check(found)
         assert passed == (STOP if trip else found.line)
         if passed is not None:
-            self.guard.left(passed)
+            self.guard.record_written(passed)
         return trip
 
 

@@ -1217,7 +1217,7 @@ def test_a_silent_mcu_makes_the_link_stale_and_the_speed_zero() -> None:
         assert bench.step(GO).applied == GO
     out = bench.step(GO)
     assert (out.applied, out.link, out.mode) == (REST, "stale", "waiting")
-    assert out.reason.startswith("a fault in sim.faults silences the built-in simulator, or")
+    assert out.reason.startswith("the built-in simulator is silent because of a fault")
 
 
 def test_without_feedback_only_zero_lines_go_out_ten_times_a_second() -> None:
@@ -1351,7 +1351,7 @@ def test_deactivating_ramps_to_zero_by_the_normal_deceleration() -> None:
     bench = Bench().driving()
     answer = bench.answer("deactivate")
     assert answer == Answer(
-        7, True, "inactive: the robot ramps to zero; srv/activate switches it on"
+        7, True, "inactive: the robot brakes to rest; call srv/activate to switch it on again"
     )
     assert bench.out.applied.linear == pytest.approx(0.49)
     for _ in range(50):
@@ -1492,7 +1492,10 @@ def test_missed_periods_are_reported_with_their_number() -> None:
     bench.now_ns += 50 * MS
     out = bench.robot.step(Inputs(bench.now, True, True, 1, missed=4))
     (event,) = (event for event in out.events if event.name == "missed_periods")
-    assert (event.text, event.count) == ("4 x missed: 4 control periods in a row", 4)
+    assert (event.text, event.count) == (
+        "4 x missed: no control step ran in 4 successive control periods",
+        4,
+    )
     assert bench.counters()["missed_periods"] == 4
 
 
@@ -1665,14 +1668,14 @@ def test_shutting_down_ramps_to_zero_by_the_stop_deceleration_and_stays_there() 
     path = [bench.step(GO).applied.linear for _ in range(20)]
     assert path[:3] == pytest.approx([0.47, 0.44, 0.41])
     assert path[17:] == [0.0, 0.0, 0.0]
-    assert (bench.mode(), bench.out.reason) == ("shutdown", "the daemon is going down")
+    assert (bench.mode(), bench.out.reason) == ("shutdown", "the daemon is shutting down")
 
 
 def test_shutting_down_is_one_event() -> None:
     bench = Bench().driving()
     bench.shutting_down = True
     (event,) = bench.step().events
-    assert event == Event("mode", "driving -> shutdown: the daemon is going down")
+    assert event == Event("mode", "driving -> shutdown: the daemon is shutting down")
     assert names(bench.step()) == []
 
 

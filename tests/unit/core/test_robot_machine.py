@@ -705,7 +705,7 @@ class RobotMachine(RuleBasedStateMachine):
         self.superseded = self.blocked or not self.port_open
         if self.superseded:
             return
-        self.guard.left(line)
+        self.guard.record_written(line)
         self.sent, self.sent_ns, self.sent_twist = wheels, self.now_ns, outputs.applied
         self.broken = False
         self.told = wheels

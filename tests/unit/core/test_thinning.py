@@ -91,6 +91,11 @@ def test_thinning_too_many_spans_keeps_the_most_severe_kind() -> None:
     assert (spans[0].begin, spans[-1].end) == (0.0, 300.0)
 
 
+def test_a_band_refuses_to_keep_fewer_than_two_spans() -> None:
+    with pytest.raises(ValueError, match="at least 2 spans, not 1"):
+        Band(["fault"], most=1)
+
+
 def test_every_place_of_a_thinned_path_is_near_a_kept_place() -> None:
     dice, track = random.Random(1), Track(most=100)
     x = y = 0.0

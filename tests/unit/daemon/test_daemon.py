@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import os
+import socket
 from contextlib import AsyncExitStack
 from pathlib import Path
 
@@ -10,7 +12,11 @@ import pytest
 from msgspec.structs import replace
 
 from acsard.core.config.settings import Config, RecordConfig
-from acsard.daemon.daemon import _recorder
+from acsard.core.values import Instant, Received
+from acsard.daemon.daemon import Departure, _control, _recorder
+from acsard.daemon.wakeup import Wakeup
+from acsard.host.logs import Log
+from acsard.host.systemd import Systemd
 from acsard.recording import recorder
 from acsard.recording.end_record import read_end
 from tests.scenarios.world import World
@@ -40,3 +46,31 @@ def test_the_recording_ends_with_the_error_of_the_daemon_and_the_error_is_raised
     last = read_end(next(tmp_path.glob("*.mcap")))
     assert last is not None
     assert (last.cut, last.why) == (cut, "ValueError: a fault of our own" if cut else "")
+
+
+def test_systemd_receives_stopping_before_the_daemon_cleans_up_after_an_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After STOPPING=1 systemd no longer checks its watchdog, which would hide the error."""
+    world = World()
+
+    def broken(late: Instant | None = None) -> tuple[Received, ...]:
+        raise ValueError("a fault of our own")
+
+    monkeypatch.setattr(world.port, "take", broken)
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as service_manager:
+        service_manager.bind(str(tmp_path / "notify"))
+        service_manager.setblocking(False)
+
+        async def run() -> None:
+            wake = Wakeup()
+            manager = Systemd({"NOTIFY_SOCKET": str(tmp_path / "notify")}, os.getpid())
+            departure = Departure(Log(world.config.log), wake, manager)
+            with pytest.raises(ValueError, match="a fault of our own"):
+                await _control(world.config, world.loop, departure, wake, manager)
+            manager.close()
+
+        asyncio.run(run())
+        lines = service_manager.recv(4096).decode().splitlines()
+        assert "STOPPING=1" in lines
+        assert service_manager.recv(4096).decode() == "STATUS=ending after an error in the daemon"

@@ -654,13 +654,13 @@ def test_a_disk_that_hangs_later_is_reported_once_and_so_is_its_recovery(
     path = tmp_path / NAME
     where = f"the latch file ({path}) cannot be written"
     assert file.trouble == f"a stop would not survive a restart: {where}: {module.DISK_HANGS}"
-    (event,) = file.news()
+    (event,) = file.take_events()
     assert (event.name, event.level) == ("latch_file", "warning")
     assert module.DISK_HANGS in event.text
-    assert file.news() == []
+    assert file.take_events() == []
     stuck.goes.set()
     until(lambda: file.trouble == "")
-    assert file.news() == [
+    assert file.take_events() == [
         Event(
             "latch_file",
             f"the daemon can write {path} again, so stops survive a restart of the daemon",
@@ -683,10 +683,10 @@ def test_a_disk_that_hangs_and_then_fails_is_not_reported_as_recovered(
     monkeypatch.setattr(module, "replace", fails_late)
     file.keep(STOP)
     until(lambda: file.trouble)
-    assert [event.level for event in file.news()] == ["warning"]
+    assert [event.level for event in file.take_events()] == ["warning"]
     goes.set()
     until(lambda: "No space left" in file.trouble)
-    (event,) = file.news()
+    (event,) = file.take_events()
     assert event.level == "warning"
     assert "No space left" in event.text
 
@@ -704,7 +704,7 @@ def test_a_full_disk_is_reported_once_and_retried_until_a_write_succeeds(
     monkeypatch.setattr(module, "replace", fails)
     file.keep(STOP)
     until(lambda: len(tries) > 3)
-    news = file.news()
+    news = file.take_events()
     path = tmp_path / NAME
     said = (
         f"a stop would not survive a restart: the latch file ({path}) cannot be written: No space "
@@ -715,7 +715,7 @@ def test_a_full_disk_is_reported_once_and_retried_until_a_write_succeeds(
     assert news == [Event("latch_file", again, "warning")]
     monkeypatch.setattr(module, "replace", replace_file)
     until(lambda: file.trouble == "")
-    assert file.news() == [
+    assert file.take_events() == [
         Event(
             "latch_file",
             f"the daemon can write {path} again, so stops survive a restart of the daemon",

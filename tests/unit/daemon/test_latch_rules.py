@@ -17,8 +17,8 @@ from acsard.daemon.latch_rules import (
     MAX_BYTES,
     Handover,
     LatchFileError,
+    after_failed_write,
     decode,
-    doubted,
     encode,
     stopped,
 )
@@ -179,7 +179,7 @@ def test_a_stop_by_the_daemon_does_not_replace_a_latched_stop() -> None:
 
 
 def test_each_latch_of_a_file_that_cannot_be_written_takes_a_new_number() -> None:
-    made = doubted(ALL, "the file cannot be written", NOW)
+    made = after_failed_write(ALL, "the file cannot be written", NOW)
     old = {latch.number for latch in (ALL.stop, ALL.fault, ALL.inactive) if latch}
     new = [latch.number for latch in (made.fault, made.inactive, made.stop) if latch]
     assert len(new) == 3
@@ -195,7 +195,10 @@ def test_each_latch_of_a_file_that_cannot_be_written_takes_a_new_number() -> Non
 def test_two_unwritable_starts_with_a_wall_clock_set_back_have_different_numbers() -> None:
     """Otherwise a clear of what the first one latched releases a stop that the crash has lost."""
     wall_ns = NOW.wall_ns - 40_828_000_000_000
-    starts = [doubted(ALL, "", Instant(mono_ns, wall_ns)) for mono_ns in (76 * 10**9, 78 * 10**9)]
+    starts = [
+        after_failed_write(ALL, "", Instant(mono_ns, wall_ns))
+        for mono_ns in (76 * 10**9, 78 * 10**9)
+    ]
     numbers = [
         latch.number for made in starts for latch in (made.fault, made.inactive, made.stop) if latch
     ]
@@ -204,7 +207,7 @@ def test_two_unwritable_starts_with_a_wall_clock_set_back_have_different_numbers
 
 
 def test_a_file_without_a_stop_that_cannot_be_written_starts_the_robot_stopped() -> None:
-    made = doubted(Latches(), "the file cannot be written", NOW)
+    made = after_failed_write(Latches(), "the file cannot be written", NOW)
     assert made.stop
     assert made.stop.why == "the file cannot be written"
 
@@ -227,7 +230,7 @@ class Keeper:
     def wait(self, latches: Latches, seconds: float) -> None:
         self.waits.append((latches, seconds))
 
-    def news(self) -> list[Event]:
+    def take_events(self) -> list[Event]:
         return [Event("latch_file", "the disk is full", "warning")]
 
 
@@ -334,7 +337,7 @@ def test_at_shutdown_the_handover_waits_for_the_keeper_up_to_the_answer_timeout(
 
 def test_the_handover_reports_the_events_and_the_trouble_of_the_keeper() -> None:
     handover = Handover(Latches(), keeper := Keeper())
-    assert handover.news() == keeper.news()
+    assert handover.take_events() == keeper.take_events()
     assert handover.trouble == keeper.trouble
 
 
@@ -343,5 +346,5 @@ def test_without_a_keeper_the_handover_never_waits_and_reports_no_trouble() -> N
     handover.take(ALL)
     handover.wait()
     assert handover.held
-    assert handover.news() == []
+    assert handover.take_events() == []
     assert handover.trouble is None

@@ -132,7 +132,7 @@ def test_the_recorded_load_is_not_idle() -> None:
     "conditions",
     [
         Conditions(undervoltage=True),
-        Conditions(hot=True),
+        Conditions(slowed_by_heat=True),
         Conditions(throttled=1),
         Conditions(slow_clock=SlowClock("powersave", 600, 1500)),
     ],
@@ -184,7 +184,7 @@ def test_a_real_time_program_is_reported_as_real_time() -> None:
 def test_the_event_has_the_duration_and_the_cause_with_its_advice() -> None:
     after = Reading(conditions=Conditions(undervoltage=True))
     late = Lateness(63 * MS, Scheduled(60 * MS, 0), Reading(), after)
-    event = event_of(late, causes(late)[1], news=True)
+    event = event_of(late, causes(late)[1], immediate=True)
     assert (event.name, event.level, event.kind) == ("missed_periods", "warning", "late")
     assert BECAUSE in event.text
     assert event.text == (

@@ -67,7 +67,7 @@ def period(watch: LateWatch, late_ns: int, missed: int) -> None:
 
 def reported(watch: LateWatch) -> Event:
     event: Event
-    (event,) = until(watch.news, 5.0, "an event")
+    (event,) = until(watch.take_events, 5.0, "an event")
     return event
 
 
@@ -106,7 +106,7 @@ def test_neither_a_punctual_period_nor_an_unknown_cause_is_an_event(
         judged(kernel, kernel.readings)
         period(watch, 30 * MS, 2)
         judged(kernel, kernel.readings)
-        assert watch.news() == []
+        assert watch.take_events() == []
 
 
 def test_only_the_first_report_of_a_cause_is_marked_as_new(
@@ -143,7 +143,7 @@ def test_a_late_period_that_began_before_the_first_reading_is_not_reported(
         now_ns = clock.mono_ns()
         watch.period(now_ns, now_ns - began_ns, 9)
         judged(kernel, kernel.readings)
-        assert watch.news() == []
+        assert watch.take_events() == []
 
 
 def test_the_cause_is_determined_for_the_worst_of_several_late_periods(
@@ -193,7 +193,7 @@ def test_reports_are_a_second_apart(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_the_loop_s_scheduler_times_are_the_differences_between_two_periods() -> None:
     late = late_watch.Late(0, 30 * MS, b"1000 200 3\n", b"1500 900 5\n")
-    assert late.loop == Scheduled(500, 700)
+    assert late.thread_times == Scheduled(500, 700)
 
 
 def test_a_kernel_without_schedstat_and_a_process_without_threads_are_no_error(
@@ -208,4 +208,4 @@ def test_a_kernel_without_schedstat_and_a_process_without_threads_are_no_error(
     with LateWatch(PlannedKernel()) as watch:
         period(watch, 0, 0)
         period(watch, 30 * MS, 2)
-        assert watch.news() == []
+        assert watch.take_events() == []

@@ -21,7 +21,7 @@ from acsard.core.values import Answer, Event, Latches, Plain, Request
 from acsard.daemon import settings_file as module
 from acsard.daemon.settings_file import SettingsFile, keeps
 from acsard.host import config_edit_process, config_file
-from acsard.host.config_edit_process import edited_apart
+from acsard.host.config_edit_process import edited_in_process
 from acsard.host.config_file import Edit
 from acsard.host.errors import MendableError
 from tests.system.harness import until
@@ -183,7 +183,7 @@ def test_a_setting_is_written_after_the_robot_has_obeyed(tmp_path: Path, started
     check(made)
     assert file.read_text() == f"# mine\n{TEXT}"
     made.use(with_speed(config, 0.8))
-    assert made.obeyed(OBEYED)
+    assert made.defers_answer(OBEYED)
     assert result(made, events) == Answer(7, True, f"{OBEYED.message}; written to {file}")
     assert file.read_text() == f"# mine\n{TEXT.replace('0.5', '0.8')}"
     (event,) = events
@@ -196,13 +196,13 @@ def test_a_setting_is_written_after_the_robot_has_obeyed(tmp_path: Path, started
 
 def test_a_setting_that_the_robot_refuses_is_not_written(file: Path, made: SettingsFile) -> None:
     check(made)
-    assert not made.obeyed(Answer(7, False, "stop the robot first"))
+    assert not made.defers_answer(Answer(7, False, "stop the robot first"))
     assert made.results(10**12, []) == []
     assert file.read_text() == TEXT
 
 
 def test_an_answer_to_another_request_does_not_change_the_file(started: Started) -> None:
-    assert not started(None, Config(), {}).obeyed(OBEYED)
+    assert not started(None, Config(), {}).defers_answer(OBEYED)
 
 
 def read_only(file: Path) -> None:
@@ -247,7 +247,7 @@ def test_nothing_is_set_if_the_file_cannot_be_changed(
     message = refusal(made)
     assert message.startswith("nothing is set: ")
     assert words in message
-    assert ("write the lines by hand" in message) is by_hand, "one remedy, which fits"
+    assert ("edit the file by hand" in message) is by_hand, "one remedy, which fits"
     assert file.read_text() == before
 
 
@@ -293,7 +293,7 @@ def test_a_file_that_changes_between_check_and_writing_keeps_both_changes(
 ) -> None:
     check(made)
     file.write_text(f"# new\n{TEXT}[rates]\nstate = 5.0\n")
-    assert made.obeyed(OBEYED)
+    assert made.defers_answer(OBEYED)
     assert result(made) == Answer(7, True, f"{OBEYED.message}; written to {file}")
     assert file.read_text() == f"# new\n{TEXT.replace('0.5', '0.8')}[rates]\nstate = 5.0\n"
 
@@ -304,7 +304,7 @@ def test_a_failed_write_after_the_robot_has_obeyed_is_reported_as_a_failure(
 ) -> None:
     check(made)
     read_only(file)
-    assert made.obeyed(OBEYED)
+    assert made.defers_answer(OBEYED)
     message = refusal(made)
     only = "but only until the daemon's next start, because"
     assert message.startswith(f"{OBEYED.message}, {only} {file} was not")
@@ -323,10 +323,10 @@ def test_a_disk_that_hangs_gets_an_answer_and_a_late_result_changes_nothing(
 
     if obeyed:
         check(made)
-    monkeypatch.setattr(module, "keep", hang)
-    monkeypatch.setattr(module, "keepable", hang)
+    monkeypatch.setattr(module, "apply_edit", hang)
+    monkeypatch.setattr(module, "prepare_edit", hang)
     if obeyed:
-        assert made.obeyed(OBEYED)
+        assert made.defers_answer(OBEYED)
     else:
         made.keep(REQUEST, 0)
     assert begun.wait(10.0)
@@ -341,6 +341,27 @@ def test_a_disk_that_hangs_gets_an_answer_and_a_late_result_changes_nothing(
     assert made.results(0, []) == []
 
 
+def test_a_thread_that_cannot_be_started_is_named_in_the_answer_at_once(
+    file: Path, started: Started, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(thread: threading.Thread) -> None:
+        raise RuntimeError("can't start new thread")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(threading.Thread, "start", full)
+        made = started(file, parse(TEXT.encode()), {})
+    assert "can't start new thread" in made.differ
+    made.keep(REQUEST, 0)
+    (answer,) = made.results(0, [])
+    assert answer == Answer(
+        REQUEST.id,
+        False,
+        "nothing is set: the daemon could not start the thread that changes the file (can't start "
+        "new thread); restart acsard, or send the request without `keep`",
+    )
+    assert made.results(module.REPLY_TIMEOUT_NS + 1, []) == []
+
+
 @pytest.mark.parametrize("fails", [False, True])
 def test_a_write_that_ends_after_its_overdue_answer_is_logged_also_if_it_fails(
     file: Path, made: SettingsFile, monkeypatch: pytest.MonkeyPatch, fails: bool
@@ -353,8 +374,8 @@ def test_a_write_that_ends_after_its_overdue_answer_is_logged_also_if_it_fails(
             raise MendableError("the disk is full")
 
     check(made)
-    monkeypatch.setattr(module, "keep", hang)
-    assert made.obeyed(OBEYED)
+    monkeypatch.setattr(module, "apply_edit", hang)
+    assert made.defers_answer(OBEYED)
     late_ns = module.REPLY_TIMEOUT_NS + 1
     (answer,) = made.results(late_ns, events)
     assert isinstance(answer, Answer)
@@ -382,7 +403,7 @@ def test_a_request_that_the_robot_received_is_not_reported_as_not_set(made: Sett
     """While a speed limit is in force, a `set` may wait for the step after the one before it."""
     check(made)
     assert made.results(module.REPLY_TIMEOUT_NS + 1, []) == []
-    assert made.obeyed(OBEYED)
+    assert made.defers_answer(OBEYED)
 
 
 @pytest.mark.slow
@@ -393,7 +414,7 @@ def test_a_limit_below_a_kept_one_is_lowered_at_the_next_start(
     made = started(file, config, {})
     assert made.latches(latches, with_speed(config, 0.3).limits) is latches
     check(made)
-    assert made.obeyed(OBEYED)
+    assert made.defers_answer(OBEYED)
     result(made)
     kept, limits = with_speed(config, 0.8).limits, with_speed(config, 0.6).limits
     assert made.latches(latches, kept).lowered == {}
@@ -439,7 +460,7 @@ def test_too_many_requests_are_refused_and_overdue_ones_take_no_more_time(
         hangs.wait()
         return Edit(file, {}, b"", "")
 
-    monkeypatch.setattr(module, "keepable", slow)
+    monkeypatch.setattr(module, "prepare_edit", slow)
     made = started(file, Config(), {})
     for number in range(1, module.MAX_JOBS + 11):
         made.keep(replace(REQUEST, id=number), 0)
@@ -464,7 +485,7 @@ def test_changed_settings_do_not_displace_a_change_of_the_file(
     check(made)
     read = SettingsFile._read
     monkeypatch.setattr(SettingsFile, "_read", lambda self: hangs.wait() and read(self))
-    assert made.obeyed(OBEYED)
+    assert made.defers_answer(OBEYED)
     for _ in range(2 * module.MAX_JOBS):
         made.use(with_speed(config, 0.8))
     hangs.set()
@@ -483,12 +504,12 @@ def test_a_change_that_the_robot_has_obeyed_is_written_before_the_next_check(
         hangs.wait()
         return Edit(file, {}, b"", "")
 
-    monkeypatch.setattr(module, "keepable", slow)
-    monkeypatch.setattr(module, "keep", lambda edit: done.append("write"))
+    monkeypatch.setattr(module, "prepare_edit", slow)
+    monkeypatch.setattr(module, "apply_edit", lambda edit: done.append("write"))
     for number in (8, 9):
         made.keep(replace(REQUEST, id=number), 0)
     until(lambda: done)
-    assert made.obeyed(OBEYED)
+    assert made.defers_answer(OBEYED)
     hangs.set()
     until(lambda: len(done) == 3)
     assert done == ["check", "write", "check"]
@@ -502,14 +523,14 @@ def test_an_edit_during_the_computation_of_a_change_is_not_lost(
     check(made)
 
     def edited(text: str, keys: Mapping[str, object]) -> str:
-        changed = edited_apart(text, keys)
+        changed = edited_in_process(text, keys)
         if texts:
             file.write_text(texts.pop() + file.read_text())
         return changed
 
-    monkeypatch.setattr(config_file, "edited_apart", edited)
+    monkeypatch.setattr(config_file, "edited_in_process", edited)
     file.write_text(f"# first\n{TEXT}")
-    assert made.obeyed(OBEYED)
+    assert made.defers_answer(OBEYED)
     answer = result(made)
     assert isinstance(answer, Answer)
     assert answer.success
@@ -528,7 +549,7 @@ def test_the_directory_is_on_the_disk_before_the_answer(
 
     monkeypatch.setattr(config_file, "sync", sync)
     check(made)
-    assert made.obeyed(OBEYED)
+    assert made.defers_answer(OBEYED)
     answer = result(made)
     assert isinstance(answer, Answer)
     assert answer.success

@@ -92,6 +92,25 @@ def test_a_router_that_once_ran_is_started_again_when_its_files_are_wrong(
     assert codes == [f"the router ended with exit code {number}" for number in (1, code, code)]
 
 
+def test_the_first_router_that_could_be_started_counts_as_the_first(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """A start that the system refused shows nothing about the router's files."""
+    monkeypatch.setattr("acsard.daemon.supervisor.LONG_RESTART_PAUSE_S", 0.01)
+    program(monkeypatch, tmp_path, "raise SystemExit(78)")
+    executable = sys.executable
+    monkeypatch.setattr(sys, "executable", "/nowhere/python")
+    events: list[Event] = []
+
+    def log(event: Event) -> None:
+        events.append(event)
+        monkeypatch.setattr(sys, "executable", executable)
+
+    assert asyncio.run(keep_running(["router"], log, ROUTER)) == 78
+    (event,) = events
+    assert "could not be started" in event.text
+
+
 @pytest.mark.parametrize(("kind", "code"), [(GATEWAY, 78), (ROUTER, 75), (ROUTER, 1)])
 def test_a_program_that_may_start_later_is_restarted(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, kind: Kind, code: int

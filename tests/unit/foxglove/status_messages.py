@@ -9,7 +9,7 @@ class Server:
     def __init__(self) -> None:
         self.shown: list[str] = []
 
-    def publish_status(self, text: str, level: object, stays: str | None) -> None:
+    def publish_status(self, text: str, level: object, status_id: str | None) -> None:
         self.shown.append(text)
 
     def remove_status(self, ids: list[str]) -> None:

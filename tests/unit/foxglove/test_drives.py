@@ -81,7 +81,7 @@ class Viewers:
 
     def publish(self, viewer: int, message: Message) -> None:
         channel = 2 if isinstance(message, TwistStamped) else 1
-        self.drives.came(viewer, channel, encode(message, "cdr"))
+        self.drives.received(viewer, channel, encode(message, "cdr"))
 
     def heard(self, viewer: int, count: int) -> list[Command]:
         """Wait until this viewer has sent at least `count` commands, and return them."""
@@ -126,7 +126,7 @@ def test_a_viewer_that_has_just_connected_sends_no_zero_of_its_own(viewers: View
     for channel in (1, 2):
         viewers.drives.withdrawn(1, channel)
     viewers.drives.advertised(1, 3, "/cmd_vel", "cdr", "geometry_msgs/msg/Twist")
-    viewers.drives.came(1, 3, encode(AHEAD, "cdr"))
+    viewers.drives.received(1, 3, encode(AHEAD, "cdr"))
     assert viewers.heard(1, 1)[0].twist.linear == 0.3
 
 
@@ -209,9 +209,9 @@ def test_single_presses_are_not_reported_as_a_slow_panel() -> None:
 def test_a_command_on_a_channel_beyond_the_limit_is_reported(viewers: Viewers) -> None:
     for channel in range(100):
         viewers.drives.advertised(1, channel, "/cmd_vel", "cdr", "geometry_msgs/msg/Twist")
-    viewers.drives.came(1, 63, encode(AHEAD, "cdr"))
+    viewers.drives.received(1, 63, encode(AHEAD, "cdr"))
     assert not said(viewers.notices)
-    viewers.drives.came(1, 64, encode(AHEAD, "cdr"))
+    viewers.drives.received(1, 64, encode(AHEAD, "cdr"))
     assert ["64 topics at most" in text for text in said(viewers.notices)] == [True]
 
 

@@ -35,22 +35,22 @@ def test_a_notice_is_repeated_only_after_a_while(monkeypatch: pytest.MonkeyPatch
 def test_a_lasting_notice_is_repeated_only_with_another_text_or_after_it_was_over() -> None:
     notices = Notices(lambda text: None, lambda: None)
     for text in ("gone", "gone", "no reply", "gone"):
-        notices.say("error", "daemon", text, stays="daemon")
+        notices.say("error", "daemon", text, status_id="daemon")
     assert shown(notices) == ["gone", "no reply", "gone"]
-    notices.say("error", "daemon", "gone", stays="daemon")
+    notices.say("error", "daemon", "gone", status_id="daemon")
     assert shown(notices) == []
-    notices.over("daemon")
-    notices.say("error", "daemon", "gone", stays="daemon")
+    notices.remove("daemon")
+    notices.say("error", "daemon", "gone", status_id="daemon")
     assert shown(notices) == ["without daemon", "gone"]
 
 
 def test_a_new_viewer_gets_the_lasting_statuses_until_they_are_over() -> None:
     notices = Notices(lambda text: None, lambda: None)
-    notices.say("error", "daemon", "gone", stays="daemon")
+    notices.say("error", "daemon", "gone", status_id="daemon")
     notices.say("info", "set", "done")
     assert shown(notices) == ["gone", "done"]
     assert shown(notices, newcomers=True) == ["gone"]
-    notices.over("daemon")
+    notices.remove("daemon")
     assert shown(notices) == ["without daemon"]
     assert shown(notices, newcomers=True) == []
 
@@ -68,30 +68,30 @@ def test_the_newest_notices_wait_for_the_viewers_and_each_wakes_the_main_thread(
 
 
 def test_an_objection_is_reported_only_after_a_delay() -> None:
-    told = Objections()
-    assert not told.look(WHY, 0)
-    assert not told.look(WHY, OBJECTS_NS - 1)
-    assert told.look(WHY, OBJECTS_NS)
-    assert told.told == WHY
+    objections = Objections()
+    assert not objections.look(WHY, 0)
+    assert not objections.look(WHY, OBJECTS_NS - 1)
+    assert objections.look(WHY, OBJECTS_NS)
+    assert objections.reported == WHY
 
 
 def test_an_objection_is_reported_once_and_withdrawn_when_it_is_over() -> None:
-    told = Objections()
-    changes = [told.look(WHY if n < 20 else "", n * OBJECTS_NS) for n in range(30)]
+    objections = Objections()
+    changes = [objections.look(WHY if n < 20 else "", n * OBJECTS_NS) for n in range(30)]
     assert changes.count(True) == 2
     assert changes[1]
     assert changes[20]
-    assert told.told == ""
+    assert objections.reported == ""
 
 
 def test_another_objection_is_reported_without_a_delay() -> None:
-    told = Objections()
-    told.look(WHY, 0)
-    told.look(WHY, OBJECTS_NS)
-    assert told.look("fault", OBJECTS_NS + 1)
-    assert told.told == "fault"
+    objections = Objections()
+    objections.look(WHY, 0)
+    objections.look(WHY, OBJECTS_NS)
+    assert objections.look("fault", OBJECTS_NS + 1)
+    assert objections.reported == "fault"
 
 
 def test_an_objection_that_is_over_soon_is_never_reported() -> None:
-    told = Objections()
-    assert not any(told.look(WHY if n % 2 else "", n * (OBJECTS_NS - 1)) for n in range(20))
+    objections = Objections()
+    assert not any(objections.look(WHY if n % 2 else "", n * (OBJECTS_NS - 1)) for n in range(20))

@@ -23,7 +23,7 @@ from acsard.core.messages.schema import (
 )
 from acsard.core.ros.attachments import Attachment
 from acsard.core.ros.transports import SOURCES, command_keys
-from acsard.foxglove.relay import News, Reader, Way, ways
+from acsard.foxglove.relay import CommandForm, EventDeduplicator, Reader, command_forms
 from tests.each import each
 
 KEPT = 20
@@ -36,54 +36,54 @@ def events(total: int, of: str = "first") -> Events:
     return Events(Time(total), total, told)
 
 
-def names(news: News, said: Events) -> list[str]:
-    return [line.name for line in news.of(said)]
+def names(deduplicator: EventDeduplicator, said: Events) -> list[str]:
+    return [line.name for line in deduplicator.of(said)]
 
 
 def test_the_first_answer_gives_all_stored_events() -> None:
-    lines = News().of(events(3))
+    lines = EventDeduplicator().of(events(3))
     assert [(line.stamp.sec, line.level, line.name) for line in lines] == [
         (0, 30, "mode0"),
         (1, 30, "mode1"),
         (2, 30, "mode2"),
     ]
     assert lines[0].msg == "first 0 (by ann)"
-    assert len(News().of(events(1000))) == KEPT
+    assert len(EventDeduplicator().of(events(1000))) == KEPT
 
 
 @each(("before", "now"), [(3, 4), (3, 3), (0, 5), (19, 23), (40, 60), (40, 55)])
 def test_each_event_is_reported_once(before: int, now: int) -> None:
-    news = News()
-    news.of(events(before))
-    assert names(news, events(now)) == [f"mode{n}" for n in range(before, now)]
+    deduplicator = EventDeduplicator()
+    deduplicator.of(events(before))
+    assert names(deduplicator, events(now)) == [f"mode{n}" for n in range(before, now)]
 
 
 def test_events_that_the_daemon_no_longer_stores_are_skipped() -> None:
-    news = News()
-    news.of(events(10))
-    assert names(news, events(100)) == [f"mode{n}" for n in range(80, 100)]
+    deduplicator = EventDeduplicator()
+    deduplicator.of(events(10))
+    assert names(deduplicator, events(100)) == [f"mode{n}" for n in range(80, 100)]
 
 
 def test_an_answer_older_than_the_last_message_reports_no_event() -> None:
-    news = News()
-    news.of(events(10))
-    assert names(news, events(9)) == []
-    assert names(news, events(11)) == ["mode10"]
+    deduplicator = EventDeduplicator()
+    deduplicator.of(events(10))
+    assert names(deduplicator, events(9)) == []
+    assert names(deduplicator, events(11)) == ["mode10"]
 
 
 def test_an_event_that_is_updated_does_not_report_older_events_again() -> None:
-    news, fault = News(), events(1).events[0]
+    deduplicator, fault = EventDeduplicator(), events(1).events[0]
     missed = LogEvent(Time(5), "periods_missed", "warning", "3 more periods", "", 1)
-    news.of(Events(Time(5), 2, [fault, missed]))
+    deduplicator.of(Events(Time(5), 2, [fault, missed]))
     later = replace(missed, stamp=Time(8), text="9 more periods")
-    assert names(news, Events(Time(8), 4, [fault, later])) == ["periods_missed"]
+    assert names(deduplicator, Events(Time(8), 4, [fault, later])) == ["periods_missed"]
 
 
 def test_a_restarted_daemon_s_events_are_reported_from_the_first() -> None:
-    news = News()
-    news.of(events(10))
+    deduplicator = EventDeduplicator()
+    deduplicator.of(events(10))
     later = replace(events(2, "second"), stamp=Time(11))
-    assert names(news, later) == ["mode0", "mode1"]
+    assert names(deduplicator, later) == ["mode0", "mode1"]
 
 
 TWIST = Twist(Vector3(x=0.3), Vector3(z=-0.2))
@@ -91,25 +91,28 @@ STAMPED = TwistStamped(Header(Time(5), "elsewhere"), TWIST)
 NAMES = list(Config().joints.as_tuple())
 
 
-def found(source: str, ros: RosConfig) -> dict[str, Way]:
-    return ways(lambda key: full_key("robot", key), ros, source)
+def found(source: str, ros: RosConfig) -> dict[str, CommandForm]:
+    return command_forms(lambda key: full_key("robot", key), ros, source)
 
 
-def arrival(payload: bytes, way: Way, put: bool = True) -> Arrival:
-    attached = Attachment(1, 2, os.urandom(16)).pack() if way.via == "rmw" else b""
-    return Arrival(way.native, put, payload, way.encoding, 7, None, "", way.via, attached)
+def arrival(payload: bytes, form: CommandForm, put: bool = True) -> Arrival:
+    attached = Attachment(1, 2, os.urandom(16)).pack() if form.via == "rmw" else b""
+    return Arrival(form.native, put, payload, form.encoding, 7, None, "", form.via, attached)
 
 
-def read(payload: bytes, way: Way = Way("cmd/nav"), put: bool = True) -> TwistStamped:  # noqa: B008
-    return Reader(Config()).read(arrival(payload, way, put), 9_000_000_001)
+NAV = CommandForm("cmd/nav")
+
+
+def read(payload: bytes, form: CommandForm = NAV, put: bool = True) -> TwistStamped:
+    return Reader(Config()).read(arrival(payload, form, put), 9_000_000_001)
 
 
 def test_a_source_commands_on_its_native_keys_and_those_of_ros() -> None:
     app = {f"acsard/robot/{kind}/app{end}" for kind in ("cmd", "wheel_cmd") for end in ("", "/*")}
     assert set(found("app", RosConfig())) == app
     nav = found("nav", RosConfig())
-    assert {way.via for way in nav.values()} == {"native", "bridge", "rmw"}
-    native = {way.native for way in nav.values()}
+    assert {form.via for form in nav.values()} == {"native", "bridge", "rmw"}
+    native = {form.native for form in nav.values()}
     assert native == {"cmd/nav", "wheel_cmd/nav", "cmd/nav/*", "wheel_cmd/nav/*"}
     assert len(nav) == 4 + 1 + 2  # over rmw, a topic with two types has two keys
 
@@ -123,7 +126,7 @@ def test_every_ros_command_key_belongs_to_a_source() -> None:
 
 def test_a_namespace_is_before_the_names_of_ros_and_a_tree_that_is_off_has_none() -> None:
     apart = found("nav", RosConfig(namespace="one", rmw=False))
-    assert [key for key, way in apart.items() if way.via != "native"] == ["one/cmd_vel"]
+    assert [key for key, form in apart.items() if form.via != "native"] == ["one/cmd_vel"]
     assert len(found("nav", RosConfig(bridge=False, rmw=False))) == 4
 
 
@@ -140,16 +143,16 @@ def test_a_twist_is_reported_with_the_time_it_came(
 def test_a_twist_over_ros_is_decoded_the_same_way(message: Twist | TwistStamped) -> None:
     name = f"geometry_msgs::msg::dds_::{type(message).__name__}_"
     every = found("nav", RosConfig()).items()
-    fit = [way for key, way in every if way.via == "bridge" or f"/{name}/" in key]
-    assert [way.via for way in fit] == ["bridge", "rmw"]
-    for way in fit:
-        assert read(encode(message, "cdr"), way).twist == TWIST
+    fit = [form for key, form in every if form.via == "bridge" or f"/{name}/" in key]
+    assert [form.via for form in fit] == ["bridge", "rmw"]
+    for form in fit:
+        assert read(encode(message, "cdr"), form).twist == TWIST
 
 
 @pytest.mark.parametrize("form", FORMATS)
 def test_wheel_speeds_are_shown_as_the_equivalent_twist(form: Format) -> None:
     wheels = JointState(name=NAMES, velocity=[6.0] * 4)
-    told = read(encode(wheels, form), Way("wheel_cmd/ros2_control"))
+    told = read(encode(wheels, form), CommandForm("wheel_cmd/ros2_control"))
     assert told.twist.linear.x == pytest.approx(0.3)
     assert told.twist.angular.z == pytest.approx(0.0)
 
@@ -161,7 +164,7 @@ def test_wheels_and_frame_are_those_of_this_robot() -> None:
         odometry=replace(Config().odometry, base_frame="trunk"),
     )
     payload = encode(JointState(name=NAMES, velocity=[6.0] * 4), "json")
-    told = Reader(mine).read(arrival(payload, Way("wheel_cmd/nav")), 0)
+    told = Reader(mine).read(arrival(payload, CommandForm("wheel_cmd/nav")), 0)
     assert told.header.frame_id == "trunk"
     assert told.twist.linear.x == pytest.approx(0.6)
 

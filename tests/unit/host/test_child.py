@@ -32,6 +32,7 @@ from acsard.host.child import (
     how_it_ended,
     running,
 )
+from tests.unit.host.privileges import WITHOUT_RAISING_LIMITS
 
 WAIT_S = 20.0
 
@@ -91,7 +92,7 @@ def test_a_child_that_is_released_sees_the_end_of_its_input() -> None:
     child, codes = Child(program(UNTIL_CLOSED)), []
     thread = threading.Thread(target=lambda: codes.append(child.run()))
     thread.start()
-    while child._ours is None:
+    while child._parent_end is None:
         threading.Event().wait(0.001)
     child.release()
     thread.join(WAIT_S)
@@ -187,6 +188,30 @@ async def test_a_running_child_gets_its_limits_and_an_ended_child_raises_no_erro
     ended = subprocess.Popen(program(""))
     ended.wait(WAIT_S)
     module.limit(ended.pid, limits)
+
+
+LIMIT_A_CHILD = """\
+import asyncio, resource, sys
+from acsard.host.child import Limits, running
+
+async def story():
+    async with running([sys.executable, "-c", "input()"], Limits(19, 2 << 30), stdin=-1) as child:
+        print(*resource.prlimit(child.pid, resource.RLIMIT_DATA))
+
+resource.setrlimit(resource.RLIMIT_DATA, (1 << 30, 1 << 30))
+asyncio.run(story())
+"""
+
+
+def test_a_child_of_a_process_with_a_lower_memory_limit_keeps_the_lower_limit() -> None:
+    done = subprocess.run(
+        [*WITHOUT_RAISING_LIMITS, sys.executable, "-c", LIMIT_A_CHILD],
+        capture_output=True,
+        text=True,
+        timeout=WAIT_S,
+        check=False,
+    )
+    assert (done.stdout, done.stderr) == (f"{1 << 30} {1 << 30}\n", "")
 
 
 # the end by signals

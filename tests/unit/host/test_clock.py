@@ -8,7 +8,7 @@ import pytest
 
 from acsard.core.values import NS_PER_S
 from acsard.host import clock
-from acsard.host.clock import MIN_SUSPEND_NS, Asleep, asleep_ns
+from acsard.host.clock import MIN_SUSPEND_NS, SuspendDetector, asleep_ns
 
 WALL_NS = 1_800_000_000_000_000_000
 
@@ -62,24 +62,24 @@ def test_an_instant_is_in_whole_microseconds(monkeypatch: pytest.MonkeyPatch) ->
 
 def test_each_suspend_is_reported_once() -> None:
     slept = [5 * MIN_SUSPEND_NS]
-    asleep = Asleep(lambda: slept[0])
-    assert not asleep.was()
+    asleep = SuspendDetector(lambda: slept[0])
+    assert not asleep.detect()
     for _ in range(2):
         slept[0] += MIN_SUSPEND_NS
-        assert asleep.was()
-        assert not asleep.was()
+        assert asleep.detect()
+        assert not asleep.detect()
 
 
 def test_a_preemption_between_the_two_clock_readings_is_not_reported_as_a_suspend() -> None:
     readings = [0, 3 * MIN_SUSPEND_NS, 0, 0]
-    asleep = Asleep(lambda: readings.pop(0))
-    assert not asleep.was()
-    assert not asleep.was()
+    asleep = SuspendDetector(lambda: readings.pop(0))
+    assert not asleep.detect()
+    assert not asleep.detect()
 
 
 def test_no_suspend_is_reported_while_the_machine_is_awake() -> None:
-    asleep = Asleep(asleep_ns)
-    assert not any(asleep.was() for _ in range(1000))
+    asleep = SuspendDetector(asleep_ns)
+    assert not any(asleep.detect() for _ in range(1000))
 
 
 def test_the_steady_clock_advances_during_a_suspend(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,7 +13,7 @@ from typing import get_args
 
 import pytest
 
-from acsard.host.extras import Extra, install, wanted_by
+from acsard.host.extras import Extra, install, requirements_of
 from tests.system.harness import ROOT
 
 
@@ -37,18 +37,18 @@ def test_an_installation_from_a_clone_installs_the_extra_from_the_clone(
     clone.mkdir()
     (clone / "pyproject.toml").touch()
     found = installed(tmp_path, url=clone.as_uri(), dir_info={"editable": editable})
-    assert wanted_by(found, "tls") == [*(["-e"] if editable else []), f"{clone}[tls]"]
+    assert requirements_of(found, "tls") == [*(["-e"] if editable else []), f"{clone}[tls]"]
 
 
 @pytest.mark.parametrize("url", ["file:///gone/away", "https://example.org/acsard.whl"])
 def test_an_installation_from_a_missing_source_installs_only_the_libraries(
     tmp_path: Path, url: str
 ) -> None:
-    assert wanted_by(installed(tmp_path, url=url), "tls") == ["one<2,>=1", "two"]
+    assert requirements_of(installed(tmp_path, url=url), "tls") == ["one<2,>=1", "two"]
 
 
 def test_an_installation_from_an_unknown_source_installs_only_the_libraries(tmp_path: Path) -> None:
-    assert wanted_by(installed(tmp_path), "web") == ["three"]
+    assert requirements_of(installed(tmp_path), "web") == ["three"]
 
 
 @pytest.mark.parametrize("extra", get_args(Extra))

@@ -97,9 +97,9 @@ def test_the_disk_delays_and_bytes_of_the_own_thread_are_read(tmp_path: Path) ->
         ({FIRMWARE: "50005\n"}, Conditions(undervoltage=True, throttled=2)),
         # The firmware remembers low voltages and heat of the past, which cause nothing now.
         ({FIRMWARE: "f0000\n"}, Conditions(throttled=2)),
-        ({FIRMWARE: "80008\n"}, Conditions(hot=True, throttled=2)),
-        ({FIRMWARE: "e0006\n"}, Conditions(hot=True, throttled=2)),
-        ({COOLER + "cur_state": "2\n"}, Conditions(hot=True, throttled=2)),
+        ({FIRMWARE: "80008\n"}, Conditions(slowed_by_heat=True, throttled=2)),
+        ({FIRMWARE: "e0006\n"}, Conditions(slowed_by_heat=True, throttled=2)),
+        ({COOLER + "cur_state": "2\n"}, Conditions(slowed_by_heat=True, throttled=2)),
         ({COUNT: "5\n"}, Conditions(throttled=5)),
         (
             {POLICY + "scaling_governor": "powersave\n"},

@@ -9,10 +9,13 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 import pytest
 
-from acsard.host.processes import holder_of, holders, master_of, name_of, running, waited_ns
+from acsard.host import processes
+from acsard.host.child import acsard
+from acsard.host.processes import holder_of, holders, is_running, master_of, name_of, waited_ns
 from tests.system.harness import until
 
 HOLD = """\
@@ -93,8 +96,8 @@ def test_a_path_that_is_not_a_device_has_no_holder(path: str) -> None:
 def test_a_program_is_found_by_its_name(device: str) -> None:
     with another(device) as pid:
         (found,) = [one for one in holders(device) if one.pid == pid]
-        assert running(found.name)
-    assert not running("no such program")
+        assert is_running(found.name)
+    assert not is_running("no such program")
 
 
 def test_a_process_that_is_not_there_has_no_name() -> None:
@@ -102,6 +105,43 @@ def test_a_process_that_is_not_there_has_no_name() -> None:
     ended.wait()
     assert name_of(os.getpid()) != ""
     assert name_of(ended.pid) == ""
+
+
+@pytest.mark.parametrize(
+    ("command", "name"),
+    [
+        (tuple(acsard("run")), "acsard"),
+        (("acsard", "sim"), "acsard"),
+        (("/opt/acsard/venv/bin/acsard", "run"), "acsard"),
+        (("/opt/acsard/venv/bin/python3.13", "/opt/acsard/venv/bin/acsard", "run"), "acsard"),
+        (("python", "-m", "acsard", "run"), "acsard"),
+        (("python3", "-PBm", "acsard"), "acsard"),
+        (("python3", "-X", "utf8", "-Wignore", "-macsard"), "acsard"),
+        (("python3", "-P", "-X", "utf8", "bin/acsard"), "acsard"),
+        (("screen", "-S", "acsard", "/dev/ttyACM0"), "other"),
+        (("tail", "-f", "/dev/null", "/tmp/acsard"), "other"),
+        (("python3", "logger.py", "acsard"), "other"),
+        (("python3", "-m", "serial.tools.miniterm", "acsard"), "other"),
+        (("python3", "-c", "input()", "acsard"), "other"),
+        (("python3", "-X", "acsard"), "other"),
+        (("python3", "-", "acsard"), "other"),
+        (("python3",), "other"),
+        ((), "other"),
+    ],
+)
+def test_only_a_process_that_executes_acsard_has_its_name(
+    command: tuple[str, ...], name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(processes, "PROC", tmp_path)
+    (tmp_path / "77").mkdir()
+    (tmp_path / "77" / "cmdline").write_bytes(b"".join(word.encode() + b"\0" for word in command))
+    (tmp_path / "77" / "comm").write_text("other\n")
+    assert name_of(77) == name
+
+
+def test_another_program_with_the_word_acsard_keeps_its_own_name() -> None:
+    with subprocess.Popen(["sh", "-c", "read line", "acsard"], stdin=subprocess.PIPE) as process:
+        assert name_of(process.pid) != "acsard"
 
 
 def test_the_time_that_a_process_waited_for_a_processor_is_read() -> None:

@@ -25,7 +25,7 @@ def test_a_bucket_holds_at_most_its_burst_size_after_a_long_pause() -> None:
 
 
 def test_an_address_has_a_limited_number_of_token_guesses_per_minute() -> None:
-    guesses, most = Buckets(GUESSES_OF_ONE, GUESSES), int(GUESSES_OF_ONE.most)
+    guesses, most = Buckets(GUESSES_OF_ONE, GUESSES), int(GUESSES_OF_ONE.burst)
     assert [guesses.take("a", 0) for _ in range(most + 1)] == [True] * most + [False]
     assert guesses.take("b", 0)
     assert all(guesses.take("a", 61 * NS_PER_S) for _ in range(most))
@@ -35,18 +35,18 @@ def test_the_guess_limit_does_not_double_at_the_boundary_of_a_minute() -> None:
     guesses = Buckets(GUESSES_OF_ONE, GUESSES)
     assert guesses.take("b", 0)
     tenths = [n * NS_PER_S // 10 for n in range(595, 610) for _ in range(20)]
-    assert sum(guesses.take("a", at_ns) for at_ns in tenths) <= GUESSES_OF_ONE.most + 1
+    assert sum(guesses.take("a", at_ns) for at_ns in tenths) <= GUESSES_OF_ONE.burst + 1
 
 
 def test_all_addresses_together_have_a_guess_limit() -> None:
     guesses = Buckets(GUESSES_OF_ONE, GUESSES)
-    assert all(guesses.take(f"10.0.0.{n}", 0) for n in range(int(GUESSES.most)))
+    assert all(guesses.take(f"10.0.0.{n}", 0) for n in range(int(GUESSES.burst)))
     assert not guesses.take("never seen", 0)
 
 
 def test_refused_guesses_of_one_address_do_not_reduce_the_limit_of_others() -> None:
     guesses = Buckets(GUESSES_OF_ONE, GUESSES)
-    for _ in range(2 * int(GUESSES.most)):
+    for _ in range(2 * int(GUESSES.burst)):
         guesses.take("a", 0)
     assert guesses.take("b", 0)
 
@@ -98,9 +98,9 @@ def test_a_bucket_is_full_again_after_its_refill_time() -> None:
 
 def test_a_place_is_held_for_a_block_and_released_after_an_error() -> None:
     places = Places(1, 1)
-    with places.held() as first, places.held() as second:
+    with places.place() as first, places.place() as second:
         assert (first, second, places.taken) == (True, False, 1)
     assert places.taken == 0
-    with pytest.raises(ValueError, match="a bug"), places.held():
+    with pytest.raises(ValueError, match="a bug"), places.place():
         raise ValueError("a bug")
     assert places.enter("")

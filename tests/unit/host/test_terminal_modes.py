@@ -16,7 +16,7 @@ import pytest
 from acsard.core.config.settings import LogConfig
 from acsard.core.values import Event
 from acsard.host.logs import Log
-from acsard.host.terminal_modes import coloured, one_by_one
+from acsard.host.terminal_modes import may_use_color, single_key_mode
 
 
 @pytest.fixture(name="terminal")
@@ -31,8 +31,8 @@ def _terminal(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[int, TextIO]]:
 
 
 def test_a_terminal_has_colours_and_a_file_has_none(terminal: tuple[int, TextIO]) -> None:
-    assert coloured(terminal[1])
-    assert not coloured(io.StringIO())
+    assert may_use_color(terminal[1])
+    assert not may_use_color(io.StringIO())
 
 
 @pytest.mark.parametrize(("name", "value"), [("NO_COLOR", "1"), ("TERM", "dumb")])
@@ -40,14 +40,14 @@ def test_the_environment_can_disable_colours(
     terminal: tuple[int, TextIO], monkeypatch: pytest.MonkeyPatch, name: str, value: str
 ) -> None:
     monkeypatch.setenv(name, value)
-    assert not coloured(terminal[1])
+    assert not may_use_color(terminal[1])
 
 
 def test_an_empty_no_color_variable_does_not_disable_colours(
     terminal: tuple[int, TextIO], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("NO_COLOR", "")
-    assert coloured(terminal[1])
+    assert may_use_color(terminal[1])
 
 
 @pytest.mark.parametrize("wanted", [True, False])
@@ -83,7 +83,7 @@ def test_ctrl_s_is_read_as_a_key_and_the_terminal_modes_are_restored_afterwards(
         monkeypatch.setattr(sys, "stdin", terminal)
         before = termios.tcgetattr(terminal)
         assert before[0] & termios.IXON
-        with one_by_one():
+        with single_key_mode():
             os.write(far.fileno(), CTRL_S)
             assert os.read(terminal.fileno(), 9) == CTRL_S
             os.write(terminal.fileno(), b"written")

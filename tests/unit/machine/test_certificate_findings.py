@@ -17,7 +17,7 @@ from acsard.cli import main
 from acsard.core.config.settings import BusConfig, Config
 from acsard.core.values import NS_PER_S
 from acsard.daemon.bus import certificate_watch
-from acsard.daemon.bus.tls import AUTHORITY, ends, require_usable
+from acsard.daemon.bus.tls import AUTHORITY, expiry_times, require_usable
 from acsard.host import clock
 from acsard.host.errors import NotPermittedError
 from acsard.machine.authority import Authority
@@ -46,7 +46,7 @@ def finding(directory: Path) -> Finding:
 
 
 def days_left(directory: Path) -> int:
-    return round((ends(str(directory))[""] - clock.now().wall_ns) / DAY_NS)
+    return round((expiry_times(str(directory))[""] - clock.now().wall_ns) / DAY_NS)
 
 
 def typed(mend: str, where: Path, monkeypatch: pytest.MonkeyPatch) -> None:

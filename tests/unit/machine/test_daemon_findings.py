@@ -44,12 +44,12 @@ from acsard.machine.daemon_findings import (
     compared,
     daemon,
     gateway,
-    gone,
     gyro,
     late,
     link,
-    lost,
+    link_losses,
     refused,
+    unanswered_lines,
 )
 from acsard.machine.finding import Finding
 from tests.each import each
@@ -193,7 +193,7 @@ def test_an_open_gateway_is_reported_with_its_endpoint() -> None:
     assert (finding.level, finding.text) == ("ok", f"open at {endpoint}")
 
 
-@pytest.mark.parametrize("does", ["off", "used", "waiting for rest"])
+@pytest.mark.parametrize("does", ["off", "used", "waiting for rest", "waiting for turn"])
 def test_a_gyro_that_works_causes_no_warning(does: str) -> None:
     assert [one.level for one in gyro(does, {})] == ([] if does == "off" else ["ok"])
 
@@ -202,7 +202,7 @@ def test_each_state_of_the_gyro_has_its_own_remedy() -> None:
     assert set(GYRO_MENDS) == set(get_args(GyroDoes)) - {"off"}
 
 
-@each("does", [*get_args(GyroDoes)[3:], "what a later one does"])
+@each("does", [*get_args(GyroDoes)[4:], "what a later one does"])
 def test_a_gyro_that_does_not_work_is_a_warning_with_a_remedy(does: str) -> None:
     (finding,) = gyro(does, {})
     assert (finding.subject, finding.level) == ("gyro", "warning")
@@ -283,8 +283,8 @@ def test_a_failed_query_of_the_daemon_has_advice_that_fits_its_error(
         raise error
 
     monkeypatch.setattr(daemon_findings, "answers", lambda _: True)
-    monkeypatch.setattr(daemon_findings, "asked", fail)
-    finding = daemon_findings.found(FILE, Address("tcp/127.0.0.1:7448", "acsar", ""))
+    monkeypatch.setattr(daemon_findings, "query", fail)
+    finding = daemon_findings.query_or_finding(FILE, Address("tcp/127.0.0.1:7448", "acsar", ""))
     assert isinstance(finding, Finding)
     assert (finding.level, finding.text) == ("failure", str(error))
     assert finding.mend.endswith(mend) if mend else not finding.mend
@@ -312,6 +312,19 @@ def test_the_advice_about_a_fault_fits_its_cause(reason: str, mend: str, unfit: 
 def test_a_sound_link_gives_one_ok_finding() -> None:
     (finding,) = found({"lines": 5, "lines_sent": 900}, {"lines": 104, "lines_sent": 1000})
     assert (finding.subject, finding.level) == ("link", "ok")
+
+
+@each(("period", "answers_are_counted"), [(0.0, True), (0.1, False)])
+def test_a_sound_link_says_which_lines_were_judged(
+    period: float, answers_are_counted: bool
+) -> None:
+    config = Config(mcu=McuConfig(port="/dev/ttyX", reply_period=period))
+    before = replace(STATE, counters={"lines": 5, "lines_sent": 900})
+    state = replace(STATE, counters={"lines": 104, "lines_sent": 1000})
+    (finding,) = link(Running(INFO, config, before, state, 0))
+    assert finding.level == "ok"
+    assert ("no line to or from the board is lost" in finding.text) is answers_are_counted
+    assert ("lines to the board were not judged" in finding.text) is not answers_are_counted
 
 
 @pytest.mark.parametrize("state", ["booting", "stale"])
@@ -344,7 +357,7 @@ def test_unanswered_lines_are_reported_only_if_they_are_a_loss(
     sent: int, came: int, period: float, told: int
 ) -> None:
     config = Config(mcu=McuConfig(reply_period=period))
-    assert len(list(lost({"lines_sent": sent, "lines": came}, config))) == told
+    assert len(list(unanswered_lines({"lines_sent": sent, "lines": came}, config))) == told
 
 
 def test_rejected_lines_are_reported_by_kind_above_one_in_fifty() -> None:
@@ -478,7 +491,7 @@ def test_after_months_only_present_problems_are_warnings() -> None:
 
 
 def test_a_lost_link_is_reported_with_the_number_of_losses() -> None:
-    assert not gone({"lines": 9})
+    assert not link_losses({"lines": 9})
     (finding,) = found({}, {"link_lost": 4})
     assert finding.level == "warning"
     assert "lost 4 times" in finding.text

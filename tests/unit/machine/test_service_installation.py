@@ -28,13 +28,13 @@ from acsard.machine.service_installation import (
     Write,
     admitted,
     files,
+    foreign_entries,
     installing,
-    lacking,
-    misplaced,
+    missing_prerequisite,
     present,
     source,
-    strangers,
     uninstalling,
+    unusable_location,
     wrong_modes,
 )
 from tests.each import each
@@ -57,11 +57,18 @@ PROGRAM = "/usr/bin/env"
 def test_a_service_is_refused_in_a_home_directory_and_outside_a_venv(
     prefix: str, base: str, good: bool
 ) -> None:
-    assert (misplaced(prefix, base, PROGRAM) == "") is good
+    assert (unusable_location(prefix, base, PROGRAM) == "") is good
+
+
+def test_outside_a_venv_the_reason_of_the_refusal_is_not_a_hidden_directory() -> None:
+    told = unusable_location("/usr", "/usr", PROGRAM)
+    assert "does not run from a venv" in told
+    assert "home directories" not in told
+    assert "home directories" in unusable_location("/home/anna/venv", "/usr", PROGRAM)
 
 
 def test_a_service_is_refused_with_a_python_in_a_home_directory() -> None:
-    told = misplaced("/opt/acsard/venv", "/root/.pyenv/versions/3.11.7", PROGRAM)
+    told = unusable_location("/opt/acsard/venv", "/root/.pyenv/versions/3.11.7", PROGRAM)
     assert "/root/.pyenv/versions/3.11.7" in told
     assert "/usr/bin/python3 -m venv --clear /opt/acsard/venv" in told
 
@@ -71,7 +78,7 @@ def test_a_link_to_a_python_in_a_home_is_followed(tmp_path: Path) -> None:
     home.mkdir(parents=True)
     (home / "python3").symlink_to(PROGRAM)
     (tmp_path / "python").symlink_to(home / "python3")
-    there = misplaced("/opt/v", "/usr", str(tmp_path / "python"), hidden=("/usr/bin",))
+    there = unusable_location("/opt/v", "/usr", str(tmp_path / "python"), hidden=("/usr/bin",))
     assert "/usr/bin" in there
 
 
@@ -79,15 +86,17 @@ def test_a_directory_that_other_users_cannot_enter_is_reported(tmp_path: Path) -
     venv = tmp_path / "venv"
     venv.mkdir()
     tmp_path.chmod(0o700)
-    told = misplaced(str(venv), "/usr", PROGRAM, hidden=())
+    told = unusable_location(str(venv), "/usr", PROGRAM, hidden=())
     assert "no permission to enter" in told
     assert "chmod o+rx" in told
 
 
 def test_a_missing_group_or_program_of_the_units_is_reported_with_a_remedy() -> None:
-    assert lacking(group="root", program=PROGRAM) == ""
-    assert "groupadd --system nobodyhome" in lacking(group="nobodyhome", program=PROGRAM)
-    assert "install the package util-linux" in lacking(program="/nowhere/setpriv")
+    assert missing_prerequisite(group="root", program=PROGRAM) == ""
+    assert "groupadd --system nobodyhome" in missing_prerequisite(
+        group="nobodyhome", program=PROGRAM
+    )
+    assert "install the package util-linux" in missing_prerequisite(program="/nowhere/setpriv")
     unit = (source() / "systemd" / UNIT).read_text()
     assert f"ExecStopPost=+{SETPRIV} " in unit
     assert f"SupplementaryGroups={GROUP}" in unit
@@ -233,7 +242,7 @@ def test_each_kept_path_is_reported_with_its_reason_and_how_to_remove_it() -> No
         STOP_FILE.path: f"{UNIT} stays and needs this file",
         OWN.path: "it is your configuration; --purge removes it",
         tls: "certificates and their authority; --purge removes it",
-        own: "not the service's own; --purge removes it",
+        own: "not a file of the service; --purge removes it",
     }
 
 
@@ -270,7 +279,7 @@ def test_other_files_in_the_directories_of_the_service_are_found(tmp_path: Path)
     (tmp_path / "tls").mkdir()
     (tmp_path / "acsard.toml").touch()
     ours = File(tmp_path / "acsard.toml", b"", kept=True)
-    assert strangers([ours], [tmp_path, tmp_path / "missing"]) == [tmp_path / "tls"]
+    assert foreign_entries([ours], [tmp_path, tmp_path / "missing"]) == [tmp_path / "tls"]
 
 
 DROP_IN = File(

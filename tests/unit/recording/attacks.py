@@ -60,6 +60,34 @@ def of_one_hash(keys: int) -> bytes:
     return pickle.EMPTY_DICT + pickle.MARK + ONE.join(pairs) + ONE + pickle.SETITEMS
 
 
+def tuples_of_one_hash(keys: int) -> bytes:
+    """Return a dict whose keys are pairs of numbers that all have one hash on a 64-bit machine.
+
+    The hash of a tuple is xxHash, which has no secret key. So the second number of each pair can be
+    computed from the first number and the wanted hash.
+    """
+    pairs, first, inverse = bytearray(), 0, pow(XXHASH_PRIME_2, -1, 1 << 64)
+    while keys:
+        first += 1
+        accumulator = _rotated(XXHASH_PRIME_5 + first * XXHASH_PRIME_2) * XXHASH_PRIME_1
+        second = (0x2BDC545D6B4B87 - accumulator) * inverse % (1 << 64)
+        if second < MAX_KEY:
+            numbers = [number.to_bytes(8, "little") for number in (first, second)]
+            pairs += b"".join([pickle.LONG1 + b"\x08" + number for number in numbers])
+            pairs += pickle.TUPLE2 + pickle.NONE
+            keys -= 1
+    return pickle.EMPTY_DICT + pickle.MARK + bytes(pairs) + pickle.SETITEMS
+
+
+XXHASH_PRIME_1, XXHASH_PRIME_2 = 11400714785074694791, 14029467366897019727
+XXHASH_PRIME_5 = 2870177450012600261
+
+
+def _rotated(lane: int) -> int:
+    lane %= 1 << 64
+    return (lane << 31 | lane >> 33) % (1 << 64)
+
+
 def attributes(*pairs: tuple[bytes, bytes]) -> bytes:
     """Return a dict of attributes and the opcode that sets them on the object below."""
     inside = b"".join([key + value for key, value in pairs])
@@ -175,6 +203,7 @@ BODIES: dict[str, bytes] = {
 ATTACKS = {name: whole(body) for name, body in BODIES.items()} | {
     "one dict copied again and again": whole(counted_again(18_000, 28_000)),
     "keys of one hash": whole(of_one_hash(40_000)),
+    "pairs of one hash": whole(tuples_of_one_hash(30_000)),
     "nothing": b"",
     "the first half": pickle.dumps(list(range(50)), PICKLE_PROTOCOL)[:60],
 }

@@ -18,12 +18,12 @@ from acsard.recording.directory import (
     NEAR_SUFFIX,
     OPEN_DIRECTORY_MODE,
     PART_SUFFIX,
-    Ring,
+    RecordingDirectory,
     Run,
     listed,
 )
 from acsard.recording.end_record import read_end
-from acsard.recording.file import About, Recording, Writing
+from acsard.recording.file import About, Recording, RecordingWriter
 from acsard.recording.retention import MAX_KEPT_FILES, MIN_FILE_BYTES, STEADY_CLOCK_NS, Kind
 
 DAY_NS = 86_400_000_000_000
@@ -34,11 +34,11 @@ def about(wall_ns: int = NOW_NS) -> About:
     return About("acsar", "0.1.0", "3.11.0", 5, wall_ns, "")
 
 
-def ring(where: Path, megabytes: float = 10.0, days: float = 14.0) -> Ring:
-    return Ring(RecordConfig(str(where), megabytes, days))
+def ring(where: Path, megabytes: float = 10.0, days: float = 14.0) -> RecordingDirectory:
+    return RecordingDirectory(RecordConfig(str(where), megabytes, days))
 
 
-def record(one: Ring, size: int = 10, kind: Kind = "plain", days: int = 0) -> Path:
+def record(one: RecordingDirectory, size: int = 10, kind: Kind = "plain", days: int = 0) -> Path:
     writing = one.begin(about())
     writing.add("steps", NOW_NS, os.urandom(size))
     path = one.end(writing, kind)
@@ -46,11 +46,11 @@ def record(one: Ring, size: int = 10, kind: Kind = "plain", days: int = 0) -> Pa
     return path
 
 
-def later(one: Ring) -> None:
+def later(one: RecordingDirectory) -> None:
     """Trim after the clock has run steadily for long enough."""
     for mono_ns in (0, STEADY_CLOCK_NS):
         now = Instant(mono_ns, NOW_NS + mono_ns)
-        one.tend(now)
+        one.maintain(now)
     one.trim(now)
 
 
@@ -206,12 +206,12 @@ def test_no_file_of_this_run_is_too_old_and_a_clock_that_was_just_set_is_not_tru
     mine = record(one, days=3)
     for mono_ns, jump_ns in ((0, 0), (STEADY_CLOCK_NS - 1, 0), (STEADY_CLOCK_NS, 400 * DAY_NS)):
         now = Instant(mono_ns, NOW_NS + mono_ns + jump_ns)
-        one.tend(now)
+        one.maintain(now)
         one.trim(now)
         assert old.exists()
     for mono_ns in (STEADY_CLOCK_NS + 1, 2 * STEADY_CLOCK_NS + 1):
         now = Instant(mono_ns, NOW_NS + mono_ns)
-        one.tend(now)
+        one.maintain(now)
         one.trim(now)
     assert (old.exists(), mine.exists()) == (False, True)
 
@@ -220,14 +220,14 @@ def test_a_jump_of_the_clock_does_not_make_earlier_files_older(tmp_path: Path) -
     one = ring(tmp_path, days=2.0)
     mine = record(one)
     ended_ns = mine.stat().st_mtime_ns
-    one.tend(Instant(0, NOW_NS))
-    one.tend(Instant(NS_PER_S, NOW_NS + NS_PER_S + 20 * DAY_NS))
+    one.maintain(Instant(0, NOW_NS))
+    one.maintain(Instant(NS_PER_S, NOW_NS + NS_PER_S + 20 * DAY_NS))
     assert mine.stat().st_mtime_ns == ended_ns + 20 * DAY_NS
     one.close()
     again = ring(tmp_path, days=2.0)
     for mono_ns in (0, STEADY_CLOCK_NS):
         now = Instant(mono_ns, NOW_NS + 21 * DAY_NS + mono_ns)
-        again.tend(now)
+        again.maintain(now)
         again.trim(now)
     assert mine.exists()
 
@@ -246,15 +246,15 @@ def test_if_other_programs_fill_the_disk_the_oldest_files_go_and_protected_ones_
         return os.statvfs_result((1000, 1000, total // 1000, free, free, *real[5:]))
 
     monkeypatch.setattr(os, "statvfs", told)
-    one.tend(Instant(0, NOW_NS))
+    one.maintain(Instant(0, NOW_NS))
     assert all(path.exists() for path in plain)
     others = 8_500_000
-    one.tend(Instant(1, NOW_NS + 1))
+    one.maintain(Instant(1, NOW_NS + 1))
     assert [path.exists() for path in plain] == [False] * 2 + [True] * 8
     left = []
     for _ in range(4):  # other programs repeatedly use all free space
         others = total - sizes(tmp_path)
-        one.tend(Instant(2, NOW_NS + 2))
+        one.maintain(Instant(2, NOW_NS + 2))
         left.append((sum(path.exists() for path in plain), kept.exists()))
     assert left == [(3, True), (1, True), (0, True), (0, False)]
 
@@ -296,7 +296,7 @@ def test_a_file_that_a_crash_cut_is_finished_and_protected(tmp_path: Path) -> No
     assert path.name.endswith(KEPT_SUFFIX)
     recording = Recording(path)
     assert [data for _, _, data in recording.messages()] == [b"whole"]
-    assert recording.whole
+    assert recording.is_intact
     last = read_end(path)
     assert last is not None
     assert last.cut == "crash"
@@ -330,7 +330,7 @@ def test_a_file_that_a_disk_error_cut_is_finished_and_keeps_its_class(tmp_path: 
     writing.flush()
     writing.close()
     one.close()
-    Ring(RecordConfig(str(tmp_path)), Run(cut={writing.path.name: "plain"}))
+    RecordingDirectory(RecordConfig(str(tmp_path)), Run(cut={writing.path.name: "plain"}))
     (path,) = listed(tmp_path)
     assert path.name == writing.path.name.removesuffix(".part")
     last = read_end(path)
@@ -373,12 +373,12 @@ def test_a_cut_file_that_this_version_cannot_read_stays_and_is_reported(
 ) -> None:
     """The file comes from a later version, or contains an event that no version writes."""
     part = tmp_path / f"000007-20270115T080000Z{PART_SUFFIX}"
-    writing = Writing(part, replace(about(), format="acsard/99") if not event else about())
+    writing = RecordingWriter(part, replace(about(), format="acsard/99") if not event else about())
     writing.add("events" if event else "steps", NOW_NS, event or b"later")
     writing.flush()
     writing.close()
     before = part.read_bytes()
-    one = Ring(RecordConfig(str(tmp_path)))
+    one = RecordingDirectory(RecordConfig(str(tmp_path)))
     (path,) = listed(tmp_path)
     assert path.read_bytes() == before
     assert path.name.endswith(KEPT_SUFFIX)
@@ -395,18 +395,18 @@ def test_a_disk_error_does_not_keep_the_directory_locked(
     monkeypatch.setenv(RECORD_VARIABLE, str(where))
     with monkeypatch.context() as failing:
 
-        def fails(one: Ring) -> None:
+        def fails(one: RecordingDirectory) -> None:
             raise OSError(5, "Input/output error")
 
-        failing.setattr(Ring, "_open_files", fails)
+        failing.setattr(RecordingDirectory, "_open_files", fails)
         with pytest.raises(OSError, match="Input/output error"):
-            Ring(RecordConfig(str(where)))
-    assert Ring(RecordConfig(str(where))).messages == []
+            RecordingDirectory(RecordConfig(str(where)))
+    assert RecordingDirectory(RecordConfig(str(where))).messages == []
 
 
 def test_an_incomplete_copy_is_deleted(tmp_path: Path) -> None:
     (left := tmp_path / f".000007-20270115T080000Z{PART_SUFFIX}.new").write_bytes(b"half")
-    Ring(RecordConfig(str(tmp_path)), run=Run())
+    RecordingDirectory(RecordConfig(str(tmp_path)), run=Run())
     assert not left.exists()
 
 
@@ -446,14 +446,16 @@ def test_a_file_that_another_process_removes_meanwhile_does_no_harm(
     first, second = record(one), record(one)
     removed = [first]
     one.trim(None)
-    one.tend(Instant(0, NOW_NS))
+    one.maintain(Instant(0, NOW_NS))
     removed = [second]
-    one.tend(Instant(1, NOW_NS + DAY_NS))
+    one.maintain(Instant(1, NOW_NS + DAY_NS))
     third, part = record(one), one.begin(about())
     part.add("steps", NOW_NS, b"cut")
     part.flush()
     one.close()
-    monkeypatch.setattr(Ring, "trim", lambda *_: None)  # the trim would find the third file first
+    monkeypatch.setattr(
+        RecordingDirectory, "trim", lambda *_: None
+    )  # the trim would find the third file first
     removed = [third]
     again = ring(tmp_path)
     assert again.cut_ns is not None

@@ -40,15 +40,15 @@ from acsard.recording.export import (
     BagTopic,
     Kind,
     bag_metadata,
+    calibration_csv,
     csv_rows,
     export,
     gyro_columns,
-    measured,
     measured_csv_rows,
     offered_qos,
     wheel_columns,
 )
-from acsard.recording.file import Recording, Topic, Writing
+from acsard.recording.file import Recording, RecordingWriter, Topic
 from acsard.recording.replay import replay_step
 from acsard.recording.time_span import Span
 from tests.scenarios.taped import BATCH, Tape, chunks, recorded_world
@@ -326,7 +326,7 @@ def test_the_readable_part_of_a_cut_recording_is_exported(path: Path, tmp_path: 
     cut.write_bytes(path.read_bytes()[: (begin + end) // 2])
     recording = Recording(cut)
     done = export(recording, tmp_path / "new.mcap", "mcap")
-    assert not recording.whole
+    assert not recording.is_intact
     with (tmp_path / "new.mcap").open("rb") as stream:
         summary = make_reader(stream).get_summary()
     assert summary is not None
@@ -370,7 +370,7 @@ def test_an_export_of_a_damaged_file_writes_messages_or_says_why_not(
         assert [*tmp_path.iterdir()] == [harmed]
     else:
         assert done.count > 0
-        assert done.gaps or not recording.whole
+        assert done.gaps or not recording.is_intact
 
 
 def test_an_export_reports_its_progress(path: Path, tmp_path: Path) -> None:
@@ -382,7 +382,7 @@ def test_an_export_reports_its_progress(path: Path, tmp_path: Path) -> None:
 
 def test_calibration_refuses_a_recording_without_a_gyro(path: Path) -> None:
     with pytest.raises(RecordingError, match="no gyro"):
-        measured(Recording(path))
+        calibration_csv(Recording(path))
 
 
 GYRO = replace(Config(), odometry=replace(Config().odometry, gyro=True))
@@ -408,7 +408,7 @@ def test_calibration_reads_the_steps_between_a_missing_beginning_and_the_next_ga
     assert len(batches) >= 3
     del messages[batches[1]]
     # `whole.about` says that the recording began before its first readable step.
-    writing = Writing(tmp_path / "harmed.mcap", whole.about)
+    writing = RecordingWriter(tmp_path / "harmed.mcap", whole.about)
     for topic, wall_ns, data in messages:
         writing.add(topic, wall_ns, data)
     writing.finish()
@@ -418,7 +418,7 @@ def test_calibration_reads_the_steps_between_a_missing_beginning_and_the_next_ga
         for row in measured_csv_rows(step, tape.taken[step.number].outputs)
         if BATCH <= step.number < 2 * BATCH
     ]
-    table = measured(Recording(tmp_path / "harmed.mcap"))
+    table = calibration_csv(Recording(tmp_path / "harmed.mcap"))
     assert table.decode().splitlines() == [MEASURED_CSV_HEADER, *rows]
 
 

@@ -25,7 +25,7 @@ from acsard.recording.file import (
     HOW_TO_READ,
     About,
     Recording,
-    Writing,
+    RecordingWriter,
     rewrite,
 )
 from acsard.recording.file_replay import config_of, replay_file, steps
@@ -60,7 +60,7 @@ def test_all_recorded_data_is_read_back(tape: Tape, whole: Path) -> None:
     read = list(steps(recording))
     assert [step.inputs for step in read] == [taken.inputs for taken in tape.taken]
     assert [step.recorded.status for step in read] == [status_of(t.outputs) for t in tape.taken]
-    assert (recording.whole, recording.damaged) == (True, 0)
+    assert (recording.is_intact, recording.damaged) == (True, 0)
     assert config_of(recording) == Config()
     assert replay_file(recording).comparison.same
 
@@ -153,7 +153,9 @@ def test_every_second_that_was_synced_can_be_read_before_its_chunk_ends(
 ) -> None:
     path, now = tmp_path / "part.mcap", tape.taken[0].inputs.now
     config = "\n".join(document(effective(Config())))
-    writing = Writing(path, About("acsar", "0.1.0", "3.11.0", now.mono_ns, now.wall_ns, config))
+    writing = RecordingWriter(
+        path, About("acsar", "0.1.0", "3.11.0", now.mono_ns, now.wall_ns, config)
+    )
     for at in range(0, len(tape.taken), BATCH):
         batch = tape.taken[at : at + BATCH]
         writing.add("steps", batch[0].inputs.now.wall_ns, encode(at, batch))
@@ -183,7 +185,9 @@ def test_a_power_cut_in_the_middle_of_a_sync_costs_nothing_of_the_syncs_before(
     synced: list[bytes] = []
     monkeypatch.setattr(os, "fsync", lambda handle: synced.append(path.read_bytes()))
     config = "\n".join(document(effective(Config())))
-    writing = Writing(path, About("acsar", "0.1.0", "3.11.0", now.mono_ns, now.wall_ns, config))
+    writing = RecordingWriter(
+        path, About("acsar", "0.1.0", "3.11.0", now.mono_ns, now.wall_ns, config)
+    )
     for at in range(0, len(tape.taken), BATCH):
         batch = tape.taken[at : at + BATCH]
         writing.add("steps", batch[0].inputs.now.wall_ns, encode(at, batch))
@@ -203,7 +207,7 @@ def test_a_power_cut_in_the_middle_of_a_sync_costs_nothing_of_the_syncs_before(
 
 def test_a_chunk_covers_about_ten_seconds_and_a_jump_of_the_clock_ends_it(tmp_path: Path) -> None:
     path = tmp_path / "long.mcap"
-    writing = Writing(path, About("acsar", "0.1.0", "3.11.0", 1, 2))
+    writing = RecordingWriter(path, About("acsar", "0.1.0", "3.11.0", 1, 2))
     for second in (*range(25), 1_000_000, 3):
         writing.add("steps", second * NS_PER_S, b"steps of one second")
         writing.flush()
@@ -216,7 +220,7 @@ def test_a_chunk_covers_about_ten_seconds_and_a_jump_of_the_clock_ends_it(tmp_pa
 
 def test_a_chunk_has_at_most_about_a_mebibyte(tmp_path: Path) -> None:
     path = tmp_path / "much.mcap"
-    writing = Writing(path, About("acsar", "0.1.0", "3.11.0", 1, 2))
+    writing = RecordingWriter(path, About("acsar", "0.1.0", "3.11.0", 1, 2))
     for _ in range(40):
         writing.add("steps", 5, bytes(100_000))
     writing.finish()
@@ -263,7 +267,7 @@ def test_all_undamaged_chunks_of_a_damaged_file_are_read(
         recording = Recording(path)
         got = [step.number for step in steps(recording)]
         assert recording.damaged == 1 or got == numbers(whole)  # the bit has no meaning
-        assert recording.whole == (recording.damaged == 0)
+        assert recording.is_intact == (recording.damaged == 0)
         hits += recording.damaged
         assert recording.ended
         assert set(range(max(numbers(whole)) + 1)) - set(got) <= set(
@@ -295,12 +299,12 @@ def test_two_neighbouring_damaged_chunks_cost_no_other_chunk(whole: Path, tmp_pa
     assert numbers(path) == every[:BATCH] + every[3 * BATCH :]
     recording = Recording(path)
     list(recording.messages())
-    assert (recording.ended, recording.whole) == (True, False)
+    assert (recording.ended, recording.is_intact) == (True, False)
 
 
 def test_the_beginnings_of_two_neighbouring_damaged_chunks_are_read(tmp_path: Path) -> None:
     path = tmp_path / "two.mcap"
-    writing = Writing(path, About("acsar", "0.1.0", "3.11.0", 1, 2))
+    writing = RecordingWriter(path, About("acsar", "0.1.0", "3.11.0", 1, 2))
     for _ in range(4):
         for second in range(5):
             writing.add("steps", second, random.Random(second).randbytes(500))
@@ -352,7 +356,7 @@ def test_a_time_outside_of_the_calendar_is_refused(name: str, tmp_path: Path) ->
     now = Config()
     about = About(now.robot.id, "0.1.0", "3.11.0", 1, 2, "\n".join(document(effective(now))))
     path = tmp_path / "far.mcap"
-    Writing(path, replace(about, **{name: 1 << 63})).finish()
+    RecordingWriter(path, replace(about, **{name: 1 << 63})).finish()
     with pytest.raises(RecordingError, match=name):
         Recording(path)
 
@@ -361,7 +365,7 @@ def test_an_event_without_a_valid_time_is_refused(tape: Tape, tmp_path: Path) ->
     path = tmp_path / "far.mcap"
     tape.write(path, Config())
     recording, far = Recording(path), b'{"seconds": 1e300, "name": "stop", "text": "stopped"}'
-    writing = Writing(tmp_path / "new.mcap", recording.about)
+    writing = RecordingWriter(tmp_path / "new.mcap", recording.about)
     writing.add("events", 1, far)
     writing.finish()
     with pytest.raises(RecordingError, match="an event that cannot be read"):
@@ -374,7 +378,7 @@ def test_a_cut_file_is_rewritten_as_a_finished_file(whole: Path, tmp_path: Path)
     rewrite(Recording(cut), new)
     recording = Recording(new)
     assert [step.number for step in steps(recording)] == numbers(cut) == list(range(4 * BATCH))
-    assert recording.whole
+    assert recording.is_intact
     assert recording.about == Recording(whole).about
     with new.open("rb") as stream:
         assert len(list(make_reader(stream).iter_messages())) > 0

@@ -25,10 +25,10 @@ from acsard.core.robot import Robot
 from acsard.core.values import Event, Inputs, Instant, Latch, Latches, Outputs
 from acsard.recording import recorder as module
 from acsard.recording import retention, step_writer
-from acsard.recording.directory import KEPT_SUFFIX, Ring, listed
-from acsard.recording.end_record import how_it_ends, read_end
+from acsard.recording.directory import KEPT_SUFFIX, RecordingDirectory, listed
+from acsard.recording.end_record import ending_text, read_end
 from acsard.recording.export import export
-from acsard.recording.file import About, Recording, Writing, rewrite
+from acsard.recording.file import About, Recording, RecordingWriter, rewrite
 from acsard.recording.file_replay import replay_file, steps
 from acsard.recording.recorded_steps import unfinished
 from acsard.recording.recorder import Recorder
@@ -315,9 +315,9 @@ def die(bench: Bench) -> None:
     """Close the open files and nothing else, as the kernel does for a killed process."""
     side = bench.recorder._writer
     assert side._writing is not None
-    assert side._ring is not None
+    assert side._directory is not None
     side._writing.close()
-    side._ring.close()
+    side._directory.close()
 
 
 @pytest.mark.slow
@@ -420,11 +420,11 @@ def test_a_bug_of_the_daemon_is_recorded_with_the_inputs_of_the_failed_step(
     assert path.name.endswith(KEPT_SUFFIX)
     assert last is not None
     assert (last.cut, last.why) == ("bug", why)
-    assert how_it_ends(last.cut, last.why) == f"cut: an internal error ended the daemon: {why}"
+    assert ending_text(last.cut, last.why) == f"cut: an internal error ended the daemon: {why}"
     recording = Recording(path)
     result = replay_file(recording)
     assert (result.comparison.same, result.comparison.steps, result.gaps) == (True, number, [])
-    assert (recording.whole, recording.cut, recording.why) == (True, "bug", why)
+    assert (recording.is_intact, recording.cut, recording.why) == (True, "bug", why)
     assert recording.unfinished is not None
     step = unfinished(recording.unfinished)
     assert step.number == number
@@ -445,7 +445,7 @@ def test_the_text_of_a_bug_is_shortened_and_printable(bench: Bench) -> None:
     (path,) = ends_by(bench, ValueError("\x1b[2J" + "x" * 1000))
     last = read_end(path)
     assert last is not None
-    told = how_it_ends(last.cut, last.why)
+    told = ending_text(last.cut, last.why)
     assert told.startswith("cut: an internal error ended the daemon: ValueError: ")
     assert (told.isprintable(), len(told) < 300) == (True, True)
 
@@ -473,7 +473,7 @@ def test_inputs_that_cannot_be_encoded_are_left_out(bench: Bench) -> None:
     told = f"in step {bench.world.steps}, OverflowError: a name that is none: "
     assert (last.cut, last.why.startswith(told)) == ("bug", True)
     assert [topic for topic, _, _ in recording.messages()].count("unfinished") == 0
-    assert (replay_file(recording).comparison.same, recording.whole) == (True, True)
+    assert (replay_file(recording).comparison.same, recording.is_intact) == (True, True)
 
 
 @pytest.mark.parametrize("error", [None, asyncio.CancelledError()])
@@ -777,7 +777,7 @@ def test_protected_files_are_not_all_deleted_for_a_disk_that_keeps_refusing(
 ) -> None:
     """The disk may lack inodes, for example, and another program takes each one that is freed."""
     die(eager)
-    ring = Ring(config(eager.where).record)
+    ring = RecordingDirectory(config(eager.where).record)
     before = [
         ring.end(ring.begin(About("acsar", "0.1.0", "3.11.0", 1, number)), "kept")
         for number in range(4)
@@ -799,7 +799,7 @@ def test_a_file_that_cannot_be_finished_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "000001-20270115T080000Z.mcap.part"
-    Writing(path, About("acsar", "9.0", "3.13", 1, 2, format="later")).close()
+    RecordingWriter(path, About("acsar", "9.0", "3.13", 1, 2, format="later")).close()
     bench = Bench(tmp_path, monkeypatch)
     bench.world.run(1.0)
     bench.write()

@@ -14,7 +14,7 @@ from mcap.reader import make_reader
 
 from acsard.core.config.settings import Config
 from acsard.recording.end_record import END_RECORD_NAME, read_end
-from acsard.recording.file import CHUNK_BYTES, HOW_TO_READ, About, Recording, Writing
+from acsard.recording.file import CHUNK_BYTES, HOW_TO_READ, About, Recording, RecordingWriter
 from acsard.recording.mcap_records import GROWING_HEAD, LAST_BLOCK
 from acsard.recording.recovery import MAX_DELETED_BYTES, recover
 from tests.scenarios.taped import Tape, chunks
@@ -71,7 +71,7 @@ def test_all_readable_data_stays_and_the_end_record_names_the_cut(
         assert messages(whole) == before
         recording = Recording(whole)
         assert len(list(recording.messages())) == len(before) > 0
-        assert (recording.whole, part.exists()) == (True, False)
+        assert (recording.is_intact, part.exists()) == (True, False)
         assert whole.stat().st_mtime == 1e9
         last = read_end(whole)
         assert last is not None
@@ -202,7 +202,7 @@ def test_a_chunk_that_still_grew_keeps_all_its_seconds(
             recording, last = Recording(whole), read_end(whole)
             assert list(recording.messages()) == before
             assert last is not None
-            assert (recording.whole, recording.cut, last.cut) == (True, "crash", "crash")
+            assert (recording.is_intact, recording.cut, last.cut) == (True, "crash", "crash")
             with whole.open("rb") as stream:
                 assert len(list(make_reader(stream).iter_messages())) == len(before)
         assert list(tmp_path.iterdir()) == [whole]
@@ -306,7 +306,7 @@ def test_a_recovery_in_place_holds_one_chunk_in_memory_and_not_the_unpacked_file
     tmp_path: Path,
 ) -> None:
     part, whole, count = tmp_path / "a.part", tmp_path / "a.mcap", 20
-    writing = Writing(part, About("acsar", "0.1.0", "3.11.0", 1, 2))
+    writing = RecordingWriter(part, About("acsar", "0.1.0", "3.11.0", 1, 2))
     for second in range(count):
         writing.add("state", second, bytes(CHUNK_BYTES))
         writing.end_chunk()

@@ -16,10 +16,10 @@ from acsard.recording.retention import (
     Bounds,
     ClockWatch,
     Disk,
-    Ended,
+    FinishedFile,
     IncidentWindow,
     Kind,
-    share,
+    file_size_limit,
     to_delete,
 )
 
@@ -28,9 +28,9 @@ BOUNDS = Bounds(10**10, -math.inf)
 DAY_NS = 86_400 * NS_PER_S
 
 
-def files(*kinds: Kind, size: int = 1000, this_run: bool = False) -> list[Ended]:
+def files(*kinds: Kind, size: int = 1000, this_run: bool = False) -> list[FinishedFile]:
     return [
-        Ended(str(number), number, kind, size, 100.0 * number, this_run)
+        FinishedFile(str(number), number, kind, size, 100.0 * number, this_run)
         for number, kind in enumerate(kinds, 1)
     ]
 
@@ -94,9 +94,9 @@ def test_a_disk_that_keeps_refusing_gets_no_protected_file_and_at_most_one_more(
 
 
 def test_a_file_may_take_a_hundredth_of_the_total_size() -> None:
-    assert share(10**9, 0, WIDE) == 10**7
-    assert share(10**9, 10**8, Disk(10**9, 15 * 10**7)) == 2 * 10**6
-    assert share(10**9, 0, Disk(10**6, 0)) == MIN_FILE_BYTES
+    assert file_size_limit(10**9, 0, WIDE) == 10**7
+    assert file_size_limit(10**9, 10**8, Disk(10**9, 15 * 10**7)) == 2 * 10**6
+    assert file_size_limit(10**9, 0, Disk(10**6, 0)) == MIN_FILE_BYTES
 
 
 def test_other_programs_keep_a_gigabyte_of_a_large_disk() -> None:

@@ -30,8 +30,16 @@ from acsard.core.values import (
     Request,
     Twist,
 )
-from acsard.recording.recorded_steps import Taken, micropose, status_of
-from acsard.recording.rows import MAX_ROWS, Batch, BatchError, Rare, decode, encode, first_of
+from acsard.recording.recorded_steps import FinishedStep, micropose, status_of
+from acsard.recording.rows import (
+    MAX_ROWS,
+    Batch,
+    BatchError,
+    OccasionalFields,
+    decode,
+    encode,
+    first_of,
+)
 from tests.each import each
 from tests.scenarios.taped import Tape, drive_through_faults
 from tests.scenarios.world import World
@@ -89,14 +97,14 @@ def test_every_field_of_the_inputs_is_recorded() -> None:
 @given(st.lists(INPUTS, min_size=1, max_size=6), st.integers(0, 1 << 40))
 def test_all_inputs_are_read_back(inputs: list[Inputs], first: int) -> None:
     outputs = Robot(Config()).step(Inputs(Instant(1, 2), True, True))
-    steps = decode(encode(first, [Taken(one, outputs, b"other") for one in inputs]))
+    steps = decode(encode(first, [FinishedStep(one, outputs, b"other") for one in inputs]))
     assert [step.inputs for step in steps] == inputs
     assert [step.number for step in steps] == [first + n for n in range(len(inputs))]
     assert {step.recorded.sent for step in steps} == {b"other"}
 
 
 @cache
-def driven() -> list[Taken]:
+def driven() -> list[FinishedStep]:
     """Return the steps of a drive through faults."""
     tape = Tape()
     drive_through_faults(World(recorder=tape), 3.0)
@@ -125,7 +133,7 @@ def test_steps_with_equal_times_keep_their_order() -> None:
     tick, other = Inputs(Instant(5, 5), True, True), Inputs(Instant(5, 5), False, True)
     outputs = Robot(Config()).step(tick)
     for inputs in ([tick, other, other], [other, tick], [tick, other, tick, other]):
-        steps = decode(encode(0, [Taken(one, outputs, None) for one in inputs]))
+        steps = decode(encode(0, [FinishedStep(one, outputs, None) for one in inputs]))
         assert [step.inputs for step in steps] == inputs
 
 
@@ -160,7 +168,7 @@ def steps_of(batch: Batch) -> int:
     return len(decode(msgspec.msgpack.encode(batch)))
 
 
-def with_rare(batch: Batch, rare: Rare) -> Batch:
+def with_rare(batch: Batch, rare: OccasionalFields) -> Batch:
     """Return the batch with these values in its fourth step."""
     rows = list(batch.rows)
     rows[3] = replace(rows[3], rare=rare)
@@ -186,19 +194,19 @@ def test_a_read_with_an_age_out_of_range_is_refused(batch: Batch) -> None:
 @pytest.mark.parametrize(
     "rare",
     [
-        Rare(requests=(Request("set_pose", pose=Pose(0.0, math.inf)),)),
-        Rare(gyro=(GyroSample(1, None, -math.inf),)),
-        Rare(gyro=(GyroSample(1, None, 0.0, math.nan),)),
+        OccasionalFields(requests=(Request("set_pose", pose=Pose(0.0, math.inf)),)),
+        OccasionalFields(gyro=(GyroSample(1, None, -math.inf),)),
+        OccasionalFields(gyro=(GyroSample(1, None, 0.0, math.nan),)),
     ],
     ids=["pose", "rate", "variance"],
 )
-def test_a_number_that_is_not_finite_is_refused(rare: Rare, batch: Batch) -> None:
+def test_a_number_that_is_not_finite_is_refused(rare: OccasionalFields, batch: Batch) -> None:
     with pytest.raises(BatchError, match="is not finite"):
         steps_of(with_rare(batch, rare))
 
 
 def test_a_command_that_the_robot_refuses_is_recorded(batch: Batch) -> None:
-    rare = Rare(commands=(Command("app", Twist(math.nan, 0.0), 1),))
+    rare = OccasionalFields(commands=(Command("app", Twist(math.nan, 0.0), 1),))
     assert steps_of(with_rare(batch, rare)) == steps_of(batch) == 100
 
 
@@ -215,5 +223,5 @@ def test_a_line_that_was_not_sent_or_was_replaced_is_read_back() -> None:
     tick = Inputs(Instant(5, 5), True, True)
     outputs = Robot(Config()).step(tick)
     sent = [None, b"", outputs.line, b"other"]
-    steps = decode(encode(0, [Taken(tick, outputs, left) for left in sent]))
+    steps = decode(encode(0, [FinishedStep(tick, outputs, left) for left in sent]))
     assert [step.recorded.sent for step in steps] == sent

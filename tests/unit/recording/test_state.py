@@ -20,7 +20,7 @@ from acsard.core.values import NS_PER_S, REST, Command, Instant
 from acsard.host.errors import RecordingError
 from acsard.recording import file_replay
 from acsard.recording.export import export
-from acsard.recording.file import Recording, Writing
+from acsard.recording.file import Recording, RecordingWriter
 from acsard.recording.file_replay import DisplayReplay, replay_file
 from acsard.recording.rows import encode
 from acsard.recording.state import Checkpoint, State, StateError, adopt, freeze, thaw
@@ -45,6 +45,20 @@ def test_a_robot_is_read_back_unchanged() -> None:
     assert state.robot.snapshot(world.now_ns) == world.loop.robot.snapshot(world.now_ns)
     again = freeze(state.robot, Memory())
     assert freeze(thaw(again).robot, Memory()) == again
+
+
+def test_a_robot_with_every_odometry_error_is_read_back_although_it_has_tuples_as_keys() -> None:
+    odometry = replace(
+        Config().odometry, gyro=True, left_wheel_radius_multiplier_std=0.01,
+        right_wheel_radius_multiplier_std=0.01, wheel_separation_multiplier_std=0.01,
+        wheel_radius_ratio_std=0.01, wheel_slip_std=0.01, distance_scale_std=0.01,
+    )  # fmt: skip
+    world = World(replace(Config(), odometry=odometry))
+    world.drive(0.5, 0.3, seconds=2.0)
+    data = freeze(world.loop.robot, Memory())
+    pairs = thaw(data).robot._odometry._uncertainty._second._bent
+    assert len(pairs) >= 15
+    assert freeze(*thaw(data)) == freeze(*thaw(freeze(*thaw(data))))
 
 
 def test_senders_of_one_command_soon_leave_the_state() -> None:
@@ -151,7 +165,7 @@ def test_a_wrong_part_of_a_state_behind_a_gap_is_reported_with_its_place(
     SPOILERS["a list for a counter"](robot)
     taped.write(tmp_path / "whole.mcap", Config())
     about = Recording(tmp_path / "whole.mcap").about
-    writing = Writing(path := tmp_path / "spoilt.mcap", about)
+    writing = RecordingWriter(path := tmp_path / "spoilt.mcap", about)
     writing.add("steps", about.wall_ns, encode(0, taped.taken[:50]))
     writing.add("state", about.wall_ns, Checkpoint(100, freeze(robot, memory)).encode())
     writing.add("steps", about.wall_ns, encode(100, taped.taken[100:]))
@@ -183,7 +197,7 @@ def test_a_report_of_a_robot_with_a_wrong_counter_is_refused_with_a_message(
     spoilt = replace_state(taped, freeze(robot, memory))
     spoilt.write(path := tmp_path / "spoilt.mcap", Config(), 100)
     with pytest.raises(RecordingError, match="cannot read the robot state"):
-        page.drawn(Recording(path), "")
+        page.make_report(Recording(path), "")
 
 
 def test_a_defect_of_the_report_is_not_reported_as_a_wrong_robot_state(
@@ -195,7 +209,7 @@ def test_a_defect_of_the_report_is_not_reported_as_a_wrong_robot_state(
     taped.write(path := tmp_path / "whole.mcap", Config(), 100)
     monkeypatch.setattr(Curve, "add", fail)
     with pytest.raises(ZeroDivisionError):
-        page.drawn(Recording(path), "")
+        page.make_report(Recording(path), "")
 
 
 def replace_state(tape: Tape, state: bytes) -> Tape:
@@ -249,7 +263,7 @@ def test_forged_states_after_gaps_take_time_in_proportion_to_the_file(
     monkeypatch.setattr(file_replay, "thaw", counted)
     taped.write(tmp_path / "whole.mcap", Config())
     about = Recording(tmp_path / "whole.mcap").about
-    writing = Writing(path := tmp_path / "forged.mcap", about)
+    writing = RecordingWriter(path := tmp_path / "forged.mcap", about)
     writing.add("steps", about.wall_ns, encode(0, taped.taken[:1]))
     for number in range(10, 210, 10):
         forged = Checkpoint(number, whole(b"(" + b"K\x01" * (MAX_OPCODES - 5) + b"t"))

@@ -17,7 +17,15 @@ from acsard.core.guard import Memory
 from acsard.core.motion.modes import Mode
 from acsard.core.values import Twist
 from acsard.recording.state import DISPATCH_TABLE, freeze, part_class, thaw
-from acsard.recording.unpickling import MAX_BYTES, MAX_DEPTH, MAX_OPCODES, MAX_PARTS, unpickle
+from acsard.recording.unpickling import (
+    MAX_BYTES,
+    MAX_DEPTH,
+    MAX_KEY,
+    MAX_OPCODES,
+    MAX_PARTS,
+    MAX_TUPLE_KEY,
+    unpickle,
+)
 from tests.each import each
 from tests.recordings.__main__ import CHECKED
 from tests.scenarios.taped import drive_through_faults, recorded_world
@@ -25,8 +33,9 @@ from tests.unit.recording.attacks import ATTACKS, doubled, whole
 
 BYTES = 2 << 30
 
-PROCESSOR_S = 60
-"""All attacks together take a second; without a limit one of them takes years."""
+PROCESSOR_S = 10
+"""Limit on the processor time of all attacks together, s. They take about a second. Without the
+limit on tuples as keys, one attack alone takes longer than this limit."""
 
 
 def limits() -> None:
@@ -86,6 +95,20 @@ def test_a_part_that_occurs_twice_stays_one_object() -> None:
     again = unpickle(pickled((inner, [inner])), part_class)
     assert isinstance(again, tuple)
     assert again[0] is again[1][0]
+
+
+@each("key", [(1, MAX_TUPLE_KEY), (-1, 1), (1, 0.5), (1, (2,)), (1, 2, 3, 4, 5)])
+def test_a_tuple_whose_hash_could_be_forged_is_refused_as_a_key(key: object) -> None:
+    unpickle(pickled([key]), part_class)
+    with pytest.raises(ValueError, match="uses a tuple as a key"):
+        unpickle(pickled({key: 1}), part_class)
+
+
+@each("sign", [1, -1])
+def test_a_number_is_refused_as_a_key_if_its_hash_could_be_forged(sign: int) -> None:
+    unpickle(pickled({sign * (MAX_KEY - 1): 1}), part_class)
+    with pytest.raises(ValueError, match=r"a number of 2\^61 - 1 or more as a key"):
+        unpickle(pickled({sign * MAX_KEY: 1}), part_class)
 
 
 def test_nesting_is_limited_in_depth_and_doubling_in_size() -> None:

@@ -11,6 +11,7 @@ import plotly.graph_objects as library
 import pytest
 
 from acsard.core.config.parsing import parse
+from acsard.core.config.settings import Config, McuConfig
 from acsard.core.thinning import Point
 from acsard.report.figures import Clip, TimeFigures, clipped
 from acsard.report.plot_elements import Figure
@@ -127,6 +128,7 @@ def test_bands_show_the_reason_on_hover(figures: dict[str, Figure]) -> None:
     words = [text.replace("<br>", " ") for text in waits["hovertext"]]
     assert "<b>waits</b> teleop has priority: wait until it is silent" in words
     assert max(column(waits["x"])) > 1500  # in ms
+    assert "for example, while a source with a higher priority sends" in figures["sources"].caption
     rows = [note["text"] for note in figures["sources"].layout["annotations"]]
     assert rows == ["mode", "link", "teleop", "nav", "others"]
     assert (
@@ -167,6 +169,23 @@ def test_ten_driving_sources_have_different_styles() -> None:
     looks = drivers(figure)
     assert len(looks) == len(set(looks.values())) == 10
     assert [pattern != "" for _, pattern in looks.values()] == [False] * 8 + [True] * 2
+
+
+def test_the_reports_of_a_board_with_its_own_clock_are_not_called_answers() -> None:
+    def reporting(world: World) -> None:
+        with world.mcu.free_running(0.1):
+            world.run(0.5)
+
+    def shown(mcu: McuConfig) -> tuple[set[str], str]:
+        report, _ = report_of(reporting, config=Config(mcu=mcu))
+        figure = TimeFigures(report, 0.0).serial()
+        return {key.meaning for key in figure.keys}, figure.caption
+
+    answering, _ = shown(McuConfig())
+    assert answering == {"sent", "answered", "dropped", "no answer"}
+    names, caption = shown(McuConfig(reply_period=0.1))
+    assert names == {"sent", "received", "dropped"}
+    assert "answer" not in caption
 
 
 def test_a_robot_without_feedback_is_drawn() -> None:

@@ -14,7 +14,7 @@ import pytest
 from acsard.core.values import Command, Event, Refusal, Twist
 from acsard.recording.recorded_steps import Step
 from acsard.recording.time_span import date
-from acsard.report.page import MAX_OPEN, escaped, page
+from acsard.report.page import MAX_UNFOLDED_EVENTS, escaped, page
 from acsard.report.report_data import Mark, ReportData
 from acsard.report.report_text import Origin
 from tests.unit.report.driven import drive_of_two, report_from
@@ -163,7 +163,9 @@ def test_missing_steps_are_reported_at_the_top() -> None:
     assert any(text.startswith("60 steps are missing: ") for text in words)
 
 
-@pytest.mark.parametrize(("count", "opened"), [(MAX_OPEN, True), (MAX_OPEN + 1, False)])
+@pytest.mark.parametrize(
+    ("count", "opened"), [(MAX_UNFOLDED_EVENTS, True), (MAX_UNFOLDED_EVENTS + 1, False)]
+)
 def test_a_long_list_of_events_is_folded(count: int, opened: bool) -> None:
     from acsard.core.config.settings import Config
 

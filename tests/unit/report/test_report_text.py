@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from msgspec.structs import replace
 
-from acsard.core.config.settings import BatteryConfig, Config, Source
+from acsard.core.config.settings import BatteryConfig, Config, McuConfig, Source
 from acsard.report.figures import path_figure
 from acsard.report.report_text import Origin, Setting, differences, reasons, rows, summary
 from tests.scenarios.instant_watch import InstantWatch
@@ -121,6 +121,22 @@ def test_the_control_loop_has_the_cause_of_a_late_period() -> None:
     assert words[1].startswith(
         f"{words[0]}; <1800000000> by 0.04 s, because other programs used the processor"
     )
+
+
+def test_the_reports_of_a_board_with_its_own_clock_are_not_called_answers() -> None:
+    def reporting(world: World) -> None:
+        with world.mcu.free_running(0.1):
+            world.run(0.5)
+
+    def serial_line(mcu: McuConfig) -> str:
+        report, _ = report_of(reporting, config=Config(mcu=mcu))
+        origin = Origin("a.mcap", "r2", "0.1.0", "3.11.0")
+        return dict(rows(report, origin, lambda s, day: f"<{s:.0f}>"))["Serial line"]
+
+    assert " answers, 0 dropped" in serial_line(McuConfig())
+    text = serial_line(McuConfig(reply_period=0.1))
+    assert text.endswith(" reports received, 0 dropped")
+    assert "answer" not in text
 
 
 def test_only_settings_that_differ_from_the_default_are_listed() -> None:

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from acsard.checkup.findings import Finding
-from acsard.host.terminal_modes import one_by_one
+from acsard.host.terminal_modes import single_key_mode
 from acsard.terminal.output import plain
 from acsard.terminal.prompt import Ask, NobodyError
 from acsard.terminal.terminal_prompt import NoPrompt, TerminalPrompt, row
@@ -52,7 +52,7 @@ def types(monkeypatch: pytest.MonkeyPatch) -> Iterator[Types]:
 def test_a_number_is_asked_for_until_it_is_valid_and_within_its_bounds(
     types: Types, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with one_by_one():
+    with single_key_mode():
         person = TerminalPrompt()
         for line in ("far\n", "0.1\n", "-2\n", "\n", "1,75\n"):
             types(line)
@@ -61,7 +61,7 @@ def test_a_number_is_asked_for_until_it_is_valid_and_within_its_bounds(
 
 
 def test_enter_alone_is_the_default(types: Types) -> None:
-    with one_by_one():
+    with single_key_mode():
         person = TerminalPrompt()
         types("\n")
         assert person.number(OPTIONAL) == 0.0
@@ -69,7 +69,7 @@ def test_enter_alone_is_the_default(types: Types) -> None:
 
 @pytest.mark.parametrize("asked", [lambda p: p.number(DISTANCE), lambda p: p.start("Go.")])
 def test_q_quits_at_every_question(types: Types, asked: Callable[[TerminalPrompt], object]) -> None:
-    with one_by_one():
+    with single_key_mode():
         person = TerminalPrompt()
         types("q\n")
         with pytest.raises(KeyboardInterrupt):
@@ -109,7 +109,7 @@ def test_a_line_that_was_typed_before_the_question_does_not_answer_it(types: Typ
 
 
 def test_nothing_but_enter_starts_a_leg(types: Types) -> None:
-    with one_by_one():
+    with single_key_mode():
         person = TerminalPrompt()
         types("x ")
         types("\n")
@@ -120,7 +120,7 @@ def test_nothing_but_enter_starts_a_leg(types: Types) -> None:
 
 def test_keys_are_read_singly_and_the_terminal_mode_is_restored(types: Types) -> None:
     before = termios.tcgetattr(sys.stdin)
-    with one_by_one():
+    with single_key_mode():
         person = TerminalPrompt()
         assert termios.tcgetattr(sys.stdin) != before
         types(" a")
@@ -130,7 +130,7 @@ def test_keys_are_read_singly_and_the_terminal_mode_is_restored(types: Types) ->
 
 def test_without_a_prompt_an_optional_number_is_0_and_a_required_one_is_an_error() -> None:
     assert NoPrompt().number(OPTIONAL) == 0.0
-    with pytest.raises(NobodyError, match=re.escape("leave --yes out")):
+    with pytest.raises(NobodyError, match=re.escape("run it without --yes")):
         NoPrompt().number(DISTANCE)
 
 

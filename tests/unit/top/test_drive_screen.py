@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from acsard.core.motion.modes import Mode
-from acsard.top.drive_screen import HELP, Teleop, lines, news, parting
+from acsard.top.drive_screen import HELP, Teleop, last_report_lines, lines, report_lines
 from acsard.top.text import MODE_STYLES
 from tests.each import each
 from tests.unit.top.screens import STATE
@@ -70,25 +70,27 @@ def test_help_stays_on_a_screen_of_few_lines() -> None:
 
 def test_a_refused_key_must_be_pressed_again_after_space() -> None:
     why = "send a zero first: teleop must send a zero before it can drive"
-    told = " ".join(news(replace(SEEN, objection=why), 200))
+    told = " ".join(report_lines(replace(SEEN, objection=why), 200))
     assert (
         f"your keys do not drive the robot: {why} (press space, then press the key again)" in told
     )
-    assert "press space" not in " ".join(news(replace(SEEN, objection="stopped by anna"), 200))
+    assert "press space" not in " ".join(
+        report_lines(replace(SEEN, objection="stopped by anna"), 200)
+    )
 
 
 def test_keys_that_do_not_drive_are_reported() -> None:
     why = "app has the same priority and came first: wait until it is silent"
     seen = replace(SEEN, objection=why)
     assert why in " ".join(" ".join(texts(seen, 40)).split())
-    assert why in told(news(seen, 40))
+    assert why in told(report_lines(seen, 40))
 
 
 def test_a_silence_is_reported_with_its_length() -> None:
     silent = replace(SEEN, age=7.0, silent=True)
     for seen in (silent, replace(silent, state=None)):
         assert "nothing received from the daemon for 7 s" in " ".join(texts(seen, 80))
-        assert "nothing received from the daemon for 7 s" in told(news(seen, 80))
+        assert "nothing received from the daemon for 7 s" in told(report_lines(seen, 80))
     assert "first state" in texts(replace(SEEN, state=None), 80)[1]
 
 
@@ -96,12 +98,12 @@ def test_a_silence_is_reported_with_its_length() -> None:
 def test_the_mode_is_not_repeated_in_its_reason(mode: Mode) -> None:
     seen = of(mode=mode.value, reason=f"{mode.value}: because")
     assert texts(seen, 80)[1].split() == [mode.value.upper(), "because"]
-    assert news(seen, 80)[0].startswith(f"{mode.value}: because; ")
+    assert report_lines(seen, 80)[0].startswith(f"{mode.value}: because; ")
 
 
 @each("width", WIDTHS)
 def test_without_a_screen_no_word_and_no_figure_is_broken_at_the_edge(width: int) -> None:
-    said = news(of(mode="waiting", reason=LONG, x=1.5), width)
+    said = report_lines(of(mode="waiting", reason=LONG, x=1.5), width)
     assert max(map(len, said)) <= width
     assert LONG in told(said)
     assert sum("x   +1.500 m" in one for one in said) == 1
@@ -110,18 +112,20 @@ def test_without_a_screen_no_word_and_no_figure_is_broken_at_the_edge(width: int
 
 def test_the_final_report_says_whether_the_robot_stands_and_where() -> None:
     still = {"linear": 0.0, "angular": 0.0, "wheels": [0.0] * 4}
-    assert told(parting(of(**still), 80)).startswith(
-        "drive ended: the robot stands; driving: commanded"
+    assert told(last_report_lines(of(**still), 80)).startswith(
+        "drive ended: the robot stands still; driving: commanded"
     )
     for moving in (of(), of(**still | {"wheels": [0.0, 0.1, 0.0, 0.0]})):
-        assert told(parting(moving, 80)).startswith("drive ended: the robot still moves; driving: ")
+        assert told(last_report_lines(moving, 80)).startswith(
+            "drive ended: the robot still moves; driving: "
+        )
     unknown = of(**still | {"linear": None, "angular": None, "wheels": []})
-    assert told(parting(unknown, 80)).startswith(
+    assert told(last_report_lines(unknown, 80)).startswith(
         "drive ended: the robot reports no speed; driving: "
     )
-    assert "forward - m/s" in told(parting(unknown, 80))
-    assert "yaw +57.3°" in told(parting(of(**still), 40))
-    assert told(parting(replace(SEEN, age=7.0, silent=True), 80)).startswith(
+    assert "forward - m/s" in told(last_report_lines(unknown, 80))
+    assert "yaw +57.3°" in told(last_report_lines(of(**still), 40))
+    assert told(last_report_lines(replace(SEEN, age=7.0, silent=True), 80)).startswith(
         "drive ended: nothing received from the daemon"
     )
 
@@ -139,5 +143,5 @@ def test_any_text_and_number_fits_the_screen_and_is_printable(
     seen = replace(seen, robot_id=text, objection=text)
     shown = texts(seen, width, height)
     assert len(shown) <= height
-    shown += [*news(seen, width), *parting(seen, width)]
+    shown += [*report_lines(seen, width), *last_report_lines(seen, width)]
     assert all(len(one) <= width and one.isprintable() for one in shown)

@@ -10,7 +10,7 @@ import pytest
 from msgspec.structs import replace
 
 from acsard.client import Client, Subscription
-from acsard.client.follower import FIRST_STATE_TIMEOUT_S, SILENT_S
+from acsard.client.follower import FIRST_STATE_TIMEOUT_S, ROBOT_SILENCE_TIMEOUT_S
 from acsard.core.messages.encodings import DecodeError
 from acsard.core.messages.schema import Info, RobotState, Time
 from acsard.daemon.bus.address import Address
@@ -120,7 +120,7 @@ def test_a_put_on_a_wildcard_is_not_a_state(robot: Robot) -> None:
 def test_a_state_of_another_version_is_reported_as_such(robot: Robot) -> None:
     feed = feed_of(robot)
     robot.state = DecodeError("bad", "unknown field")
-    with pytest.raises(ReplyError, match="another version"):
+    with pytest.raises(ReplyError, match="a different version"):
         feed.ask()
     assert feed.seen().undecodable == 1
 
@@ -133,7 +133,7 @@ def test_a_silence_is_reported_sooner_once_a_state_has_arrived(robot: Robot) -> 
     assert feed.seen().silent
     robot.tells(STATE)
     feed.poll()
-    robot.now += SILENT_S - 0.01
+    robot.now += ROBOT_SILENCE_TIMEOUT_S - 0.01
     assert not feed.seen().silent
     robot.now += 0.02
     assert feed.seen().silent

@@ -274,7 +274,7 @@ def fleet_of(
     """Return a fleet in which the robots of `answering` answer queries."""
     robot: Any = SimpleNamespace(session=session, where=Address("tcp/127.0.0.1:7448", "acsar", ""))
     stamps = count(2000)
-    robot.like = lambda name: SimpleNamespace(ask=lambda key, take: answer(name, key, take))
+    robot.sibling = lambda name: SimpleNamespace(ask=lambda key, take: answer(name, key, take))
 
     def answer(name: str, key: str, take: Callable[[Any], object]) -> None:
         if name in answering:
@@ -291,12 +291,12 @@ def test_robots_beyond_the_limit_are_reported_as_left_out(session: Session) -> N
     fleet = fleet_of(session)
     for number in range(3):
         session.comes(f"robot{number}")
-    assert fleet.more == ""
+    assert fleet.left_out_text == ""
     assert fleet.seen == "all robots visible at tcp/127.0.0.1:7448: 3 robots"
     session.comes("robot3")
     assert [row.robot_id for row in fleet.rows()] == ["robot0", "robot1", "robot2"]
-    assert "more than 3 robots, and this list leaves out the others" in fleet.more
-    assert "--id" in fleet.more
+    assert "more than 3 robots, and this list shows only 3 of them" in fleet.left_out_text
+    assert "--id" in fleet.left_out_text
 
 
 def test_the_robot_that_is_gone_for_longest_makes_room_for_a_new_one(
@@ -310,7 +310,7 @@ def test_the_robot_that_is_gone_for_longest_makes_room_for_a_new_one(
         session.comes(name, zenoh.SampleKind.DELETE)
     session.comes("robot3")
     assert sorted(row.robot_id for row in fleet.rows()) == ["robot0", "robot1", "robot3"]
-    assert fleet.more == ""
+    assert fleet.left_out_text == ""
 
 
 def test_a_robot_whose_liveliness_token_is_deleted_is_not_present(session: Session) -> None:
@@ -318,7 +318,7 @@ def test_a_robot_whose_liveliness_token_is_deleted_is_not_present(session: Sessi
     session.comes("robot1")
     session.comes("robot1", zenoh.SampleKind.DELETE)
     assert [row.here for row in fleet.rows()] == [False]
-    assert fleet.more == ""
+    assert fleet.left_out_text == ""
 
 
 def test_the_version_of_a_robot_that_publishes_its_state_often_is_queried(
@@ -361,14 +361,14 @@ def test_the_fleet_is_complete_once_each_named_robot_is_present_and_has_answered
     here: Sequence[str], whole: bool,
 ) -> None:  # fmt: skip
     fleet = fleet_of(session, ids, answering)
-    assert not fleet.whole
+    assert not fleet.all_reported
     for name in here:
         session.comes(name)
     # the first query may be answered by a storage, the second one only by the robot
     for _ in range(2):
         fleet.rows()
         clock.now += FLEET_QUERY_PERIOD_S
-    assert fleet.whole is whole
+    assert fleet.all_reported is whole
 
 
 class Remembers:
@@ -382,7 +382,7 @@ class Remembers:
     def __init__(self, session: Session) -> None:
         self.session, self.stored = session, STATE
 
-    def like(self, name: str) -> Remembers:
+    def sibling(self, name: str) -> Remembers:
         return self
 
     def ask(self, key: str, take: Callable[[Any], object]) -> None:

@@ -11,13 +11,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from acsard.client.commander import GRACE_S, RELEASED_NS, ZEROS
-from acsard.client.follower import SILENT_S
+from acsard.client.commander import GRACE_S, RELEASE_TIMEOUT_NS, ZEROS
+from acsard.client.follower import ROBOT_SILENCE_TIMEOUT_S
 from acsard.core.messages.schema import RobotState, SourceState
 from acsard.core.values import NS_PER_S, REST, Twist
 from acsard.daemon.bus.address import Address
 from acsard.host import clock
-from acsard.top.keyboard import KEY_HOLD_S, RELEASE_REASON, REPEAT_S, Keyboard, Ride, split
+from acsard.top.keyboard import KEY_HOLD_S, RELEASE_REASON, REPEAT_S, Keyboard, KeyboardDrive, split
 from tests.each import each
 from tests.unit.top.screens import STATE, sample_of
 
@@ -199,7 +199,7 @@ class Drive:
         self.now, self.asleep = 100.0, 0.0
         monkeypatch.setattr(clock, "mono_ns", lambda: round((self.now - self.asleep) * NS_PER_S))
         monkeypatch.setattr(clock, "asleep_ns", lambda: round(self.asleep * NS_PER_S))
-        self.ride = Ride(robot, Keyboard(0.5, 2.0))
+        self.ride = KeyboardDrive(robot, Keyboard(0.5, 2.0))
 
     def step(self, typed: str = "", times: int = 1) -> None:
         for _ in range(times):
@@ -319,7 +319,7 @@ def test_the_first_key_drives_however_long_the_bus_took_to_subscribe(
             return super().subscribe(name)
 
     robot: Any = Slow()
-    drive.ride = Ride(robot, Keyboard(0.5, 2.0))
+    drive.ride = KeyboardDrive(robot, Keyboard(0.5, 2.0))
     drive.step("i", times=2)
     assert robot.sent == [0.0, 0.5]
 
@@ -384,6 +384,21 @@ def test_delayed_keys_do_not_release_a_key_that_no_longer_drives(
     assert not held.drives("i", 40)
 
 
+def test_a_delayed_space_does_not_release_a_key_that_no_longer_drives(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The key was held before the stall too. A space that arrives in time releases it."""
+    held = Held(STOPPED, monkeypatch)
+    held.robot.said.append(sample_of(STATE))
+    held.step("i", times=10)
+    held.now += 1.2 * GRACE_S
+    assert not held.drives(" ", 1)
+    assert not held.drives("", 5)
+    assert not held.drives("i")
+    held.step(" ")
+    assert held.drives("i")
+
+
 def test_delayed_keys_do_not_drive_if_the_robot_was_stopped_late_in_their_delay(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -416,7 +431,7 @@ def test_a_key_that_no_longer_drives_does_so_after_its_release(
 ) -> None:
     held = Held(ZERO_FIRST, monkeypatch)
     held.step("i", times=10)
-    held.step(times=round(RELEASED_NS / NS_PER_S / 0.05) + 2)
+    held.step(times=round(RELEASE_TIMEOUT_NS / NS_PER_S / 0.05) + 2)
     held.robot.sent.clear()
     held.step("i", times=3)
     assert held.robot.sent == [0.0, 0.5, 0.5]
@@ -460,7 +475,7 @@ def test_the_operator_is_informed_that_a_robot_is_silent(monkeypatch: pytest.Mon
     drive = Drive(robot, monkeypatch)
     drive.step("i")
     assert not drive.ride.seen().silent
-    drive.now += SILENT_S
+    drive.now += ROBOT_SILENCE_TIMEOUT_S
     assert drive.ride.seen().silent
 
 

@@ -85,7 +85,7 @@ def test_before_the_first_state_the_screen_says_what_it_waits_for() -> None:
 @pytest.mark.parametrize("state", [STATE, None])
 def test_a_silent_robot_is_shown_by_three_red_lines(state: RobotState | None) -> None:
     seen = replace(SEEN, state=state, age=3.4, silent=True)
-    assert "NOTHING RECEIVED FOR 3 s: does the daemon run?" in lines_of(seen)[2]
+    assert "NOTHING RECEIVED FOR 3 s: is the daemon running?" in lines_of(seen)[2]
     assert painted(seen).count("41m") == 3  # three lines in red
     assert not any("DRIVING" in line for line in lines_of(seen))
 
@@ -118,7 +118,7 @@ def test_undecodable_messages_are_distinguished_from_silence() -> None:
         for line in lines_of(replace(SEEN, age=3.0, undecodable=9, silent=True))
         if "FOR 3 s" in line
     ]
-    assert "another version" in told
+    assert "a different version?" in told
 
 
 @each("width", [40, 80])

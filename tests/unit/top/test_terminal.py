@@ -12,8 +12,8 @@ from acsard.core.messages.schema import RobotState
 from acsard.top import terminal
 from acsard.top.drive_screen import HELP, Teleop
 from acsard.top.fleet_table import Roster
-from acsard.top.keyboard import Ride
-from acsard.top.terminal import NO_END, News, Page, part
+from acsard.top.keyboard import KeyboardDrive
+from acsard.top.terminal import NO_END, Page, ReportThrottle, print_last_report
 from tests.unit.top.screens import STATE
 from tests.unit.top.test_drive_screen import SEEN
 from tests.unit.top.test_fleet_table import ROW
@@ -21,8 +21,8 @@ from tests.unit.top.test_fleet_table import ROW
 
 def told(states: list[tuple[float, RobotState]]) -> list[RobotState]:
     """Return the states that are printed when these states arrive at these times, s."""
-    news = News()
-    return [state for now, state in states if news.tell(replace(SEEN, state=state), now)]
+    throttle = ReportThrottle()
+    return [state for now, state in states if throttle.tell(replace(SEEN, state=state), now)]
 
 
 def test_a_robot_that_moves_is_a_line_a_second_and_one_at_rest_one_in_ten() -> None:
@@ -79,11 +79,16 @@ def test_the_last_report_waits_until_the_robot_no_longer_follows_the_drive(
     moving = replace(STATE, source="teleop", reason="driving: commanded by teleop")
     still = replace(moving, linear=0.0, angular=0.0, wheels=[0.0] * 4)
     ready = replace(still, mode="ready", reason="waiting for a command", source="")
-    part(cast(Ride, Ended(moving, moving, still, still, ready)))
-    assert "drive ended: the robot stands; ready: waiting for a command" in capsys.readouterr().out
+    print_last_report(cast(KeyboardDrive, Ended(moving, moving, still, still, ready)))
+    assert (
+        "drive ended: the robot stands still; ready: waiting for a command"
+        in capsys.readouterr().out
+    )
     other = replace(still, reason="driving: commanded by nav", source="nav")
-    part(cast(Ride, Ended(still, still, other, ready)))
-    assert "drive ended: the robot stands; driving: commanded by nav" in capsys.readouterr().out
+    print_last_report(cast(KeyboardDrive, Ended(still, still, other, ready)))
+    assert (
+        "drive ended: the robot stands still; driving: commanded by nav" in capsys.readouterr().out
+    )
 
 
 @pytest.mark.parametrize("height", [1, 2, 3, 24])
@@ -98,7 +103,7 @@ def test_a_terminal_of_any_height_shows_the_heading_of_the_table_of_robots(
     monkeypatch.setenv("LINES", str(height))
     monkeypatch.setattr(terminal, "_watch", watch)
     monkeypatch.setattr(terminal, "_hold", lambda shows: shows([]))
-    fleet = SimpleNamespace(rows=lambda: [ROW], more="", seen="1 robot")
+    fleet = SimpleNamespace(rows=lambda: [ROW], left_out_text="", seen="1 robot")
     terminal.roster(cast(Roster, fleet))
     head, *others = capsys.readouterr().out.splitlines()
     assert head.startswith("ROBOT")

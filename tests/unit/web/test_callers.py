@@ -11,9 +11,9 @@ from msgspec.structs import replace
 from acsard.web.callers import (
     LOCAL_NAME,
     MAX_TOKENS,
-    Asked,
+    Identity,
     RefusedError,
-    Who,
+    RequestFacts,
     by_listed_page,
     cookie_name,
     host_name,
@@ -29,7 +29,7 @@ from tests.each import each
 
 NAMES = frozenset({"robot.local", "192.168.1.7"})
 
-MAINTAINER = Who("maintainer", LOCAL_NAME)
+MAINTAINER = Identity("maintainer", LOCAL_NAME)
 """The identity of a client on the robot itself."""
 
 
@@ -44,29 +44,29 @@ MAINTAINER = Who("maintainer", LOCAL_NAME)
     ],
 )
 def test_a_browser_on_the_robot_s_machine_is_local(peer: str, host: str) -> None:
-    assert place(Asked(peer, False, host), NAMES) == "here"
-    assert place(Asked(peer, True, host), NAMES) == "here"
+    assert place(RequestFacts(peer, False, host), NAMES) == "here"
+    assert place(RequestFacts(peer, True, host), NAMES) == "here"
 
 
 @each(
-    ("asked", "reason"),
+    ("facts", "reason"),
     [
         # a name of an attacker that resolves to 127.0.0.1
-        (Asked("127.0.0.1", False, "evil.example:8080"), "host"),
-        (Asked("127.0.0.1", False, ""), "host"),
-        (Asked("127.0.0.1", False, "localhost.evil.example"), "host"),
-        (Asked("127.0.0.1", False, "robot.local"), "host"),
-        (Asked("192.168.1.50", False, "robot.local"), "plain"),
-        (Asked("192.168.1.50", False, "localhost"), "plain"),
-        (Asked("192.168.1.50", True, "localhost"), "host"),
-        (Asked("192.168.1.50", True, "127.0.0.1"), "host"),
-        (Asked("192.168.1.50", True, "evil.example"), "host"),
-        (Asked("", True, ""), "host"),
+        (RequestFacts("127.0.0.1", False, "evil.example:8080"), "host"),
+        (RequestFacts("127.0.0.1", False, ""), "host"),
+        (RequestFacts("127.0.0.1", False, "localhost.evil.example"), "host"),
+        (RequestFacts("127.0.0.1", False, "robot.local"), "host"),
+        (RequestFacts("192.168.1.50", False, "robot.local"), "plain"),
+        (RequestFacts("192.168.1.50", False, "localhost"), "plain"),
+        (RequestFacts("192.168.1.50", True, "localhost"), "host"),
+        (RequestFacts("192.168.1.50", True, "127.0.0.1"), "host"),
+        (RequestFacts("192.168.1.50", True, "evil.example"), "host"),
+        (RequestFacts("", True, ""), "host"),
     ],
 )
-def test_any_other_host_name_is_refused(asked: Asked, reason: str) -> None:
+def test_any_other_host_name_is_refused(facts: RequestFacts, reason: str) -> None:
     with pytest.raises(RefusedError) as found:
-        place(asked, NAMES)
+        place(facts, NAMES)
     assert found.value.reason == reason
 
 
@@ -74,15 +74,15 @@ def test_any_other_host_name_is_refused(asked: Asked, reason: str) -> None:
 @each("host", ["localhost:8080", "robot.local"])
 def test_a_request_through_a_proxy_is_refused(secure: bool, host: str) -> None:
     with pytest.raises(RefusedError, match="proxy") as found:
-        place(Asked("127.0.0.1", secure, host, proxied=True), NAMES)
+        place(RequestFacts("127.0.0.1", secure, host, proxied=True), NAMES)
     assert found.value.reason == "proxy"
 
 
 @pytest.mark.parametrize("host", ["robot.local:8443", "Robot.Local", "192.168.1.7:8443"])
 def test_https_with_a_name_of_the_robot_is_remote(host: str) -> None:
-    assert place(Asked("192.168.1.50", True, host), NAMES) == "away"
+    assert place(RequestFacts("192.168.1.50", True, host), NAMES) == "away"
     # A client on the machine that uses the public name needs a token like others.
-    assert place(Asked("127.0.0.1", True, host), NAMES) == "away"
+    assert place(RequestFacts("127.0.0.1", True, host), NAMES) == "away"
 
 
 @each(
@@ -98,7 +98,7 @@ def test_https_with_a_name_of_the_robot_is_remote(host: str) -> None:
 def test_the_robot_s_own_page_and_programs_pass_the_origin_check(
     secure: bool, host: str, origin: str | None, site: str | None
 ) -> None:
-    require_own_origin(Asked("127.0.0.1", secure, host, origin, site))
+    require_own_origin(RequestFacts("127.0.0.1", secure, host, origin, site))
 
 
 @each(
@@ -116,12 +116,12 @@ def test_the_robot_s_own_page_and_programs_pass_the_origin_check(
 )
 def test_a_page_of_another_origin_is_refused(origin: str | None, site: str | None) -> None:
     with pytest.raises(RefusedError) as found:
-        require_own_origin(Asked("127.0.0.1", False, "localhost:8080", origin, site))
+        require_own_origin(RequestFacts("127.0.0.1", False, "localhost:8080", origin, site))
     assert found.value.reason == "origin"
 
 
 def test_a_role_has_the_permissions_of_the_roles_below_it() -> None:
-    viewer, operator = Who("viewer", "tv"), Who("operator", "phone")
+    viewer, operator = Identity("viewer", "tv"), Identity("operator", "phone")
     assert [viewer.may("viewer"), viewer.may("operator")] == [True, False]
     assert [operator.may("operator"), operator.may("maintainer")] == [True, False]
     assert MAINTAINER.may("maintainer")
@@ -186,13 +186,13 @@ def test_an_origin_is_listed_only_if_all_its_parts_match() -> None:
         "": False,
         None: False,
     }.items():
-        asked = Asked("127.0.0.1", False, "localhost:8080", origin)
-        assert by_listed_page(asked, origins) == listed, origin
+        facts = RequestFacts("127.0.0.1", False, "localhost:8080", origin)
+        assert by_listed_page(facts, origins) == listed, origin
 
 
 def test_the_robot_s_own_page_keeps_its_cookie_if_its_origin_is_listed_too() -> None:
     origins = {"https://robot1.local:8443", "http://robot1.local:8443"}
-    own = Asked("192.168.1.7", True, "Robot1.local:8443", "https://robot1.local:8443")
+    own = RequestFacts("192.168.1.7", True, "Robot1.local:8443", "https://robot1.local:8443")
     require_own_origin(own)
     assert not by_listed_page(own, origins)
     assert by_listed_page(replace(own, host="192.168.1.4:8443"), origins)

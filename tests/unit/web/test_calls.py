@@ -19,11 +19,11 @@ from acsard.core.messages.schema import ServiceReply
 from acsard.web.callers import RefusedError
 from acsard.web.calls import (
     MAX_REMOTE_STOPS,
+    MAX_STOPS,
     MIN_STOP_INTERVAL_S,
-    STOPS_AT_ONCE,
     Calls,
     Ending,
-    Merged,
+    StopMerger,
     Stops,
 )
 from acsard.web.fleet_rows import Fleet
@@ -42,11 +42,11 @@ async def nothing() -> Ending:
 
 def calls_of(
     known: Robots,
-    ends: Callable[[], Awaitable[Ending]] = nothing,
-    sees: Callable[[str], bool] = lambda robot: False,
+    interrupt_guide: Callable[[], Awaitable[Ending]] = nothing,
+    is_known: Callable[[str], bool] = lambda robot: False,
 ) -> Calls:
     """Return the calls of a server without a check, whose viewers see no robot."""
-    return Calls(known, ends, sees)
+    return Calls(known, interrupt_guide, is_known)
 
 
 async def test_stops_beyond_the_limit_share_the_reply_of_a_stop_sent_after_them() -> None:
@@ -63,7 +63,7 @@ async def test_stops_beyond_the_limit_share_the_reply_of_a_stop_sent_after_them(
         return ServiceReply(False, "not stopped")
 
     stops = Stops()
-    first = [asyncio.create_task(stops.ask(held)) for _ in range(STOPS_AT_ONCE)]
+    first = [asyncio.create_task(stops.ask(held)) for _ in range(MAX_STOPS)]
     await asyncio.sleep(0)
     later = [asyncio.create_task(stops.ask(refused)) for _ in range(100)]
     done, _ = await asyncio.wait(later, timeout=0.1)
@@ -72,7 +72,7 @@ async def test_stops_beyond_the_limit_share_the_reply_of_a_stop_sent_after_them(
     async with asyncio.timeout(PATIENCE_S):
         assert all(reply.success for reply in await asyncio.gather(*first))
         assert (await asyncio.gather(*later)) == [ServiceReply(False, "not stopped")] * 100
-    assert asked == {"first": STOPS_AT_ONCE, "later": 1}
+    assert asked == {"first": MAX_STOPS, "later": 1}
 
 
 async def test_a_stop_that_fails_fails_its_waiting_callers_and_not_the_next_stop() -> None:
@@ -86,7 +86,7 @@ async def test_a_stop_that_fails_fails_its_waiting_callers_and_not_the_next_stop
         raise ConnectionError("gone")
 
     stops = Stops()
-    first = [asyncio.create_task(stops.ask(held)) for _ in range(STOPS_AT_ONCE)]
+    first = [asyncio.create_task(stops.ask(held)) for _ in range(MAX_STOPS)]
     await asyncio.sleep(0)
     later = [asyncio.create_task(stops.ask(fails)) for _ in range(3)]
     await asyncio.sleep(0)
@@ -114,7 +114,7 @@ async def test_only_stop_may_be_called_on_another_robot_and_only_with_a_valid_id
 def test_a_stop_succeeds_when_the_check_has_ended_and_the_daemon_has_replied(
     ended: bool,
 ) -> None:
-    async def ends() -> Ending:
+    async def interrupt_guide() -> Ending:
         return Ending("the check started by phone has ended", ended)
 
     def served(query: zenoh.Query) -> None:
@@ -124,8 +124,10 @@ def test_a_stop_succeeds_when_the_check_has_ended_and_the_daemon_has_replied(
             query.reply(query.key_expr, answer, encoding=kind)
 
     async def story(client: Client | None) -> ServiceReply:
-        calls = calls_of(robots(client), ends)
-        assert not (await calls_of(robots(None), ends).call(MAINTAINER, "clear", {})).success
+        calls = calls_of(robots(client), interrupt_guide)
+        assert not (
+            await calls_of(robots(None), interrupt_guide).call(MAINTAINER, "clear", {})
+        ).success
         return await calls.call(replace(MAINTAINER, role="viewer"), "stop", {})
 
     told = asyncio.run(story(None))
@@ -170,7 +172,7 @@ async def test_a_stop_of_another_robot_is_sent_however_many_replies_are_pending(
 
 
 async def test_stops_of_one_client_to_one_robot_are_merged_without_a_loss() -> None:
-    merged, loop = Merged(), asyncio.get_running_loop()
+    merged, loop = StopMerger(), asyncio.get_running_loop()
     sent: list[float] = []
 
     async def stop() -> ServiceReply:
@@ -195,7 +197,7 @@ async def test_stops_of_one_client_to_one_robot_are_merged_without_a_loss() -> N
 
 
 async def test_a_stop_that_comes_as_the_pause_ends_is_sent_and_so_are_the_later_ones() -> None:
-    merged, sent = Merged(), 0
+    merged, sent = StopMerger(), 0
 
     async def stop() -> ServiceReply:
         nonlocal sent
@@ -235,7 +237,7 @@ async def test_stops_to_silent_robots_are_limited_and_an_answering_robot_is_stop
                 await stop(f"x{n}")
             except RefusedError:
                 refused += 1
-        assert refused > 100 - 2 * REMOTE_STOP_RATE.most
+        assert refused > 100 - 2 * REMOTE_STOP_RATE.burst
         assert await stop("r2")
         assert told["r2"] == 2
 
@@ -244,7 +246,7 @@ async def test_a_robot_that_a_page_shows_is_stopped_however_many_stops_were_refu
     with zenoh.open(quiet()) as session:
         known = robots(Client(session, "acsar", "teleop"))
         fleet = Fleet(known)
-        calls = calls_of(known, sees=fleet.sees)
+        calls = calls_of(known, is_known=fleet.sees)
 
         async def stop(robot: str) -> str:
             """Return the answer of the bus, which has no such service, or the refusal."""

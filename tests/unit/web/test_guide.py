@@ -13,7 +13,7 @@ from acsard.calibration.guided.methods import METHODS
 from acsard.cli import parser
 from acsard.host.processes import Holder
 from acsard.machine.serial_ports import SerialDevice
-from acsard.web.guide import KEY, NO_DEVICE, Guide, Reach, boards, last_part, words
+from acsard.web.guide import KEY, NO_DEVICE, Guide, Reach, arguments, boards, last_part
 from acsard.web.socket_messages import Begin, FrameError
 from tests.each import each
 
@@ -86,7 +86,7 @@ def parsed(given: list[str]) -> argparse.Namespace:
 
 
 def test_a_check_gets_the_port_and_the_file_and_asks_before_it_moves() -> None:
-    args = parsed(words(Begin("check", "/dev/acsar"), REACH, PORTS))
+    args = parsed(arguments(Begin("check", "/dev/acsar"), REACH, PORTS))
     assert (args.port, args.config) == ("/dev/acsar", REACH.config)
     assert args.json_lines
     assert [args.yes, args.write, args.wheels_are_lifted] == [False] * 3
@@ -95,7 +95,7 @@ def test_a_check_gets_the_port_and_the_file_and_asks_before_it_moves() -> None:
 @each("way", ["", *NEEDS])
 def test_a_calibration_is_of_the_page_s_robot_and_asks_before_it_moves(way: str) -> None:
     positions = "sim/pose" if way == "positions" else ""
-    args = parsed(words(Begin("calibrate", "", way, positions), REACH, ()))
+    args = parsed(arguments(Begin("calibrate", "", way, positions), REACH, ()))
     assert (args.connect, args.id, args.tls) == (REACH.endpoint, REACH.robot_id, REACH.tls)
     assert (args.method or "", args.positions or "") == (way, positions)
     assert args.json_lines
@@ -103,7 +103,7 @@ def test_a_calibration_is_of_the_page_s_robot_and_asks_before_it_moves(way: str)
 
 
 def test_unknown_values_are_not_passed_as_options() -> None:
-    given = words(Begin("calibrate"), Reach("", "tcp/127.0.0.1:7448", "acsar", ""), ())
+    given = arguments(Begin("calibrate"), Reach("", "tcp/127.0.0.1:7448", "acsar", ""), ())
     assert not any(
         word.startswith(("--config", "--tls", "--method", "--positions")) for word in given
     )
@@ -133,7 +133,7 @@ def test_unknown_values_are_not_passed_as_options() -> None:
 )
 def test_a_request_that_was_not_offered_is_refused_with_a_reason(wish: Begin) -> None:
     with pytest.raises(FrameError) as caught:
-        words(wish, REACH, PORTS)
+        arguments(wish, REACH, PORTS)
     assert caught.value.about == "begin"
     assert str(caught.value)
 
@@ -143,7 +143,7 @@ def test_no_text_becomes_an_option_of_its_own(
     what: str, port: str, way: str, positions: str
 ) -> None:
     try:
-        given = words(Begin(what, port, way, positions), REACH, PORTS)  # type: ignore[arg-type]
+        given = arguments(Begin(what, port, way, positions), REACH, PORTS)  # type: ignore[arg-type]
     except FrameError:
         return
     names = {word.partition("=")[0] for word in given}

@@ -10,94 +10,99 @@ from acsard.core.values import NS_PER_S
 from acsard.host.rate_limits import Buckets
 from acsard.web.limits import (
     COMMAND_RATE,
-    CONNECTIONS,
-    CONNECTIONS_ALIKE,
-    CONNECTIONS_OF_ONE,
-    CONNECTIONS_OF_TOKEN,
     GUESSES,
     GUESSES_OF_ONE,
     HANDSHAKE_RATE,
-    MAX_LOCAL_SOCKETS,
-    MIN_CONNECTIONS,
+    MAX_LOCAL_TCP_CONNECTIONS,
+    MAX_LOCAL_WEBSOCKETS,
+    MAX_TCP_CONNECTIONS,
+    MAX_TCP_OF_NETWORK,
+    MAX_TCP_OF_TOKEN,
+    MAX_WEBSOCKETS,
+    MAX_WEBSOCKETS_OF_NETWORK,
+    MAX_WEBSOCKETS_OF_TOKEN,
+    MAX_WEBSOCKETS_OF_TOKEN_IN_NETWORK,
+    MIN_TCP_CONNECTIONS,
     OPENINGS,
     PICTURES,
     REFUSAL_DELAY_S,
     REQUEST_RATE,
-    RESERVED_CONNECTIONS,
-    SOCKETS,
-    SOCKETS_HERE,
-    SOCKETS_OF_ONE,
-    SOCKETS_OF_TOKEN,
+    RESERVED_TCP_OF_TOKEN,
     STOPS,
     STRANGER_RATE,
-    Seats,
     Shares,
     Sockets,
+    WebSocketLimits,
     sockets_for,
 )
 
 
 def test_a_token_has_a_share_of_the_connections_over_all_its_addresses() -> None:
-    seats = Seats()
-    told = [seats.enter(f"10.0.0.{n}", "wall") for n in range(CONNECTIONS)]
-    assert told.count("") == CONNECTIONS_OF_TOKEN < CONNECTIONS
-    assert str(CONNECTIONS_OF_TOKEN) in told[-1]
-    assert not seats.enter("10.0.1.1", "phone")
-    seats.leave("10.0.0.0", "wall")
-    assert not seats.enter("10.0.2.1", "wall")
+    limits = WebSocketLimits()
+    told = [limits.enter(f"10.0.0.{n}", "wall") for n in range(MAX_WEBSOCKETS)]
+    assert told.count("") == MAX_WEBSOCKETS_OF_TOKEN < MAX_WEBSOCKETS
+    assert str(MAX_WEBSOCKETS_OF_TOKEN) in told[-1]
+    assert not limits.enter("10.0.1.1", "phone")
+    limits.leave("10.0.0.0", "wall")
+    assert not limits.enter("10.0.2.1", "wall")
 
 
 def test_a_refused_token_takes_no_place_of_its_address() -> None:
-    seats = Seats()
-    for n in range(CONNECTIONS_OF_TOKEN):
-        seats.enter(f"10.0.0.{n}", "wall")
-    assert all(seats.enter("10.0.1.1", "wall") for _ in range(2 * CONNECTIONS_OF_ONE))
-    assert not seats.enter("10.0.1.1", "phone")
+    limits = WebSocketLimits()
+    for n in range(MAX_WEBSOCKETS_OF_TOKEN):
+        limits.enter(f"10.0.0.{n}", "wall")
+    assert all(limits.enter("10.0.1.1", "wall") for _ in range(2 * MAX_WEBSOCKETS_OF_NETWORK))
+    assert not limits.enter("10.0.1.1", "phone")
 
 
 def test_a_token_has_a_share_of_its_address_and_leaves_others_theirs() -> None:
-    seats = Seats()
-    told = [seats.enter("10.0.0.1", "broken") for _ in range(CONNECTIONS_OF_ONE)]
-    assert told.count("") == CONNECTIONS_ALIKE < CONNECTIONS_OF_ONE
-    assert f"{CONNECTIONS_ALIKE} pages with this token are open at 10.0.0.1" in told[-1]
+    limits = WebSocketLimits()
+    told = [limits.enter("10.0.0.1", "broken") for _ in range(MAX_WEBSOCKETS_OF_NETWORK)]
+    assert told.count("") == MAX_WEBSOCKETS_OF_TOKEN_IN_NETWORK < MAX_WEBSOCKETS_OF_NETWORK
+    assert (
+        f"{MAX_WEBSOCKETS_OF_TOKEN_IN_NETWORK} pages with this token are open at 10.0.0.1"
+        in told[-1]
+    )
     assert "broken" not in told[-1]
-    assert not seats.enter("10.0.0.1", "phone")
-    assert not seats.enter("10.0.0.2", "broken")
-    seats.leave("10.0.0.1", "broken")
-    assert seats.missing("10.0.0.1", "broken") == ""
+    assert not limits.enter("10.0.0.1", "phone")
+    assert not limits.enter("10.0.0.2", "broken")
+    limits.leave("10.0.0.1", "broken")
+    assert limits.refusal("10.0.0.1", "broken") == ""
 
 
 def test_an_address_has_a_share_of_the_connections_over_all_its_tokens() -> None:
-    seats = Seats()
-    told = [seats.enter("10.0.0.1", f"token{n}") for n in range(CONNECTIONS)]
-    assert told.count("") == CONNECTIONS_OF_ONE
-    assert f"{CONNECTIONS_OF_ONE} from 10.0.0.1" in told[-1]
-    assert not seats.enter("10.0.0.2", "token0")
+    limits = WebSocketLimits()
+    told = [limits.enter("10.0.0.1", f"token{n}") for n in range(MAX_WEBSOCKETS)]
+    assert told.count("") == MAX_WEBSOCKETS_OF_NETWORK
+    assert f"{MAX_WEBSOCKETS_OF_NETWORK} from 10.0.0.1" in told[-1]
+    assert not limits.enter("10.0.0.2", "token0")
 
 
 def test_all_addresses_of_an_ipv6_network_share_the_limits_of_one_address() -> None:
-    seats = Seats()
-    told = [seats.enter(f"2001:db8::{n + 1:x}", "broken") for n in range(CONNECTIONS_OF_ONE)]
-    assert told.count("") == CONNECTIONS_ALIKE
+    limits = WebSocketLimits()
+    told = [
+        limits.enter(f"2001:db8::{n + 1:x}", "broken") for n in range(MAX_WEBSOCKETS_OF_NETWORK)
+    ]
+    assert told.count("") == MAX_WEBSOCKETS_OF_TOKEN_IN_NETWORK
     assert "are open at 2001:db8::/64 already" in told[-1]
-    told = [seats.enter(f"2001:db8::{n + 1:x}", f"token{n}") for n in range(CONNECTIONS)]
-    assert told.count("") == CONNECTIONS_OF_ONE - CONNECTIONS_ALIKE
-    assert f"{CONNECTIONS_OF_ONE} from 2001:db8::/64" in told[-1]
-    assert not seats.enter("2001:db8:0:1::1", "broken")
-    seats.leave("2001:db8::9", "broken")
-    assert not seats.enter("2001:db8::a", "broken")
+    told = [limits.enter(f"2001:db8::{n + 1:x}", f"token{n}") for n in range(MAX_WEBSOCKETS)]
+    assert told.count("") == MAX_WEBSOCKETS_OF_NETWORK - MAX_WEBSOCKETS_OF_TOKEN_IN_NETWORK
+    assert f"{MAX_WEBSOCKETS_OF_NETWORK} from 2001:db8::/64" in told[-1]
+    assert not limits.enter("2001:db8:0:1::1", "broken")
+    limits.leave("2001:db8::9", "broken")
+    assert not limits.enter("2001:db8::a", "broken")
 
 
 def test_local_browsers_have_reserved_connections() -> None:
-    seats = Seats()
-    for n in range(2 * CONNECTIONS):
-        seats.enter(f"127.0.0.{n % 9}", f"token{n}")
-    assert seats.missing("127.0.0.1", "another")
-    told = [seats.enter("127.0.0.1", "") for _ in range(MAX_LOCAL_SOCKETS + 1)]
-    assert told[:-1] == [""] * MAX_LOCAL_SOCKETS
+    limits = WebSocketLimits()
+    for n in range(2 * MAX_WEBSOCKETS):
+        limits.enter(f"127.0.0.{n % 9}", f"token{n}")
+    assert limits.refusal("127.0.0.1", "another")
+    told = [limits.enter("127.0.0.1", "") for _ in range(MAX_LOCAL_WEBSOCKETS + 1)]
+    assert told[:-1] == [""] * MAX_LOCAL_WEBSOCKETS
     assert "on the robot itself" in told[-1]
-    seats.leave("127.0.0.1", "")
-    assert not seats.enter("::1", "")
+    limits.leave("127.0.0.1", "")
+    assert not limits.enter("::1", "")
 
 
 def test_one_holder_has_a_share_and_leaves_room_for_others() -> None:
@@ -123,32 +128,33 @@ def test_the_manual_states_the_limits_of_the_connections() -> None:
     page = Path(__file__).parents[3] / "deploy" / "web" / "README.md"
     told = " ".join(page.read_text(encoding="utf-8").split())
     assert (
-        f"There are {CONNECTIONS} WebSockets for other machines: at most {CONNECTIONS_OF_ONE} of "
-        f"one network (with any tokens), {CONNECTIONS_OF_TOKEN} with one token (from all its "
-        f"networks), and {CONNECTIONS_ALIKE} with one token from one network"
+        f"There are {MAX_WEBSOCKETS} WebSockets for other machines: at most "
+        f"{MAX_WEBSOCKETS_OF_NETWORK} of one network (with any tokens), "
+        f"{MAX_WEBSOCKETS_OF_TOKEN} with one token (from all its "
+        f"networks), and {MAX_WEBSOCKETS_OF_TOKEN_IN_NETWORK} with one token from one network"
     ) in told
-    assert f"another {MAX_LOCAL_SOCKETS} WebSockets for the machine itself" in told
-    assert f"room for {SOCKETS} TCP connections from other machines" in told
-    assert f"for another {SOCKETS_HERE} from the machine itself" in told
-    fewest = next(files for files in range(4096) if sockets_for(files) == SOCKETS)
+    assert f"another {MAX_LOCAL_WEBSOCKETS} WebSockets for the machine itself" in told
+    assert f"room for {MAX_TCP_CONNECTIONS} TCP connections from other machines" in told
+    assert f"for another {MAX_LOCAL_TCP_CONNECTIONS} from the machine itself" in told
+    fewest = next(files for files in range(4096) if sockets_for(files) == MAX_TCP_CONNECTIONS)
     assert f"fewer than {fewest} files" in told
-    assert f"A network with {SOCKETS_OF_ONE} such connections" in told
-    assert f"A token keeps {SOCKETS_OF_TOKEN} connections" in told
-    assert f"{COMMAND_RATE.hz:g} commands a second, and {COMMAND_RATE.most:g} at once" in told
+    assert f"A network with {MAX_TCP_OF_NETWORK} such connections" in told
+    assert f"A token keeps {MAX_TCP_OF_TOKEN} connections" in told
+    assert f"{COMMAND_RATE.hz:g} commands a second, and {COMMAND_RATE.burst:g} at once" in told
     assert f"Some requests wait {REFUSAL_DELAY_S:g} s beyond a rate" in told
     assert f"{STOPS.hz:g} stops or `whoami` a second of one token in one network" in told
     assert f"{PICTURES.hz:g} pictures, {OPENINGS.hz:g} new WebSockets" in told
     assert f"{STRANGER_RATE.hz:g} requests a second of one network without a token" in told
-    assert f"{STRANGER_RATE.most:g} of the requests without a token may come at once" in told
+    assert f"{STRANGER_RATE.burst:g} of the requests without a token may come at once" in told
     shakes = HANDSHAKE_RATE
-    assert f"begin {shakes.most:g} TLS handshakes at once, then {shakes.hz:g} a second" in told
-    most, hz = GUESSES_OF_ONE.most, GUESSES_OF_ONE.hz
+    assert f"begin {shakes.burst:g} TLS handshakes at once, then {shakes.hz:g} a second" in told
+    most, hz = GUESSES_OF_ONE.burst, GUESSES_OF_ONE.hz
     assert f"may try {most:g} wrong tokens at once, then one every {1 / hz:g} s" in told
-    assert (GUESSES.most / most, GUESSES.hz / hz) == pytest.approx((10, 10))
+    assert (GUESSES.burst / most, GUESSES.hz / hz) == pytest.approx((10, 10))
 
 
 def test_each_token_has_its_own_rate_limit() -> None:
-    paces, most = Buckets(REQUEST_RATE), int(REQUEST_RATE.most)
+    paces, most = Buckets(REQUEST_RATE), int(REQUEST_RATE.burst)
     taken = [paces.take("one", 0) for _ in range(most + 1)]
     assert taken == [True] * most + [False]
     assert paces.take("another", 0)
@@ -157,15 +163,15 @@ def test_each_token_has_its_own_rate_limit() -> None:
 
 def _filled(*networks: str) -> Sockets[str]:
     """Return places that are all taken by strangers from these networks, in turn."""
-    sockets = Sockets[str](SOCKETS)
-    for n in range(SOCKETS):
+    sockets = Sockets[str](MAX_TCP_CONNECTIONS)
+    for n in range(MAX_TCP_CONNECTIONS):
         assert sockets.enter(networks[n % len(networks)], f"stranger {n}") is None
     return sockets
 
 
 def test_a_full_network_displaces_its_own_oldest_connection_without_a_token() -> None:
-    sockets = Sockets[int](SOCKETS)
-    for n in range(SOCKETS_OF_ONE):
+    sockets = Sockets[int](MAX_TCP_CONNECTIONS)
+    for n in range(MAX_TCP_OF_NETWORK):
         assert sockets.enter("10.0.0.1", n) is None
     sockets.prove(0, "token")
     assert sockets.enter("10.0.0.1", 100) is None  # the known one takes no stranger's place
@@ -189,7 +195,7 @@ def test_a_connection_with_a_valid_token_is_never_displaced() -> None:
 
 
 def test_the_connections_of_a_token_that_has_ended_are_found() -> None:
-    sockets = Sockets[str](SOCKETS)
+    sockets = Sockets[str](MAX_TCP_CONNECTIONS)
     shown = {"none": [], "lent": ["lent"], "kept": ["kept"], "both": ["lent", "kept"], "here": [""]}
     for one, tokens in shown.items():
         sockets.enter("10.0.0.1", one)
@@ -201,35 +207,35 @@ def test_the_connections_of_a_token_that_has_ended_are_found() -> None:
 
 
 def test_the_connections_of_a_token_beyond_its_share_are_found_when_it_ends() -> None:
-    sockets = Sockets[int](SOCKETS)
-    for n in range(SOCKETS_OF_TOKEN + 20):
+    sockets = Sockets[int](MAX_TCP_CONNECTIONS)
+    for n in range(MAX_TCP_OF_TOKEN + 20):
         sockets.enter(f"10.0.0.{n}", n)
         sockets.prove(n, "lent")
-    assert len(sockets.ended({"kept"})) == SOCKETS_OF_TOKEN + 20
-    sockets.leave(SOCKETS_OF_TOKEN + 5)
-    assert len(sockets.ended({"kept"})) == SOCKETS_OF_TOKEN + 19
+    assert len(sockets.ended({"kept"})) == MAX_TCP_OF_TOKEN + 20
+    sockets.leave(MAX_TCP_OF_TOKEN + 5)
+    assert len(sockets.ended({"kept"})) == MAX_TCP_OF_TOKEN + 19
 
 
 def test_a_token_keeps_a_share_of_the_places_only() -> None:
     sockets = _filled("a", "b", "c", "d", "e")
-    for n in range(SOCKETS):
+    for n in range(MAX_TCP_CONNECTIONS):
         sockets.prove(f"stranger {n}", "greedy")
     gone = {sockets.enter(f"phone {n}", f"phone {n}") for n in range(100)}
     assert len(gone) == 100
-    assert gone < {f"stranger {n}" for n in range(SOCKETS_OF_TOKEN, SOCKETS)}
+    assert gone < {f"stranger {n}" for n in range(MAX_TCP_OF_TOKEN, MAX_TCP_CONNECTIONS)}
 
 
 def test_if_all_connections_have_shown_a_token_the_token_with_the_most_gives_a_place() -> None:
     sockets = _filled("a", "b", "c", "d", "e")
-    for n in range(SOCKETS):
+    for n in range(MAX_TCP_CONNECTIONS):
         sockets.prove(f"stranger {n}", f"token {min(n // 50, 4)}")  # token 4 has 56
     assert sockets.enter("phone", "phone") == "stranger 200"
 
 
 def test_no_token_loses_the_connections_of_one_browser() -> None:
     sockets = _filled("a", "b", "c", "d", "e")
-    for n in range(SOCKETS):
-        sockets.prove(f"stranger {n}", f"token {n // RESERVED_CONNECTIONS}")
+    for n in range(MAX_TCP_CONNECTIONS):
+        sockets.prove(f"stranger {n}", f"token {n // RESERVED_TCP_OF_TOKEN}")
     assert sockets.enter("phone", "phone") == "phone"
     sockets.leave("phone")  # it has no place to give back
     sockets.leave("stranger 9")
@@ -237,8 +243,8 @@ def test_no_token_loses_the_connections_of_one_browser() -> None:
 
 
 def test_connections_stay_below_the_limit_of_open_files() -> None:
-    assert sockets_for(65536) == sockets_for(2048) == sockets_for(1024) == SOCKETS
+    assert sockets_for(65536) == sockets_for(2048) == sockets_for(1024) == MAX_TCP_CONNECTIONS
     for files in (384, 512, 768):
-        assert MIN_CONNECTIONS <= sockets_for(files) < SOCKETS
-        assert sockets_for(files) + SOCKETS_HERE < files
-    assert sockets_for(64) == MIN_CONNECTIONS
+        assert MIN_TCP_CONNECTIONS <= sockets_for(files) < MAX_TCP_CONNECTIONS
+        assert sockets_for(files) + MAX_LOCAL_TCP_CONNECTIONS < files
+    assert sockets_for(64) == MIN_TCP_CONNECTIONS

@@ -16,11 +16,11 @@ from acsard.host.own_identity import own_addresses
 from acsard.machine.authority import Authority
 from acsard.web.listen import (
     Listen,
-    bound,
     invitations,
-    listens,
-    opened_by,
+    open_sockets,
     own_name,
+    page_urls,
+    parse_listen,
     require_certificate,
 )
 
@@ -49,14 +49,14 @@ def reached(port: int, host: str) -> bool:
 
 
 def test_an_address_is_parsed_and_a_remote_one_must_be_https() -> None:
-    assert listens("http://127.0.0.1:8080") == Listen(False, "127.0.0.1", 8080)
-    assert listens("https://[::]:8443/") == Listen(True, "::", 8443)
-    assert listens("https://[::]:8443").url == f"https://{own_name()}:8443/"
+    assert parse_listen("http://127.0.0.1:8080") == Listen(False, "127.0.0.1", 8080)
+    assert parse_listen("https://[::]:8443/") == Listen(True, "::", 8443)
+    assert parse_listen("https://[::]:8443").url == f"https://{own_name()}:8443/"
     for wrong in ("127.0.0.1:8080", "http://:80", "http://127.0.0.1:0", "ftp://a:1", "https://a:x"):
         with pytest.raises(UsageError, match="is not an address"):
-            listens(wrong)
+            parse_listen(wrong)
     with pytest.raises(UsageError, match="use https"):
-        listens("http://0.0.0.0:8080")
+        parse_listen("http://0.0.0.0:8080")
 
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "::"])
@@ -77,16 +77,16 @@ def test_an_invitation_has_no_ipv4_address_if_another_server_has_that_port(tls: 
 
 def test_the_reported_addresses_of_the_page_are_those_of_an_invitation(tls: str) -> None:
     away, here = Listen(True, "0.0.0.0", 8443), Listen(False, "127.0.0.1", 8080)
-    assert opened_by(away, tls) == invitations([away], tls)
-    assert f"https://{own_name()}:8443/" in opened_by(away, tls)
-    assert opened_by(here, "") == ["http://127.0.0.1:8080/"]
+    assert page_urls(away, tls) == invitations([away], tls)
+    assert f"https://{own_name()}:8443/" in page_urls(away, tls)
+    assert page_urls(here, "") == ["http://127.0.0.1:8080/"]
 
 
 @pytest.mark.parametrize(("host", "by"), [("0.0.0.0", {"127.0.0.1"}), ("::", {"127.0.0.1", "::1"})])
 def test_a_wildcard_address_is_reached_by_ipv4_and_only_the_ipv6_one_by_ipv6(
     host: str, by: set[str]
 ) -> None:
-    [(one, opened)] = bound([Listen(True, host, free_port())], next_port=False)
+    [(one, opened)] = open_sockets([Listen(True, host, free_port())], next_port=False)
     with opened:
         assert {at for at in ("127.0.0.1", "::1") if reached(one.port, at)} == by
 
@@ -94,7 +94,9 @@ def test_a_wildcard_address_is_reached_by_ipv4_and_only_the_ipv6_one_by_ipv6(
 @pytest.mark.parametrize("first", ["0.0.0.0", "127.0.0.1"])
 def test_an_ipv4_address_and_the_ipv6_wildcard_can_share_a_port(first: str) -> None:
     port = free_port()
-    for one, opened in bound([Listen(True, at, port) for at in (first, "::")], next_port=False):
+    for one, opened in open_sockets(
+        [Listen(True, at, port) for at in (first, "::")], next_port=False
+    ):
         with opened:
             assert reached(one.port, "::1" if one.host == "::" else "127.0.0.1")
 
@@ -105,14 +107,14 @@ def test_a_port_in_use_is_reported_or_the_next_port_is_used() -> None:
         taken.listen()
         wished = Listen(False, "127.0.0.1", taken.getsockname()[1])
         with pytest.raises(InUseError, match="choose another"):
-            bound([wished], next_port=False)
-        [(one, opened)] = bound([wished], next_port=True)
+            open_sockets([wished], next_port=False)
+        [(one, opened)] = open_sockets([wished], next_port=True)
         with opened:
             assert one.port > wished.port
 
 
 def test_https_without_a_certificate_is_reported_and_http_needs_none(tmp_path: Path) -> None:
-    away, here = listens("https://0.0.0.0:8443"), listens("http://127.0.0.1:8080")
+    away, here = parse_listen("https://0.0.0.0:8443"), parse_listen("http://127.0.0.1:8080")
     require_certificate([here], "")
     with pytest.raises(CertificateError, match="tls init"):
         require_certificate([here, away], "")

@@ -6,7 +6,7 @@ from msgspec.structs import replace
 from prometheus_client.parser import text_string_to_metric_families
 
 from acsard.core.messages.schema import BatterySummary, Latency, RobotState, Spread, Time
-from acsard.core.messages.state_warnings import WHATS
+from acsard.core.messages.state_warnings import WARNING_KINDS
 from acsard.web.metrics import MAX_COUNTED_CLIENTS, MAX_NAMED, Counts, text
 
 SPREAD = Spread(10, 5.0, 20.0, 80.0)
@@ -68,7 +68,7 @@ def test_each_warning_of_a_later_failure_is_a_sample() -> None:
     got = parsed(text("acsar", "0.1.0+g1a2b3c4d5", ends, True, 0, {}, {}))
     assert got["acsard_info", frozenset({own, ("version", "0.1.0+g1a2b3c4d5")})] == 1
     warned = {dict(labels)["what"]: n for (name, labels), n in got.items() if "warning" in name}
-    assert warned == dict.fromkeys(WHATS, 0.0) | {"certificate": 1.0}
+    assert warned == dict.fromkeys(WARNING_KINDS, 0.0) | {"certificate": 1.0}
     assert got["acsard_certificate_seconds", frozenset({own})] == 864_000
 
 
@@ -98,17 +98,17 @@ def test_a_foreign_text_cannot_leave_its_label() -> None:
 
 def test_refusals_are_reported_once_in_one_line_by_reason() -> None:
     counts = Counts()
-    assert counts.news() is None
+    assert counts.new_refusals() is None
     for _ in range(12):
         counts.refuse("bad_token")
     counts.refuse("origin")
-    told = counts.news()
+    told = counts.new_refusals()
     assert told is not None
     assert (told.name, told.level, told.count) == ("page_refused", "warning", 13)
     assert told.text == "12 bad token, 1 origin"
-    assert counts.news() is None
+    assert counts.new_refusals() is None
     counts.refuse("origin")
-    told = counts.news()
+    told = counts.new_refusals()
     assert told is not None
     assert told.text == "1 origin"
     assert counts.refused() == {"bad_token": 12, "origin": 2}
@@ -120,13 +120,13 @@ def test_each_line_names_the_client_with_the_most_refusals_since_the_last_line()
         counts.refuse("role", "192.168.1.50 (tv)")
     counts.refuse("bad_token", "192.168.1.7")
     counts.refuse("slow")
-    told = counts.news()
+    told = counts.new_refusals()
     assert told is not None
     assert told.text == (
         "3 role, 1 bad token, 1 slow; 3 from 192.168.1.50 (tv), 1 from 192.168.1.7, 1 from others"
     )
     counts.refuse("role", "192.168.1.7")
-    told = counts.news()
+    told = counts.new_refusals()
     assert told is not None
     assert told.text == "1 role; 1 from 192.168.1.7"
 
@@ -137,7 +137,7 @@ def test_a_client_with_many_addresses_does_not_lengthen_the_line() -> None:
         counts.refuse("bad_token", f"2001:db8::{n:x}")
     for _ in range(2):
         counts.refuse("bad_token", "2001:db8::1")
-    told = counts.news()
+    told = counts.new_refusals()
     assert told is not None
     assert told.text.count(" from ") == MAX_NAMED + 1
     assert "; 3 from 2001:db8::1, " in told.text

@@ -12,7 +12,12 @@ import pytest
 import zenoh
 from msgspec.structs import replace
 
-from acsard.client.follower import FIRST_STATE_TIMEOUT_S, QUERY_PERIOD_S, SILENT_S, Watch
+from acsard.client.follower import (
+    FIRST_STATE_TIMEOUT_S,
+    QUERY_PERIOD_S,
+    ROBOT_SILENCE_TIMEOUT_S,
+    Watch,
+)
 from acsard.core.config.settings import Config
 from acsard.core.messages.schema import Time
 from acsard.core.values import NS_PER_S
@@ -102,7 +107,11 @@ def test_a_robot_that_falls_silent_is_reported_within_its_time(world: World) -> 
     (_, here), (at, gone) = found
     assert here == ""
     assert "nothing is received from the daemon at tcp/x:1" in gone
-    assert 4.9 + SILENT_S - PROCESS_PERIOD_S <= at <= 5.0 + SILENT_S + 2 * PROCESS_PERIOD_S
+    assert (
+        4.9 + ROBOT_SILENCE_TIMEOUT_S - PROCESS_PERIOD_S
+        <= at
+        <= 5.0 + ROBOT_SILENCE_TIMEOUT_S + 2 * PROCESS_PERIOD_S
+    )
 
 
 def test_a_robot_that_publishes_once_in_ten_seconds_is_queried_and_is_not_gone(
@@ -196,7 +205,7 @@ async def test_the_page_learns_about_its_robot_although_a_thread_could_not_start
 
     monkeypatch.setattr(robots, "in_thread", in_thread)
     monkeypatch.setattr(robots, "RETRY_DELAY_S", 0.0)
-    monkeypatch.setattr(robots, "ASK_SOON_S", 0.0)
+    monkeypatch.setattr(robots, "ABOUT_RETRY_S", 0.0)
     client: Any = Known()
     page = Robots(Address("tcp/x:1", "acsar", ""), lambda: client, ABOUT, Counts())
     running = asyncio.create_task(page.run())

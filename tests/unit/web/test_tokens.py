@@ -23,10 +23,10 @@ def test_a_token_is_valid_until_it_is_revoked(tmp_path: Path) -> None:
     who = owner_in(server.all(), text)
     assert who is not None
     assert (who.role, who.name) == ("operator", "phone")
-    assert who.token in server.counting()
+    assert who.token in server.valid_digests()
     keeper.revoke("phone")
     assert owner_in(server.all(), text) is None
-    assert who.token not in server.counting()
+    assert who.token not in server.valid_digests()
 
 
 def test_the_token_itself_is_not_stored_on_the_disk(tmp_path: Path) -> None:
@@ -43,7 +43,7 @@ def test_an_expired_token_is_not_valid(tmp_path: Path) -> None:
     text, token = vault.invite("viewer", "tv", 1)
     vault.path.write_bytes(msgspec.json.encode([replace(token, ends=token.made - 1)]))
     assert owner_in(vault.all(), text) is None
-    assert token.digest not in vault.counting()
+    assert token.digest not in vault.valid_digests()
 
 
 @pytest.mark.parametrize("text", ["", "x", "x" * 10_000, "ü", "\0", "\udcff"])
@@ -60,7 +60,7 @@ def test_with_a_damaged_file_no_token_is_valid(tmp_path: Path) -> None:
     for damaged in (whole[:-3], whole.replace(b'"me"', '"mü"'.encode("latin-1")), b"[" * 100_000):
         vault.path.write_bytes(damaged)
         assert owner_in(vault.all(), text) is None
-        assert vault.counting() == frozenset()
+        assert vault.valid_digests() == frozenset()
         with pytest.raises(UsageError, match="is not a list of tokens"):
             vault.invite("viewer", "tv", 1)
 
@@ -90,9 +90,9 @@ def test_the_valid_tokens_are_reported_together(tmp_path: Path) -> None:
     vault = Vault(tmp_path, "robot1")
     _, first = vault.invite("viewer", "tv", 1)
     _, second = vault.invite("operator", "phone", 1)
-    assert vault.counting() == {first.digest, second.digest}
+    assert vault.valid_digests() == {first.digest, second.digest}
     vault.revoke("tv")
-    assert vault.counting() == {second.digest}
+    assert vault.valid_digests() == {second.digest}
 
 
 def test_a_name_is_given_once_and_an_unknown_one_cannot_be_revoked(tmp_path: Path) -> None:
@@ -119,7 +119,7 @@ def test_robots_that_share_the_file_know_their_own_tokens_alone(tmp_path: Path) 
     assert owner_in(second.all(), ours) is None
     assert owner_in(first.all(), theirs) is None
     assert [one.robot for one in second.all()] == ["robot2"]
-    assert second.counting() == {token.digest}
+    assert second.valid_digests() == {token.digest}
     assert first.left_s(token.digest) == 0
     first.revoke("phone")
     assert (first.all(), [one.name for one in second.all()]) == ([], ["phone"])

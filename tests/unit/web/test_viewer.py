@@ -15,7 +15,7 @@ from acsard.core.messages.signature import unpack
 from acsard.core.values import NS_PER_S, Twist
 from acsard.daemon.bus.address import Address
 from acsard.host import clock
-from acsard.web.callers import Who
+from acsard.web.callers import Identity
 from acsard.web.guide import Guide, Reach
 from acsard.web.limits import COMMAND_RATE
 from acsard.web.metrics import Counts
@@ -73,7 +73,7 @@ def test_a_token_that_commands_without_end_is_refused_except_a_zero_after_a_spee
     rest = Wish(Twist(0.0, 0.0), 1000, steady=True)
     assert commands.give("token", "teleop", driving, sender, AHEAD)
     given = [commands.give("token", "app", flooding, sender, rest) for _ in range(1000)]
-    assert COMMAND_RATE.most - 1 <= given.count(True) < COMMAND_RATE.most + 100
+    assert COMMAND_RATE.burst - 1 <= given.count(True) < COMMAND_RATE.burst + 100
     assert not commands.give("token", "teleop", driving, sender, AHEAD)
     # A source may have a timeout of 10 s, so a zero matters for that long.
     later_ns = clock.mono_ns() + 9 * NS_PER_S
@@ -93,7 +93,7 @@ async def test_a_zero_is_obeyed_beyond_the_limit_on_messages() -> None:
     class Fake:
         certificate, session = "", None
 
-        def like(self, *_: object) -> Fake:
+        def sibling(self, *_: object) -> Fake:
             return self
 
         def put(self, twist: Any, _: Any, source: str) -> None:
@@ -108,7 +108,7 @@ async def test_a_zero_is_obeyed_beyond_the_limit_on_messages() -> None:
     request: Any = SimpleNamespace(transport=None)
     socket: Any = SimpleNamespace()
     viewer = Viewer(
-        socket, request, Who("operator", "bob", "token", "1.2.3.4"), parts, camera=False
+        socket, request, Identity("operator", "bob", "token", "1.2.3.4"), parts, camera=False
     )
 
     def take(said: dict[str, Any]) -> None:

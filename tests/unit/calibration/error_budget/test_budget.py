@@ -185,7 +185,7 @@ def test_with_counts_the_shares_of_time_and_gaps_are_zero_and_quantization_remai
 
 
 def test_if_lines_are_missing_here_the_shares_of_time_and_gaps_are_unknown() -> None:
-    found = budget(Received(driven().lines, [], whole=False), CONFIG)
+    found = budget(Received(driven().lines, [], complete=False), CONFIG)
     assert {share(found, cause).basis for cause in ("time", "quantization", "gaps")} == {"unknown"}
 
 
@@ -198,6 +198,17 @@ def test_a_wheel_that_contradicts_its_neighbour_is_measured_slip() -> None:
     found = share(budget(Received(lines, []), CONFIG), "slip")
     assert found.basis == "measured"
     assert (found.mm_per_100_m or 0.0) > 10_000
+
+
+def test_wheels_that_contradict_each_other_in_a_turn_in_place_are_measured_slip() -> None:
+    lines = [
+        Line(n / 100, (1.0, -1.0, -2.0, 2.0), (n / 100, -n / 100, -n / 50, n / 50), n / 200, 0.0)
+        for n in range(3000)
+    ]
+    found = share(budget(Received(lines, []), CONFIG), "slip")
+    assert found.mm_per_100_m is None
+    assert found.basis == "measured"
+    assert (found.deg_per_turn or 0.0) > 60.0
 
 
 def test_the_largest_cause_is_chosen_among_the_requested_bases() -> None:

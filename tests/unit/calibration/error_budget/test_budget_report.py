@@ -73,7 +73,7 @@ def test_the_advice_for_a_robot_without_calibration_comes_first() -> None:
 
 
 def test_the_advice_says_if_there_is_no_error() -> None:
-    assert advice(of()) == "the odometry shows no error on this drive"
+    assert advice(of()) == "no cause of errors was measured on this drive"
 
 
 def test_the_table_has_every_cause_and_their_sum() -> None:

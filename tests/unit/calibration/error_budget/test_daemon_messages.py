@@ -85,16 +85,16 @@ def test_the_times_of_the_sent_lines_are_the_stamps_of_the_applied_commands() ->
 
 
 @pytest.mark.parametrize(
-    ("lines", "impossible", "whole"), [(102, 0, True), (140, 0, False), (140, 40, True)]
+    ("lines", "impossible", "complete"), [(102, 0, True), (140, 0, False), (140, 40, True)]
 )
 def test_lines_that_the_daemon_counted_but_did_not_arrive_here_are_noticed(
-    lines: int, impossible: int, whole: bool
+    lines: int, impossible: int, complete: bool
 ) -> None:
     feed = Feed(Config(), state(0))
     for n in range(100):
         feed.add(wheels(n / 100))
         feed.add(odom(n / 100))
-    assert feed.received(state(lines, impossible=impossible), diagnostics()).whole is whole
+    assert feed.received(state(lines, impossible=impossible), diagnostics()).complete is complete
 
 
 @pytest.mark.parametrize(("lines", "coarse"), [(90, False), (110, True)])
@@ -108,7 +108,7 @@ def test_coarse_encoders_are_noticed_by_the_lines_that_state_counts(
 
 def test_a_daemon_with_a_limited_rate_does_not_send_all_lines() -> None:
     slow = replace(Config(), rates=RatesConfig(odom=10.0))
-    assert not Feed(slow, state(0)).received(state(0), diagnostics()).whole
+    assert not Feed(slow, state(0)).received(state(0), diagnostics()).complete
 
 
 def test_counts_are_in_force_only_if_the_link_check_has_samples() -> None:
@@ -117,7 +117,10 @@ def test_counts_are_in_force_only_if_the_link_check_has_samples() -> None:
         assert Feed(asked, state(0)).received(state(0), diagnostics(check=check)).counted is counted
 
 
-@pytest.mark.parametrize(("does", "used"), [("used", True), ("disagrees", True), ("silent", False)])
+@pytest.mark.parametrize(
+    ("does", "used"),
+    [("used", True), ("disagrees", True), ("silent", False), ("waiting for turn", False)],
+)
 def test_the_heading_is_the_gyros_where_it_is_used(does: str, used: bool) -> None:
     assert Feed(Config(), state(0)).received(state(0, does), diagnostics()).gyro is used
 

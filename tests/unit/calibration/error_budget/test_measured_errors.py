@@ -173,7 +173,7 @@ def test_the_rounding_errors_of_a_wheel_with_changing_speed_cancel_out() -> None
 def test_only_wheels_with_equal_speeds_have_equal_rounding_errors() -> None:
     rng = np.random.default_rng(2)
     one, other = (np.round(rng.uniform(5, 9, COUNT), 2) for _ in range(2))
-    alike = rounding(four(one, other, other, one), PERIOD).alike
+    alike = rounding(four(one, other, other, one), PERIOD).equal_errors
     assert alike.tolist() == [[1, 0, 0, 1], [0, 1, 1, 0], [0, 1, 1, 0], [1, 0, 0, 1]]
 
 

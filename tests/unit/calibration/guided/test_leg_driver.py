@@ -10,7 +10,7 @@ import pytest
 from acsard.calibration.guided.drive_plan import Leg, Move
 from acsard.calibration.guided.leg_driver import STALL_REASON, LegDriver, Phase
 from acsard.client.commander import OPEN_TIMEOUT_S
-from acsard.client.follower import QUIET_S
+from acsard.client.follower import MAX_STATE_AGE_S
 from acsard.core.config.settings import DriveConfig
 from acsard.core.link.link_diagnosis import HOST_STALL
 from acsard.core.messages.schema import RobotState, SourceState, Time
@@ -147,7 +147,10 @@ def test_a_leg_that_halts_on_a_fault_never_moves_again(why: str) -> None:
 
 TWO = [
     SourceState(
-        "app", 50, 0.01, "1 more of this source's senders must wait until the first one is silent"
+        "app",
+        50,
+        0.01,
+        "1 other sender of this source must wait until the sender that drives falls silent",
     )
 ]
 
@@ -194,7 +197,7 @@ def test_a_calibration_waits_for_a_program_that_leaves_during_the_zeros() -> Non
 def test_a_daemon_that_falls_silent_halts_the_leg() -> None:
     world = World(Leg("", "", (Move(10.0, 0.3),))).until_moving()
     world.speaks = False
-    world.run(QUIET_S + 2 * TICK)
+    world.run(MAX_STATE_AGE_S + 2 * TICK)
     assert world.said[-1] == REST
     assert (
         world.driver.halted
@@ -206,7 +209,7 @@ def test_a_daemon_that_falls_silent_halts_the_leg() -> None:
 
 def test_a_calibration_that_was_held_up_halts_and_does_not_blame_the_daemon() -> None:
     world = World(Leg("", "", (Move(10.0, 0.3),))).until_moving()
-    assert world.driver.step(world.now + QUIET_S + TICK) == REST
+    assert world.driver.step(world.now + MAX_STATE_AGE_S + TICK) == REST
     assert world.driver.halted == STALL_REASON
     assert world.driver.disturbed
 

@@ -125,6 +125,15 @@ def test_a_wheel_that_contradicts_the_other_of_its_side_is_noted_or_refused() ->
         with_rear_left(0.0).log()
 
 
+def test_a_leg_without_wheel_speeds_for_a_minute_is_disturbed() -> None:
+    recorder = Recorder(JOINTS)
+    for k in range(200):
+        at = 10.0 + 0.02 * k + (61.0 if k >= 100 else 0.0)
+        recorder.wheels(wheels(at, 3.0, 1.0), at)
+    with pytest.raises(DisturbedError, match="no wheel speeds arrived for 60 s"):
+        recorder.log()
+
+
 class Laptop(NoPrompt):
     """A computer that is suspended 2 s after the begin of a leg, and the robot that it drives."""
 

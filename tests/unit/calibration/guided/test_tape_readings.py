@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from acsard.calibration.calibration_report import keys, parts, report
-from acsard.calibration.fit import P
+from acsard.calibration.fit import Parameter
 from acsard.calibration.guided.drive_plan import MAX_TRACK_RATIO, GuideError, Quantity
 from acsard.calibration.guided.methods import MAX_SPIN_S, once_round, turns
 from acsard.calibration.guided.tape_readings import (
@@ -64,9 +64,9 @@ def readings() -> list[Reading]:
 
 def test_exact_readings_give_the_parameters_of_the_robot() -> None:
     told = fit_readings(readings(), BASE)
-    assert 1 / told.parameters[P.INVERSE_TRACK] == pytest.approx(1.5, rel=2e-3)
-    assert told.parameters[P.LEFT] == pytest.approx(0.98, rel=1e-3)
-    assert told.parameters[P.RIGHT] == pytest.approx(1.01, rel=1e-3)
+    assert 1 / told.parameters[Parameter.INVERSE_TRACK] == pytest.approx(1.5, rel=2e-3)
+    assert told.parameters[Parameter.LEFT] == pytest.approx(0.98, rel=1e-3)
+    assert told.parameters[Parameter.RIGHT] == pytest.approx(1.01, rel=1e-3)
     assert np.all(np.abs(told.residuals) < 3e-3)
 
 
@@ -111,7 +111,7 @@ def test_readings_that_contradict_each_other_widen_the_deviation() -> None:
     for measured, wrong in ((exact, 0.0), (worse, 0.6)):
         measured += [Reading((spin,), "turned", turned + side * wrong, 0.01) for side in (1, -1)]
     sure, unsure = (
-        fit_readings(one, BASE).covariance[P.INVERSE_TRACK, P.INVERSE_TRACK]
+        fit_readings(one, BASE).covariance[Parameter.INVERSE_TRACK, Parameter.INVERSE_TRACK]
         for one in (exact, worse)
     )
     assert unsure > 4 * sure

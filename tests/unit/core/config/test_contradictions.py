@@ -25,7 +25,7 @@ from acsard.core.config.settings import (
     WebConfig,
 )
 from acsard.host.errors import UsageError
-from acsard.web.listen import listens
+from acsard.web.listen import parse_listen
 from tests.each import each
 
 
@@ -106,7 +106,7 @@ def test_the_check_refuses_the_addresses_that_the_page_refuses(
     addresses: tuple[str, ...], tls: str
 ) -> None:
     try:
-        found = [listens(address) for address in addresses]
+        found = [parse_listen(address) for address in addresses]
         refused = any(address.secure for address in found) and not tls
     except UsageError:
         refused = True
@@ -246,7 +246,10 @@ def test_counts_that_wrap_within_two_periods_are_refused_with_the_largest_valid_
     assert line.startswith(
         "mcu.encoder_counts = 20000: at feedback.wheel_speed = 80 rad/s a wheel's counter "
     )
-    assert "wrap round within 129 ms, which is less than 2 control periods (200 ms)" in line
+    assert (
+        "change by half of its range within 129 ms, which is less than 2 control periods (200 ms)"
+        in line
+    )
     assert "write mcu.encoder_counts = 12867 or less" in line
     assert problems(mcu=McuConfig(encoder_counts=12_867), control=control) == []
     assert problems(mcu=McuConfig(encoder_counts=12_868), control=control) != []

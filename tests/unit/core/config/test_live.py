@@ -16,6 +16,7 @@ from acsard.core.config.live import LIVE, changed, flat, live
 from acsard.core.config.parsing import ConfigError, effective, parse
 from acsard.core.config.settings import Config, LimitsConfig, RobotConfig
 from acsard.core.config.toml_text import document
+from acsard.core.config.validation import show
 from tests.each import each
 
 CONFIG = Config(robot=RobotConfig("r7"))
@@ -193,7 +194,10 @@ def test_braking_can_be_made_harder_while_driving_but_softer_only_at_rest(key: s
     assert changed(config, harder, False)[1]
     assert changed(config, softer, True)[1]
     (line,) = problems(softer, False, config)
-    assert "only while the robot stands; stop the robot first" in line
+    assert line == (
+        f"{key} = {show(now * 0.9)} is lower than the present {show(now)}; this setting may be "
+        "lowered only while the robot stands; stop the robot first"
+    )
 
 
 @each(

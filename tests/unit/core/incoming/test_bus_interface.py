@@ -117,7 +117,7 @@ def test_a_peer_in_the_place_of_a_router_is_reported_once_with_its_consequence()
     told.receive(RoutersStatus((A,), peers=(A,)), counters, events)
     found = [(event.name, event.level) for event in events]
     assert found == [("router_found", "info"), ("not_a_router", "warning")]
-    assert events[-1].text.startswith(f"{A} is not a router")
+    assert events[-1].text.startswith(f"these endpoints are peers, not routers: {A}. A peer, ")
     assert "call stop --id '*'" in events[-1].text
 
 

@@ -949,34 +949,34 @@ def test_a_sender_id_is_never_taken_for_a_session_that_stamps_for_others() -> No
 def test_the_first_certificate_keeps_a_sender_id_while_it_sends() -> None:
     bindings = Bindings()
     for at_ns in range(0, 5 * BINDING_NS, BINDING_NS // 2):
-        assert bindings.other("a", "anna", at_ns) is None
-        assert bindings.other("a", "ben", at_ns + 1) == "anna"
-        assert bindings.other("a", "", at_ns + 1) == "anna"
-    assert bindings.other("b", "ben", at_ns) is None
+        assert bindings.bind("a", "anna", at_ns) is None
+        assert bindings.bind("a", "ben", at_ns + 1) == "anna"
+        assert bindings.bind("a", "", at_ns + 1) == "anna"
+    assert bindings.bind("b", "ben", at_ns) is None
 
 
 def test_a_sender_id_without_a_certificate_is_bound_to_this_machine() -> None:
     bindings = Bindings()
-    assert bindings.other("a", "", 0) is None
-    assert bindings.other("a", "anna", 1) == ""
+    assert bindings.bind("a", "", 0) is None
+    assert bindings.bind("a", "anna", 1) == ""
 
 
 def test_a_binding_ends_after_a_silence_and_refused_commands_do_not_extend_it() -> None:
     bindings = Bindings()
-    bindings.other("a", "anna", 0)
-    assert bindings.other("a", "ben", BINDING_NS) == "anna"
-    assert bindings.other("a", "ben", BINDING_NS + 1) is None
-    assert bindings.other("a", "anna", BINDING_NS + 2) == "ben"
+    bindings.bind("a", "anna", 0)
+    assert bindings.bind("a", "ben", BINDING_NS) == "anna"
+    assert bindings.bind("a", "ben", BINDING_NS + 1) is None
+    assert bindings.bind("a", "anna", BINDING_NS + 2) == "ben"
 
 
 def test_a_flood_of_sender_ids_is_bounded_in_memory_and_active_senders_stay_bound() -> None:
     bindings = Bindings()
-    bindings.other("a", "anna", 0)
+    bindings.bind("a", "anna", 0)
     for number in range(4 * MAX_BINDINGS):
-        bindings.other(f"other {number}", "ben", number)
+        bindings.bind(f"other {number}", "ben", number)
         if number % 100 == 0:
-            assert bindings.other("a", "anna", number) is None
-    assert bindings.other("a", "ben", number) == "anna"
+            assert bindings.bind("a", "anna", number) is None
+    assert bindings.bind("a", "ben", number) == "anna"
     assert len(bindings._seen) <= MAX_BINDINGS
 
 

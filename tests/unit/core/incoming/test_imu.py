@@ -156,6 +156,30 @@ def test_a_gyro_that_returns_after_a_silence_is_not_marked_as_new() -> None:
         assert sample == GyroSample(at_ns, None, 0.1)
 
 
+def test_a_gyro_after_one_without_a_name_is_marked_as_new() -> None:
+    gyro, counters, events = GyroFollower(), Counter[str](), list[Event]()
+    # On an rmw key only the attachment names the sender.
+    nameless = replace(turning(0.1, 0, ""), via="rmw")
+    first = gyro.receive(nameless, counters, events)
+    assert first is not None
+    assert not first.anew
+    assert gyro.receive(turning(0.1, 1, "abc"), counters, events) is None
+    assert "uses those of a sender without a name" in events[0].text
+    second = gyro.receive(turning(0.1, 2 * SILENCE_TIMEOUT_NS, "abc"), counters, events)
+    assert second is not None
+    assert second.anew
+
+
+def test_a_second_gyro_without_a_name_is_refused_in_words() -> None:
+    gyro, events = GyroFollower(), list[Event]()
+    gyro.receive(turning(0.1, 0, "abc"), Counter(), events)
+    assert gyro.receive(replace(turning(0.1, 1, ""), via="rmw"), Counter(), events) is None
+    assert [event.text for event in events] == [
+        "a sender without a name sends gyro samples, but the daemon already uses those of session "
+        "ba7816bf8f01cfea: end one of the two programs"
+    ]
+
+
 def test_a_robot_with_its_own_gyro_never_follows_another_one() -> None:
     counters, events = Counter[str](), list[Event]()
     told = GyroFollower(own=True)

@@ -65,7 +65,7 @@ def test_zero_means_no_limit_and_a_percentage_refers_to_the_configured_speed(
 
 def test_the_sender_of_a_limit_is_named() -> None:
     by = decode_limit(arrival(encode(FULL, "cdr"), via="rmw"), 1.0).by
-    assert by == f"speed_limit, unnamed (rmw {(b'g' * 16).hex()})"
+    assert by == f"unnamed (rmw {(b'g' * 16).hex()}) on the key speed_limit"
 
 
 REFUSED: dict[str, list[Arrival]] = {
@@ -162,7 +162,8 @@ def test_a_limit_lowers_the_setting_and_its_end_restores_the_setting() -> None:
     assert robot.speed == 0.3
     assert (
         robot.limiter.text
-        == "0.3 m/s, set by speed_limit, unnamed (native); back to 1 m/s when this limit ends"
+        == "0.3 m/s, set by unnamed (native) on the key speed_limit; back to 1 m/s when this limit "
+        "ends"
     )
     robot.limit(0.0)
     robot.step()
@@ -196,7 +197,7 @@ def test_a_set_above_the_limit_waits_for_its_end_and_the_answer_says_so() -> Non
     answer = robot.step({LOWERED_SETTING: 0.8})[1]
     text = (
         "limits.linear_speed = 0.8 will apply when the limit of 0.3 m/s ends "
-        "(speed_limit, unnamed (native))"
+        "(unnamed (native) on the key speed_limit)"
     )
     assert answer == Answer(1, True, text)
     assert [(event.name, event.text) for event in robot.events] == [("set", text)]

@@ -10,7 +10,7 @@ from contextlib import suppress
 import pytest
 
 from acsard.core.config.settings import Place, SafetyConfig, WheelMap
-from acsard.core.link.board_status import STATUS, BoardStatus, decode_status, merged, shown
+from acsard.core.link.board_status import STATUS, BoardStatus, as_text, decode_status, merged
 from acsard.core.link.checked_line import unseal
 from acsard.core.link.codec import Codec, FrameError
 from acsard.core.motion.bumpers import Bumpers
@@ -107,11 +107,11 @@ def test_the_simulated_board_writes_the_same_line(word: str, check: bool) -> Non
 def test_a_field_keeps_its_last_value_until_a_newer_line_has_it() -> None:
     status = merged(decode_status(FULL, False), BoardStatus(estop=True, volts=23.9))
     assert (status.estop, status.volts, status.amps) == (True, 23.9, -1.2)
-    assert shown(status) == {
+    assert as_text(status) == {
         "emergency_stop": "pressed", "bumpers": "..X.", "motor_driver": "fault",
         "volts": "23.90", "amperes": "-1.20", "charge": "0.87", "temperature_c": "-4.5",
     }  # fmt: skip
-    assert shown(BoardStatus()) == {}
+    assert as_text(BoardStatus()) == {}
 
 
 # confusion
@@ -124,7 +124,7 @@ def test_a_status_line_is_not_a_reply_in_any_dialect(line: bytes) -> None:
             Codec(WheelMap(), comma).decode(line)
     with pytest.raises(FrameError):
         unseal(line)
-    assert protocol.whole(line) is protocol.plain_only(line) is protocol.prefix(line) is None
+    assert protocol.reference(line) is protocol.plain_only(line) is protocol.prefix(line) is None
     assert protocol.latched(line + b",").values == {}
 
 

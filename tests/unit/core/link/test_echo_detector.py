@@ -39,7 +39,7 @@ class Echoes:
         return len(self.waiting) > lag and self.report(self.waiting.popleft())
 
     def send(self, speed: float) -> None:
-        self.detector.left(written(speed))
+        self.detector.written(written(speed))
 
     def report(self, speed: float) -> bool:
         line = written(speed)[:-2]

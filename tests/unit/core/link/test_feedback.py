@@ -156,7 +156,7 @@ def test_counts_are_ignored_unless_they_are_configured() -> None:
 def reporting(bench: Bench, lines: int = 80) -> Bench:
     """Feed this many lines one by one, every 10 ms."""
     for _ in range(lines):
-        bench.timeline.left(bench.now_ns)
+        bench.timeline.written(bench.now_ns)
         bench.line()
     return bench
 
@@ -201,7 +201,7 @@ def test_stamps_of_lines_that_waited_in_the_kernel_are_a_period_apart() -> None:
 def test_missing_lines_are_filled_and_are_not_a_gap() -> None:
     bench = reporting(Bench(counts=0))
     for ms in range(0, 310, 10):
-        bench.timeline.left(bench.now_ns + ms * MS)
+        bench.timeline.written(bench.now_ns + ms * MS)
     found = bench.line(ms=310, gap=True)
     assert found.dt == pytest.approx(0.31)
     assert found.gap == 0.0
@@ -219,7 +219,7 @@ def test_lines_missing_for_a_second_are_a_gap() -> None:
 def test_in_a_backlog_with_missing_lines_each_dt_is_the_distance_of_the_stamps() -> None:
     bench = reporting(Bench(counts=0))
     for ms in range(0, 390, 10):
-        bench.timeline.left(bench.now_ns + ms * MS)
+        bench.timeline.written(bench.now_ns + ms * MS)
     found = read(bench, 390, 3, silent=True)
     stamps = [f.at.mono_ns / 1e9 for f in found]
     assert [f.dt for f in found] == pytest.approx([0.38 / 3] * 3)
@@ -229,7 +229,7 @@ def test_in_a_backlog_with_missing_lines_each_dt_is_the_distance_of_the_stamps()
 def test_a_backlog_whose_missing_lines_last_for_a_second_begins_with_a_gap() -> None:
     bench = reporting(Bench(counts=0))
     for ms in range(0, 1500, 10):
-        bench.timeline.left(bench.now_ns + ms * MS)
+        bench.timeline.written(bench.now_ns + ms * MS)
     first, second = read(bench, 1500, 2, silent=True)
     assert (first.dt, first.bridged, second.dt, second.bridged) == (0.0, 0.0, 0.01, 0.0)
     assert first.gap == pytest.approx(1.49, abs=0.01)
@@ -239,7 +239,7 @@ def test_a_spoilt_line_still_occupies_its_slot() -> None:
     bench = reporting(Bench(counts=0))
     bench.now_ns += 10 * MS
     bench.timeline.read(Instant(bench.now_ns, bench.now_ns), LENGTH, 1, 0)
-    bench.timeline.spoilt()
+    bench.timeline.skip_bad()
     found = bench.line()
     assert (found.dt, found.bridged) == (0.02, 0.01)
 
@@ -254,9 +254,9 @@ def test_the_first_prompted_reply_fills_the_time_of_the_ignored_replies(
     for _ in range(ignored):
         bench.now_ns += 50 * MS
         bench.timeline.read(Instant(bench.now_ns, bench.now_ns), LENGTH, 1, 0)
-        bench.timeline.spoilt()
+        bench.timeline.skip_bad()
     bench.now_ns += (4 - ignored) * 50 * MS
-    bench.timeline.left(bench.now_ns)
+    bench.timeline.written(bench.now_ns)
     found = bench.line()
     assert found.dt == pytest.approx(0.21, abs=0.002)
     assert found.bridged == pytest.approx(0.2 if ignored else 0.0, abs=0.002)
@@ -297,16 +297,16 @@ def prompted(bench: Bench, lines: int = 60) -> Bench:
     One stall of the host reveals that the board answers.
     """
     for number in range(lines):
-        bench.timeline.left(bench.now_ns + 2 * MS)
+        bench.timeline.written(bench.now_ns + 2 * MS)
         bench.line(ms=160 if number == 50 else 10)
         if number == 50:
-            bench.timeline.left(bench.now_ns - 8 * MS)
+            bench.timeline.written(bench.now_ns - 8 * MS)
     return bench
 
 
 def test_the_dt_of_an_answer_is_the_time_between_the_prompting_lines() -> None:
     bench = prompted(Bench(counts=0), 80)
-    bench.timeline.left(bench.now_ns + 202 * MS)
+    bench.timeline.written(bench.now_ns + 202 * MS)
     found = bench.line(ms=210, gap=True)
     assert found.dt == pytest.approx(0.21, abs=1e-3)
     assert (found.gap, found.bridged) == (0.0, 0.0)
@@ -315,7 +315,7 @@ def test_the_dt_of_an_answer_is_the_time_between_the_prompting_lines() -> None:
 def test_replies_that_waited_in_a_stall_beyond_the_open_commands_cover_no_time_of_it() -> None:
     """The board samples only when a command arrives, and in the stall none arrived."""
     bench = prompted(Bench(counts=0), 80)
-    bench.timeline.left(bench.now_ns + 2 * MS)
+    bench.timeline.written(bench.now_ns + 2 * MS)
     bench.now_ns += 1200 * MS
     bench.timeline.read(Instant(bench.now_ns, bench.now_ns), 3 * LENGTH, 3, 0)
     found = [bench.timeline.place(SPEEDS, None, 0, LENGTH, False) for _ in range(3)]
@@ -326,7 +326,7 @@ def test_replies_that_waited_in_a_stall_beyond_the_open_commands_cover_no_time_o
 def test_the_dt_of_an_answer_that_names_its_line_is_that_of_the_named_lines() -> None:
     bench = Bench(counts=0)
     for number, ms in enumerate((0, 10, 20, 37)):
-        bench.timeline.left(10**9 + ms * MS)
+        bench.timeline.written(10**9 + ms * MS)
         bench.now_ns += (10, 3, 25, 1)[number] * MS
         bench.timeline.read(Instant(bench.now_ns, bench.now_ns), LENGTH, 1, 0)
         found = bench.timeline.place(SPEEDS, None, 0, LENGTH, False, 10**9 + ms * MS)
@@ -340,11 +340,11 @@ def test_a_stall_counts_once_if_replies_name_their_line_and_many_are_lost() -> N
     for number in range(200):
         # A stall of 100 ms begins behind line 100. The reply to that line waits for its end.
         left_ns = began_ns + (10 * number + 100 * (number > 100)) * MS
-        bench.timeline.left(left_ns)
+        bench.timeline.written(left_ns)
         if number < 95:
             # The replies to these lines are lost, so the board seems to report by its own clock.
-            bench.timeline.left(left_ns + 3 * MS)
-            bench.timeline.left(left_ns + 6 * MS)
+            bench.timeline.written(left_ns + 3 * MS)
+            bench.timeline.written(left_ns + 6 * MS)
         came_ns = bench.now_ns = left_ns + (109 if number == 100 else 9) * MS
         bench.timeline.read(Instant(came_ns, came_ns), LENGTH, 1, 0)
         total += bench.timeline.place(SPEEDS, None, 0, LENGTH, number == 100, left_ns).dt
@@ -369,7 +369,7 @@ def test_a_change_of_the_clock_neither_adds_nor_loses_time() -> None:
     total = 0.0
     for number in range(400):
         late = number % 4  # delay of the read, ms
-        bench.timeline.left(bench.now_ns)
+        bench.timeline.written(bench.now_ns)
         total += bench.line(ms=10 + late).dt
         bench.now_ns -= late * MS
         if number % 100 == 70:
@@ -384,7 +384,7 @@ def test_a_change_from_slots_to_answers_as_the_clock_keeps_the_elapsed_time(seed
     began = bench.now_ns
     for number in (*range(200), *range(215, 230)):  # the stall reveals that the board answers
         left_ns = began + number * 10 * MS
-        bench.timeline.left(left_ns)
+        bench.timeline.written(left_ns)
         bench.now_ns = left_ns + int(chance.uniform(7.0, 8.2) * MS)
         at = Instant(bench.now_ns, bench.now_ns)
         bench.timeline.read(at, LENGTH, 1, 0)
@@ -402,14 +402,14 @@ def test_answers_after_a_phase_of_sparse_replies_are_not_matched_to_old_lines() 
     bench = Bench(counts=0)
     timeline = bench.timeline
     for number in range(596):
-        timeline.left(bench.now_ns + 2 * MS)
+        timeline.written(bench.now_ns + 2 * MS)
         bench.now_ns += 10 * MS
         if number % 5 == 0:
             read(bench, 0, 1)
     assert timeline._style.speaks
     lines = []
     for number in range(60):
-        timeline.left(bench.now_ns + 2 * MS)
+        timeline.written(bench.now_ns + 2 * MS)
         bench.now_ns += 10 * MS
         if number >= 7:
             lines += read(bench, 0, 1 if number > 7 else 8)  # the host stood still for eight lines
@@ -443,6 +443,6 @@ def test_a_host_stall_reveals_whether_the_board_reports_by_itself(
     style = ReplyStyle(configured)
     for lines, periods, left in stalls:
         for _ in range(left):
-            style.left()
+            style.written()
         style.read(lines, periods)
     assert style.speaks is speaks

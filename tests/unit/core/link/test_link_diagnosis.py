@@ -13,15 +13,15 @@ from acsard.core.config.settings import McuConfig
 from acsard.core.link.lines import LineReader
 from acsard.core.link.link_diagnosis import (
     FIRST_DIAGNOSIS_NS,
-    LOOK_MENDS,
     MAX_UNANSWERED_FRACTION,
+    RECEIVED_ADVICE,
     WINDOW_LINES,
     Heard,
     Lateness,
-    Look,
+    ReceivedClass,
     SilenceDiagnosis,
     UnansweredLines,
-    is_ours,
+    blames_host,
 )
 from acsard.core.link.link_state import STATE_TEXTS
 from tests.unit.core.link.test_session import GOOD, Bench
@@ -31,7 +31,7 @@ QUIET_NS = 100 * MS
 
 STILL = b"ap00.00,bp00.00,cp00.00,dp00.00\r\n"
 
-HEARD: dict[str, tuple[bytes, Look, str]] = {
+HEARD: dict[str, tuple[bytes, ReceivedClass, str]] = {
     "mute": (b"", "nothing", "nothing was received"),
     "half lines": (
         b"ap00.00,bp00.00,c" * 9,
@@ -66,7 +66,7 @@ def test_a_board_that_only_prints_noise_is_reported_with_its_noise() -> None:
     assert "150 lines received, none good, the last one is `" in told[0]
     assert bench.session.words() == told[0]
     bench.wait(10, GOOD * 3)
-    assert bench.session.words() == "linked"
+    assert bench.session.words() == "the link to the microcontroller is up"
 
 
 def test_a_silent_link_is_reported_first_and_the_received_data_later() -> None:
@@ -74,8 +74,8 @@ def test_a_silent_link_is_reported_first_and_the_received_data_later() -> None:
     for _ in range(20):
         bench.wait(10)
     assert bench.session.words().startswith(
-        "a fault in sim.faults silences the built-in simulator, or the simulator, which is a part "
-        "of the daemon, is late: "
+        "the built-in simulator is silent because of a fault in sim.faults, or because the daemon, "
+        "which runs the simulator, is late: "
     )
     for _ in range(302):
         bench.wait(10)
@@ -122,7 +122,7 @@ def test_lines_that_the_host_read_late_give_no_advice_about_the_board(port: str)
         bench.wait(10, GOOD)
         told.add(bench.session.words())
     assert not [words for words in told if "reply_period" in words or "seldom" in words]
-    assert any(is_ours(words) for words in told)
+    assert any(blames_host(words) for words in told)
 
 
 def after(*steps_ms: int, good: bool = False, simulated: bool = False) -> Lateness:
@@ -147,7 +147,10 @@ def test_silence_during_punctual_steps_is_blamed_on_the_board() -> None:
 def test_a_host_stall_is_reported_with_its_length() -> None:
     for steps in ((800,), (10, 800, 10), (60, 800)):
         told = after(*steps).words("stale")
-        assert told.startswith("this computer did not run the daemon for 0.80 s")
+        assert told.startswith(
+            "this computer did not run the daemon for 0.80 s, so the daemon received nothing from "
+            "the microcontroller: "
+        )
         assert "which other program" in told
 
 
@@ -170,8 +173,9 @@ def test_a_link_that_is_not_stale_is_reported_unchanged_despite_a_host_stall() -
 
 def test_the_text_of_a_silence_shows_whether_the_host_caused_it() -> None:
     ours = [after(800), after(800, simulated=True), after(10, simulated=True)]
-    assert all(is_ours(lateness.words("stale")) for lateness in ours)
-    assert not any(is_ours(words) for words in (STATE_TEXTS["stale"], "", after(800).words("down")))
+    assert all(blames_host(lateness.words("stale")) for lateness in ours)
+    others = (STATE_TEXTS["stale"], "", after(800).words("down"))
+    assert not any(blames_host(words) for words in others)
 
 
 def heard(data: bytes) -> Heard:
@@ -184,12 +188,12 @@ def heard(data: bytes) -> Heard:
 
 @pytest.mark.parametrize(("data", "looks", "counted"), HEARD.values(), ids=HEARD)
 def test_the_diagnosis_says_what_was_received_how_it_looks_and_what_to_do(
-    data: bytes, looks: Look, counted: str
+    data: bytes, looks: ReceivedClass, counted: str
 ) -> None:
     found = heard(data)
     assert found.looks == looks
     assert counted in found.counted
-    told = f"no link to the microcontroller: {found.counted}; {LOOK_MENDS[looks]}"
+    told = f"no link to the microcontroller: {found.counted}; {RECEIVED_ADVICE[looks]}"
     assert found.words.startswith(told)
     assert "`acsard mcu check`" in found.words
 
@@ -243,8 +247,11 @@ def test_a_stall_within_the_time_of_the_sparse_lines_explains_them() -> None:
     bench.wait(10)
     bench.wait(800)
     found = sparse(bench)
-    assert found.words.startswith("this computer did not run the daemon for 0.80 s")
-    assert is_ours(found.words)
+    assert found.words.startswith(
+        "this computer did not run the daemon for 0.80 s, so the daemon received too few lines for "
+        "a link: "
+    )
+    assert blames_host(found.words)
 
 
 def test_lines_that_came_while_the_output_was_blocked_are_not_counted_afterwards() -> None:

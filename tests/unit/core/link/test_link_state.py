@@ -11,8 +11,8 @@ from acsard.core.link.link_state import (
     GOOD_LINES,
     STATE_TEXTS,
     TRANSITIONS,
+    Input,
     Link,
-    Sign,
     State,
 )
 
@@ -25,7 +25,7 @@ class Bench:
 
     def __init__(self) -> None:
         self.link, self.now_ns = Link(QUIET_NS), 1000 * MS
-        self.link.sign("opened")
+        self.link.apply("opened")
 
     def good(self, count: int = 1, ms: float = 10, may_rise: bool = True) -> str:
         for _ in range(count):
@@ -74,10 +74,10 @@ def test_bad_lines_alone_do_not_take_the_link_down_but_are_reported() -> None:
     ("sign", "state"),
     [("closed", "down"), ("opened", "booting"), ("restarted", "booting"), ("damaged", "stale")],
 )
-def test_after_the_link_ends_good_lines_are_counted_from_zero(sign: Sign, state: State) -> None:
+def test_after_the_link_ends_good_lines_are_counted_from_zero(sign: Input, state: State) -> None:
     bench = Bench()
     bench.good(GOOD_LINES)
-    bench.link.sign(sign)
+    bench.link.apply(sign)
     assert bench.link.state == state
     assert bench.good(GOOD_LINES - 1) == state
 
@@ -86,6 +86,6 @@ def test_the_first_line_of_a_session_has_no_time_since_a_previous_line() -> None
     bench = Bench()
     assert bench.link.good(bench.now_ns) is None
     assert bench.link.good(bench.now_ns + 7) == 7
-    bench.link.sign("restarted")
+    bench.link.apply("restarted")
     assert bench.link.silent(bench.now_ns + 8)
     assert bench.link.good(bench.now_ns + 9) is None

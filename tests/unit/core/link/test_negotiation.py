@@ -164,7 +164,7 @@ def test_a_reply_to_a_question_that_was_not_sent_is_stale() -> None:
 def test_unanswered_checked_questions_end_in_the_plain_state() -> None:
     bench = Bench()
     bench.ask()
-    bench.check.heard_plain()
+    bench.check.record_plain_reply()
     asked = bench.ask(1000)
     assert [kind(line) for line in asked] == ["checked"] * (1 + MAX_UNANSWERED_QUESTIONS)
     assert (bench.check.state, bench.check.in_force) == ("plain", "plain")
@@ -174,7 +174,7 @@ def test_unanswered_checked_questions_end_in_the_plain_state() -> None:
 def test_the_board_is_asked_three_times_with_samples_and_then_three_times_without() -> None:
     bench = Bench(SAMPLES)
     bench.ask()
-    bench.check.heard_plain()
+    bench.check.record_plain_reply()
     asked = bench.ask(2000)
     assert [kind(line) for line in asked] == ["sampled"] * MAX_UNANSWERED_QUESTIONS + [
         "checked"
@@ -184,7 +184,7 @@ def test_the_board_is_asked_three_times_with_samples_and_then_three_times_withou
 
 def test_questions_that_were_not_sent_are_not_counted() -> None:
     bench = Bench()
-    bench.check.heard_plain()
+    bench.check.record_plain_reply()
     for _ in range(300):
         if bench.ask():
             bench.check.settle(False)
@@ -193,7 +193,7 @@ def test_questions_that_were_not_sent_are_not_counted() -> None:
 
 def test_a_question_is_counted_once_however_often_the_negotiation_is_judged() -> None:
     bench = Bench()
-    bench.check.heard_plain()
+    bench.check.record_plain_reply()
     bench.ask()
     for _ in range(100):
         bench.now_ns += 10 * MS
@@ -210,7 +210,7 @@ def test_a_silent_board_is_asked_for_ever() -> None:
 
 def test_a_board_on_a_slow_wire_has_more_time_to_answer() -> None:
     bench = Bench(McuConfig(link_check="auto", baud_rate=9600))
-    bench.check.heard_plain()
+    bench.check.record_plain_reply()
     bench.ask(4 * 190)
     assert bench.check.in_force == "not checked yet"
     bench.ask(100)
@@ -219,7 +219,7 @@ def test_a_board_on_a_slow_wire_has_more_time_to_answer() -> None:
 
 def test_a_required_check_that_is_refused_is_asked_for_ever_with_its_reason() -> None:
     bench = Bench(REQUIRE)
-    bench.check.heard_plain()
+    bench.check.record_plain_reply()
     assert len(bench.ask(5000)) > 50
     assert (bench.check.asking, bool(bench.check.trouble)) == (True, True)
     assert 'mcu.link_check = "require"' in ADVICE[bench.check.trouble]
@@ -232,7 +232,7 @@ def test_a_required_check_that_is_refused_is_asked_for_ever_with_its_reason() ->
 def test_a_board_that_answered_with_a_check_is_not_accepted_without_it() -> None:
     bench = Bench().checked()
     bench.check.begin()
-    bench.check.heard_plain()
+    bench.check.record_plain_reply()
     bench.ask(5000)
     assert bench.check.asking
     assert "damaged" in ADVICE[bench.check.trouble]
@@ -241,7 +241,7 @@ def test_a_board_that_answered_with_a_check_is_not_accepted_without_it() -> None
 def test_a_new_opening_forgets_that_a_board_had_the_check() -> None:
     bench = Bench().checked()
     bench.check.begin(fresh=True)
-    bench.check.heard_plain()
+    bench.check.record_plain_reply()
     bench.ask(1000)
     assert bench.check.state == "plain"
 
@@ -380,17 +380,17 @@ def test_a_new_negotiation_is_not_checked_yet(mcu: McuConfig) -> None:
 def test_the_pace_of_questions_is_bounded() -> None:
     assert SILENT_BOARD_PERIOD_NS == 100 * MS
     bench = Bench(REQUIRE)
-    bench.check.heard_plain()
+    bench.check.record_plain_reply()
     assert len(bench.ask(1000)) <= 25
 
 
 def test_an_echo_of_a_question_is_reported_and_ends_no_negotiation() -> None:
     for mcu in (AUTO, REQUIRE, SAMPLES):
         bench = Bench(mcu)
-        bench.check.heard_plain()
+        bench.check.record_plain_reply()
         for _ in range(50):
             for line in bench.ask():
-                assert bench.check.echoed(line[:-2])
+                assert bench.check.check_question_echo(line[:-2])
         assert (bench.check.asking, bool(bench.check.trouble)) == (True, True)
         assert "the daemon's own lines come back" in ADVICE[bench.check.trouble]
         bench.check.begin(fresh=True)
@@ -401,7 +401,7 @@ def test_an_answer_is_not_an_echo() -> None:
     bench = Bench()
     (_, question) = bench.ask(110)
     answer = question.replace(b"H", b"")[:-2]
-    assert not bench.check.echoed(answer)
+    assert not bench.check.check_question_echo(answer)
 
 
 def test_the_throttle_lets_the_first_line_through_at_any_time() -> None:

@@ -359,7 +359,7 @@ class Prompted:
         self.prompts = PromptedTimes(soonest_ns=6 * MS)
 
     def leave(self, ms: float) -> None:
-        self.prompts.left(int(ms * MS))
+        self.prompts.written(int(ms * MS))
 
     def reply(
         self, ms: float, lines: int = 1, asked_ms: float | None = None, cut: bool = False
@@ -535,7 +535,7 @@ def assigned(prompts: PromptedTimes, replies: dict[int, float], hz: int) -> list
     older = []
     for ms, line in sorted(events):
         if not line:
-            prompts.left(int(ms * MS))
+            prompts.written(int(ms * MS))
             continue
         prompts.read(int(ms * MS), 1)
         if prompts.place() is not None:
@@ -550,7 +550,7 @@ def test_a_first_reply_that_is_read_late_hides_no_lost_replies() -> None:
     Then no reply is assigned to a line that is more than one line too old.
     """
     prompts, chance = PromptedTimes(soonest_ns=2 * MS), random.Random(1)
-    prompts.left(0)
+    prompts.written(0)
     prompts.read(81 * MS, 1)
     assert prompts.place() is not None
     replies = {n: 37 + 3 * chance.random() for n in range(3000) if n < 15 or n % 16 == 0}
@@ -671,7 +671,7 @@ def test_a_delay_that_varies_by_4_ms_counts_as_processing_time_of_the_mcu() -> N
     for number in range(300):
         bench.leave(number * 10)
         bench.reply(number * 10 + 7.0 + chance.uniform(0.0, 4.0))
-    assert bench.prompts.thinks
+    assert bench.prompts.varies_delay
 
 
 def test_an_early_first_reply_does_not_hide_that_the_delay_varies() -> None:
@@ -683,7 +683,7 @@ def test_an_early_first_reply_does_not_hide_that_the_delay_varies() -> None:
     for number in range(1, 300):
         bench.leave(number * 10)
         bench.reply(number * 10 + 6.5 + chance.uniform(0.0, 4.0))
-    assert bench.prompts.thinks
+    assert bench.prompts.varies_delay
 
 
 def test_a_stall_of_the_board_does_not_change_the_usual_delay() -> None:
@@ -702,4 +702,4 @@ def test_the_jitter_of_usb_does_not_count_as_processing_time_of_the_mcu() -> Non
     for number in range(300):
         bench.leave(number * 10)
         bench.reply(number * 10 + 8.0 + chance.uniform(0.0, 1.0) + chance.expovariate(1 / 0.3))
-    assert not bench.prompts.thinks
+    assert not bench.prompts.varies_delay

@@ -39,7 +39,7 @@ class Wire:
             return "superseded"
         taken = min(takes, len(data))
         self.out += data[:taken]
-        return self.gate.took(line, data, taken, now_ns)
+        return self.gate.record_write(line, data, taken, now_ns)
 
     def started(self) -> Wire:
         assert self.offer(self._stop, 0) == "sent"
@@ -144,5 +144,5 @@ def test_the_gate_never_lets_bytes_queue_on_the_wire(
         if data is not None:
             assert now_ns >= busy_until_ns
             taken = min(takes, len(data))
-            gate.took(GO, data, taken, now_ns)
+            gate.record_write(GO, data, taken, now_ns)
             busy_until_ns = now_ns + taken * 10 * 1_000_000_000 // baud

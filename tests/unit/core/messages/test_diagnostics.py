@@ -20,7 +20,7 @@ from acsard.core.messages.diagnostics import ERROR, OK, SHOW_REFUSAL_S, WARN, di
 from acsard.core.messages.schema import DiagnosticStatus
 from acsard.core.motion.battery import MISSING_REASON as MISSING_BATTERY
 from acsard.core.motion.bumpers import SILENT_REASON as SILENT_BUMPERS
-from acsard.core.motion.bumpers import missing
+from acsard.core.motion.bumpers import missing_text
 from acsard.core.motion.emergency_stop import (
     DRIVER_FAULT_REASON,
     MISSING_REASON,
@@ -84,7 +84,7 @@ def test_no_row_appears_or_disappears_in_any_state_of_the_robot(mode: str, link:
     assert [(one.name, one.hardware_id) for one in rows(CONFIG, outputs, snapshot)] == names
 
 
-@each("does", ["waiting for rest", "used", "silent", "dead", "not believed"])
+@each("does", ["waiting for rest", "waiting for turn", "used", "silent", "dead", "not believed"])
 def test_a_configured_gyro_has_a_row_in_each_of_its_states(does: Any) -> None:
     assert [one.name for one in rows(snapshot=seen(gyro=GyroStatus(does)))] == [
         *(one.name for one in rows()),
@@ -120,7 +120,7 @@ def test_a_required_emergency_stop_has_a_row_before_the_board_reports_it() -> No
 @each(
     ("bumpers", "why", "level", "message"),
     [
-        (None, "", ERROR, missing(BUMPERS.safety)),
+        (None, "", ERROR, missing_text(BUMPERS.safety)),
         ((False, False), "", OK, "2 bumpers released"),
         ((True, False), "front bumper pressed", WARN, "front bumper pressed"),
         ((True, True), SILENT_BUMPERS, ERROR, SILENT_BUMPERS),
@@ -327,11 +327,11 @@ def test_two_senders_of_one_source_are_a_warning_that_names_the_source() -> None
     assert (one.level, one.message) == (
         WARN,
         "commanded by app; 2 programs send as nav, and the robot follows one of them: end the "
-        "others, or give each a source of its own",
+        "other programs, or give each program its own source",
     )
     assert (
         values(one)["nav"]
-        == "1 more of this source's senders must wait until the first one is silent"
+        == "1 other sender of this source must wait until the sender that drives falls silent"
     )
     assert row("commands", snapshot=seen(sources=(alone,))).level == OK
 

@@ -15,7 +15,7 @@ def at(seconds: float) -> Instant:
 
 
 def told(happened: RecentEvents) -> Events:
-    said = happened.told()
+    said = happened.message()
     assert said is not None
     return said
 
@@ -25,7 +25,7 @@ def names(happened: RecentEvents) -> list[str]:
 
 
 def test_without_events_there_is_no_message() -> None:
-    assert RecentEvents().told() is None
+    assert RecentEvents().message() is None
 
 
 def test_a_fault_is_still_listed_after_an_hour_of_missed_periods() -> None:
@@ -36,7 +36,10 @@ def test_a_fault_is_still_listed_after_an_hour_of_missed_periods() -> None:
     fault, others = told(happened).events
     assert (fault.name, fault.stamp) == ("fault", Time.from_ns(at(0).wall_ns))
     assert (others.name, others.count) == ("missed_periods", 3 * 3599)
-    assert others.text == f"{3 * 3599} times; the last: 3 control periods in a row"
+    assert (
+        others.text
+        == f"{3 * 3599} times; the last: no control step ran in 3 successive control periods"
+    )
     assert others.stamp == told(happened).stamp == Time.from_ns(at(3599).wall_ns)
     assert told(happened).total == 3600
 

@@ -679,6 +679,7 @@ def test_without_a_gyro_the_state_is_off_and_diagnostics_have_no_row() -> None:
     ("does", "level"),
     [
         ("waiting for rest", 0),
+        ("waiting for turn", 0),
         ("used", 0),
         ("silent", 1),
         ("disagrees", 1),
@@ -731,7 +732,7 @@ def test_the_comparison_of_front_and_rear_wheels_is_reported() -> None:
         (row,) = [one for one in array.status if one.name == "acsard: wheels"]
         assert (state.wheel_fault, row.level) == (said.text, level)
         calm = (
-            "wheels slower than commanded: front_right 60%"
+            "wheels are slower than commanded: front_right reaches 60% of its expected speed"
             if said.slow
             else "front and rear wheels agree"
         )

@@ -38,13 +38,19 @@ SENTENCES = [
         '3 s (`ros2 topic pub` with a speed never sends a zero; the section "After a clear" of '
         "deploy/ros2/README.md lists tools that send one)",
     ),
-    (Wait("zeros", "app", lasts=3.0), "held by app, which has sent only zeros for over 3 s"),
+    (
+        Wait("zeros", "app", lasts=3.0),
+        "app keeps the robot at rest: it has sent only zeros for over 3 s",
+    ),
     (
         Wait("zeros", "ros2_control", lasts=600.0, kept="nav"),
-        "held by ros2_control, which has sent only zeros for over 10 min; nav sends speeds "
-        "and must wait",
+        "ros2_control keeps the robot at rest: it has sent only zeros for over 10 min; the speeds "
+        "of nav have no effect",
     ),
-    (Wait("zeros", "app", lasts=3600.0), "held by app, which has sent only zeros for over 1 h"),
+    (
+        Wait("zeros", "app", lasts=3600.0),
+        "app keeps the robot at rest: it has sent only zeros for over 1 h",
+    ),
     (
         Wait("proof", "high", 0.25),
         "high is new: the robot follows it when its commands have arrived with steady delays for "
@@ -63,7 +69,11 @@ SENTENCES = [
     (Wait("equal", "right"), "right has the same priority and came first: wait until it is silent"),
     (
         Wait("senders", senders=15),
-        "15 more of this source's senders must wait until the first one is silent",
+        "15 other senders of this source must wait until the sender that drives falls silent",
+    ),
+    (
+        Wait("senders", senders=1),
+        "1 other sender of this source must wait until the sender that drives falls silent",
     ),
 ]
 
@@ -131,7 +141,7 @@ def test_a_new_commander_is_reported_with_the_mode_and_as_the_commander() -> Non
         Mode.DRIVING, by("app", "joe"), "driving: by app"
     )
     assert mode == Event("mode", "commanded by app", by="app (joe)", kind="ready -> driving")
-    assert commander == Event("commander", "", by="app (joe)", kind="nobody -> app (joe)")
+    assert commander == Event("commander", "", by="app (joe)", kind="no sender -> app (joe)")
 
 
 def test_a_change_of_commander_is_reported_with_the_previous_commander() -> None:
@@ -186,7 +196,7 @@ def test_a_source_held_up_by_zeros_is_reported_once_however_often_it_pauses() ->
     assert zeros("") == []
     (event,) = zeros("nav")
     assert (event.name, event.by, event.kind) == ("commands_without_effect", "app (joe)", "nav")
-    assert event.text.startswith("held by app, which has sent only zeros for over 3 s; nav")
+    assert event.text.endswith("only zeros for over 3 s; the speeds of nav have no effect")
     assert zeros("") + zeros("nav") == []
     assert [event.kind for event in zeros("teleop")] == ["teleop"]
 
@@ -211,7 +221,7 @@ def test_the_event_of_a_refusal_has_its_reason_its_text_and_its_sender() -> None
 def test_the_event_of_missed_periods_counts_each_period() -> None:
     assert missed(3) == Event(
         "missed_periods",
-        "3 control periods in a row",
+        "no control step ran in 3 successive control periods",
         "warning",
         kind="missed",
         count=3,

@@ -10,7 +10,13 @@ import pytest
 
 from acsard.core.config.settings import Place, SafetyConfig
 from acsard.core.link.board_status import BoardStatus
-from acsard.core.motion.bumpers import DIRECTIONS, SILENT_REASON, Bumpers, missing, pressed_words
+from acsard.core.motion.bumpers import (
+    DIRECTIONS,
+    SILENT_REASON,
+    Bumpers,
+    missing_text,
+    pressed_words,
+)
 from acsard.core.motion.emergency_stop import CHECK, RELEASE
 from acsard.core.values import REST, Event, Twist
 
@@ -194,7 +200,7 @@ def test_bumpers_with_places_are_missing_until_the_board_reports_their_number() 
 
 
 def test_the_missing_bumpers_are_named_with_the_field_of_the_line() -> None:
-    assert missing(SafetyConfig(bumpers=("front",))) == (
+    assert missing_text(SafetyConfig(bumpers=("front",))) == (
         "safety.bumpers has 1 place, but the microcontroller has not reported 1 bumper: does its "
         "firmware send status lines with `bumpers=.`?"
     )

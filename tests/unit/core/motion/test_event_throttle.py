@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from acsard.core.motion.event_throttle import BURST, MAX_LISTED, EventThrottle, together
+from acsard.core.motion.event_throttle import BURST, MAX_LISTED, EventThrottle, merge
 from acsard.core.values import NS_PER_S, Event
 
 MS = 1_000_000
@@ -127,17 +127,17 @@ def test_a_line_is_news_only_if_its_event_is_news() -> None:
 def test_two_joined_lines_have_the_total_count_and_the_last_text() -> None:
     one = Event("command_refused", "12 x stale; the last: late", "info", "joe, ann", count=12)
     other = Event("command_refused", "3 x wildcard: a star", "warning", "ann, eve", count=3)
-    line = together(one, other)
+    line = merge(one, other)
     assert (line.text, line.count) == ("15 times; the last: a star", 15)
     assert (line.by, line.level) == ("joe, ann, eve", "warning")
-    assert together(line, refused()).text == "16 times; the last: late"
-    assert together(refused(), line).text == "16 times; the last: a star"
+    assert merge(line, refused()).text == "16 times; the last: late"
+    assert merge(refused(), line).text == "16 times; the last: a star"
 
 
 def test_joined_lines_of_many_senders_name_only_a_few() -> None:
     line = refused(by="")
     for number in range(100):
-        line = together(line, refused(by=f"sender{number}"))
+        line = merge(line, refused(by=f"sender{number}"))
     assert line.by.split(", ") == [*(f"sender{n}" for n in range(MAX_LISTED)), "others"]
 
 

@@ -382,21 +382,21 @@ def test_the_uncertainty_of_a_gap_is_bounded_by_its_fastest_speed() -> None:
 
 def test_a_line_between_two_gaps_makes_their_errors_independent() -> None:
     gaps = Gaps()
-    first = gaps.bridge(0.3, CRUISE, CRUISE, REST)
+    first = gaps.fill(0.3, CRUISE, CRUISE, REST)
     gaps.follow(CRUISE, 0.01)
-    assert gaps.bridge(0.3, CRUISE, CRUISE, REST) == first
-    assert gaps.bridge(0.3, CRUISE, CRUISE, REST)[0] > 20 * first[0]
+    assert gaps.fill(0.3, CRUISE, CRUISE, REST) == first
+    assert gaps.fill(0.3, CRUISE, CRUISE, REST)[0] > 20 * first[0]
 
 
 def test_a_command_to_rest_that_may_be_lost_makes_the_motion_uncertain() -> None:
     """The robot is assumed to have stood for 0.2 s, but it moved on with the probability 1/2."""
     before, after = Twist(0.5, 1.0), Twist(0.1, -1.0)
-    sure = Gaps().bridge(0.5, before, after, REST)
-    unsure = Gaps().bridge(0.5, before, after, REST, doubtful=0.2)
+    sure = Gaps().fill(0.5, before, after, REST)
+    unsure = Gaps().fill(0.5, before, after, REST, doubtful=0.2)
     assert (unsure[0] - sure[0], unsure[1] - sure[1]) == near(
         (0.2 * 0.4) ** 2 / 2, (0.2 * 2.0) ** 2 / 2
     )
-    assert Gaps().bridge(0.5, REST, REST, REST, doubtful=0.2) == (0.0, 0.0)
+    assert Gaps().fill(0.5, REST, REST, REST, doubtful=0.2) == (0.0, 0.0)
 
 
 def rounding(

@@ -85,7 +85,7 @@ class Bench:
                     replace(one, at_ns=max(one.at_ns, self.held_back_ns)) for one in heard
                 )
                 self._way = [one for one in self._way if one.at_ns > self.now_ns]
-            self.gyro.hear(heard)
+            self.gyro.add_samples(heard)
             wheels = now * (self.skid if skid is None else skid) * DT
             stands = now == 0.0 if still is None else still
             turn = self.gyro.turn(self.now_ns, DT, wheels, stands)
@@ -121,7 +121,7 @@ def over_a_gap(bench: Bench, seconds: float, rate: float) -> Turn | None:
         bench.now_ns += LINE_NS
         bench.true += rate * DT
         bench._sample()
-    bench.gyro.hear(tuple(bench._way))
+    bench.gyro.add_samples(tuple(bench._way))
     bench._way = []
     return bench.gyro.turn(bench.now_ns, 0.0, 0.0, still=False)
 
@@ -222,7 +222,7 @@ def test_a_sample_with_a_wrong_stamp_does_not_spoil_the_turn() -> None:
     bench.run(REST_FIRST)
     bench.run(1.0, 0.5)
     early = GyroSample(bench.now_ns + MS, 5, 0.5)
-    bench.gyro.hear((early,))
+    bench.gyro.add_samples((early,))
     bench.run(2.0, 0.5)
     assert bench.told == pytest.approx(bench.true, rel=0.02)
 
@@ -272,7 +272,7 @@ def test_the_wheels_alone_give_the_turn_while_the_gyro_is_silent() -> None:
     begun, true = bench.told, bench.true
     bench.run(1.0, 0.5)
     assert bench.told - begun == pytest.approx(bench.true - true)
-    assert bench.does == ["waiting for rest", "used", "silent", "used"]
+    assert bench.does == ["waiting for rest", "waiting for turn", "silent", "used"]
 
 
 @pytest.mark.parametrize("back_ms", [150, 210, 230, 290, 400])
@@ -341,6 +341,19 @@ def test_a_gyro_that_is_mounted_upside_down_is_not_believed() -> None:
     assert bench.none - none == 500
 
 
+def test_a_gyro_is_not_reported_as_used_until_it_agrees_with_the_wheels_in_a_turn() -> None:
+    bench = Bench()
+    bench.run(REST_FIRST)
+    assert bench.says() == "waiting for turn"
+    bench.run(0.1, 0.5)
+    assert bench.gyro.owes
+    assert bench.says() == "waiting for turn"
+    bench.run(1.0, 0.5)
+    assert not bench.gyro.owes
+    assert bench.says() == "used"
+    assert bench.does == ["waiting for rest", "waiting for turn"]
+
+
 @pytest.mark.parametrize(("sign", "named"), [(-1.0, "reversed"), (0.0, "dead")])
 @pytest.mark.parametrize("rate", [0.02, 0.05, 0.1])
 def test_the_wheels_give_a_slow_turn_until_the_gyro_is_proved(
@@ -381,7 +394,7 @@ def test_a_gyro_corrects_no_earlier_turn_after_the_pose_is_set() -> None:
     bench.run(REST_FIRST)
     bench.run(0.1, 0.5)
     assert bench.gyro.owes
-    bench.gyro.forgive()
+    bench.gyro.drop_corrections()
     begun, true = bench.told, bench.true
     bench.run(1.0, 0.5)
     assert bench.says() == "used"
@@ -404,7 +417,7 @@ def test_another_gyro_must_rest_and_be_proved_again() -> None:
     assert bench.gyro.learned == learned, "the track belongs to the floor, not to the gyro"
     bench.run(REST_FIRST)
     bench.run(2.0, 0.5)
-    assert bench.does == ["waiting for rest", "used", "reversed"]
+    assert bench.does == ["waiting for rest", "waiting for turn", "reversed"]
 
 
 def test_the_implied_track_is_reported_once_the_robot_has_turned_enough() -> None:
@@ -569,7 +582,7 @@ def test_a_turn_is_taken_back_only_in_a_line_that_covers_a_known_time() -> None:
     for _ in range(20):
         bench.now_ns += LINE_NS
         bench._sample()
-    bench.gyro.hear(tuple(bench._way))
+    bench.gyro.add_samples(tuple(bench._way))
     bench._way = []
     assert bench.gyro.turn(bench.now_ns, 0.0, 0.0, still=True) is None
     assert bench.says() == "not believed"
@@ -736,7 +749,7 @@ def test_a_new_pose_ends_the_doubt_of_a_contradiction() -> None:
     frozen(bench)
     bench.run(0.05, 1.0)
     bench.run(2.0, still=False)
-    bench.gyro.forgive()
+    bench.gyro.drop_corrections()
     bench.silent, bench.variance = True, 0.0
     bench.run(1.0, still=False)
     assert math.sqrt(bench.variance) < 0.3
@@ -784,7 +797,7 @@ def test_the_turn_before_a_new_pose_is_not_taken_back() -> None:
     frozen(bench)
     bench.run(0.1, 1.0)
     bench.run(0.5)
-    bench.gyro.forgive()
+    bench.gyro.drop_corrections()
     bench.told = 0.0
     bench.run(1.5)
     assert bench.told == pytest.approx(0.0, abs=0.02)

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from acsard.core.motion.gyro_match import FINE, ROUGH, Match
+from acsard.core.motion.gyro_match import INITIAL_RATIO_STD, MIN_RATIO_STD, Match
 
 DT = 0.01
 QUANTUM = math.tau / 3200 * 0.05 / 0.30
@@ -36,7 +36,7 @@ def matched(seconds: float, ratio: float = 0.6, delay: float = 0.0, rate: Rate =
 
 
 def test_the_first_ratio_is_one_with_a_rough_deviation_and_no_delay() -> None:
-    assert (Match().ratio, Match().deviation) == (1.0, ROUGH)
+    assert (Match().ratio, Match().deviation) == (1.0, INITIAL_RATIO_STD)
     assert Match().delay() is None
 
 
@@ -45,7 +45,7 @@ def test_the_first_ratio_is_one_with_a_rough_deviation_and_no_delay() -> None:
 def test_the_ratio_is_found_whatever_the_delay(ratio: float, delay: float) -> None:
     match = matched(20.0, ratio, delay)
     assert match.ratio == pytest.approx(ratio, rel=0.03)
-    assert match.deviation == FINE
+    assert match.deviation == MIN_RATIO_STD
 
 
 @settings(max_examples=20, deadline=None)
@@ -174,4 +174,4 @@ def test_a_changing_delay_of_the_gyro_does_not_make_the_ratio_less_certain() -> 
 
 
 def test_the_spread_is_the_deviation_of_the_assumed_ratio_until_something_is_learned() -> None:
-    assert Match().spread == ROUGH
+    assert Match().spread == INITIAL_RATIO_STD

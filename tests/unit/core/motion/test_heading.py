@@ -39,7 +39,7 @@ class Listening(Gyro):
         self.seconds.append(dt)
         return None
 
-    def taken_back(self, turn: float) -> float:
+    def undo_recomputation(self, turn: float) -> float:
         raise AssertionError("it owes nothing")
 
 
@@ -144,7 +144,7 @@ class Turning:
             self.true += (rate + self.rate) / 200 if gap else rate / 100
             self.rate = rate
             measured = rate * self.scale if self.hangs_at is None else self.hangs_at
-            self.gyro.hear((GyroSample(self.now_ns, None, measured),))
+            self.gyro.add_samples((GyroSample(self.now_ns, None, measured),))
             if gap and number < lines:
                 continue
             at = Instant(self.now_ns, self.now_ns)

@@ -68,7 +68,7 @@ def test_a_learned_track_too_far_from_the_configured_one_is_reported_and_not_use
     assert track.used == CONFIGURED
     assert track.event is not None
     assert track.event.level == "warning"
-    assert "(implausible), configured 1.000 (in use)" in track.event.text
+    assert "(out of range, not used), configured 1.000 (in use)" in track.event.text
     track.look(Track(share, SURE))
     assert told(track) is None
 

@@ -103,7 +103,7 @@ OFF = Latch(9, WALL_NS, "joe", "switched off by joe", kept=True)
             Latches(STOP, FAULT, OFF),
             Mode.FAULT,
             f"a wheel is dead, latched at {AT}:00 UTC, before the restart; also was stopped by ann "
-            f"at {AT}:00 UTC, before the restart; call srv/clear twice",
+            f"at {AT}:00 UTC, before the restart; call srv/clear twice, 2 s apart",
         ),
         (
             Latches(stop=Latch(7, WALL_NS, "acsard", "stopped at the start, because", kept=True)),
@@ -178,7 +178,7 @@ def test_a_number_is_not_used_again_after_a_restart_with_a_wall_clock_that_went_
     second = Lifecycle(active=True, latches=first.latches.after_restart())
     second.stop("joe", ns(3.0), Instant(ns(3.0), 0))
     assert number(second) > max(numbers)
-    with pytest.raises(RefusedError, match=f"latch {numbers[0]}, but srv/clear would"):
+    with pytest.raises(RefusedError, match=f"latch {numbers[0]} is not the latch"):
         second.clear(numbers[0], ns(3.1), Instant(ns(3.1), 0))
 
 
@@ -384,7 +384,7 @@ def test_a_release_that_names_another_latch_is_refused(held: Held, none: bool) -
     with pytest.raises(RefusedError) as caught:
         {"clear": clear, "activate": activate}[held.verb](life, 20.0, seen)
     assert str(caught.value) == (
-        f"this call names latch {seen}, but srv/{held.verb} would release another latch; the robot "
+        f"latch {seen} is not the latch that srv/{held.verb} would release now; the robot "
         f"is still {held.said} by joe{held.before}: look at the robot, then call srv/{held.verb} "
         "again with the present `latch` in `state`"
     )
@@ -484,11 +484,11 @@ def test_a_fault_keeps_the_stop_and_each_is_cleared_separately() -> None:
     assert mode(life) is Mode.FAULT
     assert life.why == (
         f"a wheel is dead, latched at {AT}:02 UTC; also stopped by ann at {AT}:01 UTC; "
-        "call srv/clear twice"
+        "call srv/clear twice, 2 s apart"
     )
     assert (
         clear(life, 5.0)
-        == "fault cleared, but the robot is still stopped by ann: call srv/clear again"
+        == "fault cleared, but the robot is still stopped by ann: call srv/clear again in 2 s"
     )
     assert mode(life) is Mode.STOPPED
     with pytest.raises(RefusedError, match="a latch was cleared less than 2 s ago"):
@@ -505,8 +505,8 @@ def test_a_stop_keeps_the_fault() -> None:
     life.fault("a wheel is dead", at(1.0))
     said = stop(life, 2.0)
     assert said == (
-        "stopped and latched; call srv/clear twice: the first call releases the fault, the second "
-        "the stop"
+        "stopped and latched; call srv/clear twice, 2 s apart: the first call releases the fault, "
+        "the second call releases the stop"
     )
     assert mode(life) is Mode.FAULT
     clear(life, 5.0)
@@ -608,12 +608,12 @@ def test_a_stop_and_a_fault_beside_a_pressed_emergency_stop_are_named_with_it() 
     life.fault("a wheel is dead", at(3.0))
     assert life.why == (
         f"a wheel is dead, latched at {AT}:03 UTC; also {stopped}; release it at the robot, then "
-        "call srv/clear twice"
+        "call srv/clear twice, 2 s apart"
     )
     life.hold("", "", ns(8.0))
     assert clear(life, 9.0) == (
         "fault cleared, but the robot is still stopped by joe and "
-        f"stopped ({PRESSED_REASON}): call srv/clear again"
+        f"stopped ({PRESSED_REASON}): call srv/clear again in 2 s"
     )
     assert life.why == f"{stopped}; call srv/clear"
 
@@ -629,7 +629,8 @@ def test_a_fault_that_the_board_still_reports_is_not_cleared() -> None:
     assert str(caught.value) == "a motor driver is hot: let it cool, then call srv/clear again"
     stop(life, 10.0, "joe")
     assert life.why == (
-        f"{fault}; also stopped by joe at {AT}:10 UTC; let it cool, then call srv/clear twice"
+        f"{fault}; also stopped by joe at {AT}:10 UTC; let it cool, then call srv/clear twice, "
+        "2 s apart"
     )
 
 
@@ -653,7 +654,7 @@ def test_a_press_after_a_release_is_a_new_latch() -> None:
     with pytest.raises(RefusedError) as caught:
         clear(life, 9.0, seen)
     assert str(caught.value) == (
-        f"this call names latch {seen}, but srv/clear would release another latch; the robot is "
+        f"latch {seen} is not the latch that srv/clear would release now; the robot is "
         f"still stopped ({PRESSED_REASON}): look at the robot, then call srv/clear again with the "
         "present `latch` in `state`"
     )
@@ -699,7 +700,7 @@ def test_an_activate_of_an_active_robot_changes_nothing_whatever_number_is_named
 def test_a_robot_that_starts_switched_off_has_the_number_0() -> None:
     life = ready(active=False)
     with pytest.raises(
-        RefusedError, match="latch 7, but srv/activate would release another latch; the"
+        RefusedError, match="latch 7 is not the latch that srv/activate would release now; the"
     ):
         activate(life, 1.0, 7)
     assert activate(life, 1.0, 0)
@@ -718,12 +719,12 @@ def test_the_latch_in_force_is_the_fault_then_the_stop_then_the_switch() -> None
 def test_a_stop_and_a_fault_during_the_shutdown_are_latched_for_the_next_start() -> None:
     life = ready()
     life.leave()
-    assert stop(life, 1.0) == "stopped and latched; the daemon is going down"
+    assert stop(life, 1.0) == "stopped and latched; the daemon is shutting down"
     assert life.fault("a wheel is dead", at(2.0))
     assert mode(life) is Mode.SHUTDOWN
     assert life.latches.stop is not None
     assert life.latches.fault is not None
-    with pytest.raises(RefusedError, match="going down"):
+    with pytest.raises(RefusedError, match="shutting down"):
         clear(life, 9.0, number(life))
 
 

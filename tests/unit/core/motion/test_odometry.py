@@ -685,7 +685,7 @@ class Says(Gyro):
     def turn(self, at_ns: int, dt: float, wheels: float, still: bool) -> Turn:
         return self._turn
 
-    def taken_back(self, turn: float) -> float:
+    def undo_recomputation(self, turn: float) -> float:
         raise AssertionError("it owes nothing")
 
 
@@ -790,6 +790,16 @@ def test_no_count_of_a_rest_is_lost() -> None:
     assert estimate.pose.x == pytest.approx(0.022 * 0.05)
 
 
+def test_a_count_at_rest_before_the_pose_is_set_moves_the_wheels_but_not_the_pose() -> None:
+    robot = odometry()
+    at_rest(robot)
+    robot.fold(counted(0.002))
+    robot.set_pose(Pose())
+    estimate = robot.fold(counted(0.1, speed=10.0))
+    assert estimate.pose.x == pytest.approx(0.1 * 0.05)
+    assert estimate.positions == pytest.approx((0.102,) * 4)
+
+
 def test_a_robot_that_creeps_too_slowly_for_two_decimals_moves() -> None:
     robot = odometry()
     at_rest(robot)
@@ -871,7 +881,7 @@ def test_another_track_changes_only_later_turns(share: float) -> None:
     for robot in (asked, plain):
         robot.fold(feedback(4.0, 9.0, 1.0))
     pose = asked.pose
-    asked.turn_by(Track(share, 0.02))
+    asked.use_track(Track(share, 0.02))
     assert asked.pose == pose == plain.pose
     came, would = asked.fold(feedback(4.0, 9.0, 0.1)), plain.fold(feedback(4.0, 9.0, 0.1))
     assert came.twist.linear == would.twist.linear
@@ -904,7 +914,7 @@ def test_a_corrected_turn_is_computed_with_the_track_at_the_time_of_that_turn() 
         if n == 51:
             assert not liar.checks.wheels.status.left_out
             for robot in (liar, honest):
-                robot.turn_by(Track(1.6, 0.02))
+                robot.use_track(Track(1.6, 0.02))
     assert liar.checks.wheels.status.left_out == ("front_left",)
     assert liar.pose.yaw == pytest.approx(honest.pose.yaw, abs=1e-4)
 
@@ -916,7 +926,7 @@ def test_a_learned_track_makes_the_estimate_as_uncertain_as_a_configured_one(sha
     Wheel noise, counts and their play depend on it as well.
     """
     asked = Odometry(OdometryConfig(learned_track=True), Kinematics(DriveConfig()), 400)
-    asked.turn_by(Track(share, 0.02))
+    asked.use_track(Track(share, 0.02))
     asked.use(OdometryConfig(learned_track=True))
     asked.set_pose(Pose())
     such = Kinematics(DriveConfig(wheel_separation_multiplier=share))

@@ -444,4 +444,5 @@ def test_the_warning_says_what_was_dropped_and_what_to_do() -> None:
     assert (event.name, event.level) == ("lines_implausible", "warning")
     assert event.text.startswith(f"{MOST + 1} of {MOST + 1} lines were dropped")
     assert "front_right at 200.00 rad/s is over feedback.wheel_speed" in event.text
+    assert "If a wheel really does that, raise feedback.wheel_speed. Otherwise" in event.text
     assert "mcu.link_check" in event.text

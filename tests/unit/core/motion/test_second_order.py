@@ -71,7 +71,7 @@ def test_an_unknown_heading_adds_no_second_order_term() -> None:
 def test_an_additional_column_does_not_change_the_existing_terms() -> None:
     second, p = straight(5, 1e-3, 0.01)
     before = second.xx
-    second.widen()
+    second.add_parameter()
     none = (0.0, 0.0, 0.0)
     second.compose(p, NONE, [none, none], [none, none])
     assert second.xx == pytest.approx(before)

@@ -146,7 +146,7 @@ def after(acceleration: float, other: float = 1.0, same: bool = True, count: flo
         command += acceleration * DT if line >= 100 else 0.0
         slow += (command - slow) * DT / (SLOW_S + DT)
         turned = 10.0 + other * (command - 10.0)
-        if stuck.says(same, (turned - 10.0) * DT, DT, count, told(command, slow)[0]):
+        if stuck.add(same, (turned - 10.0) * DT, DT, count, told(command, slow)[0]):
             return (line - 99) * DT
     return math.inf
 
@@ -180,7 +180,7 @@ def test_a_changed_speed_in_between_restarts_the_evidence_of_a_stuck_wheel() -> 
     stuck = Stuck()
     for line in range(1, 100):
         command = 10.0 + 0.2 * line
-        found = stuck.says(line % 3 != 0, 0.002 * line, DT, FINE, told(command, command - 1.0)[0])
+        found = stuck.add(line % 3 != 0, 0.002 * line, DT, FINE, told(command, command - 1.0)[0])
         assert not found
 
 
@@ -201,5 +201,5 @@ def test_a_sound_wheel_with_an_encoder_of_any_kind_is_not_stuck(
             math.floor(angle / count) - before for angle, before in zip(angles, said, strict=True)
         )
         said = [said[0] + own, said[1] + other]
-        assert not stuck.says(own == last, (other - own) * count, DT, count, told(command, slow)[0])
+        assert not stuck.add(own == last, (other - own) * count, DT, count, told(command, slow)[0])
         last = own

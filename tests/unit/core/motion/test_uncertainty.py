@@ -293,10 +293,10 @@ def test_the_error_of_a_track_counts_for_the_turns_that_it_made() -> None:
         return robot.pose.yaw - before, covariance.yawyaw
 
     assert turned(1.0) == pytest.approx((1.0, 0.05**2))
-    robot.turn_by(Track(1.6, 0.02))
+    robot.use_track(Track(1.6, 0.02))
     assert turned(1.0) == pytest.approx((1 / 1.6, 0.05**2 + (0.02 / 1.6) ** 2))
     assert turned(0.5)[1] == pytest.approx(0.05**2 + (0.02 * 1.5 / 1.6) ** 2)
-    robot.turn_by(CONFIGURED)
+    robot.use_track(CONFIGURED)
     assert turned(-1.0)[1] == pytest.approx((0.02 * 1.5 / 1.6) ** 2)
 
 

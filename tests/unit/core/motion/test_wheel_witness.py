@@ -516,7 +516,9 @@ def test_a_wheel_that_turns_the_right_way_too_slowly_is_a_warning_with_its_ratio
     robot = watching()
     assert slow(robot, 1.0, 5.0) == []
     (warning,) = slow(robot, 0.6, 5.0, wheel)
-    assert warning.startswith(f"warning slow: wheels slower than commanded: {WHEELS[wheel]} 6")
+    assert warning.startswith(
+        f"warning slow: wheels are slower than commanded: {WHEELS[wheel]} reaches 6"
+    )
     assert robot.status.slow in ((f"{WHEELS[wheel]} 60%",), (f"{WHEELS[wheel]} 61%",))
     assert robot.status.text == ""
     (again,) = slow(robot, 1.0, 5.0)

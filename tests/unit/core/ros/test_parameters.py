@@ -144,14 +144,16 @@ def test_a_set_request_gives_a_plain_value_for_each_name(
     value: rcl.ParameterValue, expected: object
 ) -> None:
     asked = rcl.SetRequest([rcl.Parameter("limits.linear_speed", value)])
-    assert rcl.wished(Cdr(rcl.SetRequest).encode(asked)) == {"limits.linear_speed": expected}
+    assert rcl.requested_values(Cdr(rcl.SetRequest).encode(asked)) == {
+        "limits.linear_speed": expected
+    }
 
 
 @each("kind", [rcl.NOT_SET, 5, 6, 10])
 def test_a_parameter_cannot_be_unset_nor_made_of_bytes(kind: int) -> None:
     asked = rcl.SetRequest([rcl.Parameter("log.level", rcl.ParameterValue(kind))])
     with pytest.raises(CdrError, match=r"log\.level"):
-        rcl.wished(Cdr(rcl.SetRequest).encode(asked))
+        rcl.requested_values(Cdr(rcl.SetRequest).encode(asked))
 
 
 def test_a_set_reply_has_one_result_per_parameter_and_an_atomic_one_has_one() -> None:
@@ -175,7 +177,7 @@ def test_a_request_cut_anywhere_is_refused(service: str) -> None:
     payload = Cdr(type(request)).encode(request)
     serve: Callable[[bytes], object] = partial(Parameters(TABLES).answer, service)
     if service in rcl.SETTING_SERVICES:
-        serve = rcl.wished
+        serve = rcl.requested_values
     assert serve(payload)
     for end in range(len(payload)):
         with pytest.raises(CdrError):

@@ -459,6 +459,29 @@ def test_a_muted_mcu_drives_but_sends_nothing() -> None:
         assert mcu.valid_lines == 10
 
 
+def test_a_muted_mcu_still_identifies_itself() -> None:
+    mcu = FakeMcu(TRUE)
+    with mcu.mute():
+        mcu.receive(0, b"?\r\n")
+        ((_, line),) = replies(mcu, 20 * MS)
+    assert line.startswith(b"!acsard-mcu ")
+
+
+def test_the_lines_that_a_fault_loses_are_recorded_too() -> None:
+    mcu = FakeMcu(TRUE)
+    with mcu.lost_commands(every=1):
+        assert drive(mcu, 0, 2) == []
+    assert [line for _, line in mcu.heard] == [LINE] * 2
+
+
+def test_a_bit_error_hits_one_of_two_lines_that_are_written_together() -> None:
+    mcu = FakeMcu(TRUE)
+    with mcu.bit_errors(every=1):
+        mcu.receive(0, LINE * 2)
+        mcu.advance(20 * MS)
+    assert mcu.valid_lines == 1
+
+
 def test_the_noise_fault_prepends_noise_to_every_answer() -> None:
     mcu = FakeMcu(TRUE)
     with mcu.noise(b"\x00\xff~"):
@@ -555,6 +578,24 @@ def test_a_frozen_encoder_keeps_its_last_speed_while_its_wheel_stops(motor: int)
     assert after[motor] == before[motor]
     assert all(t.endswith(b"p00.00") for i, t in enumerate(after) if i != motor)
     assert mcu.vehicle.speeds == [0.0] * 4
+
+
+@pytest.mark.parametrize(
+    ("fault", "front"), [("dead_motor", [0.0, 12.5]), ("reversed_motor", [8.75, 12.5])]
+)
+def test_a_motor_whose_wires_are_swapped_keeps_its_own_fault(
+    fault: str, front: list[float]
+) -> None:
+    mcu = FakeMcu(TRUE)
+    with mcu.swapped_motors(0, 1), getattr(mcu, fault)(0):
+        drive(mcu, 0, 2)
+        assert mcu.vehicle.set_points == [*front, *SPEEDS[2:]]
+
+
+def test_an_encoder_whose_wires_are_swapped_stays_reversed() -> None:
+    mcu = FakeMcu(TRUE)
+    with mcu.swapped_encoders(0, 1), mcu.reversed_encoder(0):
+        assert drive(mcu, 0, 6)[-1][1] == b"an08.75,bn12.50,cp15.00,dn10.25\r\n"
 
 
 def test_a_comma_latched_mcu_keeps_its_last_wheel_without_a_trailing_comma() -> None:

@@ -74,7 +74,7 @@ def test_each_named_fault_can_be_turned_on_and_off() -> None:
     mcu = FakeMcu(Config())
     before = dict(vars(mcu))
     for text in EACH:
-        with mcu.having(named(text)):
+        with mcu.switched_on(named(text)):
             assert vars(mcu) != before, text
         assert vars(mcu) == before, text
 
@@ -82,7 +82,7 @@ def test_each_named_fault_can_be_turned_on_and_off() -> None:
 def test_a_fault_in_the_configuration_is_active_from_the_start() -> None:
     for text in EACH:
         mcu, told = FakeMcu(Config()), FakeMcu(Config(sim=SimConfig(faults=(text,))))
-        with mcu.having(named(text)):
+        with mcu.switched_on(named(text)):
             for switch in switches(Faults()):
                 assert getattr(told, switch) == getattr(mcu, switch), (text, switch)
 

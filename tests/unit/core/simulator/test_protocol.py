@@ -5,7 +5,7 @@ from __future__ import annotations
 import binascii
 
 from acsard.core.simulator import protocol
-from acsard.core.simulator.protocol import Command, latched, plain_only, prefix, whole
+from acsard.core.simulator.protocol import Command, latched, plain_only, prefix, reference
 from tests.each import each
 
 PLAIN = b"ap12.50,bn08.75,cp15.00,dn10.25"
@@ -20,7 +20,7 @@ def closed(body: bytes) -> bytes:
 
 @each("end", [END, b"\n", b",\r\n", b",\n"])
 def test_every_parser_accepts_a_plain_line(end: bytes) -> None:
-    assert whole(PLAIN + end) == plain_only(PLAIN + end) == Command(VALUES)
+    assert reference(PLAIN + end) == plain_only(PLAIN + end) == Command(VALUES)
     assert prefix(PLAIN + end) == Command(VALUES)
     assert latched(PLAIN + b",").values == VALUES
 
@@ -37,7 +37,7 @@ def test_every_parser_accepts_a_plain_line(end: bytes) -> None:
 def test_a_checked_line_is_parsed_with_its_sequence_and_requests(
     suffix: bytes, sequence: bytes, sample: bool
 ) -> None:
-    assert whole(closed(PLAIN + suffix)) == Command(VALUES, sequence, sample)
+    assert reference(closed(PLAIN + suffix)) == Command(VALUES, sequence, sample)
 
 
 @each(
@@ -61,7 +61,7 @@ def test_a_checked_line_is_parsed_with_its_sequence_and_requests(
     ],
 )
 def test_a_line_with_any_error_in_its_suffix_is_refused(line: bytes) -> None:
-    assert whole(line) is None
+    assert reference(line) is None
 
 
 def test_the_old_firmwares_obey_a_checked_line_as_a_plain_one() -> None:
@@ -73,7 +73,7 @@ def test_the_old_firmwares_obey_a_checked_line_as_a_plain_one() -> None:
 
 @each("line", [b"", b"\r\n", b"?", PLAIN[:30], PLAIN[1:], b"\xff" * 50])
 def test_data_that_are_not_a_line_are_refused(line: bytes) -> None:
-    assert whole(line) is plain_only(line) is prefix(line) is None
+    assert reference(line) is plain_only(line) is prefix(line) is None
 
 
 def test_a_reply_is_written_with_or_without_padding() -> None:
@@ -93,4 +93,4 @@ def test_the_suffix_of_a_reply_contains_its_check_and_sample() -> None:
 def test_the_identity_line_names_the_firmware_and_is_not_a_command() -> None:
     line = protocol.identity(3200, 300, sample=True)
     assert line == b"!acsard-mcu 1 counts=3200 watchdog_ms=300 check=1 sample=1\r\n"
-    assert whole(line) is prefix(line) is plain_only(line) is None
+    assert reference(line) is prefix(line) is plain_only(line) is None

@@ -9,7 +9,7 @@ from msgspec.structs import replace
 
 from acsard.core.config.settings import Config, SimConfig
 from acsard.core.simulator.fake_mcu import MS, FakeMcu
-from acsard.core.simulator.simulated_robot import OBSERVATION_PERIOD_NS, Sight, WatchedMcu
+from acsard.core.simulator.simulated_robot import OBSERVATION_PERIOD_NS, Observation, WatchedMcu
 
 TRUE = Config(sim=SimConfig(motor_time_constant=0.0))
 LINE = b"ap02.00,bn02.00,cn02.00,dp02.00\r\n"
@@ -17,9 +17,9 @@ RATE = 2.0 * 2 * 0.05 / 0.30
 """Turn rate that the line commands, rad/s."""
 
 
-def seen(config: Config = TRUE, seconds: float = 1.0, step_ms: int = 5) -> list[Sight]:
+def seen(config: Config = TRUE, seconds: float = 1.0, step_ms: int = 5) -> list[Observation]:
     """Return all observations of a robot that is commanded to turn from 100 ms on."""
-    sights: list[Sight] = []
+    sights: list[Observation] = []
     mcu = WatchedMcu(config, 0, sights.append)
     for ms in range(0, int(seconds * 1000) + 1, step_ms):
         if ms >= 100 and ms % 20 == 0:

@@ -11,11 +11,11 @@ from acsard.core.incoming.commands import Arrival
 from acsard.core.incoming.imu import reading
 from acsard.core.messages.encodings import FORMATS, Format, encode
 from acsard.core.messages.schema import Time, Vector3
-from acsard.core.simulator.simulated_robot import Sight
+from acsard.core.simulator.simulated_robot import Observation
 from acsard.core.simulator.true_messages import true_pose, turn_rate
 from acsard.core.values import Pose
 
-SIGHT = Sight(7, Pose(1.5, -2.0, math.pi / 2), 0.25)
+SIGHT = Observation(7, Pose(1.5, -2.0, math.pi / 2), 0.25)
 WALL_NS = 1_700_000_003_250_000_001
 
 

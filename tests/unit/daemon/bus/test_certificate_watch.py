@@ -16,7 +16,7 @@ from acsard.daemon.bus.certificate_watch import (
     CertificateFiles,
     watch_certificates,
 )
-from acsard.daemon.bus.tls import ends, files_in
+from acsard.daemon.bus.tls import expiry_times, files_in
 from acsard.host import clock
 from acsard.machine.authority import Authority
 
@@ -100,7 +100,7 @@ async def test_new_files_and_a_new_router_are_noticed_and_missing_ones_change_no
     monkeypatch.setattr(module, "EXPIRY_CHECK_PERIOD_S", 0.0)
     monkeypatch.setattr(module, "ROUTER_CHECK_EVERY", 2)
     monkeypatch.setattr(module, "peer_ends_ns", lambda endpoint, tls: router[0])
-    known = ends(str(tmp_path))
+    known = expiry_times(str(tmp_path))
     first = known[""]
     bus = BusConfig(mode="client", connect=(ROUTER,), tls=str(tmp_path))
     task = asyncio.create_task(watch_certificates(bus, known))
@@ -128,7 +128,7 @@ async def test_a_disk_that_hangs_takes_one_thread(
         return {"": 8}
 
     monkeypatch.setattr(module, "EXPIRY_CHECK_PERIOD_S", 0.0)
-    monkeypatch.setattr(module, "ends", hang)
+    monkeypatch.setattr(module, "expiry_times", hang)
     known = {"": 7}
     task = asyncio.create_task(watch_certificates(BusConfig(tls=str(tmp_path)), known))
     await asyncio.sleep(0.1)

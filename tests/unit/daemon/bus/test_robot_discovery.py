@@ -9,8 +9,8 @@ from acsard.daemon.bus.robot_discovery import (
     MAX_NAMED,
     Presence,
     explain_silence,
-    named,
-    nobody,
+    no_robot_text,
+    parse_ids,
     robot_of,
 )
 from acsard.host.errors import UsageError
@@ -27,13 +27,13 @@ from tests.each import each
     ],
 )
 def test_an_id_names_one_robot_several_or_all(text: str, ids: tuple[str, ...]) -> None:
-    assert named(text) == ids
+    assert parse_ids(text) == ids
 
 
 @each("text", ["a,", ",", "a,*", "a,b/c", "a,$*"])
 def test_a_list_of_invalid_ids_is_refused_with_the_correct_form(text: str) -> None:
     with pytest.raises(UsageError, match="comma"):
-        named(text)
+        parse_ids(text)
 
 
 @each(
@@ -52,13 +52,13 @@ def test_a_key_belongs_to_one_robot_and_a_wildcard_to_none(key: str, robot: str)
 
 
 def test_over_tls_the_message_asks_for_the_names_of_the_robots() -> None:
-    assert "name the robots" in nobody("tls/router.local:7447")
-    assert "name the robots" not in nobody("tcp/127.0.0.1:7448")
+    assert "name the robots" in no_robot_text("tls/router.local:7447")
+    assert "name the robots" not in no_robot_text("tcp/127.0.0.1:7448")
 
 
 def test_over_tls_the_message_names_the_command_that_shows_the_role() -> None:
-    assert "`acsard whoami --id robot1` shows" in nobody("tls/router.local:7447")
-    assert "whoami" not in nobody("tcp/127.0.0.1:7448")
+    assert "`acsard whoami --id robot1` checks" in no_robot_text("tls/router.local:7447")
+    assert "whoami" not in no_robot_text("tcp/127.0.0.1:7448")
 
 
 HERE, PLAIN, TLS = Presence(linked=True, here=True), "tcp/127.0.0.1:7448", "tls/router:7447"

@@ -14,7 +14,7 @@ from cryptography.hazmat.primitives import serialization
 
 from acsard.core.values import NS_PER_S
 from acsard.daemon.bus import tls
-from acsard.daemon.bus.tls import AUTHORITY, common_name, ends, require_usable, trouble
+from acsard.daemon.bus.tls import AUTHORITY, common_name, expiry_times, require_usable, trouble
 from acsard.host.errors import CertificateError, NotPermittedError
 from acsard.machine.authority import Authority
 
@@ -81,14 +81,17 @@ def test_a_key_that_this_user_may_not_read_is_a_missing_permission(tmp_path: Pat
 
 
 def test_the_ends_of_the_certificate_and_of_its_authority_are_read(tmp_path: Path) -> None:
-    found, later = ends(str(made(tmp_path, 10, 100))), ends(str(made(tmp_path, 1, 1)))
+    found, later = (
+        expiry_times(str(made(tmp_path, 10, 100))),
+        expiry_times(str(made(tmp_path, 1, 1))),
+    )
     # An authority is valid for five times the days that were asked for.
     days = {whose: round((found[whose] - later[whose]) / DAY_NS) for whose in found}
     assert days == {"": 10 - 1, AUTHORITY: 5 * 100 - 5 * 1}
 
 
 def test_missing_files_have_no_end(tmp_path: Path) -> None:
-    assert ends(str(tmp_path)) == {}
+    assert expiry_times(str(tmp_path)) == {}
 
 
 @pytest.mark.parametrize(
@@ -141,7 +144,7 @@ def test_the_options_of_an_endpoint_are_not_part_of_its_port(
 def test_a_rejected_server_certificate_has_the_reason_of_openssl(
     code: int, reason: str, told: str
 ) -> None:
-    found = tls._server_rejected(code, reason, "robot", "dir")
+    found = tls._server_certificate_error(code, reason, "robot", "dir")
     assert found.startswith(("the authority in ", "the certificate of robot"))
     assert told in found
     assert f"({reason})" in found
@@ -149,9 +152,9 @@ def test_a_rejected_server_certificate_has_the_reason_of_openssl(
 
 
 def test_a_rejected_client_certificate_has_the_alert_of_the_server() -> None:
-    found = tls._client_rejected("SSLV3_ALERT_CERTIFICATE_REVOKED", "robot", "dir")
+    found = tls._client_certificate_error("SSLV3_ALERT_CERTIFICATE_REVOKED", "robot", "dir")
     assert "robot does not accept dir/certificate.pem (SSLV3_ALERT_CERTIFICATE_REVOKED)" in found
-    assert "did not sign" in tls._client_rejected("TLSV1_ALERT_UNKNOWN_CA", "robot", "dir")
+    assert "did not sign" in tls._client_certificate_error("TLSV1_ALERT_UNKNOWN_CA", "robot", "dir")
 
 
 @pytest.mark.slow
