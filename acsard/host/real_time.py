@@ -21,6 +21,10 @@ ends the process. Otherwise a loop that hangs would block all ordinary programs,
 has priority over them. A step takes a thousandth of this time. The systemd service has no such
 limit: systemd's watchdog ends a daemon that hangs."""
 
+MIN_SPIN_S = 0.5
+"""Smallest hard limit of this time, s. With a lower one, the kernel could end the daemon during its
+start, so the daemon then runs without real-time scheduling."""
+
 WAKE_UP_LATENCY = "/dev/cpu_dma_latency"
 """Device file with which a process limits the time that a processor takes to wake up."""
 
@@ -86,6 +90,8 @@ def _schedule() -> bool:
         policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
         spin_us, hard_us = MAX_SPIN_S * 1_000_000, resource.getrlimit(resource.RLIMIT_RTTIME)[1]
         if hard_us != resource.RLIM_INFINITY:
+            if hard_us < MIN_SPIN_S * 1_000_000:
+                return False
             # Without CAP_SYS_RESOURCE, a process cannot raise its hard limit.
             spin_us = min(spin_us, hard_us)
         resource.setrlimit(resource.RLIMIT_RTTIME, (spin_us, spin_us))

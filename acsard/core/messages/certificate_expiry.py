@@ -37,12 +37,21 @@ def expiry(ends: Mapping[str, int], now_ns: int) -> tuple[int, str]:
     of = f" (certificate of {whose})" if whose else ""
     days = (ends_ns - now_ns) / DAY_NS
     if days < 0:
-        # Zenoh ignores the dates of an authority, so not every expired certificate has this effect.
-        effect = "" if whose else ": TLS refuses every client"
-        return 2, f"expired {-days:.0f} days ago{of}{effect}"
+        return 2, f"expired {-days:.0f} days ago{of}{_effect(ends, now_ns)}"
     if days < EXPIRY_DAYS:
         return 1, f"expires in {days:.0f} days{of}"
     return 0, f"valid for {days:.0f} days{of}"
+
+
+def _effect(ends: Mapping[str, int], now_ns: int) -> str:
+    # Zenoh ignores the dates of an authority, so only the robot's own certificate has this effect.
+    own_ns, others = ends.get("", now_ns), [ends_ns for owner, ends_ns in ends.items() if owner]
+    if own_ns >= now_ns or own_ns in others:
+        return ""
+    if not others:
+        # The time may come from the gateway, which does not say whose certificate it is.
+        return ": if it is the certificate of the robot, TLS refuses every client"
+    return ": TLS refuses every client"
 
 
 def first_expiry(ends: Mapping[str, int]) -> tuple[str, int]:

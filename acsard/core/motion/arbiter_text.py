@@ -83,7 +83,8 @@ def waiting(wait: Wait) -> str:
 
 def missed(periods: int) -> Event:
     """Return the log event for `periods` successive control periods without a step of the robot."""
-    text = f"no control step ran in {many(periods, 'successive control period')}"
+    when = "one control period" if periods == 1 else f"{periods} successive control periods"
+    text = f"no control step ran in {when}"
     return Event("missed_periods", text, "warning", kind="missed", count=periods, news=False)
 
 

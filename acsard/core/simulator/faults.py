@@ -118,21 +118,24 @@ class Faults:
         return self._with(cut_replies=True)
 
     def bias(self, wheel: int, gain: float) -> Fault:
-        """Multiply the reported speed and counts of motor `wheel` by `gain`.
+        """Multiply the speed and counts that the board reports for motor `wheel` by `gain`.
 
-        `wheel` is 0 to 3 for the motors a to d.
+        `wheel` is 0 to 3 for the motors a to d, even if encoders are swapped.
         """
         return self._with(gains=[gain if i == wheel else g for i, g in enumerate(self.gains)])
 
     def stuck_encoder(self, wheel: int) -> Fault:
         """Make the board report that motor `wheel` stands still, even while it turns.
 
-        `wheel` is 0 to 3 for the motors a to d.
+        `wheel` is 0 to 3 for the motors a to d, even if encoders are swapped.
         """
         return self._with(stuck=wheel)
 
     def frozen_encoder(self, wheel: int) -> Fault:
-        """Make the board repeat the last speed of motor `wheel` (0 to 3 for a to d) forever."""
+        """Make the board repeat the last speed that it has reported for motor `wheel` forever.
+
+        `wheel` is 0 to 3 for the motors a to d, even if encoders are swapped.
+        """
         return self._with(frozen=wheel)
 
     @contextmanager

@@ -205,7 +205,7 @@ def test_the_event_has_the_duration_and_the_cause_with_its_advice() -> None:
 def test_the_cause_is_parsed_from_each_form_of_a_log_line(line: str) -> None:
     cause = "by 0.06 s, because the processor is hot (cool it: now), and it is slow (speed it)"
     assert cause_in(line.format(cause)) == cause
-    assert cause_in("11 x missed: 11 in a row") == ""
+    assert cause_in("11 x missed: no control step ran in 11 successive control periods") == ""
 
 
 def test_present_causes_are_listed_without_a_late_period() -> None:

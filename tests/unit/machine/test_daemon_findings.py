@@ -499,7 +499,7 @@ def test_a_lost_link_is_reported_with_the_number_of_losses() -> None:
 
 def test_the_last_causes_of_lateness_are_warnings_only_if_periods_are_missed_now() -> None:
     texts = [
-        "11 x missed: 11 in a row",
+        "11 x missed: no control step ran in 11 successive control periods",
         *(f"late: by 0.1{n} s, because it is {n}" for n in range(5)),
     ]
     events = tuple(

@@ -15,7 +15,11 @@ NOW_NS = 1_700_000_000_000_000_000
         (30, 0, "valid for 30 days"),
         (29, 1, "expires in 29 days"),
         (0, 1, "expires in 0 days"),
-        (-2, 2, "expired 2 days ago: TLS refuses every client"),
+        (
+            -2,
+            2,
+            "expired 2 days ago: if it is the certificate of the robot, TLS refuses every client",
+        ),
     ],
 )
 def test_expiry_is_a_warning_for_a_month_before_the_end_and_an_error_after_it(
@@ -28,8 +32,10 @@ def test_the_certificate_that_expires_first_is_named_unless_it_is_the_robot_s_ow
     ends = {"": NOW_NS + 10 * DAY_NS, "the authority": NOW_NS + 400 * DAY_NS}
     assert expiry(ends, NOW_NS)[1] == "expires in 10 days"
     ends["the router tls/router.local:7447"] = NOW_NS - 3 * DAY_NS
-    told = "expired 3 days ago (certificate of the router tls/router.local:7447)"
-    assert expiry(ends, NOW_NS) == (2, told)
+    text = "expired 3 days ago (certificate of the router tls/router.local:7447)"
+    assert expiry(ends, NOW_NS) == (2, text)
+    ends[""] = NOW_NS - DAY_NS
+    assert expiry(ends, NOW_NS) == (2, f"{text}: TLS refuses every client")
 
 
 def test_an_authority_that_expires_together_with_its_gateway_certificate_is_named() -> None:
