@@ -259,7 +259,7 @@ def first_run(host: Host) -> None:
     host.world.port.unplug()
     host.world.port.trouble = "/dev/ttyACM0 was lost; reopening it"
     host.run(3.0)
-    host.note("cable plugged in", "^link up: linked", after=0.1)
+    host.note("cable plugged in", "^link up: the link to the microcontroller is up", after=0.1)
     host.world.port.trouble = ""
     host.world.port.plug(host.world.mcu)
     host.run(3.0)

@@ -477,21 +477,6 @@ FAULTS = (
         "        if latch is None:\n",
     ),
     fault(
-        "lifecycle second",
-        "a further cause of a fault does not get a number of its own",
-        LIFECYCLE,
-        '        self._latch(fault=with_causes(self._made(now, "", why), latch))\n',
-        '        made = with_causes(self._made(now, "", why), latch)\n'
-        "        self._latch(fault=replace(made, number=latch.number) if latch else made)\n",
-    ),
-    fault(
-        "lifecycle unseen",
-        "a clear without a number releases a fault at once",
-        LIFECYCLE,
-        "            self._require_seen(was,",
-        "            latches.fault or self._require_seen(was,",
-    ),
-    fault(
         "lifecycle off",
         "deactivate answers, but does nothing",
         LIFECYCLE,

@@ -113,7 +113,7 @@ async def test_a_key_stops_the_leg_and_other_clients_see_the_procedure_and_canno
         end = await guided.ended()
         assert (end["ended"], end["meaning"]) == (1, "failure")
         assert "a key was pressed" in end["text"]
-        assert "writes no file" in end["text"]
+        assert "did not change any file" in end["text"]
         await other.says(lambda said: said.get("running") == "")
     none_left(page)
     assert page.refused()["malformed"] >= before.get("malformed", 0) + 200
