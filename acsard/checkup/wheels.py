@@ -142,7 +142,10 @@ def encoder_finding(mcu: McuConfig, channel: Channel) -> Finding:
 
 
 def _whose(mcu: McuConfig, channel: Channel) -> str:
-    """Return what the operator's answer adds to the name of an outcome, such as ", motor"."""
+    """Return the suffix for the name of the check's outcome, such as ", motor".
+
+    The suffix depends on the wheel and the direction that the operator has seen.
+    """
     wheel, sign = wheel_of(mcu, channel.motor)
     seen = channel.wheel
     match channel.kind:

@@ -259,7 +259,7 @@ class Handover:
     def trouble(self) -> str | None:
         """Reason why the latches would not survive a restart, in words, or "" if they would.
 
-        The value is None without a keeper, because latches are then never stored.
+        The value is None if this daemon has no latch file, because it then never stores latches.
         """
         return None if self._keeper is None else self._keeper.trouble
 

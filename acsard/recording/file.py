@@ -99,8 +99,8 @@ CHANNEL_DESCRIPTIONS: dict[Topic, str] = {
     f"array of {', '.join(Batch.__struct_fields__)}; each of the rows is a step, an array of "
     f"{', '.join(Row.__struct_fields__)}; the module acsard.recording.rows documents each field",
     "state": "the robot between two steps, in MessagePack: an array of "
-    f"{', '.join(Checkpoint.__struct_fields__)}; the data is a Python pickle, which only acsard "
-    "reads safely",
+    f"{', '.join(Checkpoint.__struct_fields__)}; its element data is a Python pickle, which "
+    "only acsard reads safely",
     "events": "an event, in JSON; the schema describes it",
     "unfinished": "the inputs of the step in which the daemon failed, in MessagePack: a map of "
     f"{', '.join(Unfinished.__struct_fields__)}",

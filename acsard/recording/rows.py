@@ -202,7 +202,11 @@ def encode(first: int, taken: Sequence[FinishedStep]) -> bytes:
 
 
 def _times(taken: Sequence[FinishedStep], mono_ns: int, offset_ns: int) -> Iterator[list[int]]:
-    """Yield for each row `Row.now`, `Row.offset`, and then age and offset of each read, ns."""
+    """Yield the times of each row in a list, ns.
+
+    A list begins with `Row.now` and `Row.offset`. Then it has the age and the offset of each read
+    of the row.
+    """
     tick_ns = mono_ns
     for inputs, _, _ in taken:
         now = inputs.now

@@ -273,7 +273,7 @@ class _Machine:
     def _extend(self, parts: list[_Entry]) -> None:
         whole = self._stack[-1]
         if type(whole.value) not in (list, deque):
-            raise TypeError("an instruction appends to an object that is not a list")
+            raise TypeError("the state's pickle appends to an object that is not a list")
         whole.holds(parts)
         whole.value.extend([part.value for part in parts])
 
@@ -321,8 +321,8 @@ class _Machine:
         kind, given = self._top(2)
         if not isinstance(kind.value, type) or given.value != ():
             raise TypeError(
-                "an instruction makes an object of a value that is not a class, or of a class that "
-                "needs arguments"
+                "the state's pickle calls something that is not a class, or a class without the "
+                "arguments that it needs"
             )
         if not _is_part(kind.value):
             raise ValueError(f"{kind.value.__name__} cannot be constructed without values")
@@ -386,8 +386,8 @@ def _keys(entries: Sequence[_Entry]) -> None:
                 )
         elif type(value) not in KEY_TYPES and not isinstance(value, Enum):
             raise ValueError(
-                f"the robot state uses a {type(value).__name__} as a key, which this acsard never "
-                "writes"
+                f"the robot state has a dictionary with a {type(value).__name__} as a key, which "
+                "this version of acsard never writes"
             )
         elif type(value) is int and abs(value) >= MAX_KEY:
             raise ValueError(

@@ -477,11 +477,11 @@ class Driving:
         return self._steps(squares)
 
     def missed(self) -> Steps:
-        """Return the steps with the errors that gaps in the feedback cause."""
+        """Return all steps of the drive. Their errors are those that gaps in the feedback cause."""
         return self._steps(self._motion.filled, self._motion.unfilled)
 
     def rounded(self) -> Steps:
-        """Return the steps with the errors that the rounding of the reported speeds causes."""
+        """Return all steps of the drive. Their errors come from the rounding of reported speeds."""
         found = self._rounding
         if found.count:
             return self._steps(missed=self._of_wheels(found.offset[1:]))

@@ -354,9 +354,10 @@ class FreeRunningTimes:
 
 
 def _slots(reads: list[Read], period: float = math.inf) -> list[int]:
-    """Return the number of the slot of the last line of each read. The first read has slot 0.
+    """Return the slot of the last line of each read.
 
-    With a finite `period`, ns, missing lines have slots too.
+    A slot is the index of a line. The last line of the first read has the slot 0. If `period`, ns,
+    is finite, the lines that are missing according to the times of the reads have slots too.
     """
     slots = [0]
     for (before, _), (at, lines) in pairwise(reads):
@@ -693,10 +694,11 @@ class PromptedTimes:
         self._delay = self._base
 
     def _given_up_too_early(self, delay: float) -> bool:
-        """Stop waiting for lost replies. Return whether an earlier call stopped too early.
+        """Stop waiting for replies that seem lost, and return whether an earlier call was wrong.
 
-        If so, the present reply answers the last command that the earlier call gave up. Call this
-        only if the last read of the port contained a single reply.
+        An earlier call was wrong if it stopped waiting for a reply that was only late. The present
+        reply is then this late reply. Call this only if the last read of the port contained a
+        single reply.
         """
         left, at, wide = self._left, self._at, 4 * self._spread
         lost, self._lost = self._lost, False

@@ -128,7 +128,10 @@ class _Source:
             sender.unlearn()
 
     def present(self, now_ns: int) -> list[Sender]:
-        """Return the present senders: armed ones first, then live ones, then the earliest."""
+        """Return the present senders: armed ones first, then live ones, then the others.
+
+        Within each of these groups, the sender that began to send first comes first.
+        """
         present = []
         for sender in self.senders.values():
             if sender.present(now_ns):

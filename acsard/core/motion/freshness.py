@@ -80,10 +80,10 @@ JUMP_PROOF_NS = 3 * NS_PER_S // 2
 cause of a jump is more likely a backlog that arrives in bursts than a clock that was set."""
 
 MAX_PAUSE_NS = 2 * NS_PER_S
-"""Longest silence of a sender that is not a pause, ns. If the timeout of the source is longer, the
-timeout applies instead, because the sender need not send more often. A pause ends a test of the
-delay. If both stamps and arrival times show the pause, a foreign clock (one that may be adjusted)
-may have been set by any amount during the pause."""
+"""Limit for the silence of a sender, ns. A longer silence counts as a pause. If the timeout of the
+sender's source is longer, this timeout is the limit, because the sender need not send more often. A
+pause ends a test of the sender's delay. If the stamps show the pause as well as the arrival times
+do, a foreign clock (one that may be adjusted) may have been set by any amount in the pause."""
 
 MAX_STOPPED_STAMP_NS = 10_000
 """Largest difference between the stamps of two successive commands, ns, that shows that the clock
