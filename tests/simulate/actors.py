@@ -120,7 +120,7 @@ class Run:
         self._ended = b""
         """The last byte of the board that reached the daemon."""
         self._rest = b""
-        """What the board has sent of a line that has no end yet."""
+        """The bytes of the newest line from the board, if its end has not arrived yet."""
         self._plain = "link_check" not in plan["config"]["mcu"]
         """The serial lines have no check, so that a whole line always counts."""
         self._begins = 1

@@ -137,7 +137,7 @@ class Followed:
     ) -> None:
         """Take note of a message that arrived at `at_ns` by the robot's clock.
 
-        `wish` is None if the message is no command that can be read.
+        `wish` is None if the message is not a command, or cannot be read.
         """
         self._count += 1
         if wish is None:

@@ -1,4 +1,4 @@
-"""Lines that only repeat the daemon's own are an echo, and what a board measures is none."""
+"""Lines that only repeat the daemon's own lines are an echo. Lines with measured speeds are not."""
 
 from __future__ import annotations
 
