@@ -552,6 +552,10 @@ class Inputs:
             raise BrokenError("a press stops the robot, however short", true_ns, text)
         if self._fresh and moving:
             raise BrokenError("a press is a zero at once", true_ns, str(moving))
+        if not self._mode and "emergency stop" in seen.reason:
+            # A new daemon knows a stop of the emergency stop from its latch file. Only `clear` ends
+            # it, also if a full disk has lost the `clear` of the daemon before.
+            self._powered = self._driver_faulted = False
         self._drivers(true_ns, seen)
         self._answers(true_ns, seen, calm)
         self._keeps_names(true_ns, seen)

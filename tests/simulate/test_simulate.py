@@ -467,6 +467,22 @@ def test_a_fault_of_a_motor_driver_stops_the_robot_unless_its_emergency_stop_is_
         bench.step(1.1, data, mode, RESTS)
 
 
+@pytest.mark.parametrize(
+    ("reason", "finding"), [("emergency stop pressed at the robot", False), ("by op1", True)]
+)
+def test_a_new_daemon_takes_no_driver_fault_behind_the_emergency_stop_of_its_latch_file(
+    reason: str, finding: bool
+) -> None:
+    bench = Bench()
+    bench.step(1.0, OK, "driving", RESTS)
+    bench.inputs.new_life()
+    bench.reason = reason
+    bench.step(2.0, OK, "stopped", RESTS)
+    expected = pytest.raises(BrokenError, match="a fault of a motor driver stops the robot")
+    with expected if finding else nullcontext():
+        bench.step(2.1, FAULTY, "stopped", RESTS)
+
+
 def test_no_clear_works_until_the_board_reports_that_the_motor_drivers_are_in_order() -> None:
     bench = Bench()
     bench.step(1.0, FAULTY, "fault", RESTS)
