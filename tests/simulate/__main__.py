@@ -1,5 +1,6 @@
-"""Play random plans against the whole daemon, and print a line for each broken promise.
+"""Play random plans against the whole daemon in virtual time.
 
+The program prints a line for each plan in which the daemon breaks a promise of its documentation.
 `tests/README.md` says how to use it.
 """
 
@@ -22,7 +23,7 @@ from tests.simulate.plan import Plan, made
 
 HERE = Path(__file__).parent
 
-LARGEST = ("largest container", "largest text")
+LARGEST = ("largest container", "largest text", "largest buffer")
 """Counts of which the table has the largest value of all runs, and not the sum."""
 
 MOST_SHRUNK = 3
@@ -30,7 +31,7 @@ MOST_SHRUNK = 3
 
 
 def commit() -> str:
-    """Return the commit that is tried, with a + if files were changed since."""
+    """Return the commit of this checkout, with a + if files have changed since."""
     told = subprocess.run(
         ["git", "describe", "--always", "--dirty=+"],
         capture_output=True, text=True, check=False, cwd=HERE,
@@ -39,7 +40,10 @@ def commit() -> str:
 
 
 def results(seed: int, seconds: float, workers: int, within_s: float) -> Iterator[Result]:
-    """Play this seed and the following ones, for simulated `seconds` or for real `within_s`."""
+    """Play the plans of consecutive seeds in parallel, and yield their results.
+
+    It ends after `seconds` of simulated time in total, or after `within_s` of real time.
+    """
     end = time.monotonic() + within_s
     with ProcessPoolExecutor(workers, initializer=collect_seldom) as pool:
         # A worker that is not forked, as in Python 3.14, does not import a package's `__main__`, so
@@ -58,12 +62,12 @@ def results(seed: int, seconds: float, workers: int, within_s: float) -> Iterato
 
 
 def show(result: Result) -> None:
-    """Print a finding in one line."""
+    """Print the broken promise of a run in one line."""
     print(f"{commit()} seed {result.seed}: {result.finding}", flush=True)
 
 
 def table(counts: Counter[str]) -> str:
-    """Return the counts of all that was played and judged, a line for each group."""
+    """Return a table of how often each kind of event and check occurred, one line per group."""
     groups: dict[str, list[str]] = {}
     for name, count in sorted(counts.items()):
         group, _, rest = name.partition(" ")
@@ -74,9 +78,9 @@ def table(counts: Counter[str]) -> str:
 def explore(
     seed: int, hours: float, workers: int, within_s: float = math.inf, plans: Path | None = None
 ) -> int:
-    """Play seeds for this number of simulated hours; return the number of findings.
+    """Play random plans for this many simulated hours. Return the number of broken promises.
 
-    The plan of each finding goes into the directory `plans`.
+    If `plans` is a directory, the plans that broke a promise are written into it.
     """
     broken: list[Result] = []
     counts, simulated, cpu, findings, runs = Counter[str](), 0.0, 0.0, 0, 0
@@ -106,9 +110,10 @@ def explore(
 
 
 def keep_plans(broken: list[Result], where: Path) -> None:
-    """Write the plan of each finding into a directory, and then the first ones once more, shrunk.
+    """Write the plan of each finding into a directory. Then shrink the first plans and write them
+    again.
 
-    To shrink them may take an hour, in which a job may be ended.
+    Shrinking may take an hour, and a CI job may end before it is over.
     """
     found_by = commit()
     for result in broken:
@@ -120,7 +125,7 @@ def keep_plans(broken: list[Result], where: Path) -> None:
 
 
 def replay(what: str) -> int:
-    """Play one seed or one file of plain data again."""
+    """Play the plan of a seed, or the plan in a JSON file."""
     result = played(shrink.load(Path(what)) if what.endswith(".json") else made(int(what)))
     if result.finding:
         show(result)
@@ -129,7 +134,7 @@ def replay(what: str) -> int:
 
 
 def reduce(seed: int, keep: str) -> int:
-    """Shrink the plan of a seed that breaks a promise, and print or keep the result."""
+    """Shrink the plan of a seed that breaks a promise. Print the result, or store it."""
     plan = made(seed)
     result = played(plan)
     if not result.finding:

@@ -1,7 +1,8 @@
-"""Plays a plan: senders over their networks, operators, the board and the host, in true time.
+"""Plays a plan: it acts as the senders, the networks, the operators, the board and the host.
 
-`Run.play` returns what was covered. It raises `BrokenError` at the first promise that does not
-hold, also for an exception of the product.
+Its times are true times, which continue while the host sleeps. `Run.play` returns how often each
+kind of event occurred. It raises `BrokenError` at the first broken promise, and also if the daemon
+raises an exception.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ NO_TROUBLE = DIALECTS | INPUTS
 
 
 class Result(NamedTuple):
-    """The result of a run."""
+    """The result of playing one plan."""
 
     seed: int
     finding: str
@@ -59,16 +60,17 @@ class Result(NamedTuple):
 
 
 def collect_seldom() -> None:
-    """Have Python look for garbage seldom, in a process that plays many plans.
+    """Let Python collect garbage rarely, in a process that plays many plans.
 
-    A run makes few cycles, and looking for them as often as usual takes 6 % of the time.
+    A run creates few reference cycles, and the usual collection takes 6 % of the time.
     """
     gc.freeze()
     gc.set_threshold(100_000)
 
 
 def played(plan: Plan, log: Callable[[dict[str, Any]], None] | None = None) -> Result:
-    """Play a plan in this process. `log` gets all that each step showed."""
+    """Play a plan in this process, and return the result. `log` receives the outputs of each step.
+    """
     began = time.process_time()
     run = Run(plan, log)
     try:
@@ -82,7 +84,7 @@ def played(plan: Plan, log: Callable[[dict[str, Any]], None] | None = None) -> R
 
 
 class Run:
-    """One plan, one robot."""
+    """One run of a plan: the daemon, its surroundings, and the judges that check the promises."""
 
     def __init__(self, plan: Plan, log: Callable[[dict[str, Any]], None] | None = None) -> None:
         self.plan, self.log = plan, log
@@ -149,12 +151,12 @@ class Run:
         return self.product.now_ns - START_NS + self.slept_ns
 
     def at(self, at_ns: int, do: Callable[[], None]) -> None:
-        """Have something done at this time."""
+        """Call `do` at this true time."""
         self._order += 1
         heapq.heappush(self.todo, (at_ns, self._order, do))
 
     def run_to(self, true_ns: int) -> None:
-        """Do all that is due by then, at its own time."""
+        """Advance to this true time, and call each planned function at its time."""
         while self.todo and self.todo[0][0] <= true_ns:
             at_ns, _, do = heapq.heappop(self.todo)
             self._pass(at_ns)
@@ -171,13 +173,17 @@ class Run:
             raise self.failure
 
     def _arrival(self, true_ns: int) -> int:
-        """Return the robot's time at which something arrives that the network brings now."""
+        """Convert the true arrival time of a message to the robot's clock, limited to possible
+        times.
+
+        Nothing can arrive before the last resume of the host or after the present.
+        """
         return max(self.resumed_ns, min(self.product.now_ns, true_ns + START_NS - self.slept_ns))
 
     # the play
 
     def play(self) -> Counter[str]:
-        """Play the plan to its end; raise `BrokenError` for a promise that does not hold."""
+        """Play the plan to its end. Raise `BrokenError` at the first broken promise."""
         try:
             self._begin()
             self.run_to(int(self.plan["seconds"] * NS))
@@ -235,7 +241,7 @@ class Run:
         self.at(message.arrives_ns, arrive)
 
     def deliver(self, sender: dict[str, Any], message: Message) -> None:
-        """Hand a message to the daemon, if there is one."""
+        """Deliver a message to the daemon if it runs, and tell all judges about it."""
         if not self.product.alive:
             return
         waited_ns = self._bus_ns if self._bus_ns <= self.true_ns else 0
@@ -251,14 +257,14 @@ class Run:
         self.product.deliver(at_ns, one.key, one.payload, **one.options)
 
     def _dropped(self, key: str) -> None:
-        """Note that the inbox dropped its oldest message of this key unread."""
+        """Note that the inbox was full and dropped its oldest message on this key."""
         self.witness.dropped(key)
         self.reasons.dropped(key, self.true_ns)
 
     # operators
 
     def call(self, event: dict[str, Any]) -> None:
-        """Have an operator call a service, over a network that may lose or delay the call."""
+        """Let an operator call a service over a network that may lose, delay or repeat the call."""
         if event["lost"]:
             return
         latch, read_ns = None, None
@@ -280,9 +286,9 @@ class Run:
                 )
 
     def _typed(self, latch: int, place: int) -> tuple[int, int]:
-        """Return a number that an operator types by hand, and when a state last had it.
+        """Return a latch number that an operator types by hand, and when `state` last contained it.
 
-        It is one of the last numbers that another state had, or one that no latch ever had.
+        The number is one of the last ones that `state` had before, or one that no latch ever had.
         """
         older = [known for known in self._numbers.items() if known[0] != latch]
         return older[-place] if 0 < place <= len(older) else (2**53, -1)
@@ -445,7 +451,7 @@ class Run:
                     self._restart(event, after_ns)
 
     def _spoil_gyro(self, fault: list[Any], until_ns: int) -> None:
-        """Have the gyro report one wrong rate, or repeat a rate until then."""
+        """Let the gyro report one wrong rate, or repeat its last rate until `until_ns`."""
         gyro, (name, *values) = self.product.gyro, fault
         self.counts[f"gyro {name}"] += 1
         if name == "wrong":
@@ -460,7 +466,10 @@ class Run:
         self.at(until_ns, works)
 
     def _look(self) -> None:
-        """Judge the speeds and the pose in `state`, unless the host has just slept or stalled."""
+        """Check the speeds and the pose in `state`.
+
+        The check is left out shortly after the host stalled or slept.
+        """
         product, since_ns = self.product, self.true_ns - NS // 10
         # An echo of zeros looks like a board at rest.
         if self.echo.on or not product.alive:
@@ -472,7 +481,7 @@ class Run:
                 judge_pose(self.true_ns, state, self.pose.latest, self._fed_ns, quiet_ns)
 
     def _weigh(self) -> None:
-        """Judge that a line without an end has not filled the memory."""
+        """Check that an endless line of the board has not filled the memory."""
         self.liveness.weigh()
 
     def _block(self, blocked: bool) -> None:
@@ -481,7 +490,7 @@ class Run:
         self.witness.blocked_ns = self.true_ns if blocked else None
 
     def _board(self) -> None:
-        """Have the board misbehave in all active ways."""
+        """Apply all active faults to the simulated board."""
         self.product.board(list(self.active))
         self._names = {name for name, _ in self.active}
         new = [one for one in self.active if one not in self.lasting]
@@ -516,8 +525,8 @@ class Run:
     def plug(self, new: bool, without: Sequence[str] = ()) -> None:
         """Plug the board in again, unless it is plugged in.
 
-        A new board is `without` the faults whose names begin with these words: it never reports
-        such an input.
+        `without` has the beginnings of fault names. A new board never reports the inputs of these
+        faults.
         """
         self.liveness.event(TROUBLE_NS if new else 0)
         if not self.product.plugged:
@@ -540,7 +549,7 @@ class Run:
             self._linked = False
 
     def _suspend(self, lasts_ns: int) -> None:
-        """The host sleeps: its monotonic clock stands, and its USB ports lose their power."""
+        """Let the host sleep: its monotonic clock stops, and its USB ports lose their power."""
         product, true_ns = self.product, self.true_ns
         if not product.alive or not product.plugged:
             return
@@ -656,14 +665,17 @@ class Run:
             self.failure = error
 
     def _take_answers(self) -> None:
-        """Hand each answer of the daemon to the call that it belongs to."""
+        """Pass each answer of the daemon to the call that it answers."""
         for ticket, reply in self.product.replies():
             if ticket in self._calls:
                 _, _, answered = self._calls.pop(ticket)
                 answered(reply)
 
     def _late_answers(self, true_ns: int) -> None:
-        """Judge that no call waits for long while the host runs and the disk takes the latches."""
+        """Check that no call waits for more than 1 s.
+
+        Times in which the host stalls or sleeps, or the disk is full, do not count.
+        """
         woke_ns = self.resumed_ns - START_NS + self.slept_ns
         calm_ns = max(self._full_ns, self._stalled_ns, woke_ns)
         for call, arrived_ns, _ in self._calls.values():
@@ -770,10 +782,10 @@ class Run:
 
 
 def named(by: str, via: str) -> str:
-    """Return the words by which `state` names a client that stopped the robot.
+    """Return the words by which `state` names the client that stopped the robot.
 
-    A client on a native key is named by the SHA-256 of its id. Others, and one without an id, are
-    unnamed.
+    A client on a native key is named by the SHA-256 of its id. A client without an id, and any
+    client on another key, is "unnamed".
     """
     if via == "native" and by:
         return hashlib.sha256(by.encode()).hexdigest()[:16]
@@ -781,14 +793,14 @@ def named(by: str, via: str) -> str:
 
 
 def disarms(event: dict[str, Any]) -> bool:
-    """Return whether this event of a plan may ask each sender for a zero when it begins."""
+    """Return whether the start of this event may disarm all senders."""
     if event["do"] == "board":
         return event["fault"][0] not in QUIET_FAULTS
     return event["do"] not in ("stall", "stall in step", "block", "tear", "flip")
 
 
 def asks_for_zeros(verb: str, event: dict[str, Any], success: bool, text: str) -> bool:
-    """Return whether a call with this answer may have asked each sender for a zero."""
+    """Return whether a call with this answer may have disarmed all senders."""
     match verb:
         case "clear":
             return success and not text.startswith("nothing")

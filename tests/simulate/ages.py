@@ -1,10 +1,10 @@
-"""The zeros of each sender, and how old its commands may be by the true clock.
+"""Judges the age of commands by the true clock, and records the zeros of each sender.
 
-The robot cannot see a true age, because it compares delays by two clocks. This module allows what
-`deploy/clients/README.md` promises and no more. A command is fresh if its true age exceeds the
-lowest delay that the robot has seen by at most the timeout. For a foreign clock, 1 s is allowed in
-addition, and 1 s more for each minute. The robot knows no lowest delay of a new sender, so it
-accepts any delay of that sender that has stayed constant for the proof time.
+The robot cannot know the true age of a command, because it compares two clocks. This module allows
+the ages that `deploy/clients/README.md` allows, and no more. A command is fresh if its true age
+exceeds the lowest delay that the robot has seen by at most the timeout. For a foreign clock 1 s is
+allowed in addition, and 1 s more for each minute. For a new sender the robot knows no lowest delay,
+so it accepts any delay that has been constant for the proof time.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ REMEMBERED = 1000
 
 
 class Wish:
-    """A command that arrived, as the omniscient view judges it."""
+    """A command that arrived, with its true properties, which the robot cannot know."""
 
     __slots__ = ("armed_ns", "arrived_ns", "certain", "fresh", "identity", "shared", "v", "w")
 
@@ -47,7 +47,7 @@ class Wish:
 
 
 class Sender:
-    """Zeros and speeds of one identity on one source."""
+    """The zeros and speeds of one sender identity on one source."""
 
     def __init__(self) -> None:
         self.zeros: list[tuple[int, int]] = []
@@ -76,10 +76,10 @@ class Clock:
         the age of its commands."""
 
     def learn(self, age: int, arrived_ns: int, foreign: bool) -> None:
-        """Take note of a delay.
+        """Record a true delay.
 
-        A foreign clock that the daemon knows may have been set, so the daemon believes lower delays
-        only when they have stayed.
+        The stamps of a foreign clock look fresher if that clock was set. So the daemon believes
+        lower delays of a clock that it knows only after they have stayed low.
         """
         least, lower = self.least_ns, self.lower
         known = foreign and (self.followed or self.constant)
@@ -100,7 +100,7 @@ class Ages:
         self.clocks: dict[str, Clock] = {}
 
     def forget_least(self, at_ns: int) -> None:
-        """Note that the robot's own clock stood until now."""
+        """Note that the robot slept until now, so it no longer knows any lowest delay."""
         self.learned_ns = at_ns
         for clock in self.clocks.values():
             clock.least_ns, clock.constant = None, False
@@ -114,7 +114,7 @@ class Ages:
         timeout_ns: int,
         loose: bool,
     ) -> bool:
-        """Return whether the pages allow the robot to obey this command, by its true age."""
+        """Return whether the documentation allows the robot to obey a command of this true age."""
         if not sample.clock:
             return True
         age = arrived_ns - message.sent_ns
@@ -161,10 +161,11 @@ class Ages:
         return fresh
 
     def _falls(self, clock: Clock, age: int, now_ns: int, proof_ns: int) -> bool:
-        """Return whether the delays cannot have looked constant for the time of a proof.
+        """Return whether the delays fall, so that the daemon cannot take them for constant.
 
-        If the robot has followed this clock, they must be lower than in the 3 s before. One late
-        message before a prompt one does not look like a backlog then.
+        The delays must have been constant for the proof time. If the robot has followed this clock,
+        they are compared with those of the 3 s before. One late message before a prompt one then
+        does not look like a backlog.
         """
         recent = clock.recent
         window = [(at, d) for at, d in recent if at >= now_ns - proof_ns - MARGIN_NS]

@@ -1,8 +1,8 @@
-"""Plans whose events meet in a way that chance seldom gives.
+"""Adds rare coincidences of events to some plans, because chance seldom produces them.
 
-A part of the plans has one of the moments in `MOMENTS`. Such a plan keeps its configuration, but
-has senders and events of its own, so that nothing else hides what the moment shows. Each moment has
-dice of its own, so the other plans stay as they are.
+`MOMENTS` lists the coincidences. A plan with one of them keeps its configuration, but gets new
+senders and events, so that nothing else hides the effect. Each coincidence has a separate random
+generator, so all other plans stay the same.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ CALL: Event = {
 
 
 def add(plan: Plan) -> None:
-    """Give some plans a moment."""
+    """Change this plan to have one of the coincidences in `MOMENTS`, with their probabilities."""
     for name, (share, fits, give) in MOMENTS.items():
         dice = random.Random(f"a moment {name} {plan['seed']}")
         if dice.random() < share and fits(plan):
@@ -37,7 +37,7 @@ def add(plan: Plan) -> None:
 
 
 def removed(plan: Plan) -> Plan:
-    """Return the plan without the faults that an older simulated board does not know."""
+    """Return the plan without the events and faults that an older simulator does not know."""
     return plan | {
         "board": [fault for fault in plan["board"] if fault[0] not in NEW],
         "events": [
@@ -59,7 +59,8 @@ def _best(plan: Plan) -> dict[str, Any]:
 
 
 def _driver(plan: Plan, source: dict[str, Any], **more: Any) -> dict[str, Any]:
-    """Return the first sender of the plan, on a good network and with nothing odd."""
+    """Return the plan's first sender with a good network, an exact clock, and the fields in `more`.
+    """
     usual = {
         "source": source["name"], "wheels": False, "from": 0.0, "to": plan["seconds"],
         "delay": 0.001, "jitter": 0.0, "congestion": [], "clock": [], "bursts": [],
@@ -70,7 +71,7 @@ def _driver(plan: Plan, source: dict[str, Any], **more: Any) -> dict[str, Any]:
 
 
 def _speed(dice: random.Random) -> list[float]:
-    """Return a speed, and often a turn rate."""
+    """Return a random linear speed in m/s and an angular one in rad/s, which is often zero."""
     turn = dice.choice((0.0, round(dice.uniform(-2.0, 2.0), 3)))
     return [dice.choice((-1, 1)) * round(dice.uniform(0.1, 1.0), 3), turn]
 
@@ -80,10 +81,10 @@ def _call(at: float, verb: str, **more: Any) -> Event:
 
 
 def _late_step(plan: Plan, dice: random.Random) -> None:
-    """Let one step, which comes late, read a call, a zero and an event that asks for a zero.
+    """Let one late step read a call, a zero, and an event that disarms the sender.
 
-    The call releases a latch or changes a timeout. They come in any order, a few ms apart. The
-    sender has sent speeds before, sends that one zero, and goes on with speeds.
+    The call releases a latch or changes a timeout. The three arrive in any order, a few ms apart.
+    The sender sends speeds, this one zero, and speeds again.
     """
     config, source = plan["config"], _best(plan)
     config["control"].pop("auto_activate", None)
@@ -111,7 +112,7 @@ def _late_step(plan: Plan, dice: random.Random) -> None:
 
 
 def _meeting(dice: random.Random, at: float, source: str, away: bool) -> list[Event]:
-    """Return a stall that begins at this time, and what comes while it lasts."""
+    """Return the events of such a step: a stall at this time, and the call and event during it."""
     first_s, second_s = (dice.choice((0.002, 0.012, 0.05, 0.2)) for _ in range(2))
     events: list[Event] = [
         {"at": at, "do": "stall", "for": first_s},
@@ -146,7 +147,10 @@ def _meeting(dice: random.Random, at: float, source: str, away: bool) -> list[Ev
 
 
 def _alone(plan: Plan, dice: random.Random, phases: list[list[Any]]) -> dict[str, Any]:
-    """Leave one sender of the best source, and no event. Return the sender."""
+    """Replace all senders by one on the source of the highest priority, and remove all events.
+
+    Returns the sender.
+    """
     source = _best(plan)
     plan["config"]["control"].pop("auto_activate", None)
     hz = 50.0 if source["timeout"] < 0.2 else 20.0
@@ -159,7 +163,11 @@ def _alone(plan: Plan, dice: random.Random, phases: list[list[Any]]) -> dict[str
 def _drives(
     plan: Plan, dice: random.Random, rests: float, shortest: float, longest: float
 ) -> list[Any]:
-    """Return phases that rest for `rests` s or more, and then drive, over and over."""
+    """Return the phases of a sender that rests and drives in turn.
+
+    Each rest takes `rests` seconds plus the configured pause. A phase is a start time, a linear and
+    an angular speed.
+    """
     rests += plan["config"]["commands"].get("neutral_pause", 1.0)
     phases: list[list[Any]] = []
     at = 0.0
@@ -173,7 +181,7 @@ def _drives(
 
 
 def _is_plain(plan: Plan) -> bool:
-    """Return whether the board answers each line, and neither has a check."""
+    """Return whether the board is a prompted one on a link without checksums and has no faults."""
     mcu = plan["config"]["mcu"]
     return not ("link_check" in mcu or "reply_period" in mcu or plan["board"])
 
@@ -183,19 +191,19 @@ def _any(plan: Plan) -> bool:
 
 
 def _without_check(plan: Plan) -> bool:
-    """Return whether the link has no check, so that each status line counts."""
+    """Return whether the link has no checksums. The daemon then uses every status line."""
     return "link_check" not in plan["config"]["mcu"]
 
 
 def _may_be_ideal(plan: Plan) -> bool:
-    """Return whether the board's lag may be a few periods."""
+    """Return whether the configuration allows a board whose lag is a few control periods."""
     config = plan["config"]
     rate, gyro = config["control"]["rate"], config.get("odometry", {}).get("gyro")
     return _is_plain(plan) and not gyro and isinstance(rate, float) and rate >= 20.0
 
 
 def _half_duplex(plan: Plan, dice: random.Random) -> None:
-    """Let the daemon hear its own lines beside the replies, while the motors have a load."""
+    """Let the daemon receive its own lines in addition to the replies, under load."""
     _alone(plan, dice, _drives(plan, dice, 0.3, 1.0, 4.0))
     fault = ["half_duplex", dice.choice((0.0, 0.2, 0.3, 0.5, 0.7))]
     at, lasts = round(dice.uniform(2.0, 5.0), 3), round(dice.uniform(15.0, 30.0), 3)
@@ -203,7 +211,7 @@ def _half_duplex(plan: Plan, dice: random.Random) -> None:
 
 
 def _flip(plan: Plan, dice: random.Random) -> None:
-    """Flip a bit of a digit in one of the first lines behind a silence or a clear."""
+    """Invert one bit of a digit in one of the first lines after a silence or after a clear."""
     _alone(plan, dice, _drives(plan, dice, 2.5, 1.0, 4.0))
     at = 4.0
     while at < plan["seconds"] - 6.0:
@@ -229,7 +237,7 @@ def _flip(plan: Plan, dice: random.Random) -> None:
 
 
 def _ideal(plan: Plan, dice: random.Random) -> None:
-    """Give the board exact encoders, and a lag and an answer time that fit its period exactly."""
+    """Give the board very fine encoders, a lag of whole periods, and a constant answer time."""
     config = plan["config"]
     lag = dice.choice((1, 2, 3, 4)) / config["control"]["rate"]
     config["mcu"].pop("encoder_counts", None)
@@ -240,7 +248,7 @@ def _ideal(plan: Plan, dice: random.Random) -> None:
 
 
 def _inputs(plan: Plan, dice: random.Random, names: tuple[str, ...]) -> str:
-    """Give the board one of these inputs, and no other, and return its name."""
+    """Give the board one of these inputs, remove all others, and return its name."""
     config, name = plan["config"], dice.choice(names)
     config.pop("battery", None)
     config["safety"] = {}
@@ -252,7 +260,7 @@ def _inputs(plan: Plan, dice: random.Random, names: tuple[str, ...]) -> str:
 
 
 def _press(dice: random.Random, plan: Plan, name: str, lasts: float) -> list[Any]:
-    """Return a fault of the board that presses an input, or reports a fault of a motor driver."""
+    """Return the fault of the board that activates this input for `lasts` seconds."""
     match name:
         case "bumpers":
             number = dice.randint(1, len(plan["config"]["safety"]["bumpers"]))
@@ -263,7 +271,7 @@ def _press(dice: random.Random, plan: Plan, name: str, lasts: float) -> list[Any
 
 
 def _named_stop(plan: Plan, dice: random.Random) -> None:
-    """Press an input of a robot that a client has stopped."""
+    """Press an input of the board shortly after a client has stopped the robot."""
     _alone(plan, dice, _drives(plan, dice, 0.3, 1.0, 4.0))
     name, at = _inputs(plan, dice, ("bumpers", "estop")), 4.0
     while at < plan["seconds"] - 6.0:
@@ -283,7 +291,7 @@ def _named_stop(plan: Plan, dice: random.Random) -> None:
 
 
 def _other_board(plan: Plan, dice: random.Random) -> None:
-    """Replace a board that reports a fault or a press by one that never reports this input."""
+    """Replace a board that reports a fault or a press by a board without this input."""
     _alone(plan, dice, _drives(plan, dice, 0.3, 1.0, 4.0))
     name = _inputs(plan, dice, ("driver", "estop"))
     at, lasts = round(dice.uniform(3.0, 15.0), 3), round(dice.uniform(0.3, 3.0), 3)
@@ -302,7 +310,7 @@ def _other_board(plan: Plan, dice: random.Random) -> None:
 def _behind_a_press(plan: Plan, dice: random.Random) -> None:
     """Press the emergency stop while the robot drives.
 
-    Until some time after the release, a person rolls the robot, or its motor drivers have no power.
+    For some time after the release, the motor drivers have no power, or a person pushes the robot.
     """
     _alone(plan, dice, _drives(plan, dice, 0.3, 1.5, 4.0))
     _inputs(plan, dice, ("estop",))
@@ -329,7 +337,7 @@ def _behind_a_press(plan: Plan, dice: random.Random) -> None:
 
 
 def _restart_in_fault(plan: Plan, dice: random.Random) -> None:
-    """End the daemon while a fault is latched whose cause is over, and start it again."""
+    """Restart the daemon while a fault is latched but its cause is already over."""
     _alone(plan, dice, _drives(plan, dice, 0.3, 1.5, 3.0))
     plan["config"].pop("feedback", None)
     driver, at = dice.random() < 0.5, 5.0
@@ -352,7 +360,10 @@ def _restart_in_fault(plan: Plan, dice: random.Random) -> None:
 
 
 def _slow_sender(plan: Plan, dice: random.Random) -> None:
-    """Let a sender that keeps all rules send a command every few seconds, within its timeout."""
+    """Let a sender that obeys all rules send only one command every few seconds.
+
+    Its timeout is longer than that.
+    """
     source = _best(plan)
     source["timeout"] = dice.choice((2.0, 5.0, 5.0, 10.0))
     every = source["timeout"] * dice.uniform(0.2, 0.45)
@@ -364,7 +375,7 @@ def _slow_sender(plan: Plan, dice: random.Random) -> None:
 
 
 def _set_back(plan: Plan, dice: random.Random) -> None:
-    """Set a foreign clock back while a message is lost, or while all messages come twice."""
+    """Set a foreign clock back while the network loses a message or delivers all messages twice."""
     _best(plan)["timeout"] = dice.choice((0.25, 0.5))
     driver = _alone(plan, dice, [])
     phases, clock, holes, at = [[0.0, 0.0, 0.0], [2.5, *_speed(dice)]], [], [], 8.0
@@ -396,7 +407,10 @@ def _set_back(plan: Plan, dice: random.Random) -> None:
 
 
 def _routed(plan: Plan, dice: random.Random) -> None:
-    """Let two programs without an id send through a router that is not linked to the robot."""
+    """Let two programs without a sender id send through the same distant Zenoh router.
+
+    The robot has no link to this router.
+    """
     plan["config"]["commands"]["neutral_first"] = True
     _best(plan)["timeout"] = dice.choice((0.25, 0.5, 1.0))
     first = _alone(plan, dice, [])
@@ -421,9 +435,10 @@ def _routed(plan: Plan, dice: random.Random) -> None:
 
 
 def _newcomers(plan: Plan, dice: random.Random) -> None:
-    """Start one new sender after another, and let the network hold back the commands of each.
+    """Start one new sender after another on a congested network.
 
-    The commands wait, and then arrive faster than they were sent.
+    The network first stores each sender's commands, and then delivers them faster than they were
+    sent.
     """
     _best(plan)["timeout"] = dice.choice((0.25, 0.5, 1.0))
     first = _alone(plan, dice, [])
@@ -447,9 +462,9 @@ def _newcomers(plan: Plan, dice: random.Random) -> None:
 
 
 def _later_and_later(plan: Plan, dice: random.Random) -> None:
-    """Let the network delay the commands of a foreign clock more and more.
+    """Let the network delay the commands of a foreign clock more and more, in steps.
 
-    Each delay stays for some seconds, in which the sender sends zeros and speeds.
+    During each step the sender sends zeros and speeds.
     """
     _best(plan)["timeout"] = dice.choice((0.25, 0.5))
     driver = _alone(plan, dice, [])
@@ -468,9 +483,10 @@ def _later_and_later(plan: Plan, dice: random.Random) -> None:
 
 
 def _stall_behind_a_zero(plan: Plan, dice: random.Random) -> None:
-    """Let the whole process stand still between the zero of one program and the speeds of another.
+    """Stall the whole process between a zero of one program and the speeds of another one.
 
-    The two share their identity. What arrived meanwhile reaches the daemon behind its first step.
+    Both programs share a sender identity. The daemon takes its first step after the stall before
+    the bus delivers the waiting speeds.
     """
     commands, source = plan["config"]["commands"], _best(plan)
     pause_s = dice.choice((0.5, 0.7, 1.0))
@@ -497,9 +513,10 @@ def _stall_behind_a_zero(plan: Plan, dice: random.Random) -> None:
 
 
 def _doubtful_holder(plan: Plan, dice: random.Random) -> None:
-    """Bring the stamps of a sender that holds the robot into doubt, while another one may move it.
+    """Make the stamps of a sender of zeros doubtful, while another sender wants to move the robot.
 
-    The clock of the first sender is set, its delay falls, or the daemon stands still.
+    The first sender has the higher priority. Its clock is set, its delay falls, or the daemon
+    stalls.
     """
     commands, best = plan["config"]["commands"], _best(plan)
     best["timeout"] = dice.choice((0.25, 0.5))
@@ -537,7 +554,7 @@ def _doubtful_holder(plan: Plan, dice: random.Random) -> None:
 
 
 def _coarse(plan: Plan, dice: random.Random) -> None:
-    """Give the robot encoders with few counts, and wheels that respond as late as allowed."""
+    """Give the robot encoders with few counts, and motors with the slowest allowed response."""
     config, counts = plan["config"], dice.choice((16, 20, 32, 48))
     config.pop("feedback", None)
     config["drive"] = {"wheel_radius": 0.05, "wheel_separation": 0.3}
@@ -564,9 +581,9 @@ def _coarse(plan: Plan, dice: random.Random) -> None:
 
 
 def _late_lines(plan: Plan, dice: random.Random) -> None:
-    """Stall the computer while a board reports by its own clock over a slow wire.
+    """Stall the computer while a free-running board reports over a slow wire.
 
-    The board stops its motors meanwhile, and its lines wait.
+    During the stall the board stops its motors, and its lines wait in the buffer.
     """
     config = plan["config"]
     period, baud = dice.choice(((0.01, 38400), (0.01, 115200), (0.02, 19200), (0.05, 9600)))
@@ -585,7 +602,7 @@ def _late_lines(plan: Plan, dice: random.Random) -> None:
 
 
 def _wheel_limit(plan: Plan, dice: random.Random) -> None:
-    """Let one axis speed up at the limit of the wheels while the other one slows down gently."""
+    """Let one axis speed up while the other one slows down gently, at the wheels' speed limit."""
     config = plan["config"]
     limits, drive = config["limits"], config.get("drive", {})
     radius = drive.get("wheel_radius", 0.05)

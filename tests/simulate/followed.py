@@ -114,6 +114,8 @@ class Followed:
         """The same for the commands since the last step, of which a full buffer may drop some."""
         self._rests_ns: dict[Who, int] = {}
         """Arrival of the newest zero of each sender, by the robot's clock."""
+        self._stamps_ns: dict[Who, int] = {}
+        """The latest stamp of a zero of each sender."""
         self._latest: dict[Who, Command] = {}
         """The last command that arrived from each sender, without overtaken speeds."""
         self._slowest: tuple[float, float] | None = None
@@ -153,6 +155,7 @@ class Followed:
             self._latest[who] = found
         if not (wish.v or wish.w or message.junk):
             self._rests_ns[who] = at_ns
+            self._stamps_ns[who] = max(message.stamp_ns, self._stamps_ns.get(who, 0))
             self._zero_ns[who] = max(message.sent_ns, self._zero_ns.get(who, 0))
         if self._keeper is not None:
             priority = self._witness.priority
@@ -244,7 +247,8 @@ class Followed:
         """The speeds of the command that the robot follows, None if that is not known.
 
         A newer zero of the same sender may have ended them, although its delay is in doubt. If
-        several programs share a clock by name, a zero that came earlier may have the later stamp.
+        several programs share a clock by name, or a clock is set back, a zero that came earlier may
+        have the later stamp.
         """
         holder = self._holder
         if holder is None:
@@ -253,6 +257,9 @@ class Followed:
         if holder.clock in self._witness.shared_clocks:
             overtakes_ns = 2 * self._witness.timeout[holder.who[0]]
         if self._rests_ns.get(holder.who, -overtakes_ns - 1) > holder.arrived_ns - overtakes_ns:
+            return None
+        later = self._stamps_ns.get(holder.who, 0) > holder.message.stamp_ns
+        if later and not stable(holder.sender):
             return None
         return None if holder.overtaken else (holder.v, holder.w)
 

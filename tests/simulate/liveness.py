@@ -26,11 +26,15 @@ MOST_HELD = 1500
 The largest one has the clocks of the last 1024 senders.
 """
 
-LONGEST = 1024
-"""Longest text or byte buffer that the daemon may hold.
+LONGEST_BUFFER = 1024
+"""Longest byte buffer that the daemon may hold.
 
-The longest one is a reason in words. A board sends more than that in 3.5 s without an end of line.
+A board sends more than that in 3.5 s without an end of line.
 """
+
+LONGEST_TEXT = 8192
+"""Longest text that the daemon may hold: a reason with all causes of a fault, and when each of them
+was latched. There are 24 of them."""
 
 SETTLES_NS = 3 * NS
 """After the last event a lawful sender drives within this time."""
@@ -272,13 +276,14 @@ class Liveness:
     def weigh(self) -> None:
         """Judge that nothing in the daemon has grown too long."""
         run = self.run
-        size, kind, longest = run.product.largest()
-        for name, length in (("container", size), ("text", longest)):
+        size, kind, text, buffer = run.product.largest()
+        for name, length in (("container", size), ("text", text), ("buffer", buffer)):
             run.counts[f"largest {name}"] = max(run.counts[f"largest {name}"], length)
         if size > MOST_HELD:
             raise BrokenError("memory is bounded", run.true_ns, f"a {kind} of {size} entries")
-        if longest > LONGEST:
-            raise BrokenError("memory is bounded", run.true_ns, f"a text of {longest} bytes")
+        if text > LONGEST_TEXT or buffer > LONGEST_BUFFER:
+            found = f"a text of {text} letters, a buffer of {buffer} bytes"
+            raise BrokenError("memory is bounded", run.true_ns, found)
 
     def _drive_lawfully(self, clears_ns: int) -> None:
         """Have a lawful sender drive; an operator has cleared the latches from `clears_ns` on."""

@@ -511,14 +511,14 @@ class Product:
         self._world, self.alive = world, True
         self._began()
 
-    def largest(self) -> tuple[int, str, int]:
+    def largest(self) -> tuple[int, str, int, int]:
         """Return the length and the type of the largest container that the daemon holds.
 
-        The last number is the length of its longest text or byte buffer.
+        The last two numbers are the lengths of its longest text and its longest byte buffer.
         """
         seen: set[int] = set()
         todo: deque[object] = deque([self._world.loop])
-        best, longest = (0, ""), 0
+        best, text, buffer = (0, ""), 0, 0
         while todo:
             one = todo.pop()
             if id(one) in seen:
@@ -526,8 +526,10 @@ class Product:
             seen.add(id(one))
             if isinstance(one, Arrival):
                 continue  # only the messages of the last step are kept, as they came
-            if isinstance(one, str | bytes | bytearray):
-                longest = max(longest, len(one))
+            if isinstance(one, str):
+                text = max(text, len(one))
+            elif isinstance(one, bytes | bytearray):
+                buffer = max(buffer, len(one))
             elif isinstance(one, dict):
                 best = max(best, (len(one), "dict"))
                 todo.extend(one.values())
@@ -538,4 +540,4 @@ class Product:
                 slots = getattr(type(one), "__struct_fields__", ())
                 todo.extend(getattr(one, name) for name in slots)
                 todo.extend(getattr(one, "__dict__", {}).values())
-        return *best, longest
+        return *best, text, buffer

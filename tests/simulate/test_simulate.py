@@ -880,6 +880,23 @@ def test_a_robot_may_not_speed_up_by_a_speed_that_a_zero_overtook(
         followed.line(at_ns, before, after)
 
 
+@pytest.mark.parametrize("clock", [[], [["step", 2.0, -3.0]]])
+def test_a_zero_has_the_later_stamp_only_if_the_clock_of_its_sender_was_set_back(
+    clock: list[Any],
+) -> None:
+    witness = witnessed()
+    followed = Followed(witness)
+    source = witness.config["commands"]["sources"][0]["name"]
+    sender = {"way": "rmw", "source": source, "clock": clock}
+    for number, v, at_ns, stamp_ns in ((1, 0.0, NS, 5 * NS), (2, 1.0, 9 * NS, 4 * NS)):
+        message = Message(at_ns, at_ns, v, 0.0, stamp_ns, number, "")
+        one = Sample(f"cmd/{source}", b"", {}, "s0", False, "s0")
+        followed.command(sender, message, one, at_ns, Wish(at_ns, v, 0.0))
+    witness.mode = "driving"
+    followed.step(at_ns + 1, at_ns + 1, at_ns, "driving", "up")
+    assert followed.wish == (None if clock else (1.0, 0.0))
+
+
 def test_a_drive_may_end_with_a_single_zero_that_overtakes_the_last_speed() -> None:
     phases = [[0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]
     sender = driven()["senders"][0] | {"id": "s0", "way": "rmw", "phases": phases}
