@@ -110,8 +110,7 @@ def explore(
 
 
 def keep_plans(broken: list[Result], where: Path) -> None:
-    """Write the plan of each finding into a directory. Then shrink the first plans and write them
-    again.
+    """Write the plan of each finding into a directory, and replace the first ones by shrunk plans.
 
     Shrinking may take an hour, and a CI job may end before it is over.
     """

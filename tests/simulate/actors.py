@@ -107,6 +107,8 @@ class Run:
         self._order = 0
         self._calls: dict[int, tuple[dict[str, Any], int, Callable[[bytes], None]]] = {}
         """Calls without an answer: the event, its arrival and the function for the answer."""
+        self._puts_ns: list[int] = []
+        """Arrivals of stops that were put on the key, and that no step has read yet."""
         self._ticket = 0
         self._numbers: dict[int, int] = {}
         """Numbers of latches that operators have read in `state`, each with the last time."""
@@ -173,8 +175,7 @@ class Run:
             raise self.failure
 
     def _arrival(self, true_ns: int) -> int:
-        """Convert the true arrival time of a message to the robot's clock, limited to possible
-        times.
+        """Convert a true arrival time to the robot's clock.
 
         Nothing can arrive before the last resume of the host or after the present.
         """
@@ -333,6 +334,7 @@ class Run:
                 put_by = event["by"] if via == "native" else ""
                 self.inputs.asked(true_ns, named(put_by, "native"))
                 product.deliver(at_ns, "stop", b"", via="native", attachment=attachment)
+                self._puts_ns.append(true_ns)
                 return
         self._ticket += 1
         ticket = self._ticket
@@ -583,6 +585,9 @@ class Run:
         for call, arrived_ns, _ in self._calls.values():
             witness.unanswered(call["verb"], call.get("settings", {}), arrived_ns)
         self._calls.clear()
+        for arrived_ns in self._puts_ns:
+            witness.unanswered("stop", {}, arrived_ns)
+        self._puts_ns.clear()
         if product.disk.behind:
             witness.file_is_behind()
 
@@ -694,6 +699,8 @@ class Run:
             # A stall in a step waits for a step that makes a line.
             self._stalled_ns = max(self._stalled_ns, true_ns)
         witness.read()
+        if self._puts_ns:
+            self._puts_ns = [at_ns for at_ns in self._puts_ns if at_ns > seen.decided_ns + offset]
         if self.product.disk.full:
             self._full_ns = true_ns
         if witness.blocked_ns is not None:

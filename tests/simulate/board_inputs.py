@@ -1,11 +1,11 @@
-"""Plans whose board reports inputs, and their promises: emergency stop, bumpers, motor drivers and
-battery.
+"""Plans whose board reports inputs, and the judge of the promises about them.
 
-`deploy/firmware/README.md` says what each status line means. `Inputs` reads the bytes that reached
-the daemon and takes each line at the step that takes it, so it knows which lines the daemon has
-read. Where the pages leave open whether a line or a silence counts, it judges nothing.
+The inputs are the emergency stop, bumpers, motor drivers and the battery.
+`deploy/firmware/README.md` defines the status lines. `Inputs` reads the same bytes as the daemon
+and handles each line at the step in which the daemon reads it. If the documentation leaves open
+whether a line or a silence counts, `Inputs` judges nothing.
 
-The plans have dice of their own, so the plans without inputs stay as they are.
+These plans have separate random generators, so the plans without inputs stay the same.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ CLEAR = {
 
 
 def add(plan: Plan) -> None:
-    """Give some plans inputs, and operators who clear the stops."""
+    """Give some plans inputs, presses of these inputs, and operators who clear the stops."""
     dice = random.Random(f"board inputs {plan['seed']}")
     # A line without a checksum does not count once the link has the check.
     if dice.random() <= SHARE and "link_check" not in plan["config"]["mcu"]:
@@ -95,7 +95,7 @@ def add(plan: Plan) -> None:
 
 
 def _bumpers(plan: Plan, dice: random.Random) -> None:
-    """Add bumpers that stop the robot, and leave out the other trouble of the board."""
+    """Add bumpers that stop the robot, and remove most other events of the plan."""
     places = [dice.choice(PLACES) for _ in range(dice.randint(1, 4))]
     plan["config"]["safety"] = {"bumpers": places}
     plan["board"].append(["bumpers"])
@@ -109,7 +109,7 @@ def _bumpers(plan: Plan, dice: random.Random) -> None:
 
 
 def _clears(dice: random.Random, events: list[Any], at: float, lasts: float) -> None:
-    """Add operators who clear during an event of the board, and one who does so behind it."""
+    """Add operators who clear during an event of the board, and one who clears afterwards."""
     for _ in range(dice.randrange(4)):
         early = round(at + dice.uniform(0.0, lasts + 1.0), 3)
         events.append({"at": early, **CLEAR, "named": dice.random() < 0.7})
@@ -118,7 +118,7 @@ def _clears(dice: random.Random, events: list[Any], at: float, lasts: float) -> 
 
 
 def _moment(plan: Plan, dice: random.Random) -> float:
-    """Return a time, mostly one at which a sender drives."""
+    """Return a time in s, mostly one at which a sender drives."""
     drives = [p[0] for s in plan["senders"] for p in s["phases"] if p[1]]
     if drives and dice.random() < 0.7:
         return float(min(dice.choice(drives) + dice.uniform(0.2, 3.0), plan["seconds"]))
@@ -128,9 +128,10 @@ def _moment(plan: Plan, dice: random.Random) -> float:
 def _pressed(
     plan: Plan, dice: random.Random, press: str, silent: str, number: int = 0, longest: float = 6.0
 ) -> tuple[float, float]:
-    """Press an input, or let it fall silent, often beside other trouble; return when and how long.
+    """Add a press of an input, or a silence of it, often together with other trouble.
 
-    The times of the fault are its own, so that it also changes while the host stalls.
+    The fault itself contains its start and its length, so that the input also changes during a
+    stall of the host. Returns the start and the whole length in s.
     """
     events, at = plan["events"], _moment(plan, dice)
     name, lasts = press, dice.choice((0.005, 0.03, 0.3, 2.0, longest))
@@ -173,7 +174,7 @@ def _emergency_stop(plan: Plan, dice: random.Random) -> None:
 
 
 def _away(plan: Plan, dice: random.Random) -> None:
-    """Add bumpers that let the robot drive away, and often a sender that pushes on."""
+    """Add bumpers that let the robot drive away, often with a sender that drives against them."""
     safety = plan["config"].setdefault("safety", {})
     if "bumpers" in safety:
         return
@@ -198,7 +199,7 @@ def _away(plan: Plan, dice: random.Random) -> None:
 
 
 def _driver(plan: Plan, dice: random.Random) -> None:
-    """Add faults of a motor driver."""
+    """Add faults of a motor driver at random times."""
     plan["board"].append(["driver_fault", NEVER_S, 1.0])
     for _ in range(1 + int(plan["seconds"] / 15)):
         _pressed(plan, dice, "driver_fault", "driver_fault")
@@ -222,9 +223,9 @@ def _battery(plan: Plan, dice: random.Random) -> None:
 
 
 def kinds(plan: Plan) -> set[str]:
-    """Return the inputs of a plan.
+    """Return the kinds of inputs in a plan: `estop`, `stop`, `away`, `battery` and `driver_fault`.
 
-    They are `estop`, bumpers that `stop` or let drive `away`, `battery` and `driver_fault`.
+    `stop` and `away` are bumpers that stop the robot, or from which it may drive away.
     """
     safety, names = plan["config"].get("safety", {}), {name for name, *_ in plan["board"]}
     found = names & {"estop", "battery", "driver_fault"}
@@ -232,7 +233,7 @@ def kinds(plan: Plan) -> set[str]:
 
 
 def removed(plan: Plan) -> Plan:
-    """Return the plan without inputs, for a product that does not know them."""
+    """Return the plan without inputs, for an older product that does not know them."""
     tables = plan["config"].items()
     return plan | {
         "config": {name: table for name, table in tables if name not in ("safety", "battery")},
@@ -245,7 +246,8 @@ def removed(plan: Plan) -> Plan:
 
 
 class _Input:
-    """The emergency stop, or all bumpers, as the daemon has read them."""
+    """The state of the emergency stop or of all bumpers, from the lines that the daemon has read.
+    """
 
     def __init__(self) -> None:
         self.marks = b""
@@ -265,16 +267,21 @@ class _Input:
 
     @property
     def known(self) -> bool:
-        """Whether the daemon certainly knows the marks."""
+        """Whether the daemon certainly knows which of these inputs are pressed."""
         return self.sure and not self.silent and self.reported_ns is not None
 
 
 class _Mean:
-    """The mean of the battery's measure, and the levels that it must and may have reached."""
+    """The mean of the battery's voltage or charge.
+
+    It also has the battery levels that `state` must have reached, and those that it may have
+    reached.
+    """
 
     def __init__(self, config: dict[str, Any], emptied: bool) -> None:
-        """`emptied` says whether the daemon may have started with the stop of an empty battery.
+        """Start without reports.
 
+        If `emptied` is true, the daemon may have started with a latched stop of an empty battery.
         The battery then counts as empty until its mean rises.
         """
         names = [name for name in ("warning", "return", "stop") if config.get(f"{name}_below")]
@@ -289,14 +296,17 @@ class _Mean:
 
     @property
     def level(self) -> set[str]:
-        """The levels that `state` may have, if the mean counts."""
+        """The set of battery levels that the daemon may report for this mean."""
         names = ["ok", *self.bounds]
         least = max([names.index(name) for name in self.bounds if self.must[name]], default=0)
         most = max([names.index(name) for name in self.bounds if self.may[name]], default=0)
         return set(names[least : most + 1])
 
     def take(self, at_ns: int, value: float) -> None:
-        """Take a report. Each stands for 0.3 s at most, and a silence of 5 s begins anew."""
+        """Add a report to the mean.
+
+        A report has a weight of at most 0.3 s. After a silence of 5 s the mean restarts.
+        """
         gap_s = 0.0 if self.at_ns is None else (at_ns - self.at_ns) / NS
         if self.at_ns is None or gap_s > 5.0:
             self.mean, self.stood_s = value, 0.0
@@ -316,10 +326,10 @@ class _Mean:
 
 
 class Inputs:
-    """Judges what the robot does while an input counts as pressed or the battery is empty."""
+    """Judges the robot's behaviour while an input is pressed, is silent, or has a fault."""
 
     def __init__(self, witness: Witness, reports: bool) -> None:
-        """`reports` says whether the board ever reports an input."""
+        """Start for a plan. `reports` is true if its board reports any input."""
         self._witness = witness
         self._reports = reports
         config = witness.config
@@ -339,7 +349,7 @@ class Inputs:
         self.new_life()
 
     def new_life(self) -> None:
-        """Note that a daemon starts: it knows no input."""
+        """Note that a daemon starts, which has received no report of an input yet."""
         self.estop, self.bumpers, self.driver = _Input(), _Input(), _Input()
         self._driver_faulted = False
         """Whether a line of this step certainly reports a fault of a motor driver that counts."""
@@ -364,22 +374,22 @@ class Inputs:
         names."""
 
     def replaced(self) -> None:
-        """Note that another board was plugged in, which does not report what this one did."""
+        """Note that the board was replaced by one that may not report these inputs."""
         self.estop, self.driver = _Input(), _Input()
         self._powered, self._cut_ns = False, None
         self._doubt()
 
     def asked(self, asked_ns: int, name: str) -> None:
-        """Note a stop that a client of this name asked for, and that has worked."""
+        """Note that the daemon has executed a stop of the client with this name."""
         self._names.append((asked_ns, name))
 
     def fed(self, at_ns: int, data: bytes) -> None:
-        """Take bytes that reached the port, by the robot's clock."""
+        """Add bytes that reached the port. `at_ns` is their time on the robot's clock."""
         if self._reports:
             self._came.append((at_ns, data))
 
     def lost(self) -> None:
-        """Note that the port was closed, or the daemon ended, before it has read all bytes."""
+        """Note that the daemon may not have read all bytes, because its port closed or it ended."""
         if self._came:
             self._doubt()
             self.driver.sure = False
@@ -387,20 +397,23 @@ class Inputs:
         self._held = b""
 
     def plugged(self, true_ns: int) -> None:
-        """Note that a board was plugged in: it must report the inputs that the robot needs."""
+        """Note that a board was plugged in, which must first report the required inputs."""
         self.estop.awaited = self.bumpers.awaited = True
         self._plugged_ns = true_ns
 
     @property
     def limiting(self) -> bool:
-        """Whether a bumper may be pressed that allows only some motion."""
+        """Whether a bumper may be pressed from which the robot may only drive away."""
         free = self.bumpers.known and b"X" not in self.bumpers.marks
         return self._away and (self._fresh or not free)
 
     def take(self, decided_ns: int, offset: int, calm_ns: int) -> None:
-        """Take the bytes that the step at `decided_ns` has read, by the robot's clock.
+        """Read the same bytes as the daemon's step that began at `decided_ns` on the robot's clock.
 
-        True time is later by `offset`. At `calm_ns` the last stall of the host was over.
+        Args:
+            decided_ns: Start of the step.
+            offset: True time minus the robot's time, ns.
+            calm_ns: End of the last stall of the host, on the robot's clock.
         """
         self._fresh = self._latches = self._driver_faulted = False
         self._witness.driver_fault = False
@@ -444,7 +457,10 @@ class Inputs:
             self.battery.take(at_ns, float(fields[self._field].rstrip(b"%")))
 
     def _report(self, known: _Input, marks: bytes, certain: bool, at_ns: int, true_ns: int) -> None:
-        """Take the marks of a line. One that is pressed now is a stop, or asks for zeros."""
+        """Handle the emergency stop or the bumpers in a status line.
+
+        A new press stops the robot, or disarms all senders if the robot may drive away.
+        """
         known.reported_ns, known.awaited = at_ns, False
         before, was_sure, was_silent = known.marks, known.sure, known.silent
         known.marks, known.sure, known.silent = marks, certain, ""
@@ -470,9 +486,10 @@ class Inputs:
             self._press(known, true_ns, self._away and known is self.bumpers)
 
     def _driver(self, faulty: bool, certain: bool, true_ns: int) -> None:
-        """Take the report about the motor drivers, which counts until the next one.
+        """Handle the report about the motor drivers in a status line.
 
-        A fault that the board reports while its emergency stop is pressed latches nothing.
+        The report is valid until the next one. A fault while the emergency stop is pressed latches
+        nothing.
         """
         driver, estop = self.driver, self.estop
         driver.marks, driver.sure = b"X" if faulty else b".", certain
@@ -485,7 +502,10 @@ class Inputs:
         self._driver_faulted |= faulty and certain and free and self._powered
 
     def _silence(self, known: _Input, decided_ns: int, offset: int, calm_ns: int) -> None:
-        """Take a silence: it counts as a press, at the latest when the host has had time."""
+        """Handle an input that the board has not reported for a while: it counts as pressed.
+
+        The daemon may detect the silence a little later after a stall of the host.
+        """
         reported_ns, witness = known.reported_ns or 0, self._witness
         if known.awaited and decided_ns + offset > self._plugged_ns + FORGET_NS:
             # The daemon may have forgotten the input, because another board may lack it.
@@ -518,7 +538,7 @@ class Inputs:
             insort(witness.stops, true_ns)
 
     def _doubt(self) -> None:
-        """Note that the robot may have been stopped, or not."""
+        """Note that it is uncertain whether an input has stopped the robot."""
         self._doubtful = self._witness.cut = True
         self._witness.perhaps_latched.add("clear")
 
@@ -532,7 +552,10 @@ class Inputs:
         calm: bool,
         state: Callable[[], dict[str, Any]],
     ) -> None:
-        """Judge a step behind its lines. `calm` if the host has not just stalled."""
+        """Judge a step of the daemon after `take` has read its bytes.
+
+        `calm` is true if the host has not stalled shortly before.
+        """
         if not self._reports:
             return
         witness, moving = self._witness, self._moving(seen.lines)
@@ -582,11 +605,11 @@ class Inputs:
             self._state(true_ns, state(), seen.decided_ns)
 
     def _keeps_names(self, true_ns: int, seen: Seen) -> None:
-        """Judge that the reason names a client that has stopped the robot, until a clear.
+        """Check that the reason names a client that has stopped the robot, until a clear.
 
-        The judge learns a name from the answer to the stop, and forgets all names when the daemon
-        ends. So a full reason may name only the clients from before that, and the last one, whose
-        answer is still on its way.
+        The judge learns a client's name from the answer to its stop, and forgets all names when the
+        daemon ends. The reason names only a few clients. If it names the maximum number, the
+        clients known to the judge may be missing.
         """
         if not self._names or seen.mode not in STOPPED:
             self._names.clear()
@@ -598,7 +621,11 @@ class Inputs:
                 raise BrokenError("a stop keeps the name of its client", true_ns, text)
 
     def _drivers(self, true_ns: int, seen: Seen) -> None:
-        """Judge the fault of a motor driver. A pressed emergency stop causes one that is none."""
+        """Check that a fault of a motor driver stops the robot.
+
+        A pressed emergency stop removes the drivers' power, and the fault that they then report
+        does not count.
+        """
         estop = self.estop
         free = not estop.marks and not self._fresh
         free |= estop.known and estop.marks == b"." and not self._fresh
@@ -621,7 +648,7 @@ class Inputs:
             raise BrokenError("drivers without power are no fault", true_ns, text)
 
     def _stopping(self) -> Iterator[tuple[str, int]]:
-        """Yield each input that certainly stops the robot, and the true time since when."""
+        """Yield each input that certainly stops the robot, with the true time of its press."""
         if self.estop.pressed_ns is not None:
             yield "an emergency stop", self.estop.pressed_ns
         latches = not self._away or self.bumpers.silent == "surely"
@@ -637,7 +664,7 @@ class Inputs:
         return [wheels for wheels in found if any(wheels)]
 
     def _answers(self, true_ns: int, seen: Seen, calm: bool) -> None:
-        """Judge that a line leaves within a period behind a press."""
+        """Check that the daemon sends a line within a period after a press."""
         if self._due_ns is None:
             return
         if seen.lines or not calm or seen.link != "up":
@@ -663,7 +690,10 @@ class Inputs:
                 raise BrokenError("nothing drives towards a pressed bumper", true_ns, text)
 
     def _pushes(self, now_ns: int) -> None:
-        """Disarm a sender whose command certainly led elsewhere, so that it must send a zero."""
+        """Disarm a sender whose command certainly does not lead away from the pressed bumpers.
+
+        It must send a zero before it can move the robot again.
+        """
         witness, sign = self._witness, self._sign()
         latest: set[tuple[str, str]] = set()
         for source, wish in reversed(witness.wishes):
@@ -681,7 +711,7 @@ class Inputs:
             latest.add(who)
 
     def _empty(self, true_ns: int, seen: Seen) -> None:
-        """Judge the stop of an empty battery. The robot stops between two bounds of the mean."""
+        """Check the stop of an empty battery. The judge allows a small error of the mean."""
         battery, witness = self.battery, self._witness
         if not battery.bounds:
             return
@@ -700,7 +730,7 @@ class Inputs:
             raise BrokenError("an empty battery stops the robot", true_ns, text)
 
     def _ramps(self, true_ns: int, cause: str) -> None:
-        """Judge the first line of a stop by this cause: the robot does not stand at once."""
+        """Check that a stop with this cause ramps down instead of sending zeros at once."""
         witness, (before, before_ns) = self._witness, self._before
         even = witness.last_ns - before_ns < 3 * witness.period_ns
         if witness.last != ZERO or witness.cut or not even:
@@ -709,7 +739,7 @@ class Inputs:
             raise BrokenError(f"{cause} stops the robot with a ramp", true_ns, str(before))
 
     def cleared(self, asked_ns: int) -> None:
-        """Judge a clear that worked, at the step that has answered it."""
+        """Check that no input forbade a clear that the daemon has executed."""
         self._names = [one for one in self._names if one[0] > asked_ns]
         for name, pressed_ns in self._stopping():
             if asked_ns > pressed_ns:
@@ -724,7 +754,7 @@ class Inputs:
             raise BrokenError("no clear works while the battery is empty", asked_ns, text)
 
     def _state(self, true_ns: int, state: dict[str, Any], decided_ns: int) -> None:
-        """Hold the inputs in `state` against the lines."""
+        """Compare the inputs in `state` with the lines of the board."""
         if self.estop.known:
             expected = "pressed" if self.estop.marks == b"X" else "released"
             self._same(true_ns, "the emergency stop", state["emergency_stop"], {expected})

@@ -1,6 +1,7 @@
-"""The promise that the robot drives as told: on the curve of the command, also at its limits.
+"""The promise that the robot drives with the commanded speeds.
 
-It also reaches the speeds of the command in the time that its limits give to the ramp.
+At its limits it drives slower on the same curve. It reaches the speeds in the time that the
+configured limits allow.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ SETTLED_NS = NS // 2
 
 
 class Course:
-    """The speeds of the lines since they last changed, and the command that they follow."""
+    """Compares the wheel speeds on the wire with the command that the robot follows."""
 
     def __init__(self, witness: Witness) -> None:
         self._witness = witness
@@ -32,7 +33,14 @@ class Course:
     def step(
         self, true_ns: int, wish: tuple[float, float] | None, wheels: tuple[float, ...], lines: int
     ) -> None:
-        """Judge the last line of a step by its command; `lines` is the number of whole ones."""
+        """Judge the last line of a step.
+
+        Args:
+            true_ns: True time of the step.
+            wish: The speeds of the command that the robot follows, or None if they are unknown.
+            wheels: The wheel speeds of the line.
+            lines: Number of complete lines in the step.
+        """
         witness = self._witness
         if lines:
             self._ramp(true_ns, wish, wheels)
@@ -59,13 +67,13 @@ class Course:
             raise BrokenError("the robot drives on the curve", true_ns, f"{got} for {goal}")
 
     def _begin(self, goal: tuple[object, ...], true_ns: int, wheels: tuple[float, ...]) -> None:
-        """Start over with a ramp from these wheel speeds."""
+        """Expect a new ramp from these wheel speeds to the goal."""
         self._goal, self._from_ns, self._from, self._reached = goal, true_ns, wheels, None
 
     def _ramp(
         self, true_ns: int, wish: tuple[float, float] | None, wheels: tuple[float, ...]
     ) -> None:
-        """Judge that the ramp to a command ends in time."""
+        """Check that the ramp to a command does not take too long."""
         witness = self._witness
         late_ns, self._line_ns = true_ns - self._line_ns, true_ns
         goal, limits = (wish, witness.changed_ns, witness.mode_ns), witness.limits

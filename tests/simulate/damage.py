@@ -1,7 +1,7 @@
-"""The promise about a damaged wire: the daemon hears whole lines again behind damaged ones.
+"""The promise that the daemon soon decodes lines again after damaged ones.
 
-A line is whole if it has the four speeds and nothing else. The daemon may lose two whole lines
-behind a damaged one, because it finds the ends of the lines again in them.
+A line is whole if it contains the four speeds and nothing else. After a damaged line the daemon may
+lose two whole lines, because it must find the line ends again.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ MAX_LINE = 4096
 
 
 class Damage:
-    """The lines that the board sent, and how many whole ones followed the last damaged one."""
+    """Counts the whole lines that the board sent after the last damaged line."""
 
     def __init__(self) -> None:
         self.forget()
 
     def forget(self) -> None:
-        """Note that the port was opened again, or that something else interrupted the lines."""
+        """Restart, because the port was opened again or something else interrupted the lines."""
         self._held = b""
         self._whole = -1
         """Whole lines since the last damaged one, -1 before the first damaged one."""
@@ -44,7 +44,7 @@ class Damage:
         """Since when fewer lines are counted than came."""
 
     def fed(self, data: bytes) -> None:
-        """Take bytes that reached the daemon."""
+        """Add bytes of the board that reached the daemon."""
         *ends, rest = (self._held + data).split(b"\n")
         for line in ends:
             if WHOLE.fullmatch(line):
@@ -56,8 +56,8 @@ class Damage:
     def look(self, at_ns: int, lines: Callable[[], int], stalled: bool = False) -> None:
         """Judge a step.
 
-        `lines` returns the number of good lines that the daemon has counted. A step that `stalled`
-        leaves the lines that came meanwhile to the next step.
+        `lines` returns the number of valid lines that the daemon has counted. If the step
+        `stalled`, the daemon reads the lines of that time only in the next step.
         """
         if stalled:
             self._short_ns = None

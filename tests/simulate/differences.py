@@ -1,7 +1,7 @@
-"""The deliberate differences between two checkouts, which a paired run does not report.
+"""The intended differences between two checkouts, which a paired run does not report.
 
-A change that is meant to alter the daemon's behavior is named here while the checkout before it is
-still compared with later ones. The section on older checkouts in `tests/README.md` says how.
+A change that intentionally alters the daemon's behavior is listed here as long as an older checkout
+is compared with newer ones. The section on older checkouts in `tests/README.md` explains how.
 """
 
 from __future__ import annotations

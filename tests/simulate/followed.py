@@ -1,8 +1,9 @@
-"""Which command the robot may follow: the arrival that it reports, held against all senders.
+"""Judges which command the robot follows.
 
-The robot reports when the command arrived that it follows, so the simulator knows its sender.
-`deploy/clients/README.md` says which sender that must be. A command counts here only if the daemon
-certainly accepts it: it has no stamp, or its delays were the lowest and even for long enough.
+The robot reports the arrival time of the command that it follows, so the simulator knows its
+sender. `deploy/clients/README.md` says which sender that must be. The judge expects only commands
+that the daemon certainly accepts: they have no stamp, or their delays were the lowest ones and
+constant for long enough.
 """
 
 from __future__ import annotations
@@ -49,7 +50,7 @@ Who = tuple[str, str]
 
 
 class Command(NamedTuple):
-    """A command that arrived, by the robot's clock and as the omniscient view knows it."""
+    """A command that arrived, with its time on the robot's clock and its true properties."""
 
     arrived_ns: int
     true_ns: int
@@ -70,7 +71,7 @@ class Command(NamedTuple):
 
 
 class Run:
-    """A run of even delays of one clock."""
+    """A series of messages of one clock whose delays are nearly equal."""
 
     def __init__(self, at_ns: int, age: int) -> None:
         self.begun_ns = self.last_ns = at_ns
@@ -80,7 +81,7 @@ class Run:
 
 
 class Followed:
-    """The commands that arrived at one daemon, and the one that it follows."""
+    """The commands that arrived at one daemon, and the command that the daemon follows."""
 
     def __init__(self, witness: Witness) -> None:
         self._witness = witness
@@ -137,9 +138,9 @@ class Followed:
         at_ns: int,
         wish: Wish | None,
     ) -> None:
-        """Take note of a message that arrived at `at_ns` by the robot's clock.
+        """Record a message that arrived at `at_ns` on the robot's clock.
 
-        `wish` is None if the message is not a command, or cannot be read.
+        `wish` is None if the message is not a command or is not readable.
         """
         self._count += 1
         if wish is None:
@@ -170,9 +171,10 @@ class Followed:
             self._waiting[who] = found
 
     def _is_overtaken(self, found: Command) -> bool:
-        """Return whether a zero of the same sender overtook this speed on the network.
+        """Return whether a later zero of the same sender arrived before this speed.
 
-        A zero that came earlier by more than the timeout may belong to another use of the numbers.
+        A zero that arrived more than the timeout earlier does not count, because the sender may
+        have restarted its numbers since.
         """
         zero, timeout_ns = self._latest.get(found.who), self._witness.timeout[found.who[0]]
         return (
@@ -187,7 +189,10 @@ class Followed:
         )
 
     def _go_on(self, at_ns: int) -> None:
-        """Note a command of the sender that keeps the robot, unless it was silent before."""
+        """Record another command of the sender that drives the robot.
+
+        If it was silent for longer than its timeout, it has lost the robot.
+        """
         assert self._keeper is not None
         timeout_ns = self._witness.timeout[self._keeper.who[0]]
         went_ns = max(self._going_ns, self._goes_ns)
@@ -269,7 +274,7 @@ class Followed:
         return None if self._holder is None else self._holder.sender
 
     def forget(self) -> None:
-        """Note that the daemon may have forgotten all commands."""
+        """Note that the daemon may have forgotten all earlier commands."""
         self._sure.clear()
         self._holder = self._keeper = None
 
@@ -278,7 +283,7 @@ class Followed:
     ) -> None:
         """Judge the command that the robot follows in a step that began at `decided_ns`.
 
-        The witness has judged the ages of all commands before.
+        The caller has judged the ages of all commands before.
         """
         witness = self._witness
         armed_since_ns = witness.armed_since_ns
@@ -316,9 +321,10 @@ class Followed:
             self._keeper = None
 
     def line(self, true_ns: int, before: Wheels, wheels: Wheels) -> None:
-        """Judge a line: while the robot follows a speed that a zero overtook, it slows down.
+        """Check that the robot slows down if the speed that it follows is older than a zero.
 
-        `before` has the wheel speeds of the line before it.
+        Such a speed arrived after a zero that its sender sent later. `before` contains the wheel
+        speeds of the previous line.
         """
         witness, holder = self._witness, self._holder
         # A limited jerk lets a speed grow on for a moment.
@@ -345,9 +351,10 @@ class Followed:
         self._slowest = min(v, least_v), min(w, least_w)
 
     def _first_keeps(self, true_ns: int, decided_ns: int, found: Command) -> None:
-        """The robot leaves a sender that is not silent only for a source of higher priority.
+        """Check that the robot leaves its sender only for a source of higher priority.
 
-        The daemon may refuse that sender meanwhile, for example because its clock was set.
+        It may also leave a sender that is silent, or that the daemon refuses because its clock was
+        set.
         """
         keeper, witness = self._keeper, self._witness
         if keeper is None or keeper.who != found.who:
@@ -363,7 +370,7 @@ class Followed:
         self._keeper, self._going_ns = found, max(self._going_ns, found.arrived_ns)
 
     def _is_kept(self, keeper: Command, decided_ns: int) -> bool:
-        """Return whether the sender that was followed certainly keeps the robot."""
+        """Return whether the daemon must continue to follow this sender."""
         witness, source = self._witness, keeper.who[0]
         return (
             decided_ns - self._going_ns < witness.timeout[source] - witness.period_ns
@@ -395,10 +402,10 @@ class Followed:
             )  # fmt: skip
 
     def _adjusted_needs_zero(self, true_ns: int, found: Command) -> None:
-        """A foreign clock that was stepped by more than the timeout needs a zero afterwards.
+        """Check that a sender sends a zero after its foreign clock was stepped.
 
-        A clock that was set forward makes delays shorter, so a network that delays the commands at
-        the same time may hide that. Another step, or a robot that slept, may hide any step.
+        Only steps larger than the timeout count. The check is left out if something may hide the
+        step: a longer network delay after a step forwards, a second step, or a sleep of the robot.
         """
         witness, sender, message = self._witness, found.sender, found.message
         before = self._before.get(found.clock)

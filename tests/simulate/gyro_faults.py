@@ -1,11 +1,11 @@
-"""Plans whose gyro reports wrong rates, and the wrong rates.
+"""Plans whose gyro reports wrong rates, and the simulation of these rates.
 
-`acsard/core/motion/gyro.py` states what the product does with such rates, and `pose.py` allows its
-limits: a wrong sample that differs by at most 2 rad/s from the rate before it counts, and a rate
-that repeats is taken back only after 1 s of rest. Two similar wrong samples in a row count too, so
-no plan has them.
+`acsard/core/motion/gyro.py` describes how the product handles them, and `pose.py` allows its known
+limits. A wrong sample counts if it differs by at most 2 rad/s from the rate before it. The product
+corrects a rate that hangs only after 1 s of rest. It also accepts two similar wrong samples in a
+row, so no plan contains these.
 
-The plans have dice of their own, so the plans without these faults stay as they are.
+These plans have separate random generators, so all other plans stay the same.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ PASSES = 2.1
 
 
 def add(plan: Plan, kinds: list[str]) -> None:
-    """Give a plan with a gyro the faults of these kinds."""
+    """Add the gyro faults of these kinds to a plan whose robot has a gyro."""
     if not plan["config"].get("odometry", {}).get("gyro"):
         return
     if "wrong gyro samples" in kinds:
@@ -65,7 +65,8 @@ def _add_wrong_samples(plan: Plan, dice: random.Random) -> None:
 
 
 def _add_hangs(plan: Plan, dice: random.Random) -> None:
-    """Let the gyro hang, often when a turn ends, so that it repeats the rate of the turn."""
+    """Add times in which the gyro repeats its rate, often the rate of a turn that has just ended.
+    """
     ends = [
         after[0]
         for sender in plan["senders"]
@@ -83,7 +84,7 @@ def _add_hangs(plan: Plan, dice: random.Random) -> None:
 
 
 class GyroFaults:
-    """The rates that a gyro reports instead of the measured ones."""
+    """Replaces the measured rates of a gyro by the wrong ones that it reports."""
 
     def __init__(self) -> None:
         self.hanging = False
@@ -95,11 +96,11 @@ class GyroFaults:
         self._wrong: float | None = None
 
     def spoil(self, rate: float) -> None:
-        """Have the next sample report this rate, rad/s, unless the gyro hangs."""
+        """Let the next sample report this rate in rad/s, unless the gyro hangs."""
         self._wrong = rate
 
     def reported(self, measured: float) -> float:
-        """Return the rate that the gyro reports for a measured one, rad/s."""
+        """Return the rate that the gyro reports when the true rate is `measured`, both in rad/s."""
         wrong, self._wrong = self._wrong, None
         if not self.hanging:
             self.hung = None

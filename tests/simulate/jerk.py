@@ -1,7 +1,8 @@
-"""The promise of jerk, judged by the lines alone: while a speed grows, so does its slope, slowly.
+"""The promise of the jerk limit, judged from the lines alone.
 
-A line has speeds in steps of 0.01 rad/s, so two accelerations from three lines say little. `Slope`
-therefore keeps the highest speed and slope that all lines since the last braking allow.
+While a speed grows, its acceleration may grow only slowly. Speeds in lines are rounded to 0.01
+rad/s, so three lines do not determine a change of the acceleration. `Slope` therefore stores the
+highest speed and acceleration that are possible since the last braking.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ STEP = 0.01
 
 
 class Slope:
-    """Bounds on the speed of one axis in one direction, and on its slope."""
+    """Upper bounds on the speed and the acceleration of one axis in one direction."""
 
     def __init__(self) -> None:
         self._seen = self._high = 0.0
@@ -21,9 +22,14 @@ class Slope:
     def take(
         self, speed: float, seconds: float, jerk: float, acceleration: float, room: float
     ) -> bool:
-        """Take the speed of a line and return whether the jerk allows it.
+        """Add the speed of a line. Return whether the jerk limit allows it.
 
-        `room` is the most that rounding can have changed. The line is `seconds` behind the last.
+        Args:
+            speed: The new speed.
+            seconds: Time since the previous line, s.
+            jerk: The jerk limit.
+            acceleration: The acceleration limit.
+            room: The largest possible rounding error of the speed.
         """
         before, self._seen = self._seen, speed
         seen = (speed - before + 2 * room) / seconds if seconds > 0.0 else acceleration
@@ -36,5 +42,5 @@ class Slope:
         return speed - room <= high
 
     def lose(self, speed: float, room: float, acceleration: float) -> None:
-        """Start over from this speed, with any slope."""
+        """Restart at this speed. Its acceleration may be anything up to the limit."""
         self._seen, self._high, self._slope = speed, speed + room, acceleration

@@ -1,8 +1,8 @@
-"""The promises that something happens: a lawful sender drives, nothing is lost without a count.
+"""The promises that the robot does drive, and that each lost message is counted.
 
-While a plan runs, a sender that keeps all rules and has the highest priority must move the robot,
-if nothing has happened for 3 s. Only the events that the pages name ask it for another zero. At the
-end of each plan all faults end, an operator releases all latches, and a lawful sender drives.
+A lawful sender obeys all rules and has the highest priority. During a plan it must move the robot
+if nothing else has happened for 3 s. Only the events that the documentation names disarm it. At the
+end of each plan all faults end, an operator releases all latches, and a lawful sender must drive.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ ASKS_NS = 3 * NS // 2
 
 
 class Liveness:
-    """Judges that a lawful sender drives, and counts and memory at the end of a plan."""
+    """Judges that a lawful sender drives, and judges counters and memory at the end of a plan."""
 
     def __init__(self, run: Run) -> None:
         self.run = run
@@ -104,13 +104,13 @@ class Liveness:
 
     @property
     def event_ns(self) -> int:
-        """Return the time of the last event."""
+        """The time of the last event."""
         return self._event_ns
 
     def event(self, lasts_ns: int = 0, *, disarms: bool = True) -> None:
         """Note an event that is not a command.
 
-        If it `disarms`, it may ask each sender for a zero from now on for `lasts_ns`.
+        If it `disarms`, it may disarm all senders at any time in the next `lasts_ns`.
         """
         now_ns = self._event_ns = self.run.true_ns
         if disarms:
@@ -119,7 +119,7 @@ class Liveness:
             self._disarmed_ns = max(self._disarmed_ns, until_ns)
 
     def stalls(self, until_ns: int) -> None:
-        """Note that the host stalls, so that the daemon sees what has just happened later."""
+        """Note that the host stalls until `until_ns`, so the daemon reads recent messages late."""
         now_ns = self.run.true_ns
         begun_ns = self._stall[0] if now_ns <= self._stall[1] else now_ns
         self._stall = begun_ns, max(self._stall[1], until_ns)
@@ -131,7 +131,7 @@ class Liveness:
 
     @cached_property
     def lawful(self) -> set[str]:
-        """The names of the senders that keep all rules and have no rival."""
+        """The names of the senders that obey all rules and have no rival."""
         return {one["name"] for one in self.run.plan["senders"] if self._keeps_rules(one)}
 
     @property
@@ -139,7 +139,7 @@ class Liveness:
         return self.run.witness.period_ns + MARGIN_NS
 
     def command(self, sender: dict[str, Any], sample: Sample) -> None:
-        """Take note of a command of a lawful sender."""
+        """Record a command of a lawful sender."""
         name = sender["name"]
         if name not in self.lawful:
             return
@@ -160,7 +160,8 @@ class Liveness:
         return self._armed.get(name, -1) > self._disarmed_ns + self._tick_ns
 
     def _take_zero(self, name: str, wish: Wish) -> None:
-        """Note the zero that arms this sender, unless the daemon may not have taken it."""
+        """Record the zero that arms this sender, unless a stall may have hidden it from the daemon.
+        """
         zero_ns, (begun_ns, ended_ns) = wish.armed_ns, self._stall
         if self._is_armed(name):
             return
@@ -171,7 +172,7 @@ class Liveness:
             self._armed[name] = zero_ns
 
     def _keeps_rules(self, sender: dict[str, Any]) -> bool:
-        """Return whether this sender has a good network, a clock of its own and no rival."""
+        """Return whether this sender has a good network, an unshared clock and no rival."""
         run = self.run
         priority = run.witness.priority
         rivals = [s for s in run.plan["senders"] if s["name"] != sender["name"]]
@@ -188,7 +189,7 @@ class Liveness:
         )
 
     def look(self, now_ns: int) -> None:
-        """Have a lawful sender drive if it has wished so for long enough."""
+        """Check that the robot drives if a lawful sender has sent speeds for long enough."""
         run = self.run
         self._stays_armed(now_ns)
         if not self._since or run.active != run.lasting or run.witness.held is not None:
@@ -206,9 +207,10 @@ class Liveness:
                     raise BrokenError("a lawful sender drives", now_ns, text)
 
     def _stays_armed(self, now_ns: int) -> None:
-        """A sender whose speed the robot has followed is armed until an event asks it for a zero.
+        """Check that a sender that the robot has followed stays armed until an event disarms it.
 
-        A zero may be followed, and arm its sender, until its clock turns out to be unproven.
+        The robot must have followed a speed. If it follows only a zero, the sender's clock may
+        still turn out to be unproven.
         """
         run = self.run
         sender = run.followed.sender
@@ -230,9 +232,9 @@ class Liveness:
 
     @cached_property
     def _sole_senders(self) -> dict[str, str]:
-        """The name of the sender of each source that has one only, without a foreign clock.
+        """Maps each source with only one sender to this sender's name. Foreign clocks are left out.
 
-        The reason of a source names no sender, so it may be about another one of its senders.
+        The reason in `state` names a source but no sender, so with several senders it is ambiguous.
         """
         found: dict[str, str] = {}
         senders = self.run.plan["senders"]
@@ -243,7 +245,7 @@ class Liveness:
         return found
 
     def end(self) -> None:
-        """End all faults, release all latches and have a lawful sender drive."""
+        """End all faults, release all latches, and check that a lawful sender drives."""
         run = self.run
         run.epilogue = True
         product, end_ns = run.product, run.true_ns
@@ -274,7 +276,7 @@ class Liveness:
         self._drive_lawfully(clears_ns)
 
     def weigh(self) -> None:
-        """Judge that nothing in the daemon has grown too long."""
+        """Check that no container, text or buffer in the daemon has grown too large."""
         run = self.run
         size, kind, text, buffer = run.product.largest()
         for name, length in (("container", size), ("text", text), ("buffer", buffer)):
@@ -286,7 +288,10 @@ class Liveness:
             raise BrokenError("memory is bounded", run.true_ns, found)
 
     def _drive_lawfully(self, clears_ns: int) -> None:
-        """Have a lawful sender drive; an operator has cleared the latches from `clears_ns` on."""
+        """Let a lawful sender send zeros and a speed, and check that the robot drives.
+
+        An operator has released the latches since `clears_ns`.
+        """
         run = self.run
         plan, begin_ns = run.plan, run.true_ns
         source = plan["config"]["commands"]["sources"][0]["name"]
@@ -343,7 +348,7 @@ class Liveness:
         run.run_to(run.true_ns + NS)
 
     def _check_course(self, speed: float, turn: float) -> None:
-        """The robot drives as commanded, or slower on the same curve."""
+        """Check that the robot drives as commanded, or slower on the same curve."""
         run = self.run
         witness, limits = run.witness, run.witness.limits
         got, told = witness.twist(witness.last), witness.clamped(speed, turn)

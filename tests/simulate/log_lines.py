@@ -1,6 +1,6 @@
-"""The promises about the log: it has each change of the mode, and nothing floods it.
+"""The promises about the log: it contains each change of the mode, and its rate is limited.
 
-`deploy/systemd/README.md` has them. Times are in ns of the robot's monotonic clock.
+`deploy/systemd/README.md` states them. Times are in ns of the robot's monotonic clock.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ LEVELS = {"info", "warning", "error"}
 
 
 class LogLines:
-    """The lines of one daemon's log."""
+    """Judges the log lines of one daemon."""
 
     def __init__(self) -> None:
         self._paid_ns: dict[str, int] = {}

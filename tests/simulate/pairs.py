@@ -1,9 +1,9 @@
 """Plays the same plans on two checkouts and compares their steps bit by bit.
 
-Each side is a process of its own with its own `acsard`. The other side brings its own virtual
-world and its own `product.py` where it has them, since both follow the layout of the product. A
-side answers a plan with a hash of each simulated second; the first second that differs is played
-again and shown step by step.
+Each side is a separate process that imports the `acsard` of its checkout. The other side also uses
+the virtual world and the `product.py` of its checkout if they exist, because both depend on the
+structure of the product. A side answers a plan with a hash for each simulated second. If the hashes
+of a second differ, both sides play the plan again and return the steps of that second.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ Step = dict[str, Any]
 
 
 def serve(where: Path) -> None:
-    """Answer plans on the standard input until it ends."""
+    """Play each plan from standard input, and print its hashes, until the input ends."""
     from tests.simulate.actors import collect_seldom
     from tests.simulate.unjudged import Unjudged
 
@@ -72,7 +72,7 @@ def serve(where: Path) -> None:
 
 
 class Trace:
-    """A hash of each second of a run, and the steps of one second as text."""
+    """The hashes of all seconds of a run, and the steps of one second."""
 
     def __init__(self, second: int | None = None) -> None:
         self.hashes: list[str] = []
@@ -80,7 +80,7 @@ class Trace:
         self._second, self._hash = second, hashlib.sha256()
 
     def step(self, step: Step) -> None:
-        """Take the results of a step."""
+        """Add the results of a step to the hash of its second."""
         step = rewritten(step)
         second = step["at"] // 10**9
         # msgspec writes each float so that it can be read back to the last bit.
@@ -94,7 +94,7 @@ class Trace:
 
 
 def rewritten(step: Step, differences: tuple[tuple[str, str, str, str], ...] = DIFFERENCES) -> Step:
-    """Return a step with the deliberate differences taken out."""
+    """Return a step without the intended differences between the checkouts."""
     changed = dict(step)
     for field, pattern, replacement, _ in differences:
         value = changed[field]
@@ -109,7 +109,8 @@ def _replaced(pattern: str, replacement: str, text: str) -> str:
 
 
 def comparable(plan: Plan, left_out: tuple[tuple[str, object, str], ...] = LEFT_OUT) -> Plan:
-    """Return a plan without the events by which the sides are meant to differ."""
+    """Return a plan without the events that intentionally have different effects on the two sides.
+    """
     events = plan["events"]
     for field, value, _ in left_out:
         events = [event for event in events if event.get(field) != value]
@@ -117,10 +118,11 @@ def comparable(plan: Plan, left_out: tuple[tuple[str, object, str], ...] = LEFT_
 
 
 class Side:
-    """The process that plays plans on one checkout."""
+    """A process that plays plans on one checkout."""
 
     def __init__(self, tree: Path, adapter: Path | None = None) -> None:
-        """Start the process. `adapter` stands for the tree's own `product.py`."""
+        """Start the process on the checkout `tree`. `adapter` replaces the checkout's `product.py`.
+        """
         environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
         self._process = subprocess.Popen(
             [sys.executable, "-c", BOOT, str(tree.resolve()), str(OURS),
@@ -133,7 +135,7 @@ class Side:
             raise SystemExit(f"{tree} has no acsard: {self.package} was imported")
 
     def play(self, plan: Plan, second: int | None = None) -> dict[str, Any]:
-        """Return the hashes of a plan, and the steps of one second."""
+        """Play a plan, and return its hashes and the steps of the given second."""
         assert self._process.stdin is not None
         self._process.stdin.write(json.dumps({"plan": plan, "second": second}) + "\n")
         self._process.stdin.flush()
@@ -161,7 +163,7 @@ class Pair:
         self.sides = Side(ours), Side(other, adapter)
 
     def differs(self, plan: Plan) -> tuple[str, float]:
-        """Return the first difference in words, "" for none, and the simulated s."""
+        """Play the plan on both sides. Return the first difference or "", and the simulated s."""
         with ThreadPoolExecutor(2) as pool:
             a, b = pool.map(lambda side: side.play(plan), self.sides)
         if a["hashes"] == b["hashes"] and a["error"] == b["error"]:
@@ -180,7 +182,7 @@ class Pair:
 
 
 def first_difference(ours: list[Step], theirs: list[Step]) -> str:
-    """Return the first field that differs in these steps, in words."""
+    """Return a text that describes the first field that differs in these steps."""
     for a, b in zip(ours, theirs, strict=False):
         for field in a:
             if a[field] != b[field]:
@@ -197,7 +199,10 @@ def compare(
     adapter: Path | None = None,
     show: Callable[[str], None] = print,
 ) -> int:
-    """Compare this checkout with another one for `seconds`; return 1 if they differ."""
+    """Compare this checkout with another one for `seconds` of simulated time.
+
+    Returns 1 if they differ, otherwise 0.
+    """
     began, differing, runs, total = time.perf_counter(), 0, 0, 0.0
     pairs = [Pair(OURS, tree, adapter) for _ in range(max(1, workers // 2))]
     try:

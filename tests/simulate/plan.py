@@ -1,8 +1,8 @@
-"""From a seed to a plan: what the robot, its board, senders, operators and host will do.
+"""Creates the plan of a seed: the actions of robot, board, senders, operators and host.
 
-A plan is plain data, so that `shrink.py` can drop parts of it and `corpus/` can keep it. Times are
-in s from the start, by the true clock. Swarm testing (Groce and others, 2012): each run switches a
-random part of the kinds of trouble off, because one kind of trouble often hides another one.
+A plan is plain data, so `shrink.py` can remove parts of it and `corpus/` can store it. Times are in
+s of true time from the start. Each plan leaves out a random part of the kinds of trouble, because
+one kind often hides another one. This is swarm testing (Groce and others, 2012).
 """
 
 from __future__ import annotations
@@ -116,8 +116,8 @@ def made(seed: int, seconds: float | None = None) -> Plan:
 def _draw_low_bound(dice: random.Random, config: dict[str, Any]) -> None:
     """In a tenth of the plans put `feedback.wheel_speed` just above the limit of the wheels.
 
-    In some of these plans the wheels are so slow that one encoder count looks faster than the
-    bound.
+    In some of these plans the wheels are slow and their encoders coarse. One encoder count then
+    looks faster than this bound.
     """
     if dice.random() >= 0.1:
         return
@@ -131,11 +131,10 @@ def _draw_low_bound(dice: random.Random, config: dict[str, Any]) -> None:
 
 
 def _draw_routers(dice: random.Random, plan: Plan) -> None:
-    """Put most of the senders whose sessions stamp behind routers that stamp in their place.
+    """Put most senders whose Zenoh session stamps their messages behind routers that stamp them.
 
-    The session that stamps changes while the plan runs: to that of another router, of the sender,
-    or of the daemon. In a tenth of the plans, all senders are behind routers and command one
-    source.
+    The session that stamps changes during the plan: another router, the sender itself, or the
+    daemon. In a tenth of the plans, all senders are behind routers and command one source.
     """
     senders, together = plan["senders"], dice.random() < 0.1
     for sender in senders:
@@ -155,10 +154,9 @@ def _draw_routers(dice: random.Random, plan: Plan) -> None:
 def _draw_unstamped_zeros(dice: random.Random, senders: list[dict[str, Any]]) -> None:
     """Let some senders stamp only their speeds, and often end a drive with a single zero.
 
-    A ROS node does so that fills the header of its speeds, and ends with an empty `TwistStamped`.
-    The daemon then takes the stamp of the header for a speed, and that of the attachment for a
-    zero, so two clocks stamp the messages of one sender. The network often swaps the last two
-    messages of a drive.
+    A ROS node may fill the header of its speeds and end with an empty `TwistStamped`. The daemon
+    then uses the header's stamp for a speed and the attachment's stamp for a zero, so two clocks
+    stamp the messages of one sender. The network often swaps the last two messages of a drive.
     """
     ids = [sender["id"] for sender in senders]
     for sender in senders:
@@ -178,10 +176,10 @@ def _draw_unstamped_zeros(dice: random.Random, senders: list[dict[str, Any]]) ->
 
 
 def _draw_lawful_driver(dice: random.Random, plan: Plan) -> bool:
-    """In a quarter of the plans make the first sender keep all rules, and nobody outrank it.
+    """In a quarter of the plans let the first sender obey all rules and have the highest priority.
 
-    `liveness.py` judges inside a plan that such a sender drives. Few plans have one by chance.
-    Return whether this plan has one.
+    `liveness.py` checks that such a sender drives, and few plans have one by chance. Returns
+    whether this plan has one.
     """
     if dice.random() >= 0.25:
         return False
@@ -210,10 +208,10 @@ def _draw_lawful_driver(dice: random.Random, plan: Plan) -> bool:
 
 
 def _rare_events(dice: random.Random, plan: Plan) -> list[dict[str, Any]]:
-    """Return trouble at the right time for it, in a fifth of the plans with a lawful driver.
+    """Return trouble for a fifth of the plans with a lawful driver, timed by its drives.
 
-    By chance few echoes last through changes of speed, and few drives meet an output that is
-    blocked while the board goes on to report.
+    The trouble is an echo during changes of the speed, or a blocked output while the board still
+    reports. Both are rare by chance.
     """
     mcu, phases = plan["config"]["mcu"], plan["senders"][0]["phases"]
     times = [phase[0] for phase in phases if 1.0 < phase[0] < plan["seconds"] - 4.0]
@@ -237,7 +235,8 @@ def _rare_events(dice: random.Random, plan: Plan) -> list[dict[str, Any]]:
 
 
 def _drives(dice: random.Random, seconds: float) -> list[list[Any]]:
-    """Return the phases of a sender that drives for up to minutes, rests, and often reverses."""
+    """Return the phases of a sender that drives for up to a few minutes, rests, and often reverses.
+    """
     phases: list[list[Any]] = []
     t = 0.0
     while t < seconds:
@@ -254,7 +253,8 @@ def _drives(dice: random.Random, seconds: float) -> list[list[Any]]:
 def _config(
     dice: random.Random, odd: bool, timing: bool, vehicle: bool
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """A configuration as tables of `acsard.toml`, and the lasting nature of the board."""
+    """Return a random configuration as tables of `acsard.toml`, and the board's lasting properties.
+    """
     linear, angular = round(dice.uniform(0.2, 2.0), 2), round(dice.uniform(0.5, 6.0), 2)
     slow = round(max(linear / 5, dice.choice((0.5, 1.0, 3.0))) + 0.001, 3)
     slow_turn = round(max(angular / 5, dice.choice((2.0, 4.0, 9.0))) + 0.001, 3)
@@ -342,9 +342,9 @@ def _make_odd(dice: random.Random, config: dict[str, Any], extras: dict[str, Any
 
 
 def _make_extreme(dice: random.Random, config: dict[str, Any]) -> None:
-    """Draw rates, timeouts and pauses from their whole range, and one to six sources.
+    """Draw rates, timeouts and pauses from their whole ranges, and one to six sources.
 
-    No rate above 349 Hz is legal, because a plain line takes 2.9 ms at the highest baud rate.
+    No rate is above 349 Hz, because a plain line takes 2.9 ms at the highest baud rate.
     """
     rate, period = dice.choice(
         ((10.0, 0.1), (200.0, 0.005), (300.0, 0.0034), ("auto", 0.01), (100.0, 0.01))
@@ -366,7 +366,8 @@ def _make_extreme(dice: random.Random, config: dict[str, Any]) -> None:
 
 
 def _make_other(dice: random.Random, config: dict[str, Any]) -> None:
-    """Draw corrections of the wheels, bounds that a sound wheel keeps, and error rates."""
+    """Draw multipliers of the wheels, bounds that a healthy wheel never exceeds, and error rates.
+    """
     config["drive"] = config.get("drive", {}) | {
         "wheel_separation_multiplier": round(dice.uniform(0.8, 1.6), 3),
         "left_wheel_radius_multiplier": round(dice.uniform(0.95, 1.05), 3),
@@ -387,7 +388,7 @@ def _make_other(dice: random.Random, config: dict[str, Any]) -> None:
 
 
 def _dialect(dice: random.Random, mcu: dict[str, Any]) -> list[list[Any]]:
-    """Return the lasting dialects of a board that a daemon with these settings can drive."""
+    """Return lasting variations of the board's protocol that these settings of the daemon allow."""
     possible = ["unpadded", "spaces", "watchdog_fed_by_bad_lines"]
     # A board with a reply period ends its lines with a comma in any case.
     if not (mcu.get("trailing_comma") or mcu.get("reply_period")):
@@ -403,7 +404,10 @@ def _dialect(dice: random.Random, mcu: dict[str, Any]) -> list[list[Any]]:
 
 
 def _phases(dice: random.Random, seconds: float, lawful: bool) -> list[list[Any]]:
-    """A sender's habit: from each time on a speed and a turn rate, or None for silence."""
+    """Return the phases of a sender: start times, each with a speed and a turn rate.
+
+    None in place of the speeds means silence.
+    """
     habits = ["stop and go"] * 3 + ["pauses"] * 3
     habit = dice.choice(habits if lawful else [*habits, "never neutral", "wild"])
     phases: list[list[Any]] = []
@@ -442,7 +446,7 @@ def _phases(dice: random.Random, seconds: float, lawful: bool) -> list[list[Any]
 def _tried_again(
     dice: random.Random, phases: list[list[Any]], congestion: list[list[Any]]
 ) -> list[list[Any]]:
-    """Return the phases of an operator who releases the stick and tries again."""
+    """Return phases in which an operator releases the stick and tries again during a congestion."""
     if all(speed != 0.0 for _, speed, _ in phases):
         return phases
     for begin, end, _, _ in congestion:
@@ -558,7 +562,7 @@ def _events(
     changes, drives = [phase[0] for phase in phases], [phase[0] for phase in phases if phase[1]]
 
     def moment() -> float:
-        """Return a time. Half of them lie just behind a change of a sender or another event."""
+        """Return a random time. Half of them follow a sender's change or another event closely."""
         chance = dice.random()
         if chance < 0.3 and changes:
             at = dice.choice(changes) + dice.choice((0.3, 3.0)) * dice.random()
@@ -569,14 +573,17 @@ def _events(
         return float(round(max(1.0, min(at, seconds)), 3))
 
     def add(kind: str, every: float) -> list[float]:
-        """Return times for events of this kind, about one in `every` s."""
+        """Return random times for events of this kind, on average one in `every` seconds."""
         if kind not in kinds:
             return []
         count = dice.randrange(1, max(2, int(2 * seconds / every)))
         return [moment() for _ in range(count)]
 
     def series(at: float) -> list[float]:
-        """Return this time, or a series of times from it on in which a ramp may lie."""
+        """Return either this time alone or a series of times from it on.
+
+        A series may meet a ramp, which is too short for a single time to meet.
+        """
         if dice.random() < 0.6:
             return [at]
         gap, count = dice.uniform(0.3, 1.5), dice.randrange(3, 15)
@@ -756,7 +763,7 @@ def _events(
 
 
 def _settings(dice: random.Random, config: dict[str, Any]) -> dict[str, float]:
-    """Settings to change, legal or not: the daemon has to know."""
+    """Return settings for a `set`, legal or not. The daemon must refuse illegal ones."""
     limits, found = config["limits"], {}
     what = dice.choice(("limits", "limits", "commands", "both"))
     if what != "commands":

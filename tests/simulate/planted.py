@@ -2,10 +2,11 @@
 
     python -m tests.simulate.planted [--jobs 2] [--only NAME] [--missing] [--again]
 
-Each fault is planted alone into a copy of this tree. One process plays seeds there until a promise
-breaks or the time is over. A finding counts only if the same seed breaks no promise on this tree.
-`PLANTED.md` keeps the results; a run replaces the rows that it has played. With `--again` only the
-recorded seed of each row is played, which takes seconds, and the page stays as it is.
+Each fault is planted alone into a copy of this tree. A process plays seeds there until a promise
+breaks or the time limit is reached. A finding counts only if the same seed breaks no promise
+without the fault. `PLANTED.md` stores the results; a run replaces the rows of the faults that it
+played. `--again` plays only the recorded seed of each row, which takes seconds, and changes no
+file.
 """
 
 from __future__ import annotations
@@ -64,7 +65,7 @@ while left > 0.0:
 
 
 class Row(NamedTuple):
-    """A line of the table: texts as they are shown."""
+    """A row of the table in `PLANTED.md`. All fields are text."""
 
     name: str
     breaks: str
@@ -81,9 +82,9 @@ class Row(NamedTuple):
 
 
 def version() -> str:
-    """Return a digest of the code that makes, plays and judges plans.
+    """Return a digest of the modules that create, play and judge plans.
 
-    Another version may give a seed another plan, or find something else in it.
+    With another version a seed may have another plan or another finding.
     """
     here = Path(__file__).parent
     code = b"".join((here / f"{name}.py").read_bytes() for name in MEASURED_WITH)
@@ -91,7 +92,7 @@ def version() -> str:
 
 
 def plant(fault: Fault, tree: Path) -> None:
-    """Write a copy of the product and of the simulator with this fault into `tree`."""
+    """Write a copy of the product with this fault, and of the simulator, into `tree`."""
     ignored = shutil.ignore_patterns("__pycache__", "page", "*.md")
     shutil.copytree(ROOT / "acsard", tree / "acsard", ignore=ignored)
     shutil.copytree(ROOT / "tests" / "simulate", tree / "tests" / "simulate", ignore=ignored)
@@ -103,10 +104,10 @@ def plant(fault: Fault, tree: Path) -> None:
 
 
 def edited(fault: Fault) -> dict[str, str]:
-    """Return the source of each module with the fault in it.
+    """Return the source of each module that the fault changes.
 
     Raises:
-        ValueError: The product was changed, and an edit does not fit exactly once any more.
+        ValueError: The text that an edit replaces does not occur exactly once in the product.
     """
     texts: dict[str, str] = {}
     for module, old, new in fault.edits:
@@ -121,7 +122,7 @@ def edited(fault: Fault) -> dict[str, str]:
 
 
 def hunt(fault: Fault, minutes: float) -> Row:
-    """Plant the fault and play until it is found or the time is over."""
+    """Plant the fault and play seeds until one finds it or the time limit is reached."""
     seed, cpu_s, simulated_s = FIRST_SEED, 0.0, 0.0
     with tempfile.TemporaryDirectory() as name:
         plant(fault, Path(name))
@@ -144,7 +145,8 @@ def _row(fault: Fault, promise: str, seed: str, cpu_s: float, simulated_s: float
 
 
 def broken_again(fault: Fault, row: Row) -> str:
-    """Return why the recorded seed of a row no longer finds its fault, "" if it still does."""
+    """Play the recorded seed of a row. Return why it no longer finds the fault, or "" if it does.
+    """
     seed = int(row.seed)
     with tempfile.TemporaryDirectory() as name:
         plant(fault, Path(name))
@@ -157,12 +159,12 @@ def broken_again(fault: Fault, row: Row) -> str:
 
 @cache
 def sound_finding(seed: int) -> str:
-    """Return the finding of this seed in the product without a fault, "" for none."""
+    """Return the promise that this seed breaks in the product without a fault, or ""."""
     return played(made(seed)).finding
 
 
 class Play(NamedTuple):
-    """One seed that was played with a fault."""
+    """The result of playing one seed with a fault."""
 
     seed: int
     promise: str
@@ -171,9 +173,10 @@ class Play(NamedTuple):
 
 
 def plays(tree: Path, seed: int, seconds: float, kind: str = "") -> Iterator[Play]:
-    """Yield one run in `tree` after another; with a `kind`, only those of plans with such inputs.
+    """Yield the results of consecutive seeds, played on the code in `tree`.
 
-    Ends when the time is over, or early if another program ends the process.
+    With a `kind`, only plans with these inputs or this moment are played. It ends when the time is
+    over, or early if another program ends the process.
     """
     environment = os.environ | {"PYTHONPATH": str(tree), "PYTHONDONTWRITEBYTECODE": "1"}
     child = subprocess.Popen(
@@ -227,7 +230,7 @@ def read() -> dict[str, Row]:
 
 
 def text_of(rows: dict[str, Row]) -> str:
-    """Return the page with these rows, in the order of the lists."""
+    """Return the text of `PLANTED.md` with these rows, in the order of the faults' definitions."""
     minutes = {"fault": FAULT_MINUTES, "case": CASE_MINUTES}
     text = HEAD.format(seed=FIRST_SEED, **minutes)
     for title, faults in (("Faults", FAULTS), ("Cases that were once true", CASES)):
@@ -238,9 +241,9 @@ def text_of(rows: dict[str, Row]) -> str:
 
 
 def again(faults: list[Fault], jobs: int) -> int:
-    """Play the recorded seed of each of these faults; return the number of rows that do not hold.
+    """Play the recorded seed of each of these faults. Return how many no longer find their fault.
 
-    A fault without a row, or with none that has a seed, has nothing to play.
+    Faults without a recorded seed are left out.
     """
     rows = read()
     present = version()

@@ -1,7 +1,7 @@
-"""Eleven ways in which the robot once moved, or did not stop, planted back for `planted.py`.
+"""Eleven former defects by which the robot moved, or did not stop, for `planted.py`.
 
-Reviewers found them by hand in the virtual world, one afternoon. Each edit brings back what the
-code did then, or the part of it that mattered.
+Reviewers once found them by hand in the virtual world. Each edit restores the former code, or its
+relevant part.
 """
 
 from __future__ import annotations

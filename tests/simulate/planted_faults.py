@@ -1,7 +1,7 @@
-"""Small faults in the product's source, one at a time, for `planted.py` to find.
+"""Small faults in the product's source, which `planted.py` plants one at a time.
 
-A fault that only weakens the guard is not here alone: while the rest of the product is sound, the
-guard has nothing to replace. Two faults weaken it together with the part that it watches.
+A fault that only weakens the guard cannot be found, because the rest of the product never gives the
+guard a line to replace. Two faults therefore weaken the guard and the part that it checks.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 
 class Edit(NamedTuple):
-    """A change in one module."""
+    """A replacement of one text in one module."""
 
     module: str
     old: str
@@ -31,7 +31,7 @@ PLANS_OF_FAULT = {
 
 
 class Fault(NamedTuple):
-    """One planted fault."""
+    """A fault to plant: its name, its symptom and its edits."""
 
     name: str
     breaks: str
@@ -40,7 +40,10 @@ class Fault(NamedTuple):
 
     @property
     def kind(self) -> str:
-        """The kind of inputs, or the moment, of the plans that are played; "" for all plans."""
+        """The kind of plans that can find the fault, or "" for all plans.
+
+        It is a kind of inputs or a moment of `bad_moments.py`.
+        """
         first = self.name.split()[0]
         return PLANS_OF_FAULT.get(self.name) or PLANS_OF_FAULT.get(first, "")
 
@@ -114,7 +117,7 @@ class Freshness(Freshness):
 
 
 def judging(rule: str) -> Edit:
-    """Return an edit by which freshness gives the value of this expression as its verdict."""
+    """Return an edit that makes the freshness check return the value of this expression."""
     return Edit(FRESHNESS, "", JUDGING.format(rule=rule))
 
 

@@ -1,6 +1,6 @@
-"""The promises about a board that is unplugged and plugged in again, and about one that stays.
+"""The promises about a board that is unplugged and plugged in again, or that stays plugged in.
 
-Times are in ns of the robot's monotonic clock, which stands while the host sleeps.
+Times are in ns of the robot's monotonic clock, which stops while the host sleeps.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ PERIODS = 2
 
 
 class Plugging:
-    """Judges what the daemon says and sends about the time at which the board comes and goes."""
+    """Judges the link state and the lines of the daemon when the board is unplugged or plugged in.
+    """
 
     def __init__(self, period_ns: int) -> None:
         self._period_ns = period_ns
@@ -31,7 +32,7 @@ class Plugging:
         """When the step ended that made the last line, or in which the link was not up."""
 
     def see(self, true_ns: int, seen: Seen, product: Product, calm_ns: int) -> None:
-        """Judge a step. At `calm_ns` the last stall of the host or of the output was over."""
+        """Judge a step. The last stall of the host, or block of the output, ended at `calm_ns`."""
         if not product.plugged:
             late_ns = seen.decided_ns - product.unplugged_ns
             if seen.link == "up" and late_ns > SEEN_NS + self._period_ns:

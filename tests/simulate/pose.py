@@ -1,4 +1,4 @@
-"""The promise of odometry: the pose stays within its covariance and never jumps."""
+"""The promises about odometry: the error of the pose agrees with its covariance, without jumps."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ Pose = tuple[float, float, float]
 
 
 class Hang:
-    """A gyro that repeats one rate, as the omniscient view knows it."""
+    """A time in which the gyro repeats one rate, with the true headings in it."""
 
     def __init__(self, at_ns: int, rate: float) -> None:
         self.rate = rate
@@ -99,7 +99,10 @@ class Hang:
 
 
 class PoseWitness:
-    """Compares the estimates with the true pose, from an anchor on where both were the same."""
+    """Compares the estimated poses with the true ones.
+
+    The comparison starts at an anchor, a sample at which both poses count as equal.
+    """
 
     def __init__(self, config: dict[str, Any]) -> None:
         drive = config.get("drive", {})
@@ -168,11 +171,10 @@ class PoseWitness:
         silence."""
 
     def doubt(self, mute: bool = False) -> None:
-        """The encoders missed a part of the drive: restart the comparison at the next estimate.
+        """Restart the comparison at the next estimate, because the encoders missed some motion.
 
-        The pose may not jump all the same.
-
-        A board that was only `mute` leaves a gap, which is judged by itself.
+        The pose must not jump even then. If the board was only `mute`, there is a gap in the
+        feedback, which `_gap` judges.
         """
         self._anchor = self._expected = None
         if self._hang is not None:
@@ -181,11 +183,11 @@ class PoseWitness:
             self._before = None
 
     def flip(self) -> None:
-        """Note a damaged line of a plain link, whose speed may look like a possible one."""
+        """Note a damaged line on a plain link, which may report a wrong but plausible speed."""
         self._unsure_m += self._per_flip_m
 
     def gyro(self, now_ns: int, faults: GyroFaults) -> None:
-        """Note the rate that the gyro repeats, if it hangs, and its wrong samples."""
+        """Note whether the gyro hangs and at which rate, and the effect of its wrong samples."""
         self._spoiled = faults.spoiled
         if faults.hung is not None and self._hang is None:
             self.doubt()
@@ -204,18 +206,18 @@ class PoseWitness:
             self.unknown_until(at_ns + QUEUED_NS)
 
     def unknown_until(self, at_ns: int) -> None:
-        """Note that until then nobody can know the motion from the lines."""
+        """Note that the lines do not show the true motion until this time."""
         self._known_ns = max(self._known_ns, at_ns)
 
     def begin(self) -> None:
-        """Note that a new daemon or a new pose begins: nothing before it counts."""
+        """Forget all earlier estimates, because a daemon starts or the pose is set."""
         self.doubt()
         self._last = self._unproved = None
 
     def placed(self, asked: Pose | None = None) -> None:
-        """The pose was set: the estimates of this step are still the old ones.
+        """Note that a call sets the pose. The estimates of this step still have the old pose.
 
-        `asked` is the new pose, None if it is not certain that this step has set it.
+        `asked` is the new pose, or None if the call may take effect in another step.
         """
         self._placed, self._asked = True, asked
 
@@ -260,7 +262,7 @@ class PoseWitness:
             self._before = true and (last_ns, self.latest, true, self._speed, covariance)
 
     def end_step(self) -> bool:
-        """Forget the pose if it was set in this step, and return whether it was."""
+        """Forget the pose if a call has set it in this step. Return whether one has."""
         placed = self._placed
         if placed:
             last, asked = self._last, self._asked
@@ -331,7 +333,7 @@ class PoseWitness:
             )  # fmt: skip
 
     def _spoils_pose(self, now_ns: int) -> bool:
-        """Return whether the gyro hangs, or has hung so shortly before that it is not judged."""
+        """Return whether the gyro hangs, or has hung too recently to judge the pose."""
         if self._hang is not None or now_ns < self._settles_ns:
             return True
         rests_ns = self._settles_at_rest_ns
@@ -345,7 +347,7 @@ class PoseWitness:
     ) -> None:
         """Judge the heading while the gyro hangs.
 
-        The position is not judged, because a heading that is taken back was wrong on the way.
+        The position is not judged. It stays wrong even after the product has corrected the heading.
         """
         true, yaw = self._true_at(at_ns), pose[2]
         passed_ns, hang.seen_ns = at_ns - hang.seen_ns, at_ns
@@ -382,7 +384,7 @@ class PoseWitness:
         true_ns: int,
         true: Pose,
     ) -> None:
-        """Judge the first estimate after a gap: its covariance grew by the motion in the gap."""
+        """Check that the covariance of the first estimate after a gap includes the gap's motion."""
         then_ns, pose, true_then, speed, covariance = before
         sampled_ns, ex, ey, eyaw, (xx, _, _, yy, _, yawyaw), _ = estimate
         # A robot that stood may have been pushed in the gap, unless it stands where it stood.
@@ -427,7 +429,8 @@ class PoseWitness:
     def _put(
         self, now_ns: int, expected: tuple[Pose, Pose], true: Pose, pose: Pose, room: float
     ) -> None:
-        """Judge the first estimate behind a call: it has the pose asked for, and moved since."""
+        """Check that the first estimate after a call has the requested pose, plus the motion since.
+        """
         x, y, yaw = _through(expected, true)
         off, turned = math.hypot(pose[0] - x, pose[1] - y), math.remainder(pose[2] - yaw, math.tau)
         if off > ROOM_M + room or abs(turned) > ROOM_RAD + room / self.track:
@@ -435,7 +438,7 @@ class PoseWitness:
             raise BrokenError("the pose is put where a call asks for it", now_ns, text)
 
     def _present_speed(self) -> float:
-        """Return the true speed now, m/s, with that of the rim in a turn."""
+        """Return the true speed of the robot in m/s, plus the speed of its wheels in a turn."""
         if len(self._true) < 2:
             return 0.0
         (t0, a), (t1, b) = self._true[-2], self._true[-1]
@@ -444,7 +447,7 @@ class PoseWitness:
         return float((math.hypot(b[0] - a[0], b[1] - a[1]) + abs(turn)) / seconds)
 
     def _true_at(self, at_ns: int) -> Pose | None:
-        """Return the true pose at a time, None where nobody looked shortly before and after."""
+        """Return the interpolated true pose at a time, or None without samples close to it."""
         after = None
         for then_ns, pose in reversed(self._true):
             if then_ns <= at_ns:
@@ -465,7 +468,10 @@ class PoseWitness:
 
 
 def _through(anchor: tuple[Pose, Pose], true: Pose) -> Pose:
-    """Return where the odometry should be, if both were the same at the anchor."""
+    """Return the pose that exact odometry has when the true pose is `true`.
+
+    The anchor is a pair of the true pose and the pose of the odometry at the same time.
+    """
     (tx, ty, tyaw), (ox, oy, oyaw) = anchor
     turn = oyaw - tyaw
     dx, dy = true[0] - tx, true[1] - ty

@@ -1,7 +1,8 @@
-"""The product under test, as the simulator sees it. No other module here imports the product.
+"""The interface of the simulator to the product. No other module here imports the product.
 
-A paired run loads this module twice, each time beside another checkout of the product. So whatever
-the simulator wants of the product is a method here, and takes and returns plain data.
+A paired run loads this module twice, each time with another checkout of the product. Therefore
+everything that the simulator needs of the product is a method here, with plain data as arguments
+and results.
 
 Time is in ns of the robot's monotonic clock. `Product.see` is called after every control step.
 """
@@ -55,7 +56,7 @@ NONE: Sequence[Estimate] = ()
 
 
 class Seen(msgspec.Struct, frozen=True, gc=False):
-    """The results of one control step that others can see."""
+    """The externally visible results of one control step."""
 
     at_ns: int
     decided_ns: int
@@ -73,7 +74,7 @@ class Seen(msgspec.Struct, frozen=True, gc=False):
 
 
 def problems(config: dict[str, Any]) -> list[str]:
-    """Return the problems of this configuration, in words; none if it is legal."""
+    """Return the error messages for this configuration, or an empty list if it is legal."""
     try:
         parse(b"", config)
     except ConfigError as error:
@@ -94,11 +95,11 @@ def _plain(found: Measured) -> Estimate:
 
 
 class CrashError(Exception):
-    """The exception that stands for a defect of the daemon."""
+    """An exception that simulates a bug in the daemon."""
 
 
 class Disk:
-    """The latch file, from which the next daemon starts."""
+    """The latch file on a simulated disk. The next daemon reads it at its start."""
 
     def __init__(self) -> None:
         self.full = False
@@ -110,11 +111,14 @@ class Disk:
 
     @property
     def behind(self) -> bool:
-        """Return whether the file lacks the newest latches."""
+        """Whether the file lacks the newest latches."""
         return self._written != self._newest
 
     def fill(self, full: bool) -> None:
-        """Begin or end a time in which nothing can be written; the daemon tries again by itself."""
+        """Fill the disk, so that nothing can be written, or make space again.
+
+        The daemon then writes its newest latches.
+        """
         self.full = full
         if self._running:
             self.keep(self._newest)
@@ -148,7 +152,7 @@ class Disk:
         return []
 
     def read(self, now: Instant) -> Latches:
-        """Return the latches that the next start begins with."""
+        """Return the latches that the next start of the daemon uses."""
         try:
             found = decode("acsar", self._data)
         except LatchFileError as error:
@@ -164,7 +168,7 @@ class Disk:
 
 
 class Product:
-    """One robot with its computer and its board, over all the daemon's lives."""
+    """One robot with its computer and its board. Its daemon may end and start several times."""
 
     def __init__(self, config: dict[str, Any], see: Callable[[Seen], None]) -> None:
         self._config, self._see = parse(b"", config), see
@@ -242,7 +246,7 @@ class Product:
         return self._world.instant.wall_ns
 
     def run_until(self, at_ns: int) -> None:
-        """Let time pass; without a daemon only the board lives."""
+        """Advance to this time. If no daemon runs, only the board is simulated."""
         world = self._world
         if at_ns <= world.now_ns:
             return
@@ -267,7 +271,8 @@ class Product:
         via: Any = "native",
         attachment: bytes = b"",
     ) -> None:
-        """Hand over a sample that arrived at this time, not later than now."""
+        """Deliver a sample to the daemon's inbox. `at_ns` is its arrival, at most the present time.
+        """
         world = self._world
         arrivals = world.bus.arrivals
         received = None if session else self.wall_ns
@@ -289,16 +294,16 @@ class Product:
             world._step()
 
     def stop_unseen(self) -> None:
-        """Have a stop arrive that no step has taken yet."""
+        """Deliver a stop without letting a step read it."""
         arrival = Arrival("stop", True, b"", "", self.now_ns, None, "", "native", b"", self.wall_ns)
         self._world.bus.arrivals.insert(0, arrival)
 
     def ask(
         self, at_ns: int, service: str, ticket: int, payload: bytes, via: Any, attachment: bytes
     ) -> None:
-        """Hand over a service call. A stop also goes ahead of its query, as on the real bus.
+        """Deliver a service call. As on the real bus, a sample on the key `stop` precedes a stop.
 
-        `service` is a service, or a parameter service of ROS, which has "/" in its name.
+        `service` is a service name, or a ROS parameter service, which has "/" in its name.
         """
         key = service if "/" in service else f"srv/{service}"
         if service == "stop":
@@ -307,7 +312,7 @@ class Product:
         self._world.bus.queries.append(query)
 
     def replies(self) -> list[tuple[int, bytes]]:
-        """Take the answers that were given since the last call, each with its ticket."""
+        """Return the answers since the last call, each with the ticket of its query."""
         bus = self._world.bus
         if not bus.replies:
             return []
@@ -330,7 +335,7 @@ class Product:
     # the board
 
     def board(self, faults: list[tuple[str, tuple[Any, ...]]]) -> None:
-        """Have the board misbehave in these ways, and in no others, from now on."""
+        """Set the faults of the board. They replace all earlier ones."""
         self._lasting.close()
         self._faults = faults
         mcu, bauds = self._world.mcu, [values[0] for name, values in faults if name == "wrong_baud"]
@@ -353,7 +358,7 @@ class Product:
                 self._half_duplex(mcu, *values)
 
     def _garble(self, mcu: FakeMcu, baud_rate: int) -> None:
-        """Put a wire to this board on which its end has this baud rate."""
+        """Connect this board by a serial line on which the board uses another baud rate."""
         ours, kind = self._config.mcu.baud_rate, type(mcu)
         vars(mcu).pop("receive", None)
         vars(mcu).pop("advance", None)
@@ -369,7 +374,8 @@ class Product:
         vars(mcu).update(receive=receive, advance=advance)
 
     def _half_duplex(self, mcu: FakeMcu, load: float) -> None:
-        """Let the daemon hear each of its lines beside the board's reply, and load the motors."""
+        """Send each line of the daemon back to it, in addition to the replies, and load the motors.
+        """
         receive = mcu.receive
 
         def both(at_ns: int, data: bytes) -> None:
@@ -383,9 +389,9 @@ class Product:
         self._lasting.callback(setattr, mcu.vehicle, "load", 0.0)
 
     def flip(self, place: int, mask: int, behind: int) -> None:
-        """Have the wire flip bits of a character in the speeds that the board reports.
+        """Invert bits of one character in a reply with speeds.
 
-        The next lines, as many as `behind` says, stay whole, and only the one behind them has that.
+        `behind` is the number of replies that stay intact before the damaged one.
         """
         mcu = self._world.mcu
         send, left = type(mcu)._send, behind
@@ -410,7 +416,7 @@ class Product:
         self._world.port.trouble = "the device is gone"
 
     def plug(self, new: bool = False) -> None:
-        """Plug the board in again, or another one."""
+        """Plug the same board in again, or a new one."""
         world = self._world
         if new:
             self._lasting.close()
@@ -433,7 +439,7 @@ class Product:
         self.plugged_ns = self.now_ns
 
     def truth(self) -> tuple[int, float, float, float, float]:
-        """Return the time of the board, the true pose, and the true speed of the fastest wheel."""
+        """Return the board's time, the true pose (m, m, rad) and the fastest wheel (rad/s)."""
         mcu = self._world.mcu
         vehicle = mcu.vehicle
         pose, fastest = vehicle.pose, max(map(abs, vehicle.speeds))
@@ -456,14 +462,14 @@ class Product:
         self._world.port.blocked = blocked
 
     def tear(self, taken: int) -> None:
-        """Have the kernel take only this many bytes of the next line."""
+        """Let the kernel accept only this many bytes of the next line."""
         self._world.port.takes = taken
 
     def step_wall(self, seconds: float) -> None:
         self._world.wall_offset_ns += int(seconds * 1e9)
 
     def end(self, way: str) -> None:
-        """End the daemon by SIGTERM (`term`), by an exception in a step, or at once (`kill`)."""
+        """End the daemon: by SIGTERM (`term`), a bug in a step (`crash ...`), or a `kill`."""
         world = self._world
         if way.startswith("crash"):
             self._crash(way)
@@ -482,7 +488,7 @@ class Product:
         self.alive = False
 
     def _crash(self, way: str) -> None:
-        """Take a step in which the robot, or the port behind it, raises an exception."""
+        """Run a step in which the robot raises an exception, or the port after the robot's step."""
         loop, port = self._world.loop, self._world.port
 
         def broken(*_: Any) -> Any:

@@ -1,11 +1,11 @@
-"""The promises of the product as predicates, judged from an omniscient view.
+"""The promises of the product, judged with the knowledge of all true events.
 
-`Witness` knows when each command was really sent, which stop and clear arrived when, and reads the
-lines on the wire with code of its own. It shares nothing with the product: each rule is written
-from the pages (`deploy/clients/README.md`, the README) and allows whatever they allow. The first
-predicate that does not hold raises `BrokenError` with its name.
+`Witness` knows when each command was really sent and when each stop and clear arrived, and it reads
+the lines on the wire with separate code. It shares nothing with the product. Each rule follows the
+documentation (`deploy/clients/README.md`, the README) and allows everything that the documentation
+allows. The first broken rule raises `BrokenError` with its name.
 
-Times are true ns from the start. A suspended robot's own clock stands, the true one does not.
+Times are true ns from the start. True time continues while the robot's clock stops in a suspend.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ before them arms nobody."""
 
 
 class BrokenError(AssertionError):
-    """A promise did not hold."""
+    """Raised when the product breaks a promise."""
 
     def __init__(self, promise: str, at_ns: int, text: str) -> None:
         super().__init__(f"{promise} at {at_ns / NS:.3f} s: {text}")
@@ -251,7 +251,7 @@ class Witness:
     def command(
         self, sender: dict[str, Any], message: Message, sample: Sample, arrived_ns: int
     ) -> Wish | None:
-        """Take note of a command that reached the daemon; return None if it cannot be read."""
+        """Record a command that reached the daemon. Return None if it is not readable."""
         self.delivered += 1
         self._unread.append((sample.key, None, ()))
         source = sender["source"]
@@ -291,9 +291,9 @@ class Witness:
         return wish
 
     def dropped(self, key: str) -> None:
-        """Note that the inbox dropped its oldest message of this key, which no step will read.
+        """Note that the inbox dropped its oldest message on this key, so no step will read it.
 
-        The robot does not follow it, and does not learn its delay.
+        The robot does not follow this command, and does not learn its delay.
         """
         place = next(n for n, (other, *_) in enumerate(self._unread) if other == key)
         del self._unread[place]
@@ -310,29 +310,32 @@ class Witness:
                 self._unread[place] = key, None, ()
 
     def _cancel_zeros(self, source: str, now_ns: int) -> None:
-        """Note what may be a speed of any program that shares its identity."""
+        """Cancel the zeros of the source's shared identities, because a possible speed arrived.
+
+        Any program with that identity may have sent the speed.
+        """
         for known in self._sharing.get(source, ()):
             self._arm(known, now_ns)
             known.zeros.clear()
 
     def _arm(self, known: Sender, now_ns: int) -> None:
-        """Arm a shared identity by the latest zero that the pause has passed behind."""
+        """Arm a shared identity by its latest zero after which the neutral pause is over."""
         place = bisect_right(known.zeros, (now_ns - self.pause_ns, now_ns))
         if place:
             known.armed_ns = max(known.armed_ns, known.zeros[place - 1][1])
 
     def arming(self, at_ns: int) -> None:
-        """Note an event after which every sender must send a zero."""
+        """Note an event that disarms all senders, so that each must send a zero."""
         self.armed_since_ns = max(self.armed_since_ns, at_ns)
 
     def suspended(self, at_ns: int) -> None:
-        """Note that the robot's clock stood, so that it cannot know the delays it knew before."""
+        """Note that the robot slept, so that it no longer knows the delays of the senders."""
         # The delays of the commands that wait for a step are of the time before.
         self._judge_ages()
         self.ages.forget_least(at_ns)
 
     def cleared(self, asked_ns: int, read_ns: int | None, text: str, name: str) -> None:
-        """Note a clear that worked, as the daemon says. Its sender saw the latch at `read_ns`."""
+        """Note that the daemon has executed a clear, whose sender read the latch at `read_ns`."""
         if text.startswith("nothing"):
             return
         self.counts["clear"] += 1
@@ -349,7 +352,7 @@ class Witness:
         self._release(self.stops, "a clear releases no later stop", asked_ns, read_ns, name)
 
     def activated(self, asked_ns: int, read_ns: int | None, name: str) -> None:
-        """Note an `activate` that worked, as the daemon says."""
+        """Note that the daemon has executed an `activate`."""
         self.perhaps_latched.discard("activate")
         if self.dormant_ns is not None or self.offs:
             self.arming(asked_ns)
@@ -372,7 +375,7 @@ class Witness:
         latched[:] = later
 
     def set_limits(self, at_ns: int, settings: dict[str, float], asked_ns: int) -> None:
-        """Note settings that a `set` has changed. With a full disk its answer is late."""
+        """Note that a `set` has changed these settings. With a full disk its answer comes late."""
         self.before, self.changed_ns = dict(self.limits), at_ns
         for key, value in settings.items():
             parts = key.split(".")
@@ -395,7 +398,7 @@ class Witness:
     def unanswered(self, verb: str, settings: dict[str, float], arrived_ns: int) -> None:
         """Note a call whose answer did not come before the daemon ended.
 
-        It may be in force after the restart, or not.
+        After the restart the call may have an effect or not.
         """
         if verb in ("stop", "clear"):
             self.perhaps_latched.add("clear")
@@ -419,7 +422,7 @@ class Witness:
                         self.limits[name] = max(value, self.limits[name])
 
     def file_is_behind(self) -> None:
-        """Note that the daemon ended before it wrote the latches in force into the file."""
+        """Note that the daemon ended before it could store its newest latches."""
         self.perhaps_latched |= {"clear", "activate"}
         self.stops.clear()
         self.offs.clear()
@@ -436,7 +439,8 @@ class Witness:
     # the steps and lines of the daemon
 
     def step(self, at_ns: int, mode: str, reason: str, fed_ns: int = -1) -> None:
-        """Judge the mode and the words for it; `fed_ns` is when the board was last heard."""
+        """Judge the mode and the reason. The daemon last received bytes of the board at `fed_ns`.
+        """
         if mode == "driving" and fed_ns >= 0:
             if self._silent(at_ns, fed_ns):
                 text = f"last heard {fed_ns / NS:.3f} s"
@@ -475,7 +479,7 @@ class Witness:
 
     @property
     def held(self) -> tuple[int, str] | None:
-        """Since when nothing may move, and why."""
+        """The time since which the robot must not move, and the cause, or None."""
         found = []
         if self.stops:
             found.append((self.stops[0], "a stop"))
@@ -491,7 +495,10 @@ class Witness:
 
     @property
     def _surely_held(self) -> tuple[int, str] | None:
-        """Like `held`, without each latch that a call that waits for the disk may have released."""
+        """Like `held`, but without latches that a pending call may have released.
+
+        A call is pending while the daemon waits for the disk.
+        """
         if not self.pending:
             return self.held
         cleared_ns, active_ns = self.pending.get("clear", -1), self.pending.get("activate", -1)
@@ -506,9 +513,10 @@ class Witness:
         return min(found, default=None)
 
     def ended(self, at_ns: int, moving: tuple[float, ...]) -> None:
-        """Judge an orderly end, which began with these wheel speeds and is over now.
+        """Judge the orderly end of the daemon, which began at these wheel speeds.
 
-        It may cut the ramp short, but only one that takes longer than this end may.
+        The daemon may cut the ramp short only if the ramp takes longer than the time for an orderly
+        end.
         """
         begun_ns = self.ending_ns
         if begun_ns is None or self.blocked_ns is not None or self._stalled[1] > begun_ns:
@@ -524,8 +532,11 @@ class Witness:
     def line(self, at_ns: int, line: bytes, fed_ns: int, made_ns: int) -> None:
         """Judge a line on the wire.
 
-        `fed_ns` is when the board was last heard. Speeds grow by the time between the steps that
-        made two lines, at `made_ns`; a stalled step hands its line over later.
+        Args:
+            at_ns: Time at which the line left.
+            line: The bytes of the line.
+            fed_ns: Time at which the daemon last received bytes of the board.
+            made_ns: Time of the step that made the line. The limits apply between such steps.
         """
         wheels = self._decoded.get(line) or self._read(at_ns, line)
         if wheels is None:
@@ -569,7 +580,7 @@ class Witness:
         self.last, self.last_ns, self.cut, self.rested = wheels, made_ns, False, False
 
     def obeyed(self, at_ns: int, wheels: tuple[float, ...]) -> None:
-        """Judge that a wheel which clearly does not obey is a fault of the robot."""
+        """Check that the robot reports a fault if a wheel clearly does not obey."""
         clear = self.mode == "driving" and self.linked
         for place, speed in enumerate(wheels):
             since_ns, before = self._driven[place]
@@ -592,7 +603,7 @@ class Witness:
             raise BrokenError("a wheel that does not obey is a fault", at_ns, text)
 
     def reported(self, at_ns: int, lines: bytes) -> None:
-        """Note lines of the board, which report the speeds of its motors a to d."""
+        """Record the motor speeds in lines of the board."""
         if len(self.lies) != 1 or self.lies[0][0] != "dead_motor":
             return
         letter = "abcd"[self.lies[0][1][0]].encode()
@@ -600,9 +611,9 @@ class Witness:
             self._turned_ns = at_ns
 
     def stalls(self, begun_ns: int, ended_ns: int) -> None:
-        """Note a stall of the host. The steps behind it read the bytes that came meanwhile.
+        """Note a stall of the host. The steps after it read the bytes that arrived during it.
 
-        The daemon sees no speed while it stands still, so that time is no part of a pause.
+        The daemon reads no speeds during a stall, so the stall does not count as part of a pause.
         """
         lasts_ns = ended_ns - begun_ns
         if lasts_ns > LATE_NS:
@@ -615,14 +626,14 @@ class Witness:
         self._stalled = begun_ns, ended_ns
 
     def _silent(self, at_ns: int, fed_ns: int) -> bool:
-        """Return whether the daemon must know that the board is silent."""
+        """Return whether the board has been silent for so long that the daemon must know it."""
         tolerance_ns = 2 * self.period_ns + MARGIN_NS
         begun_ns, ended_ns = self._stalled
         stalled = begun_ns <= at_ns < ended_ns + tolerance_ns
         return at_ns - fed_ns > self.quiet_ns + tolerance_ns and not stalled
 
     def _read(self, at_ns: int, line: bytes) -> tuple[float, ...] | None:
-        """Return the wheel speeds of a line, None for a question to the board or a torn line."""
+        """Return the wheel speeds of a line, or None for a question to the board or a torn line."""
         match = LINE.match(line)
         if match is not None and not line.endswith(b"\n"):
             return None  # only its end is missing: the board may obey it, and the daemon says no
@@ -638,19 +649,23 @@ class Witness:
         return wheels
 
     def twist(self, wheels: tuple[float, ...]) -> tuple[float, float]:
-        """Return the speed and turn rate of these wheels, front right and front left first."""
+        """Return the speed (m/s) and turn rate (rad/s) for these wheel speeds (rad/s).
+
+        The first two wheels are front right and front left.
+        """
         right, left = self.radii[0] * wheels[0], self.radii[1] * wheels[1]
         return (right + left) / 2, (right - left) / (2 * self.half)
 
     def _most(self, name: str, at_ns: int) -> float:
-        """Return a limit; shortly after it was changed the larger of the two."""
+        """Return a limit. Shortly after a change, return the larger of the old and the new value.
+        """
         value = self.limits[name]
         if at_ns - self.changed_ns < MARGIN_NS + self.period_ns:
             return float(max(value, self.before[name]))
         return float(value)
 
     def _most_limits(self, at_ns: int) -> dict[str, float]:
-        """Return all limits; shortly after a change the larger one of each two."""
+        """Return all limits. Shortly after a change, use the larger of the old and new values."""
         if at_ns - self.changed_ns < MARGIN_NS + self.period_ns:
             return {name: max(value, self.before[name]) for name, value in self.limits.items()}
         return self.limits
@@ -691,7 +706,7 @@ class Witness:
                 )  # fmt: skip
 
     def _jerk(self, at_ns: int, wheels: tuple[float, ...], dt: int) -> None:
-        """Judge the change of the acceleration while a speed grows."""
+        """Check that the acceleration changes within the jerk limit while a speed grows."""
         rim, longest_s = self._most("wheel_speed", at_ns), max(0.05, 1.5 * self.period_ns / NS)
         saturated = max(map(abs, wheels)) > rim - STEP or _fastest(self.last) > rim - STEP
         # A line that goes at once, or late, belongs to a step of another length than its interval.
@@ -716,9 +731,10 @@ class Witness:
                     )  # fmt: skip
 
     def ramp_ns(self, stop: bool, wheels: tuple[float, ...] | None = None) -> int:
-        """Return how long the softest limits of this drive allow a ramp to rest to take.
+        """Return the longest time that a ramp to rest may take, in ns.
 
-        The ramp begins at these wheel speeds, or else at the highest ones.
+        It uses the lowest limits of this drive. The ramp begins at these wheel speeds, or at the
+        highest possible ones.
         """
         low = self.softest
         rim = low["wheel_speed"] * self.radius
@@ -752,7 +768,7 @@ class Witness:
             raise BrokenError(name, at_ns, text)
 
     def wheels(self, at_ns: int, fastest: float) -> None:
-        """Judge the true wheels: those of a robot that is held must stand in the end."""
+        """Check that the true wheels come to rest if the robot must not move."""
         unseen, self._wheels_ns = at_ns - self._wheels_ns > NS // 2, at_ns
         if self.last != ZERO or fastest > 0.1 or unseen:
             self._turns_ns = at_ns
@@ -796,7 +812,7 @@ class Witness:
     def _explains(
         self, at_ns: int, wheels: tuple[float, ...], before: tuple[float, ...], grows: bool
     ) -> tuple[Wish | None, str]:
-        """Return a wish that allows this line, or None and the reason against the latest one."""
+        """Return a command that allows this line, or None and why the latest one does not."""
         slack = self.period_ns + MARGIN_NS
         wishes, longest = self.wishes, max(self.timeout.values()) + slack
         while wishes and wishes[0][1].arrived_ns < at_ns - longest:
@@ -826,7 +842,10 @@ class Witness:
         return None, why
 
     def _lowest(self, at_ns: int) -> int:
-        """Return the highest priority of a source that certainly sends now."""
+        """Return the lowest priority that may still drive: the highest one of the active sources.
+
+        Only sources that certainly send now are counted.
+        """
         if self.churned:
             return 0
         # A call without an answer may be in force.
@@ -842,7 +861,7 @@ class Witness:
         return found
 
     def _leads(self, wish: Wish, wheels: tuple[float, ...], before: tuple[float, ...]) -> bool:
-        """Return whether the way from `before` to `wheels` leads towards the wish."""
+        """Return whether the change from `before` to `wheels` approaches the commanded speeds."""
         if self.away and self._approaches(self.clamped(wish.v, 0.0), wheels, before):
             return True  # away from a bumper the robot does not turn
         return self._approaches(self.clamped(wish.v, wish.w), wheels, before)
@@ -850,7 +869,7 @@ class Witness:
     def _approaches(
         self, goal: tuple[float, float], wheels: tuple[float, ...], before: tuple[float, ...]
     ) -> bool:
-        """Return whether neither speed grows beyond the goal, or away from it."""
+        """Return whether no speed exceeds its goal or grows away from it."""
         for new, old, wished, room in zip(
             self.twist(wheels),
             self.twist(before),
@@ -866,9 +885,9 @@ class Witness:
     def clamped(
         self, v: float, w: float, limits: dict[str, float] | None = None
     ) -> tuple[float, float]:
-        """Return a wish scaled down to the limits with its curvature kept.
+        """Return commanded speeds scaled down to the limits, on the same curve.
 
-        Without limits it is scaled to the highest ones of this drive.
+        Without `limits` it uses the highest limits of this drive.
         """
         limits, scale = limits or self.softest, 1.0
         scale = min(scale, limits["linear_speed"] / abs(v) if v else 1.0)
@@ -881,7 +900,7 @@ class Witness:
 
 
 def disobeys(name: str, values: tuple[Any, ...]) -> bool:
-    """Return whether a wheel with this fault of the board clearly does not obey its command."""
+    """Return whether this fault of the board makes a wheel clearly disobey its command."""
     if name == "bias":
         return values[1] in (-1.0, 9.0)
     return name in ("dead_motor", "stuck_encoder", "reversed_motor", "reversed_encoder")

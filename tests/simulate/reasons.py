@@ -1,9 +1,9 @@
-"""The words of a robot that stands although a sender wishes a speed, held against the true cause.
+"""Compares the reason of a resting robot with the true cause, while a sender sends speeds.
 
-The pages say that `state` has the reason for each refusal: in `reason`, or in the `waits_for` of
-the source. Here the words are sorted into kinds of causes, and only the kind is judged. A kind is
-right if the omniscient view allows it. The view knows which senders stamp, how steady their
-network is, what arrived when, and since when nothing has happened beside commands.
+The documentation says that `state` has the reason of each refusal, in `reason` or in the source's
+`waits_for`. This module sorts the texts into kinds of causes and judges only the kind. A kind is
+right if the true events allow it. The module knows which senders stamp, how constant their delays
+are, when each message arrived, and when the last other event happened.
 """
 
 from __future__ import annotations
@@ -46,7 +46,10 @@ FORGOTTEN_NS = 200 * NS
 
 
 def kind_of(words: str) -> tuple[str, str]:
-    """Return the kind of cause that the words name and the source in them, "?" for no kind."""
+    """Return the kind of cause in a text, and the source that it names.
+
+    The kind is "?" if no pattern matches.
+    """
     for kind, pattern in KINDS:
         match = pattern.search(words)
         if match is not None:
@@ -77,12 +80,12 @@ class _Clock:
         return not self.odd and self.most_ns - self.least_ns <= STEADY_NS
 
     def known(self, at_ns: int, timeout_ns: int) -> bool:
-        """Return whether its proof certainly was over at this time."""
+        """Return whether the daemon certainly had proved this clock's delays at this time."""
         lasted = at_ns - self.first_ns
         return self.steady and lasted > 5 * min(timeout_ns, 2 * NS) + NS and self.count >= PROOF
 
     def may_be_known(self, at_ns: int, timeout_ns: int) -> bool:
-        """Return whether its proof may have been over at this time."""
+        """Return whether the daemon may have proved this clock's delays at this time."""
         return (
             self.odd or self.unsure or at_ns - self.first_ns > min(timeout_ns, 2 * NS) - MARGIN_NS
         )
@@ -105,7 +108,7 @@ class _Heard:
 
 
 class Reasons:
-    """The messages that one daemon received, and the reasons that it publishes while it stands."""
+    """The messages that one daemon received, and the judge of the reasons that it publishes."""
 
     def __init__(self, run: Run) -> None:
         self.run = run
@@ -118,9 +121,9 @@ class Reasons:
         self.restart()
 
     def restart(self, stood: bool = False) -> None:
-        """Forget all senders: another daemon starts, or the robot's clock `stood`.
+        """Forget all senders, because a daemon starts, or because the robot slept (`stood`).
 
-        A daemon whose clock stood still knows the delays from before, so they look changed to it.
+        After a sleep the daemon still remembers the old delays, so all delays look changed to it.
         """
         self._stood = stood
         if stood:
@@ -137,7 +140,7 @@ class Reasons:
         """Sources with refused messages, any of which may undo the zero of a shared identity."""
 
     def command(self, sender: dict[str, Any], message: Message, one: Sample) -> None:
-        """Take note of a command that the witness has noted just before."""
+        """Record a command. The caller has passed it to the witness before."""
         source = sender["source"]
         if message.junk or sender.get("bad_stamps"):
             self._junk.add(source)
@@ -164,11 +167,11 @@ class Reasons:
         heard.clock = clock
 
     def dropped(self, key: str, at_ns: int) -> None:
-        """Note that the inbox dropped a message of this key unread."""
+        """Note that the inbox dropped a message on this key before a step read it."""
         self._dropped_ns[key.split("/")[1]] = at_ns
 
     def _clock(self, name: str, at_ns: int, delay_ns: int) -> _Clock:
-        """Return the clock of this name with one more delay."""
+        """Add a delay to the clock of this name, and return the clock."""
         clock = self._clocks.get(name)
         if clock is None:
             clock = self._clocks[name] = _Clock(at_ns, delay_ns)
@@ -184,7 +187,7 @@ class Reasons:
         return clock
 
     def look(self, now_ns: int, stalled_ns: int) -> None:
-        """Judge `state` if the robot has been ready for a while and a sender wishes a speed."""
+        """Judge `state` if the robot has been ready for a while although a sender sends speeds."""
         run, witness = self.run, self.run.witness
         if witness.mode != "ready":
             self._ready_ns = -1
@@ -209,7 +212,7 @@ class Reasons:
             self._judge(now_ns, wishing, run.product.state())
 
     def _waits(self, source: str, heard: _Heard, now_ns: int, tick_ns: int) -> bool:
-        """Return whether the daemon certainly has a speed of this sender, and it is live."""
+        """Return whether the daemon certainly has a fresh speed of this sender."""
         age_ns = now_ns - heard.speed_ns
         return (
             heard.speed_ns == heard.arrived_ns > self._calm_ns + tick_ns
@@ -218,7 +221,7 @@ class Reasons:
         )
 
     def _judge(self, now_ns: int, wishing: list[str], state: dict[str, Any]) -> None:
-        """Compare the words of `state` with the possible causes."""
+        """Compare the reasons in `state` with the possible causes."""
         self.run.counts["reason looks"] += 1
         name = "every refusal has its reason in state"
         words = {one["name"]: one["waits_for"] for one in state["sources"]}
@@ -235,7 +238,7 @@ class Reasons:
             raise BrokenError(name, now_ns, text)
 
     def allowed(self, source: str, now_ns: int) -> set[str]:
-        """Return the kinds of causes that this source may wait for now, if it has live senders."""
+        """Return the kinds of causes for which this source may wait now."""
         witness, found = self.run.witness, set[str]()
         timeout_ns = witness.timeout[source]
         for heard in self._live(source, now_ns):
@@ -266,7 +269,7 @@ class Reasons:
         return found
 
     def _live(self, source: str, now_ns: int) -> list[_Heard]:
-        """Return the senders of this source that may be live."""
+        """Return the senders of this source whose last command may still be fresh."""
         longest_ns = self.run.witness.timeout[source] + MARGIN_NS
         senders = self._heard.get(source, {}).values()
         return [heard for heard in senders if now_ns - heard.arrived_ns <= longest_ns]

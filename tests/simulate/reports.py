@@ -1,7 +1,7 @@
-"""The robot's reports about itself, compared with the true events.
+"""Compares the robot's reports about itself with the true events.
 
-The lines on the wire do not show which of several commands the robot follows, or what `state` says
-of its speed while the board says nothing.
+The lines on the wire do not show which of several commands the robot follows. They also do not show
+the speed in `state` while the board is silent.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ ECHO_WAY = 0.5
 
 
 class Reports:
-    """The commands that arrived at one daemon, by their time, and the newest it has followed."""
+    """The commands that arrived at one daemon, by arrival time, and the newest followed ones."""
 
     def __init__(self) -> None:
         self._arrived: dict[int, tuple[str, int] | None] = {}
@@ -54,7 +54,7 @@ class Reports:
     def command(
         self, sender: dict[str, Any], message: Message, sample: Sample, arrived_ns: int, loose: bool
     ) -> None:
-        """Take note of a command; `loose` if other senders stamp by the same clock."""
+        """Record a command. `loose` is true if other senders use the same clock."""
         if message.junk in REFUSED_AS:
             # A twist on a key of wheel speeds is wrong in two ways.
             twice_wrong = message.junk in ("fields", "garbage") and "wheel_cmd/" in sample.key
@@ -71,9 +71,9 @@ class Reports:
             del self._arrived[self._order.popleft()]
 
     def follows(self, at_ns: int, followed_ns: int) -> str:
-        """Judge the command that the robot follows: none older than one that it has followed.
+        """Check that the robot does not follow an older command after a newer one.
 
-        Return its clock, or "" if the order of that clock says nothing.
+        Returns the command's clock, or "" if its messages have no certain order.
         """
         known = self._arrived.get(followed_ns)
         if known is None:
@@ -89,7 +89,10 @@ class Reports:
         return clock
 
     def judge_junk(self, at_ns: int, state: dict[str, Any], dropped: int) -> None:
-        """Hold the counters of junk against what arrived; `dropped` messages were never read."""
+        """Compare the counters of refused messages with the messages that arrived.
+
+        The daemon never read `dropped` of them.
+        """
         for reason in REFUSED_AS.values():
             expected, counted = self._junk[reason], state["counters"].get(f"command_{reason}", 0)
             most = expected
@@ -101,7 +104,7 @@ class Reports:
 
 
 def judge_state(at_ns: int, state: dict[str, Any], fed_ns: int, quiet_ns: int) -> None:
-    """Hold the speeds in `state` against the time at which the board was last heard."""
+    """Check that `state` has no speeds if the board has been silent since `fed_ns` for too long."""
     said = state["linear"], state["angular"], state["wheels"]
     if at_ns - fed_ns > quiet_ns + 2 * MARGIN_NS and said != (None, None, []):
         raise BrokenError(
@@ -113,7 +116,7 @@ def judge_state(at_ns: int, state: dict[str, Any], fed_ns: int, quiet_ns: int) -
 def judge_pose(
     at_ns: int, state: dict[str, Any], pose: tuple[float, float, float], fed_ns: int, quiet_ns: int
 ) -> None:
-    """Hold the pose in `state` against that of the last estimate, while the board is silent."""
+    """Check that the pose in `state` does not change while the board is silent."""
     said = state["x"], state["y"], state["yaw"]
     moved = max(abs(a - b) for a, b in zip(said, pose, strict=True))
     if at_ns - fed_ns > quiet_ns + 2 * MARGIN_NS and moved > 1e-6:
@@ -122,9 +125,9 @@ def judge_pose(
 
 
 def judge_counts(at_ns: int, state: dict[str, Any], expected: int) -> None:
-    """Hold the counters against the number of commands that arrived: each is in one of them.
+    """Check that each command that arrived is counted in exactly one counter.
 
-    `command_displaced` counts the steps in which commands were dropped unread.
+    `command_displaced` is left out, because it counts steps and not commands.
     """
     counters = {n: v for n, v in state["counters"].items() if n != "command_displaced"}
     counted = counters.get("commands", 0) + counters.get("commands_of_new_senders", 0)
@@ -135,19 +138,19 @@ def judge_counts(at_ns: int, state: dict[str, Any], expected: int) -> None:
 
 
 class _Changes:
-    """The changes of speed in lines of which each is an echo."""
+    """The changes of speed in the lines that the daemon receives back as echoes."""
 
     def __init__(self) -> None:
         self.on = False
         self.restart()
 
     def begin(self) -> None:
-        """Note that from now on the daemon hears itself."""
+        """Note that from now on the daemon receives its own lines."""
         self.on = True
         self.restart()
 
     def restart(self) -> None:
-        """Note that the daemon, or the opening of its port, begins anew."""
+        """Restart, because the daemon started or opened its port again."""
         self._lines, self._change = 0, 0.0
         self._since_corner = 0
         """Number of lines since the first bend of the speeds, which may still be on the wire."""
@@ -155,7 +158,7 @@ class _Changes:
         self._slope: list[float] = []
 
     def take(self, wheels: tuple[float, ...]) -> bool:
-        """Take a line, and return whether the echo is surely known now."""
+        """Add a line. Return whether the daemon must have recognised the echo by now."""
         last, before = self._last, self._slope
         if self.on:
             self._last = wheels
@@ -175,34 +178,37 @@ class _Changes:
 
 
 class Echo(_Changes):
-    """The lines while TX is joined to RX and no board answers."""
+    """The daemon's lines while its TX is connected to its RX and no board answers."""
 
     def line(self, at_ns: int, wheels: tuple[float, ...]) -> None:
-        """Judge a line: an echo through changes of speed is known as one."""
+        """Check that the daemon stops driving when enough changes of speed have shown the echo."""
         if self.take(wheels) and any(wheels):
             raise BrokenError("an echo is no board", at_ns, self.text)
 
 
 class HalfDuplex(_Changes):
-    """The lines and the pose while the daemon hears its own lines beside those of the board.
+    """The lines and the pose while the daemon receives its own lines beside those of the board.
 
-    The pose then has a part of the commanded motion. That must not stay unseen while the robot
-    drives at other speeds than the commanded ones.
+    The pose then includes a part of the commanded motion, even if the robot drives at other speeds.
+    The daemon must notice that.
     """
 
     def restart(self) -> None:
-        """Note that the daemon, or the opening of its port, begins anew."""
+        """Restart, because the daemon started or opened its port again."""
         super().restart()
         self._known = False
         self._way = 0.0
         self._before: tuple[float, ...] | None = None
 
     def line(self, wheels: tuple[float, ...]) -> None:
-        """Take a line that went to the board."""
+        """Add a line that went to the board."""
         self._known |= self.take(wheels)
 
     def see(self, at_ns: int, mode: str, pose: tuple[float, ...], true: tuple[float, ...]) -> None:
-        """Judge a step: compare the ways since the echo began. Both tuples begin with x and y."""
+        """Judge a step: compare the pose's distance with the true one since the echo began.
+
+        Both tuples begin with x and y in m.
+        """
         before, self._before = self._before, (*pose[:2], *true[:2])
         if before is None:
             return

@@ -1,6 +1,6 @@
-"""The messages of one sender of a plan: when each is sent, when it arrives, and its bytes.
+"""Creates the messages of one sender of a plan: their times of sending and arrival, and bytes.
 
-Nothing here knows the product: the formats are those of `deploy/clients/README.md`.
+This module does not use the product. The formats are those of `deploy/clients/README.md`.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ JUNK = ("garbage", "not a number", "delete", "wildcard", "huge", "stranger", "ca
 
 
 class Message(NamedTuple):
-    """One command, as the omniscient view knows it. Times are true ns."""
+    """One command with its true times, in ns."""
 
     sent_ns: int
     arrives_ns: int
@@ -47,7 +47,7 @@ class Message(NamedTuple):
 
 
 class Sample(NamedTuple):
-    """A sample as the bus hands it over, with the identity of its sender."""
+    """A sample as the bus delivers it, with its sender's identity."""
 
     key: str
     payload: bytes
@@ -59,7 +59,10 @@ class Sample(NamedTuple):
 
 
 def messages(sender: dict[str, Any], seed: int, seconds: float, wall_ns: int) -> list[Message]:
-    """Return all messages of a sender in the order of their arrival. `wall_ns` is at time 0."""
+    """Return all messages of a sender in the order of their arrival.
+
+    `wall_ns` is the wall-clock time at the start of the plan.
+    """
     dice = random.Random(f"{seed} {sender['name']}")
     # Most senders of junk send few kinds of it, because one kind may hide what another one does.
     swarm = random.Random(f"junk {seed} {sender['name']}")
@@ -109,7 +112,7 @@ def messages(sender: dict[str, Any], seed: int, seconds: float, wall_ns: int) ->
 
 
 def _let_last_wait(found: list[Message], number: int, until_ns: int) -> None:
-    """Let the message with this number, which is the last one so far, arrive at this time."""
+    """Delay the last message, which has this number, until this time."""
     for place in range(max(0, len(found) - 2), len(found)):
         if found[place].number == number:
             found[place] = found[place]._replace(arrives_ns=until_ns)
@@ -133,7 +136,7 @@ def _jitter(scale: float, chance: float) -> float:
 
 
 def _held(sender: dict[str, Any], t: float) -> float:
-    """How much longer a message takes that is sent at `t`, s."""
+    """Return the additional network delay of a message that is sent at `t`, in s."""
     for begin, end, shape, size in sender["congestion"]:
         if shape == "drain":
             # Everything waits until half of the time is over, then flows faster than it was sent.
@@ -156,7 +159,7 @@ def _held(sender: dict[str, Any], t: float) -> float:
 
 
 def _ahead(sender: dict[str, Any], t: float) -> float:
-    """By how much the sender's clock is ahead of the true one, s."""
+    """Return the offset of the sender's clock from true time at `t`, in s."""
     ahead = sender["ahead"] + sender["drift"] * t
     for kind, at, *rest in sender["clock"]:
         if kind == "step" and t >= at:
@@ -167,14 +170,15 @@ def _ahead(sender: dict[str, Any], t: float) -> float:
 
 
 def stable(sender: dict[str, Any]) -> bool:
-    """Return whether nothing adjusts this sender's clock, and all its stamps are true."""
+    """Return whether the sender's clock is never adjusted and all its stamps are right."""
     return not sender["clock"] and not sender.get("bad_stamps")
 
 
 def sample(
     sender: dict[str, Any], message: Message, config: dict[str, Any], robot_wall_ns: int
 ) -> Sample:
-    """Return a message as it arrives at the robot, whose wall clock shows `robot_wall_ns`."""
+    """Return the sample of a message. The robot's wall clock shows `robot_wall_ns` at its arrival.
+    """
     way, source = sender["way"], sender["source"]
     options: dict[str, Any] = {}
     own = f"{sender['id']}{message.number}" if sender["churn"] else sender["id"]
@@ -300,9 +304,9 @@ def _is_stamped(sender: dict[str, Any]) -> bool:
 
 
 def _seconds(sender: dict[str, Any], message: Message) -> tuple[int, int]:
-    """Return the stamp as the header has it, with signed seconds of 32 bits.
+    """Return the stamp of a header in signed 32-bit seconds and ns.
 
-    It is 0 in a zero of a sender that stamps only its speeds.
+    It is 0 for a zero if the sender stamps only its speeds.
     """
     if sender.get("stamps_speeds") and not (message.v or message.w):
         return 0, 0
@@ -324,7 +328,7 @@ def _wheels(config: dict[str, Any], v: float, w: float, cancels: bool) -> bytes:
 
 
 def parameters(settings: dict[str, float]) -> bytes:
-    """Return a request of ROS in CDR that sets these parameters."""
+    """Return a ROS request in CDR that sets these parameters."""
     out = struct.pack("<I", len(settings))
     for name, value in settings.items():
         text = name.encode() + b"\0"
@@ -337,9 +341,9 @@ def parameters(settings: dict[str, float]) -> bytes:
 
 
 def read_reply(reply: bytes, via: str, listed: bool = False) -> tuple[bool, str]:
-    """Return whether a call worked, and the answer in words.
+    """Return whether a call succeeded, and the text of its answer.
 
-    `listed` is true for a reply of ROS with a list of results, of which the first is read.
+    `listed` is true for a ROS reply with a list of results. Only the first result is read.
     """
     if via == "native":
         found = msgspec.json.decode(reply)

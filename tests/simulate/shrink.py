@@ -1,8 +1,8 @@
-"""Drops each part of a plan that its finding does not need.
+"""Removes each part of a plan that is not needed to break the same promise.
 
-The method is delta debugging (Zeller & Hildebrandt, 2002). A part of a plan is named by its path: a
-sender, an event, a phase of a sender, a setting. Each sender draws its chances by its own name, so
-the others do the same without it.
+The method is delta debugging (Zeller & Hildebrandt, 2002). A part is a sender, an event, a phase of
+a sender or a setting, and is identified by its path. Each sender has a random generator that
+depends on its name, so the other senders stay the same when one is removed.
 """
 
 from __future__ import annotations
@@ -37,7 +37,8 @@ class _Search:
         return result if result.promise == self.promise else None
 
     def drop(self, kind: Callable[[Plan], list[Part]]) -> None:
-        """Drop parts of one kind: halves first, then quarters, down to single ones."""
+        """Remove all unneeded parts of one kind: try halves first, then quarters, then single ones.
+        """
         parts = kind(self.plan)
         size = max(1, len(parts) // 2)
         while parts:
@@ -57,14 +58,14 @@ class _Search:
                 size = max(1, size // 2)
 
     def cut(self, result: Result) -> None:
-        """End the plan just behind the finding, unless only its end shows it."""
+        """End the plan shortly after the broken promise, if that is before the plan's end."""
         at = result.at_ns / 1e9
         if at < self.plan["seconds"]:
             self.plan = ended(self.plan, at)
 
 
 def ended(plan: Plan, at: float) -> Plan:
-    """Return the plan without all that begins behind this time."""
+    """Return the plan without events and phases that begin after this time."""
     less = deepcopy(plan)
     less["seconds"] = round(at + 0.5, 3)
     less["events"] = [event for event in less["events"] if event["at"] <= at]
@@ -74,12 +75,12 @@ def ended(plan: Plan, at: float) -> Plan:
 
 
 def large(plan: Plan) -> list[Part]:
-    """Return the senders and events of a plan."""
+    """Return the paths of the senders and events of a plan."""
     return [(kind, n) for kind in ("senders", "events") for n in range(len(plan[kind]))]
 
 
 def small(plan: Plan) -> list[Part]:
-    """Return the phases, congestions and clock changes of all senders."""
+    """Return the paths of the phases, congestions and clock changes of all senders."""
     lists = ("phases", "congestion", "clock")
     return [
         ("senders", n, name, place)
@@ -90,7 +91,10 @@ def small(plan: Plan) -> list[Part]:
 
 
 def settings(plan: Plan) -> list[Part]:
-    """Return the settings that may be at their defaults; the simulator itself reads the others."""
+    """Return the paths of the settings that can be removed, so that their defaults apply.
+
+    The simulator needs the other settings itself.
+    """
     needed = ("limits", "commands")
     return [
         ("config", table, key)
@@ -130,7 +134,7 @@ def written(plan: Plan, result: Result, commit: str) -> str:
 
 
 def kept(plan: Plan, result: Result, commit: str, path: Path) -> str:
-    """Write a corpus file, which `test_corpus.py` plays from now on; return where."""
+    """Write a corpus file, which `test_corpus.py` then plays. Return a message with its path."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(written(plan, result, commit), encoding="utf-8")
     return f"{path}: commit it with the change that mends this"

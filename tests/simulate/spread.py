@@ -1,8 +1,8 @@
-"""The upper bound of the pose's covariance: it grows by no more than the motion explains.
+"""The upper bound of the pose's covariance: it must not grow more than the motion justifies.
 
-A covariance that is too small is a broken promise of `pose.py`. One that is far too large makes a
-filter ignore the odometry. The error rates of `[odometry]` bound the growth from one estimate to
-the next, by the distance and the turn between them.
+`pose.py` judges a covariance that is too small. With one that is far too large, a filter ignores
+the odometry. The error rates in `[odometry]`, with the distance and the turn between two estimates,
+limit how much the covariance may grow.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ LEAST_NS = 12_000_000
 
 
 class Spread:
-    """The highest variances that the motion since an anchor explains."""
+    """The largest standard deviations that the motion since an anchor justifies."""
 
     def __init__(self, witness: Witness) -> None:
         config = witness.config
@@ -65,15 +65,15 @@ class Spread:
         """Standard deviation of the position, m, and of the heading, rad: the bounds."""
 
     def forget(self) -> None:
-        """Note that the next estimate has another covariance for another reason than motion."""
+        """Note that the next estimate's covariance changes for another reason than motion."""
         self._last = None
 
     def trouble(self, now_ns: int) -> None:
-        """Note that a line with a wrong speed may have come now."""
+        """Note that the board may have sent a line with a wrong speed."""
         self._calm_ns = now_ns + CALM_NS
 
     def see(self, now_ns: int, estimate: Estimate, faults: set[str]) -> None:
-        """Judge an estimate while the board has these faults."""
+        """Judge an estimate. `faults` are the present faults of the board."""
         if not self._judged:
             return
         if not faults <= DIALECTS:

@@ -1,4 +1,4 @@
-"""A plan that once broke a promise breaks none now.
+"""Plays the plans that once broke a promise, and checks that they break none now.
 
 `--shrink SEED --keep NAME` adds a plan.
 """

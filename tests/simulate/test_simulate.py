@@ -1,4 +1,4 @@
-"""The simulator itself: it repeats a seed to the byte, finds a planted fault and shrinks it."""
+"""Tests of the simulator: it repeats a seed exactly, finds a planted fault and shrinks its plan."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ EMPTY: Plan = {
 
 
 def quiet() -> Plan:
-    """A plan in which nothing happens but the lawful drive at the end."""
+    """Return a plan without senders and events. Only the lawful sender drives at its end."""
     return EMPTY | {"config": PLAIN["config"]}
 
 
@@ -152,14 +152,14 @@ def test_the_plan_of_each_finding_is_kept_and_the_first_ones_are_shrunk(
 
 
 def moves(witness: Witness, at_s: float) -> None:
-    """Put a first slow line on the wire."""
+    """Give the judge a first line with a low speed."""
     witness.line(
         int(at_s * NS), b"ap00.02,bp00.02,cp00.02,dp00.02\r\n", int(at_s * NS), int(at_s * NS)
     )
 
 
 def witnessed() -> Witness:
-    """A witness of a robot that has just started, and drives."""
+    """Return a judge of a robot that has just started to drive."""
     witness = Witness(PLAIN["config"])
     witness.step(NS // 2, "driving", "driving: commanded by app")
     return witness
@@ -214,7 +214,7 @@ RESTS, MOVES = [
 
 
 class Bench:
-    """The judge of the inputs beside a witness, without a product. Times are in s."""
+    """The judge of the board's inputs with a witness, without a product. Times are in s."""
 
     def __init__(self, **safety: Any) -> None:
         config = PLAIN["config"] | {"safety": safety}
@@ -225,7 +225,7 @@ class Bench:
         self.reason = "a reason"
 
     def step(self, at: float, data: bytes = b"", mode: str = "stopped", *lines: Any) -> None:
-        """Have a step read these bytes and send these lines."""
+        """Give the judge a step that reads these bytes and sends these lines."""
         at_ns = round(at * NS)
         if not self.state:
             self.inputs._looked_ns = at_ns  # `state` is not judged
@@ -562,7 +562,7 @@ def test_a_plan_with_bumpers_breaks_no_promise_and_a_robot_that_ignores_them_doe
 
 
 def driven(**changes: Any) -> Plan:
-    """A plan in which a sender that keeps all rules drives from 1.3 s on."""
+    """Return a plan in which a lawful sender drives from 1.3 s on."""
     source = max(PLAIN["config"]["commands"]["sources"], key=lambda one: one["priority"])
     clean = {
         "wheels": False, "hz": 50.0, "from": 0.0, "to": 12.0, "jitter": 0.0, "congestion": [],
@@ -594,7 +594,10 @@ def test_a_sender_that_must_send_a_zero_without_an_event_is_a_finding(noted: boo
 
 @pytest.mark.slow
 def test_a_zero_before_the_greeting_of_a_board_arms_nobody() -> None:
-    """The greeting may be the first bytes of all (seed 182028320)."""
+    """The board's boot line may be the first bytes that it sends. It disarms all senders.
+
+    The judge once missed that (seed 182028320).
+    """
     config = PLAIN["config"] | {"sim": PLAIN["config"]["sim"] | {"boot_time": 0.5}}
     result = played(driven(config=config))
     assert (result.finding, result.counts["lawful looks"]) == ("", 0)
@@ -602,7 +605,7 @@ def test_a_zero_before_the_greeting_of_a_board_arms_nobody() -> None:
 
 @pytest.mark.slow
 def test_a_zero_whose_pause_was_interrupted_by_a_stall_arms_nobody_behind_the_next_stall() -> None:
-    """Seed 2702000061."""
+    """The judge does not expect the robot to drive after such a zero (seed 2702000061)."""
     stalls = [{"at": 2.6, "do": "stall", "for": 0.5}, {"at": 7.0, "do": "stall", "for": 0.2}]
     plan = driven(events=stalls)
     plan["senders"][0] |= {"from": 2.0, "phases": [[2.0, 0.0, 0.0], [3.49, 0.3, 0.0]]}
@@ -612,7 +615,7 @@ def test_a_zero_whose_pause_was_interrupted_by_a_stall_arms_nobody_behind_the_ne
 
 @pytest.mark.slow
 def test_a_plan_may_switch_the_robot_off_behind_its_end() -> None:
-    """Seed 182028330."""
+    """The judge accepts a late `deactivate` during the lawful drive at the end (seed 182028330)."""
     call = {"verb": "deactivate", "late": 0.0, "lost": False, "twice": False, "via": "native"}
     plan = quiet() | {"events": [{"at": 8.0, "do": "call", "by": "op1", **call}]}
     result = played(plan)
@@ -620,7 +623,7 @@ def test_a_plan_may_switch_the_robot_off_behind_its_end() -> None:
 
 
 def ramp(witness: Witness, fastest: float, share: float) -> None:
-    """Put lines on the wire that fall from this speed by a share of the deceleration."""
+    """Give the judge lines that ramp down from this speed at `share` times the deceleration."""
     radius, fall = witness.radius, witness.limits["linear_deceleration"]
     for n in range(1, 400):
         speed = fastest - n * 0.01 * share * fall / radius
@@ -795,7 +798,7 @@ def test_only_a_gyro_may_correct_the_heading_once_and_soon_after_a_wheel_fault(
 
 
 def hung(rests_s: float, rate: float, off: float, deviation: float) -> None:
-    """Judge a robot that rests, whose gyro repeats `rate`, and whose heading is wrong by `off`."""
+    """Judge a robot at rest whose gyro hangs at `rate`, and whose heading is wrong by `off`."""
     pose, gyro = PoseWitness({"odometry": {"gyro": True}}), GyroFaults()
     covariance = (0.0001, 0.0, 0.0, 0.0001, 0.0, deviation**2)
 
@@ -1050,7 +1053,10 @@ def test_a_delay_that_falls_is_a_backlog_unless_the_robot_knew_it_before(known: 
 def test_the_robot_knows_a_lower_delay_of_a_foreign_clock_only_when_it_has_stayed(
     lower_s: float, obeyed: bool
 ) -> None:
-    """Seed 2009000117: a hole in the network closed for a moment, and another one followed."""
+    """The delay of a foreign clock falls for `lower_s` seconds and then rises above the old value.
+
+    The robot may obey the late commands only if the lower delay did not stay (seed 2009000117).
+    """
     ages, sender = Ages(0), {"way": "zenoh", "delay": 0.001, "clock": []}
 
     def fresh(at_ns: int, delay_ns: int) -> bool:
@@ -1211,7 +1217,10 @@ def test_a_new_daemon_learns_anew_that_it_hears_itself(restarts: bool) -> None:
 
 @pytest.mark.parametrize(("lines", "finding"), [(56, False), (70, True)])
 def test_the_line_that_shows_an_echo_must_come_back_first(lines: int, finding: bool) -> None:
-    """A steady ramp shows no echo; its end is line 50, which is on the wire for some lines."""
+    """A steady ramp does not show an echo, but its end at line 50 does.
+
+    The judge waits until that line can have come back from the wire.
+    """
     echo = Echo()
     echo.begin()
     with pytest.raises(BrokenError, match="an echo is no board") if finding else nullcontext():
@@ -1392,7 +1401,10 @@ def test_junk_that_is_counted_by_another_reason_is_a_finding() -> None:
 
 
 def with_a_set_before_sigterm(settings: dict[str, float]) -> Plan:
-    """A plan whose `set` has no answer when SIGTERM ends the daemon: the disk is full."""
+    """Return a plan in which SIGTERM ends the daemon before it answers a `set`.
+
+    The disk is full, so the answer waits.
+    """
     call = {"verb": "set", "settings": settings, "late": 0.0, "lost": False, "twice": False}
     events: list[dict[str, Any]] = [
         {"at": 1.0, "do": "disk", "for": 0.6},
@@ -1409,7 +1421,7 @@ def test_a_limit_that_was_lowered_on_the_way_down_is_no_finding() -> None:
 
 
 def quiet_with(*events: dict[str, Any]) -> Plan:
-    """A quiet plan of 6 s with these events."""
+    """Return a plan of 6 s with only these events."""
     return quiet() | {"seconds": 6.0, "events": list(events)}
 
 
@@ -1549,7 +1561,7 @@ def test_a_pose_in_state_that_moves_while_the_board_is_silent_is_a_finding() -> 
 
 
 class Board(NamedTuple):
-    """The knowledge of the judge of the plugging about the board."""
+    """The facts about the board that the judge of plugging uses."""
 
     plugged: bool
     unplugged_ns: int = 0
@@ -1621,10 +1633,13 @@ def followed_in_turn(
     refused: Collection[float] = (),
     flood: int = 0,
 ) -> None:
-    """Have the robot follow each command of two `signed` senders: time, sender, speed, by.
+    """Let the judge see commands of two senders, each followed by the robot.
 
-    The commands that arrive at the times in `late` took 1 s. The robot does not follow those that
-    arrive at the times in `refused`; before each of them, `flood` other messages arrive.
+    Args:
+        sent: The arrival (s), sender, speed (m/s) and clock step (s) of each command.
+        late: Arrivals of the commands whose network delay was 1 s.
+        refused: Arrivals of the commands that the robot does not follow.
+        flood: Number of other messages that arrive before each refused command.
     """
     witness, followed_ns = witnessed(), None
     followed = Followed(witness)
@@ -1813,9 +1828,9 @@ def test_shrinking_leaves_what_the_finding_needs(monkeypatch: pytest.MonkeyPatch
 
 
 def copy_of_the_package(where: Path) -> Path:
-    """Make another checkout of the package alone, as an installed wheel is one.
+    """Copy the package alone to another directory, like an installed wheel.
 
-    Its compiled modules come along, because compiling all of them takes longer than the plan.
+    The copy includes the compiled modules, because compiling takes longer than the plan.
     """
     shutil.copytree(OURS / "acsard", where / "acsard")
     return where
@@ -1887,7 +1902,7 @@ def test_a_listed_difference_is_taken_out_on_both_sides() -> None:
 
 @cache
 def plans_of_moments() -> dict[str, Plan]:
-    """Return the first plan of each moment."""
+    """Return, for each moment of `bad_moments.py`, the first plan that has it."""
     found: dict[str, Plan] = {}
     for plan in map(made, range(2000)):
         found.setdefault(plan.get("moment", ""), plan)

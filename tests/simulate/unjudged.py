@@ -1,7 +1,7 @@
 """Plays a plan without the judges, for a comparison with another checkout.
 
-The judges know the newest promises only, and an older product breaks some of them. So a pair
-compares what both products do, and judges neither.
+The judges check the present promises, and an older product breaks some of them. So a paired run
+compares the behaviour of both products without judging either.
 """
 
 from __future__ import annotations
@@ -14,10 +14,12 @@ from tests.simulate.roads import NS, Message, sample
 
 
 class Unjudged(Run):
-    """A run that hands each step to `log` and judges nothing."""
+    """A run that passes each step to `log` and judges nothing."""
 
     def played(self) -> str:
-        """Play the plan without the lawful drive at its end. Return an exception as text, or ""."""
+        """Play the plan without the lawful drive at its end. Return the text of an exception, or
+        "".
+        """
         try:
             self._begin()
             self.run_to(int(self.plan["seconds"] * NS))
@@ -27,11 +29,11 @@ class Unjudged(Run):
 
     @property
     def simulated_s(self) -> float:
-        """The time that the product simulated, without suspends."""
+        """The simulated time in s, without the time in which the host slept."""
         return (self.true_ns - self.slept_ns) / NS
 
     def deliver(self, sender: dict[str, Any], message: Message) -> None:
-        """Hand a message to the daemon, if there is one."""
+        """Deliver a message to the daemon if it runs."""
         if self.product.alive:
             at_ns = self._arrival(message.arrives_ns)
             one = sample(sender, message, self.plan["config"], self.product.wall_ns)
