@@ -50,15 +50,22 @@ class EventDeduplicator:
         adds no messages.
         """
         known, told, stamp_ns = self._total, self._told, events.stamp.to_ns()
+        before_ns = self._stamp_ns
         if events.total < known:
             if stamp_ns <= self._stamp_ns:
                 return []  # an older answer that arrived after a published list
             known, told = 0, []  # the daemon was restarted
         self._total, self._stamp_ns, self._told = events.total, stamp_ns, events.events
-        new = min(events.total - known, len(events.events))
-        last = events.events[len(events.events) - new :]
-        # An event that lasts counts several times in the total but appears once in the list.
-        return [log(one, one.stamp) for one in last if one not in told]
+        first = len(events.events) - min(events.total - known, len(events.events))
+        # The number of new events is wrong if the daemon was restarted and has logged at least as
+        # many events as before, so also use the times. Times alone are not enough, because the
+        # clock may be set back. An event that lasts counts several times in the total but appears
+        # once in the list.
+        return [
+            log(one, one.stamp)
+            for place, one in enumerate(events.events)
+            if (place >= first or one.stamp.to_ns() > before_ns) and one not in told
+        ]
 
 
 class _Out:
@@ -72,7 +79,7 @@ class _Out:
 
 
 class CommandForm(Struct, frozen=True):
-    """The form in which commands arrive on one key of the bus."""
+    """The encoding and the transport of the commands on one key of the bus."""
 
     native: str
     """The native key of acsard for these commands, without the robot's id. "*" stands for the name
@@ -85,9 +92,9 @@ class CommandForm(Struct, frozen=True):
 def command_forms(
     key_of: Callable[[str], str], ros: RosConfig, source: str
 ) -> dict[str, CommandForm]:
-    """Return a `CommandForm` for each full key on which commands of a source may arrive.
+    """Map each full key on which commands of a source may arrive to its `CommandForm`.
 
-    These are the keys of acsard and those of ROS.
+    The keys are those of acsard and those of ROS.
 
     Args:
         key_of: function that adds the robot's id to a key of acsard.

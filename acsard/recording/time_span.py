@@ -1,8 +1,8 @@
 """Parses times that a person types, and finds the part of a recording between two such times.
 
-A recording may cross midnight, and the wall clock may be adjusted during the recording. Therefore a
-recording is divided into stretches without an adjustment of the clock, and a time is searched in
-every `Stretch`.
+A recording may cross midnight, and the wall clock may be adjusted during the recording. Therefore
+this module divides a recording where the clock was adjusted, and searches a time in each part. Such
+a part is called a `Stretch`.
 """
 
 from __future__ import annotations
@@ -121,9 +121,10 @@ def _time_of_day(words: str, text: str) -> TimeOfDay:
 
 
 def _date(words: str, text: str, now_s: float) -> tuple[int, int, int]:
-    """Return the triple (year, month, day).
+    """Parse a typed date, such as "today" or "2026-11-21". Return (year, month, day).
 
-    On the first day of a month, "yesterday" has the day 0: the last day of the previous month.
+    If today is the first day of a month, "yesterday" gives the day 0. `_moment` treats this day as
+    the last day of the previous month.
     """
     if words in _DAYS_AGO:
         today = time.localtime(now_s)
@@ -153,13 +154,12 @@ def _unknown(text: str) -> TimeError:
 def resolve(begin: When | None, end: When | None, now_s: float) -> tuple[float, float]:
     """Return the range of time that a person typed, as the pair (first, last), s since 1970.
 
-    None and an `Offset` set no limit, so `first` is -inf or `last` is inf. The limits of a `Moment`
-    are used unchanged. A `TimeOfDay` gets a date:
+    None and an `Offset` set no limit, so `first` is -inf or `last` is inf. A `Moment` already has a
+    date. A `TimeOfDay`, for example 14:05, gets a date as follows:
 
-    - For `begin`, the result is the last such time before the present. If `end` is a `Moment`, it
-      is the last such time before `end`.
-    - For `end`, the result is the first such time after `begin`. If `begin` sets no limit, it is
-      the last such time before the present.
+    - `begin` is the most recent 14:05 before the present, and before `end` if `end` is a `Moment`.
+    - `end` is the first 14:05 after `begin`. If `begin` sets no limit, `end` is the most recent
+      14:05 before the present.
 
     Args:
         begin: the beginning of the range.
@@ -171,7 +171,7 @@ def resolve(begin: When | None, end: When | None, now_s: float) -> tuple[float, 
     """
     first, last = -math.inf, math.inf
     if isinstance(begin, TimeOfDay):
-        first = _last_occurrence(begin, end.end if isinstance(end, Moment) else now_s)
+        first = _last_occurrence(begin, min(now_s, end.end) if isinstance(end, Moment) else now_s)
     elif isinstance(begin, Moment):
         first = begin.begin
     if isinstance(end, Moment):

@@ -1,7 +1,7 @@
 """Each way to release the stick stops the robot, with a real browser on another host.
 
-The tests judge the lines at the far end of the port: when they begin to slow down, and whether any
-of them ever grows again. The browser comes by HTTPS, with an invitation.
+The tests check the lines at the far end of the serial port: when the speed begins to fall, and that
+it never grows again. The browser uses HTTPS with an invitation.
 """
 
 from __future__ import annotations
@@ -108,7 +108,7 @@ class Field:
         return self.browser.process.pid
 
     def ready(self) -> None:
-        """Open the page and wait until it is live; no finger touches it."""
+        """Open the page, if necessary, and wait until it is live. No finger is on the stick."""
         if self.server.process.poll() is not None:
             self.serve()
         assert self.browser.process is not None
@@ -129,7 +129,7 @@ class Field:
         self.browser.open(f"{self.server.away}/#token={self.token}")
 
     def _live(self) -> bool:
-        """Return whether the page is live. Reload it first if it asks for that.
+        """Return whether the page is live. First reload the page if it asks for a reload.
 
         On a very busy machine one of the page's files may take longer than the server allows.
         """
@@ -143,12 +143,12 @@ class Field:
         self.browser.hold(lambda: self.steady_since(begun))
 
     def steady_since(self, at: float) -> bool:
-        """Return whether all of the last lines had the speed."""
+        """Return whether the latest lines since `at` all have the full speed."""
         last = self.peer.since(at)[-LINES:]
         return len(last) == LINES and all(one.line.startswith(STEADY) for one in last)
 
     def settle(self) -> None:
-        """Wait until everything on the way has arrived, or the process that held it has gone."""
+        """Wait until all sent bytes have arrived, or the process that would send them has ended."""
         until(lambda: not self._on_the_way(), 90.0, "nothing is on the way any more")
         now = time.monotonic()
         until(lambda: len(self.peer.since(now)) >= QUIET, 5.0, "some lines more")
@@ -163,9 +163,9 @@ class Field:
         return False
 
     def braking(self, gone: float) -> tuple[float, float]:
-        """Return the seconds from then to the first slower line, and the allowed time.
+        """Return the time from `gone` to the first slower line, and the allowed time, both in s.
 
-        The robot stands.
+        Waits until the robot is at rest.
         """
 
         def slower() -> Heard | None:
@@ -178,10 +178,9 @@ class Field:
         return at - gone, allowed
 
     def obeyed(self, gone: float) -> int:
-        """Return the lines that grew after the timeout of the last command.
+        """Return the number of lines whose speed grew after the allowed time.
 
-        Before that the command still counts, also after a moment in which a busy machine kept the
-        answers from the daemon.
+        Until then the last command is still valid. On a busy machine the allowed time is longer.
         """
         lines = [one for one in self.peer.since(gone) if one.line != EMPTY]
         grown = [
@@ -192,11 +191,11 @@ class Field:
         return sum(at - gone > self.allowed(gone, at) for at in grown)
 
     def allowed(self, gone: float, at: float) -> float:
-        """Return the allowed time from the one moment to the other."""
+        """Return the allowed time in s for a release at `gone` whose effect is seen at `at`."""
         return TIMEOUT_S + 2 * TICK_S + HANDS * lost(gone, at)
 
     def lets_go(self, way: Way, number: int) -> Round:
-        """Drive, release, and watch until nothing of the drive can arrive any more."""
+        """Drive, release the stick in this way, and wait until no more commands can arrive."""
         self.ready()
         self.hold()
         with way(self, number) as gone:
@@ -229,9 +228,9 @@ def second_finger(field: Field, number: int) -> Iterator[float]:
 
 @contextmanager
 def window_blurred(field: Field, number: int) -> Iterator[float]:
-    """The focus goes to another program.
+    """The focus changes to another program.
 
-    Without a screen there is no focus, so this sends the event alone.
+    A browser without a screen has no focus, so this function only sends the event `blur`.
     """
     begun = time.monotonic()
     field.browser.js("window.dispatchEvent(new Event('blur'))")
@@ -284,10 +283,10 @@ def tab_killed(field: Field, number: int) -> Iterator[float]:
 
 @contextmanager
 def page_left(field: Field, number: int) -> Iterator[float]:
-    """The page under the finger disappears.
+    """The browser leaves the page while a finger is on it.
 
-    A Chromium waits for the finger's end there and accepts no next one, so a new browser is
-    started.
+    This Chromium still waits for the end of that touch and accepts no new one, so afterwards a new
+    browser is started.
     """
     begun = time.monotonic()
     field.browser.open("about:blank")
@@ -297,7 +296,7 @@ def page_left(field: Field, number: int) -> Iterator[float]:
 
 @contextmanager
 def page_stalled(field: Field, number: int) -> Iterator[float]:
-    """A script runs for longer than a page may stand still. The finger is still down after it."""
+    """A script blocks the page for longer than allowed. The finger is still down afterwards."""
     begun = time.monotonic()
     field.browser.js(
         "(() => { const end = performance.now() + 1200; while (performance.now() < end); })()"
@@ -329,9 +328,9 @@ def browser_frozen(field: Field, number: int) -> Iterator[float]:
 
 @contextmanager
 def network_gone(field: Field, number: int) -> Iterator[float]:
-    """Nothing arrives in either direction, and no program gets an error.
+    """The network delivers nothing in either direction, and no program gets an error.
 
-    This lasts for between one second and the longest time.
+    This lasts for between 1 s and `longest_s`.
     """
     length_s = 1.0 + (field.longest_s - 1.0) * ((number * GOLDEN) % 1.0)
     field.hosts.cut()
@@ -399,7 +398,7 @@ def field(hosts: Hosts, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fi
 
 
 def tell(what: str, rounds: list[Round]) -> None:
-    """Check one row of the table."""
+    """Print the delays of these rounds, and fail if a robot slowed down late or sped up again."""
     ticks = sorted(one.took_s / TICK_S for one in rounds)
     print(
         f"\n{what:16} {len(rounds):4} times  slower after {statistics.median(ticks):5.1f} ticks "
@@ -475,14 +474,19 @@ class Program:
 
 
 def goes_on(field: Field, number: int) -> Round:
-    """The network is cut, and the program has not noticed: it sends backwards speeds meanwhile."""
+    """Cut the network while a program drives.
+
+    The program does not notice the cut and sends backward speeds. Count the lines to the board that
+    obey those speeds after the network has returned.
+    """
     with Program(field) as program:
         with network_gone(field, number) as gone:
             program.speed = -SPEED
             took, allowed = field.braking(gone)
+            # After the network has returned, the program must not send a backward speed any more.
+            program.speed = SPEED
         # There is one connection, so messages sent without a network arrive before later ones. They
         # need at most as long again as the network was cut.
-        program.speed = SPEED
         wait_until(2 * time.monotonic() - gone + 1.0)
     lines = [one.line for one in field.peer.since(gone) if one.line != EMPTY]
     return Round(took, allowed, sum(wheels(line)[0] < 0.0 for line in lines))

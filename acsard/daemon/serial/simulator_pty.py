@@ -56,12 +56,11 @@ class PtyEnd:
         return data
 
     def write(self, data: bytes) -> bool:
-        """Send data to the host. If the pty's buffer is full, drop the data and return False."""
+        """Send data to the host. Drop what the pty's buffer cannot take, and then return False."""
         try:
-            os.write(self._master, data)
+            return os.write(self._master, data) == len(data)
         except BlockingIOError:
             return False
-        return True
 
     def close(self) -> None:
         os.close(self._master)

@@ -1,4 +1,4 @@
-"""Each event becomes exactly one line of the log, and a command is shown as an export has it."""
+"""The bridge makes one log line of each event, and shows a command as in an exported recording."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ KEPT = 20
 
 
 def events(total: int, of: str = "first") -> Events:
-    """Return the daemon's events after this many of them."""
+    """Return the daemon's recent events after this many events have happened."""
     kept = range(max(0, total - KEPT), total)
     told = [LogEvent(Time(n), f"mode{n}", "warning", f"{of} {n}", "ann", 1) for n in kept]
     return Events(Time(total), total, told)
@@ -84,6 +84,15 @@ def test_a_restarted_daemon_s_events_are_reported_from_the_first() -> None:
     deduplicator.of(events(10))
     later = replace(events(2, "second"), stamp=Time(11))
     assert names(deduplicator, later) == ["mode0", "mode1"]
+
+
+@each("total", [3, 4])
+def test_a_restarted_daemon_that_has_logged_as_many_events_reports_all_of_them(total: int) -> None:
+    deduplicator = EventDeduplicator()
+    deduplicator.of(events(3))
+    restarted = [replace(one, stamp=Time(10)) for one in events(total, "second").events]
+    found = names(deduplicator, Events(Time(11), total, restarted))
+    assert found == [f"mode{n}" for n in range(total)]
 
 
 TWIST = Twist(Vector3(x=0.3), Vector3(z=-0.2))
