@@ -45,9 +45,9 @@ class Report(Struct, frozen=True):
     """The object that `--json` prints for a calibration.
 
     A field `..._error_before` is an error of the odometry with the configured multipliers. The
-    field `..._error_after` is the same error with the new multipliers. The two errors are measured
-    on drives that the fit did not use. The two fields are None if the log does not show this
-    error.
+    field `..._error_after` is the same error with the new multipliers. Both errors are measured on
+    drives that the fit did not use. Both fields are None if the log does not show how large the
+    error is.
     """
 
     log: str
@@ -207,7 +207,9 @@ def report(log: str, calibration: Calibration, drive: DriveConfig, written: str)
 def _noise(calibration: Calibration) -> tuple[BeforeAfter, BeforeAfter]:
     """Return the random errors of heading, deg, and of distance, m, after `REPORT_DISTANCE_M`.
 
-    Each of the two is computed from the configured and from the new noise settings.
+    Each error is given twice: for the configured and for the new noise settings. Both errors are
+    None if the noise settings stay as configured. The error of the distance is also None if the log
+    has no positions.
     """
     noise = calibration.noise
     if noise is None or not noise.better:
@@ -346,7 +348,7 @@ def _remains(report: Report, calibration: Calibration, *, guided: bool) -> list[
             "asks for after the straight leg"
             if guided
             else "drive 2 m or more straight ahead, measure the distance, and give --distance "
-            "METRES"
+            "METERS"
         )
         sentences.append(
             "the calibration compared only the left with the right wheels and did not measure "

@@ -3,7 +3,7 @@
 This is a cross-validation. Each run (one drive in the log) is left out in turn: the parameters are
 fitted to the other runs, and the odometry error is measured on the run that was left out. If the
 log has fewer than three runs, each fifth of the log is left out instead. The configured values are
-kept unless the new values are surely better.
+replaced only if the new values are better by more than chance explains.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ If a log has less, the heading error per 10 m is not computed, because it would 
 class BeforeAfter(Struct, frozen=True):
     """An odometry error with the configured multipliers, and with the new multipliers.
 
-    The two numbers are None if the log does not show this error.
+    Both numbers are None if the log does not show how large the error is.
     """
 
     before: float | None
@@ -255,10 +255,11 @@ def per_amount(sums: Floats, unit: float) -> BeforeAfter:
 
 
 def _gain(kinds: Sequence[Floats]) -> tuple[float, float]:
-    """Return `Improvement.log_improvement` and `Improvement.gain_std`.
+    """Return the size of the improvement, and the standard deviation of this size.
 
-    `kinds` has one array for each kind of error: heading or position. Each array has one row for
-    each fold, in the form that `rms()` takes.
+    The results are the fields `log_improvement` and `gain_std` of `Improvement`. `kinds` has one
+    array for each kind of error: heading or position. Each array has one row for each fold, in the
+    form that `rms()` takes.
     """
     drives = np.any([squares[:, 2] > 0.0 for squares in kinds], axis=0)
     if not np.any(drives):
@@ -274,9 +275,10 @@ def _gain(kinds: Sequence[Floats]) -> tuple[float, float]:
 def with_gain_std(gain: Callable[[Mask], float], drives: Mask) -> tuple[float, float]:
     """Return a pair: the gain from all drives, and the standard deviation of this gain.
 
-    `gain` computes a gain from the drives in a mask, and `drives` is the mask of all drives. The
-    deviation comes from a jackknife over the drives, and is widened to that of Student's t. It is
-    infinite for a single drive.
+    A gain is a measure of the improvement that new settings bring. `gain` computes it from the
+    drives in a mask, and `drives` is the mask of all drives. The deviation comes from a jackknife
+    over the drives. `student_factor()` increases it if there are few drives. It is infinite for a
+    single drive.
     """
     count = int(drives.sum())
     if count == 1:
@@ -289,10 +291,11 @@ def with_gain_std(gain: Callable[[Mask], float], drives: Mask) -> tuple[float, f
 def _by_group(
     before: Floats, after: Floats, group: npt.NDArray[np.int64], among: Mask, amount: float
 ) -> Floats:
-    """Return the three numbers that `per_amount()` takes.
+    """Return the total errors before and after the calibration, and `amount`, for `per_amount()`.
 
-    In each group, the errors are added with their signs. The absolute values of these sums are
-    then added. The mask `among` selects the intervals to use.
+    `group` contains the group of each interval, and the mask `among` selects the intervals to use.
+    Within a group, the errors are added with their signs, so random errors cancel. The total is the
+    sum of the absolute values of all groups.
     """
     sums = (np.abs(np.bincount(group[among], errors[among])).sum() for errors in (before, after))
     return np.array([*sums, amount])
@@ -327,7 +330,7 @@ def _of_positions(
 
 
 def no_better(found: Improvement) -> str:
-    """Return the text of the error that the new multipliers are not clearly better.
+    """Return the text of the error for new multipliers that are not clearly better.
 
     `found` contains the errors of the odometry before and after the calibration.
     """
@@ -339,9 +342,13 @@ def no_better(found: Improvement) -> str:
         )
         if error.before is not None and error.after is not None
     )  # fmt: skip
+    compared = (
+        f"the errors on drives that the fit did not use are: {errors}"
+        if errors
+        else "the errors could not be compared, because no drive of the log could be left out of "
+        "the fit"
+    )
     return (
-        "the multipliers of this log are not clearly better than the configured ones on whole "
-        "drives that the fit did not use "
-        f"({errors or 'no drive of the log could be left out of the fit'}): "
-        "keep the configured multipliers"
+        "the multipliers that were computed from this log are not clearly better than the "
+        f"configured ones: keep the configured multipliers; {compared}"
     )

@@ -116,9 +116,10 @@ def drives_enough(parts: Sequence[Block]) -> None:
 
 
 def turns_in_place(rows: Rows) -> bool:
-    """Return whether the log has only turns in place, apart from less than `MIN_ROLL` of rolling.
+    """Return whether the log has only turns in place.
 
-    Such a log does not show the ratio of the right to the left wheel radius.
+    The wheels may roll ahead and back by less than `MIN_ROLL` in total. Such a log does not show
+    the ratio of the right to the left wheel radius.
     """
     return float(np.abs(rows.right + rows.left).sum()) / 2 < MIN_ROLL
 
@@ -126,11 +127,12 @@ def turns_in_place(rows: Rows) -> bool:
 def rolls_enough(rows: Rows, *, spins: bool = False) -> None:
     """Raise `RefusedError` if the log lacks a movement of the wheels that the fit needs.
 
-    Two angles are computed in each interval of `rows`: the mean of the left and the right angle,
-    and half of their difference. Each angle must add up to `MIN_ROLL`. The two angles must not
-    be proportional to each other (`MAX_CORRELATION`). If `spins` is true, the mean may add up to
-    less than `MIN_ROLL`, as in a log with only turns in place. The two angles may then also be
-    proportional.
+    The fit needs driving ahead or back, which is the mean of the left and the right wheel angle. It
+    also needs turns, which are half of the difference of these angles. Each of the two must add up
+    to `MIN_ROLL` over all intervals of `rows`. They must not be proportional to each other
+    (`MAX_CORRELATION`), because the robot then always drives the same curve.
+
+    If `spins` is true, a log with only turns in place is permitted too.
     """
     together, against = (rows.right + rows.left) / 2, (rows.right - rows.left) / 2
     in_place = spins and turns_in_place(rows)
@@ -214,10 +216,9 @@ def separates_track(fitted: Fit) -> bool:
 
 
 def heading_follows(source: str, rows: Rows, base: Base, sides: Floats) -> None:
-    """Raise `RefusedError` if the heading sensor's turns differ much from those of the wheels.
+    """Raise `RefusedError` if the wheels and the heading sensor show very different turns.
 
-    `source` is the name of the sensor. `sides` contains the two factors with which the wheels fit
-    the sensor best, as `heading.side_factors()` returns them.
+    `source` is the name of the sensor. `sides` is the result of `heading.side_factors()`.
     """
     spread = float(rows.turned @ rows.turned)
     off = rows.turned - heading.by_sides(rows, base, sides)
@@ -231,7 +232,7 @@ def heading_follows(source: str, rows: Rows, base: Base, sides: Floats) -> None:
 
 
 def positions_follow(starting_point: StartingPoint) -> None:
-    """Raise `RefusedError` if the positions do not follow the path of the wheels.
+    """Raise `RefusedError` if the positions do not follow the path computed from the wheels.
 
     `starting_point` is the result of `positions.search()`.
     """
@@ -267,7 +268,8 @@ def turns_the_right_way(
         if side in (by_heading, by_places):
             raise RefusedError(
                 f"the {side} wheels turn backwards when the robot goes ahead: their speeds have "
-                "the wrong sign; rad/s must be positive ahead on both sides"
+                "the wrong sign; the speeds of both sides must be positive when the robot drives "
+                "ahead"
             )
     if sides is not None and starting_point is not None and by_heading != by_places:
         other = "x and y are swapped, or y is positive to the right"
@@ -290,7 +292,8 @@ def turns_the_right_way(
         )
         raise RefusedError(
             f"{sensor} and the wheels show turns in opposite directions: the columns of left and "
-            f"right are swapped, or the wheel speeds of both sides are negative ahead{or_sensor}"
+            "right are swapped, or the wheel speeds of both sides are negative when the robot "
+            f"drives ahead{or_sensor}"
         )
 
 
@@ -321,8 +324,8 @@ def turns_like_the_wheels(source: str, rows: Rows, base: Base) -> None:
 def turn_rates(source: str, rows: Rows) -> None:
     """Raise `RefusedError` if the heading sensor seems to report its turns in degrees.
 
-    The turns are then too fast for a robot. The sensor is not compared with the wheels, because
-    the wheel speeds may be in degrees as well.
+    The turns are then too fast for a robot. This check does not use the wheel speeds, because they
+    may be in degrees as well.
     """
     rate = float(np.percentile(np.abs(rows.turned) / rows.seconds, 90))
     if rate > MAX_TURN_RATE:

@@ -147,7 +147,7 @@ def _messages(file: Path, notes: list[str]) -> Iterator[RosMessage]:
                 type_ = "" if schema is None else schema.name
                 encoding = channel.message_encoding
                 if one.log_time > MAX_LOG_TIME_NS:
-                    raise ValueError(f"the time of a message is {one.log_time} ns")
+                    raise ValueError(f"a message has the impossible time {one.log_time} ns")
                 yield RosMessage(channel.topic, type_, encoding, one.log_time, one.data)
         except EndOfFile:
             notes.append(f"{file.name} is cut off: only the messages before the cut are used")

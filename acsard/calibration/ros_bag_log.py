@@ -5,8 +5,8 @@ The wheel speeds come from a `JointState`, the turn rates from an `Imu`, and the
 user can name the topics to use instead.
 
 An `Odometry` is usually computed from the wheels, so it cannot calibrate them. It is used only if
-the user names its topic, or if the bag has neither turn rates nor other positions. If the user did
-not name its topic, an `Odometry` whose turns are exactly those of the wheels is refused.
+the user names its topic, or if the bag has neither turn rates nor other positions. In the second
+case it is refused if it shows exactly the same turns as the wheels.
 """
 
 from __future__ import annotations
@@ -144,8 +144,10 @@ class _Topic:
         return pose.position.x, pose.position.y, _yaw(pose.orientation)
 
     def _joints(self, message: JointState, joints: Sequence[str]) -> Sequence[float]:
-        """Return the wheels' angles, then their speeds; () unless the wheels are those of the
-        first message."""
+        """Return the angles of the wheels in a message, followed by their speeds.
+
+        Return () if the message contains no wheels, or other wheels than the first message.
+        """
         columns = wheel_joints(tuple(message.name), tuple(joints))
         self.joints.update(message.name[:8])
         self.wheels = self.wheels or tuple(columns)
@@ -208,8 +210,8 @@ def wheel_of(joint: str) -> str:
 def wheel_joints(names: tuple[str, ...], joints: tuple[str, ...]) -> dict[str, list[int]]:
     """Return the wheel joints that fill each column of the log, as indices in `names`.
 
-    The columns are "fr", "fl", "rl" and "rr", or "left" and "right". The result is empty unless
-    both sides have a wheel joint.
+    The columns are "fr", "fl", "rl" and "rr", or "left" and "right". If one side has no wheel
+    joint, the result is empty.
 
     Args:
         names: the names of the joints in a message.
@@ -330,7 +332,11 @@ class _Log:
         return wheels, gyro, places
 
     def _one(self, what: str, fit: Sequence[_Topic], *, free: bool = True) -> _Topic | None:
-        """Return the topic to use, if any. Unless `free`, use only a topic that the user named."""
+        """Return the one topic of `fit` to use as the source of `what`, or None.
+
+        If the user has named a topic, only this topic is used. If `free` is false, only a topic
+        that the user named may be used.
+        """
         named = [topic for topic in fit if topic.name in self._choice.topics]
         for topic in named:
             if len(topic) < MIN_MESSAGES:
@@ -459,8 +465,8 @@ def _too_few(topic: _Topic) -> str:
     if topic.unreadable > len(topic):
         return f"the messages of {topic} cannot be read: {topic.why}"
     return (
-        f"{topic} has only {many(len(topic), 'message')} with a value: record it while the robot "
-        "drives"
+        f"{topic} has only {many(len(topic), 'message')} that the tool can use, but "
+        f"{MIN_MESSAGES} are needed: record this topic while the robot drives"
     )
 
 
@@ -499,7 +505,10 @@ def speeds_of(t: Floats, angles: Floats) -> tuple[Floats, Floats]:
 
 
 def _unwrapped(angles: Floats) -> Floats:
-    """Remove jumps by 2 pi. Angles that span more than 2 pi are not wrapped."""
+    """Remove jumps by 2 pi from angles that are wrapped to one turn.
+
+    Angles that span more than 2 pi are not wrapped, so they stay unchanged.
+    """
     jumps = np.abs(np.diff(angles)).max(initial=0.0) > np.pi
     within = float(np.ptp(angles)) <= 2 * np.pi + 1e-3 if len(angles) else False
     return np.unwrap(angles) if jumps and within else angles
@@ -526,7 +535,10 @@ def _edges(t: Floats, sides: tuple[Floats, Floats, Floats]) -> Floats:
 
 
 def _follows(t: Floats, rates: Floats, sides: tuple[Floats, Floats, Floats]) -> float:
-    """Return the correlation of a sensor's turns with those of the wheels; NaN if unknown."""
+    """Return how well the turns of a sensor follow the robot's turns according to the wheels.
+
+    The result is a correlation from -1 to 1, or NaN if it is unknown.
+    """
     order = np.argsort(t, kind="stable")
     edges = _edges(t, sides)
     if len(edges) < 4:

@@ -87,9 +87,10 @@ class WheelResponse(Struct, frozen=True):
         return {"response_time": self.proposed}
 
     def sentences(self) -> list[str]:
-        """Return a sentence about the response time, for the report.
+        """Return one or two sentences for the report.
 
-        If `fastest` is finite, the list also contains a sentence about `limits.wheel_speed`.
+        The first sentence is about the response time. If `fastest` is finite, a second sentence is
+        about `limits.wheel_speed`.
         """
         follow = f"the wheels follow their commands with a response time of {self.seconds:.2g} s"
         if self.false_fault:
@@ -103,8 +104,8 @@ class WheelResponse(Struct, frozen=True):
                 then += "first lower limits.wheel_speed as the next note says"
             else:
                 then += (
-                    "a longer response time would not prevent this with enough reserve; if the "
-                    "wheels are healthy, raise feedback.fault_time"
+                    "raising feedback.response_time does not reliably prevent this; if the wheels "
+                    "are healthy, raise feedback.fault_time"
                 )
         elif max(self.seconds / self.present, self.present / self.seconds) > AGREEMENT_FACTOR:
             then = (
@@ -166,7 +167,8 @@ def response(
 def _commanded(run: Run, drive: DriveConfig) -> tuple[Floats, Floats, Floats]:
     """Return time steps, s, and the commanded and measured speeds (left, right), rad/s.
 
-    A step is NaN if no command applies to its sample, or if a gap precedes the sample.
+    A time step is the interval before a sample of the wheel speeds. It is NaN if no command applies
+    to this sample, or if the interval is a gap.
     """
     kinematics = Kinematics(drive)
     ahead = kinematics.wheel_speeds(Twist(1.0, 0.0))
@@ -182,7 +184,10 @@ def _commanded(run: Run, drive: DriveConfig) -> tuple[Floats, Floats, Floats]:
 
 
 def _expected(steps: Floats, wanted: Floats, seen: Floats) -> Floats:
-    """Return the speeds that each of `RESPONSE_TIMES_S` predicts: (samples, 2, times)."""
+    """Return the wheel speeds, rad/s, that each of `RESPONSE_TIMES_S` predicts.
+
+    The shape is (samples, 2 sides, response times).
+    """
     # The speed y of a healthy wheel follows the command u with the response time T:
     #
     #     T dy/dt = u - y
@@ -200,7 +205,10 @@ def _expected(steps: Floats, wanted: Floats, seen: Floats) -> Floats:
 def _evidence(
     parts: Sequence[tuple[Floats, Floats, Floats]], response_time: float, fault_time: float
 ) -> float:
-    """Return the longest time for which the daemon would consider a wheel faulty, s."""
+    """Return the longest time for which a wheel contradicts the daemon's model of a wheel, s.
+
+    If this time exceeds `fault_time`, the daemon would report a fault.
+    """
     longest, most = 0.0, fault_time / MIN_EVIDENCE_LINES
     for steps, wanted, seen in parts:
         sides = [(Expected(), Witness()) for _ in range(2)]

@@ -64,9 +64,10 @@ def per_turn(replies: Sequence[Reply], motors: Sequence[int]) -> float | None:
 def coarse(replies: Sequence[Reply], motors: Sequence[int]) -> float | None:
     """Estimate the counts per wheel turn of coarse encoders from the jumps of the reported speeds.
 
-    This function is for replies that contain no counts. `motors` are numbers from 0 to 3. Return
-    None if the encoders are not coarse, if too few replies contain a speed other than 0, or if the
-    replies are too rare (`MAX_REPLY_GAP_S`).
+    A coarse encoder has few counts per turn, so its reported speed jumps at each count. This
+    function is for replies that contain no counts. `motors` are numbers from 0 to 3. Return None if
+    the encoders are not coarse, if too few replies contain a speed other than 0, or if the replies
+    are too rare (`MAX_REPLY_GAP_S`).
     """
     course = [step for step in steps(replies) if 0.0 < step.seconds <= SHORT_MEASUREMENT_S]
     # Use the median, because the arrival time of a single reply is wrong if this computer is late.
@@ -123,8 +124,8 @@ def finding(board: Board, motors: Sequence[int]) -> Finding:
             return outcomes.find("encoder counts: damaged", share=board.lost)
         counts = configured if near else round(measured)
         how = (
-            f"counts and speeds in the replies give {measured:.0f} per turn; the check tolerates a "
-            f"difference of {MAX_COUNT_DIFFERENCE:.0%}"
+            f"the counts and speeds in the replies give {measured:.0f} counts per wheel turn; the "
+            f"check accepts a configured number that differs by up to {MAX_COUNT_DIFFERENCE:.0%}"
         )
     elif abs(measured - named) > MAX_COUNT_DIFFERENCE * named:
         return outcomes.find("encoder counts: misnamed", named=named, measured=measured)
@@ -132,7 +133,9 @@ def finding(board: Board, motors: Sequence[int]) -> Finding:
         counts, how = named, f"the firmware states this number; the check measured {measured:.0f}"
     if counts > MAX_COUNTS:
         return outcomes.find("encoder counts: many", unused, counts=counts, most=MAX_COUNTS)
-    right, off = configured in (0, counts), abs(configured / counts - 1)
+    right = configured in (0, counts)
+    # The daemon divides the counts by the configured number to get the turns of a wheel.
+    off = abs(counts / configured - 1) if configured else 0.0
     return outcomes.find(
         "encoder counts: right" if right else "encoder counts: wrong",
         {"mcu.encoder_counts": counts},

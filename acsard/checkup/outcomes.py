@@ -245,7 +245,7 @@ WARN encoder counts: many | {counts} per turn
 PASS encoder counts: right | {counts} per turn
     {how}
 FAIL encoder counts: wrong | {counts}, not {configured}
-    {how}: every distance would be wrong by {off:.1%}
+    {how}. With the configured number, every distance would be wrong by {off:.1%}
     -> write mcu.encoder_counts = {counts}
 
 SKIPPED watchdog: untested
@@ -429,5 +429,5 @@ def find(outcome: str, keys: dict[str, object] | None = None, **seen: object) ->
 
 
 def plain(found: Finding) -> Finding:
-    """Return a copy of the finding as a `Finding`, even if it is a `TimingFinding`."""
+    """Return the finding as a `Finding`, without the `margin_s` of a `TimingFinding`."""
     return Finding(*(getattr(found, name) for name in Finding.__struct_fields__))

@@ -117,10 +117,10 @@ class Restarts:
             self._turned, self._turned_s = motors, at_s
 
     def look(self, line: bytes, at_s: float, reply: Reply | None) -> Restart | None:
-        """Return the restart that a received line shows, or None if it does not show a restart.
+        """Process a received line. Return a `Restart` if it shows that the board restarted.
 
-        `at_s` is the time at which `line` arrived, s. `reply` is the decoded line, or None if the
-        line is not a valid reply.
+        Otherwise return None. `at_s` is the time at which `line` arrived, s. `reply` is the decoded
+        line, or None if the line is not a valid reply.
         """
         sign = ""
         if reply is not None:
@@ -161,7 +161,10 @@ class Restarts:
 
 
 def cause(lines: Sequence[bytes]) -> str:
-    """Return the cause of a restart that `lines` of the board report, or "" without a report."""
+    """Return the cause of the last restart that the board reports in `lines`, such as "power".
+
+    Return "" if `lines` do not report a cause.
+    """
     said = [match[1].decode() for line in lines if (match := _CAUSE.search(line))]
     return said[-1] if said else ""
 
@@ -174,8 +177,10 @@ def finding(mcu: McuConfig, restarts: Sequence[Restart], back: bool = True) -> F
     """
     each = Counter(_told(mcu, one) for one in restarts)
     seen: dict[str, object] = {
-        "times": f"restarted{_times(len(restarts))}",
-        "told": "; ".join(f"while {when}{_times(n)}: {sign}" for (when, sign), n in each.items()),
+        "times": ", ".join(filter(None, ("restarted", _times(len(restarts))))),
+        "told": "; ".join(
+            f"{_times(n)} while {when}: {sign}".lstrip() for (when, sign), n in each.items()
+        ),
         "silent": min(one.silent_s for one in restarts),
         "patience": BOOT_S,
     }
@@ -204,4 +209,4 @@ def _told(mcu: McuConfig, restart: Restart) -> tuple[str, str]:
 
 
 def _times(count: int) -> str:
-    return "" if count == 1 else ", twice" if count == 2 else f", {count} times"
+    return "" if count == 1 else "twice" if count == 2 else f"{count} times"

@@ -37,7 +37,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--follow",
         action="store_true",
         help="run until Ctrl-C and print a result every S seconds (see --seconds). Each result "
-        "covers the time since the start, but at most the last ten minutes",
+        "covers the time since the start, but at most the last 60000 feedback lines (ten minutes "
+        "at 100 Hz)",
     )
     parser.add_argument("--json", action="store_true", help="print each result as a line of JSON")
     add_bus(parser)

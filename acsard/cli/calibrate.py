@@ -287,8 +287,8 @@ def _usable(args: argparse.Namespace, odometry: str) -> None:
         raise UsageError(f"--positions is not for --method {args.method}: leave one of them out")
     if args.positions in ("odom", odometry):
         raise UsageError(
-            "the daemon computes odom from the wheels themselves: give --positions the Zenoh key "
-            "of another source"
+            "the daemon computes odom from the wheels, so odom cannot show the errors of the "
+            "wheels: give --positions the Zenoh key of another source"
         )
     if args.imu and (args.positions or args.method not in (None, "gyro")):
         other = "--positions" if args.positions else f"--method {args.method}"

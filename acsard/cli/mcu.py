@@ -29,19 +29,19 @@ from acsard.terminal.prompt import Prompt, ended_by_signals
 from acsard.terminal.terminal_prompt import NoPrompt, TerminalPrompt
 
 DESCRIPTION = """\
-Test the microcontroller on your own robot with its wheels lifted. The tool finds its protocol and
-tests everything that the robot's safety depends on: baud rate, dialect and trailing comma, reply
-rate and round trip, the checked link, each motor and encoder alone, the watchdog, damaged lines,
-and the emergency stop and the bumpers that the board reports. It opens the port itself, so stop the
-daemon first (exit code 75 if the daemon has the port). It asks you to type that the wheels are
-lifted. Then it turns the motors one by one, and then all together. It commands at most 3 rad/s, but
-a wheel whose encoder is dead or reversed can reach full speed. If the board restarts during a test,
-the tool reports that and repeats the test. The check ends if the tool itself could not run for more
-than 0.5 s (5 s before the first motor test), for example because the computer was suspended. The
-tool always ends by sending zero speeds to the board, and sends nothing more after them. The exit
-code is 0 if every test was judged and none failed. It is 1 if a test failed, if the tool ended
-early, or if this computer was too slow to judge a test; in that case try again when the computer is
-idle.
+Test the microcontroller on your own robot with its wheels lifted. The tool finds the protocol of
+the board and tests everything that the robot's safety depends on: baud rate, dialect and trailing
+comma, reply rate and round trip, the checked link, each motor and encoder alone, the watchdog,
+damaged lines, and the emergency stop and the bumpers that the board reports. The tool opens the
+port itself, so stop the daemon first (exit code 75 if the daemon has the port). It asks you to type
+that the wheels are lifted. Then it turns the motors one by one, and then all together. It commands
+at most 3 rad/s, but a wheel whose encoder is dead or reversed can reach full speed. If the board
+restarts during a test, the tool reports that and repeats the test. The check ends if the tool
+itself could not run for more than 0.5 s (5 s before the first motor test), for example because the
+computer was suspended. The tool always ends by sending zero speeds to the board, and sends nothing
+more after them. The exit code is 0 if every test was judged and none failed. It is 1 if a test
+failed, if the tool ended early, or if this computer was too slow to judge a test; in that case try
+again when the computer is idle.
 """
 
 

@@ -259,18 +259,18 @@ def _address(text: str) -> str:
 
 
 _ADDED = """\
-{place} is for {name}. Add the name to its role in the robot's acsard.toml, and keep the names
-that are there. The lines below include the names in {where}. With --write FILE, this command
-changes the file for you. If the robot connects to a fleet's router, leave the lines out, because
-router.json5 has the roles.
+{place} is for {name}. Add the name to the list of its role in [access] of the robot's acsard.toml,
+and keep the names that are already in the list. The lines below include the names in {where}. With
+--write FILE, this command changes the file for you. If the robot connects to a fleet's router,
+leave the lines out, because router.json5 has the roles.
 """
 
 COMMAND_NAMES_WARNING = """\
 `acsard router`, `acsard web` and the gateway of `acsard run` use the new certificate within 5 s by
-themselves. For this, the gateway and the router disconnect their clients for about a second, and a
-robot that one of those clients drives ramps to zero. If you started `acsard gateway` by hand, it
-ends with code 1: start it again. A robot that connects to a router uses the new certificate when it
-connects the next time. Until then, `acsard doctor` warns about the old certificate; a restart of
+themselves. For this, the gateway and the router disconnect their clients for about a second. If one
+of these clients drives a robot, the robot ramps to zero. If you started `acsard gateway` by hand,
+it ends with code 1: start it again. A robot that connects to a router uses the new certificate when
+it connects the next time. Until then, `acsard doctor` warns about the old certificate; a restart of
 `acsard run` ends the warning immediately.
 
 A systemd service has copies of the files. To renew the copies, run these commands on the machine

@@ -49,7 +49,7 @@ def ros_table(config: Config) -> Topics:
             note = (
                 "changes the settings that `acsard set` lists"
                 if sets
-                else "the configuration as parameters"
+                else "reads the configuration as ROS parameters"
             )
         elif row.native.partition("/")[0] in COMMANDS and row.native not in known:
             note += ": refused, because no [[commands.sources]] has this name"

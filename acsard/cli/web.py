@@ -117,9 +117,10 @@ def _serve(args: argparse.Namespace, config: Config) -> int:
 
     def announce(found: Sequence[Listen]) -> None:
         for one, wished in zip(found, listen, strict=True):
-            taken = "" if one == wished else f"  ({wished.url} is taken)"
+            instead = f"  (instead of {wished.url}, at which acsard cannot listen)"
+            note = "" if one == wished else instead
             for url in page_urls(one, tls):
-                print(f"  page    {url}{taken}", flush=True)
+                print(f"  page    {url}{note}", flush=True)
 
     tls = args.tls or config.bus.tls
     listen = _listen(args, config)

@@ -71,8 +71,8 @@ ns. For a shorter delay the robot gets 0, because the estimated sample times are
 anyway."""
 
 NOT_STORED = (
-    "the new state is not stored on the disk yet; if the daemon restarts before it is stored, it "
-    "may lose a stop"
+    "the new state is not on the disk yet; if the daemon restarts before the disk has this state, "
+    "it may lose a stop"
 )
 """Text that is added to a successful answer if the answer is sent before the newest latches are in
 the latch file. This happens if the disk is slow."""
@@ -311,11 +311,11 @@ class ControlLoop:
         return outputs, went is not None
 
     def _to_keep(self, latches: Latches) -> Latches:
-        """Return the latches, and the lowered limits, that the next start of the daemon needs.
+        """Return `latches` in the form that the keeper must store for the next start of the daemon.
 
-        The result includes the limits that `set` requests have lowered, except decelerations. It
-        does not include the limit from the key `speed_limit`: the program that sent this limit may
-        have ended before the next start, so no program would lift it.
+        The field `lowered` of the result contains the limits that `set` requests have lowered,
+        except decelerations. It does not contain the limit from the key `speed_limit`. The program
+        that sent this limit may have ended before the next start, so no program would lift it.
         """
         now, file = self._speed.settings.limits, self._settings_file
         if file is not None:
@@ -422,10 +422,10 @@ class ControlLoop:
             self._others.append(BUS_STUCK)
 
     def _served(self, query: Query, now: Instant, refusals: list[Refusal]) -> Request | None:
-        """Answer a query and return None, or return the request that the robot must answer.
+        """Answer a query, or return it as a request if the robot must process it.
 
-        Also return None for a `set` request with the field `keep`, which waits for the settings
-        file.
+        Return None if this method has answered the query. Also return None for a `set` request with
+        the field `keep`. This request first waits until the settings file has been checked.
         """
         try:
             served = self._queries.serve(query, self._current, self.outputs)
@@ -447,8 +447,8 @@ class ControlLoop:
     def _keep(self, request: Request, now: Instant) -> None:
         if self._settings_file is None:
             text = (
-                "nothing is set: this daemon has no configuration file in which to keep settings; "
-                "leave `keep` out of the request"
+                "no setting was changed: this daemon has no configuration file in which to keep "
+                "settings; leave `keep` out of the request"
             )
             self._answers.append((now.mono_ns, Answer(request.id, False, text)))
         else:
@@ -457,8 +457,9 @@ class ControlLoop:
     def _keepable(self, now: Instant) -> tuple[Request, ...]:
         """Return the `set` requests with the field `keep` that the robot must process now.
 
-        The thread of the settings file has checked that it can write their settings to the file.
-        Also queue the answers to the requests that have ended.
+        The thread of the settings file has checked that it can write the settings of these requests
+        to the file. This method also queues the answers to `set` requests that failed or are
+        complete.
         """
         if self._settings_file is None:
             return ()

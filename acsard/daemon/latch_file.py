@@ -1,7 +1,7 @@
-"""The file that keeps the latches for the next start of the daemon.
+"""The file that stores the latches for the next start of the daemon.
 
 A latch is a stop, a fault or "inactive", which lasts until a person releases it. The file also
-keeps the limits that `set` requests have lowered, except decelerations. `latch_rules.py` decides
+stores the limits that `set` requests have lowered, except decelerations. `latch_rules.py` decides
 with which latches the robot starts.
 
 The control loop hands the newest latches to a thread that writes the file, and never waits for the
@@ -357,9 +357,9 @@ class LatchFile:
         return trouble
 
     def _read_late(self, now: Instant) -> None:
-        """Read the file that `start()` could not read in time.
+        """Read the latches in the file, if `start()` could not read the file in time.
 
-        Otherwise, the next write would overwrite its latches.
+        Without this call, the next write of the file would overwrite these latches.
         """
         self._blind = False
         if self._found is None:
@@ -425,8 +425,9 @@ class LatchFile:
         """Return `latches` with the latches in `_missed` added.
 
         `_missed` contains latches of the file that `start()` could not read in time. If `latches`
-        has a fault or "inactive", the one in `_missed` is dropped permanently. A missed stop is
-        never added, because `start()` has set a stop when it could not read the file.
+        has a fault, the fault in `_missed` is dropped permanently. The same holds for "inactive".
+        `_missed` never contains a stop, because `start()` has set a stop when it could not read the
+        file.
         """
         missed = self._missed
         if latches.fault is not None:
@@ -445,7 +446,12 @@ class LatchFile:
         if reason == self._failed:
             return
         self._failed = reason
-        text = f"{unwritable(self.where, reason)}; the daemon tries again every {RETRY_PAUSE_S:g} s"
+        then = (
+            "the daemon does not try again: correct this, and restart the daemon"
+            if self._barred
+            else f"the daemon tries again every {RETRY_PAUSE_S:g} s"
+        )
+        text = f"{unwritable(self.where, reason)}; {then}"
         self._news.put(Event("latch_file", text, "warning"))
 
     def _recover(self) -> None:

@@ -70,7 +70,10 @@ class _Checked(Struct, frozen=True):
 
 
 class _Pending(Struct):
-    """A `set` request with the field `keep` that waits for its reply or the change of the file."""
+    """A `set` request with the field `keep` that is not finished yet.
+
+    Its client has no answer yet, or the thread may still change the file.
+    """
 
     request: Request
     due_ns: int
@@ -158,8 +161,9 @@ class SettingsFile:
     def keep(self, request: Request, now_ns: int) -> None:
         """Queue a `set` request with the field `keep`, so that the thread checks it.
 
-        `results` later returns the request, if the robot must use its settings, or an answer for
-        the client. `now_ns` is the present monotonic time, ns.
+        If the check succeeds, a later call of `results` returns the request, and the robot must use
+        the settings in it. Otherwise `results` returns an answer for the client. `now_ns` is the
+        present monotonic time, ns.
         """
         why = ""
         if self._no_thread:
@@ -207,9 +211,10 @@ class SettingsFile:
     def results(self, now_ns: int, events: list[Event]) -> list[Request | Answer]:
         """Return the requests whose settings the robot must use now, and the answers for clients.
 
-        Append an event to `events` for each request whose settings were written to the file. Also
-        append an event if the file could not be changed for a request that was overdue, because its
-        client already has an answer. `now_ns` is the present monotonic time, ns.
+        Append an event to `events` for each request whose settings were written to the file. If a
+        request took too long, its client already has an answer. If the file then cannot be changed,
+        append an event too, because the client gets no further answer. `now_ns` is the present
+        monotonic time, ns.
         """
         if not self._pending:
             return []
@@ -236,7 +241,7 @@ class SettingsFile:
                 text = f"{keys} to {self._file}: {one.message}"
                 events.append(Event("set", text, "warning", by=by, kind="not written"))
         # Skip a request that the robot is deciding about. The robot may use its settings, so the
-        # answer must not say that nothing is set.
+        # answer must not say that no setting was changed.
         overdue = [
             waits
             for waits in self._pending.values()
@@ -266,7 +271,7 @@ class SettingsFile:
         The next start reads the limits from the configuration file. If the daemon has not written
         limits to that file, the result is `latches`. Otherwise the field `lowered` of the result
         contains each limit, except decelerations, that is lower in `now` than in the file. For the
-        same arguments, the result is the same object.
+        same arguments, the result is the same object, so that the latch file is not written again.
 
         Args:
             latches: the robot's latches.
@@ -314,7 +319,7 @@ class SettingsFile:
         try:
             return _Checked(request, prepare_edit(self._file, request.settings))
         except MendableError as error:
-            return Answer(request.id, False, f"nothing is set: {error}")
+            return Answer(request.id, False, f"no setting was changed: {error}")
 
     def _written_answer(self, edit: Edit, answer: Answer) -> Answer:
         told = answer.message
@@ -370,5 +375,5 @@ def _overdue(pending: _Pending) -> Answer:
         text = f"{answer.message}, but {why}: check whether the file has the new value"
     else:
         refused = pending.refused or f"{why}; check the disk (`dmesg`), then try again"
-        text = f"nothing is set: {refused}"
+        text = f"no setting was changed: {refused}"
     return Answer(pending.request.id, False, text)

@@ -183,7 +183,10 @@ def compared(running: Running, file: Config) -> Iterator[Finding]:
 
 
 def _tables(differing: Mapping[str, Difference]) -> str:
-    """Return text for the configuration file that sets the daemon's values of these keys."""
+    """Return the lines that the user must write into the configuration file.
+
+    With these lines, the file contains the values that the running daemon has.
+    """
     parts = [(key.rpartition("."), write(one.its)) for key, one in differing.items()]
     return "; ".join(f"[{table}] {name} = {value}" for (table, _, name), value in parts)
 
@@ -246,12 +249,12 @@ def link(running: Running) -> Iterator[Finding]:
     for times, text in went:
         yield Finding("link", "warning" if times > often else "ok", text, mend)
     if not problems and not late and not went:
-        text = "the link is up, and no line to or from the board is lost"
+        text = "the link is up, and almost all lines to and from the board arrive"
         if config.mcu.reply_period:
             text = (
-                "the link is up, and the daemon can read the lines from the board; the lines to "
-                "the board were not judged, because a board with mcu.reply_period does not answer "
-                "each line"
+                "the link is up, and the daemon can read the lines from the board; this tool "
+                "cannot check the lines to the board, because a free-running board "
+                "(mcu.reply_period is set) does not answer each line"
             )
         yield Finding("link", "ok", text)
     if state.wheel_fault:
@@ -282,7 +285,10 @@ def _bumpers(config: Config, state: RobotState, mend: str) -> Iterator[Finding]:
         # If the board has fallen silent, all bumpers count as pressed.
         todo = f"{RELEASE}; if none is pressed, {CHECK}; then `acsard call clear`"
         if safety.bumper == "away":
-            todo = f"drive straight away from the obstacle; if the robot is stopped, {todo}"
+            todo = (
+                "drive the robot in a straight line away from the obstacle; if the robot is "
+                f"stopped, {todo}"
+            )
         yield Finding("bumpers", "warning", bumpers.pressed_words(safety.bumpers, pressed), todo)
     elif pressed is not None:
         text = f"the board reports {many(len(pressed), 'bumper')}, and none is pressed"
@@ -313,8 +319,9 @@ def _battery(config: BatteryConfig, battery: BatterySummary | None, mend: str) -
 def unanswered_lines(passed: Mapping[str, int], config: Config) -> Iterator[str]:
     """Yield a warning text if the board answered too few of the daemon's lines.
 
-    Yield nothing for a board with a configured `mcu.reply_period`. `passed` maps the name of each
-    of the daemon's counters to its increase within about a second.
+    Yield nothing for a free-running board (a board with a configured `mcu.reply_period`), because
+    such a board does not answer each line. `passed` maps the name of each of the daemon's counters
+    to its increase within about a second.
     """
     sent, came = passed.get("lines_sent", 0), passed.get("lines", 0)
     # With fewer than 40 lines, the share of lost lines is not significant.
@@ -572,7 +579,8 @@ def late(running: Running) -> Iterator[Finding]:
     ]
     for event, cause in causes[-MAX_CAUSES:]:
         level: Level = "warning" if told else "ok"
-        text = f"the daemon missed control periods just before {utc(event.stamp.to_ns())}: {cause}"
+        at = utc(event.stamp.to_ns())
+        text = f"the daemon missed control periods just before {at}: it was late {cause}"
         yield Finding("daemon", level, text, CAUSES_PAGE)
 
 

@@ -102,12 +102,12 @@ def scheduling(wanted: bool, pid: int | None) -> Iterator[Finding]:
             REAL_TIME_ADVICE,
         )
     elif real_time.allowed():
-        yield Finding("real time", "ok", "a daemon of this user gets real-time scheduling")
+        yield Finding("real time", "ok", "a daemon that this user starts gets real-time scheduling")
     else:
         yield Finding(
             "real time",
             "warning",
-            "a daemon of this user gets no real-time scheduling",
+            "a daemon that this user starts does not get real-time scheduling",
             REAL_TIME_ADVICE,
         )
 

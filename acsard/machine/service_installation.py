@@ -53,8 +53,8 @@ def unusable_location(
     """
     if prefix == base:
         return (
-            f"acsard runs from {prefix} and does not run from a venv, but a service needs one; "
-            f"install acsard in a venv at {HOME} (deploy/systemd/README.md)"
+            f"acsard runs from {prefix}, which is not a venv, but a service needs a venv; install "
+            f"acsard in a venv at {HOME} (deploy/systemd/README.md)"
         )
     if _hidden(Path(prefix), hidden):
         return (
@@ -161,8 +161,9 @@ class File(Struct, frozen=True):
     def is_as_written(self) -> bool:
         """Return whether the existing file has the permission bits `mode` and the owner root.
 
-        Return True for each file with `kept` and for each symbolic link, because the user decides
-        about their mode and owner. Raises `OSError` if the file does not exist.
+        Return True for each symbolic link, and for each file that the user may change (`kept` is
+        true), because the user decides about their mode and owner. Raises `OSError` if the file
+        does not exist.
         """
         status = self.path.lstat()
         if self.kept or stat.S_ISLNK(status.st_mode):
@@ -396,7 +397,7 @@ def admitted(file: File, found: bytes | None, directory: Path) -> Write | Keep:
         file.content if found is None else found,
     )
     if text == found:
-        return Keep(file.path, "it names these certificates")
+        return Keep(file.path, "it already names the directory of the certificates")
     return Write(File(file.path, text))
 
 
@@ -418,15 +419,16 @@ def installing(
 ) -> list[Step]:
     """Return the steps that install the service.
 
-    An existing file with `File.kept` stays as it is.
+    The steps never change an existing file that the user may change (`File.kept` is true).
 
     Args:
         wanted: the files of the installation.
         found: the present content of each file, by path; None for a file that does not exist.
         wrong: the paths of the existing files whose mode or owner is wrong. The steps write these
             files again.
-        force: whether to overwrite existing files whose content differs from the installation. If
-            `force` is false and such a file exists, the function raises `MendableError`.
+        force: whether to overwrite other existing files whose content differs from the
+            installation. If `force` is false and such a file exists, the function raises
+            `MendableError`.
     """
     steps: list[Step] = []
     changed: list[str] = []
@@ -477,10 +479,10 @@ def uninstalling(
         wanted: the files of the installation.
         found: the present content of each file, by path; None for a file that does not exist.
         others: other paths in the service's directories. Only `purge` removes them.
-        force: whether to remove even files whose content was changed, except those with
-            `File.kept`.
-        purge: whether to remove everything, including changed files, files with `File.kept`, the
-            paths in `others` and the state directories.
+        force: whether to remove files whose content was changed, too. Even then, a changed file
+            stays if it is meant for the user's changes (`File.kept` is true).
+        purge: whether to remove everything, including all changed files, the paths in `others` and
+            the state directories.
         stateful: the units that have a state directory. Only `purge` removes these directories. If
             such a unit is missing, a purge first installs it again, because only systemd can remove
             the directory.

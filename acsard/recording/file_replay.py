@@ -1,4 +1,6 @@
-"""Replays a recording, and compares the two copies of each event in the recording.
+"""Replays a recording, and checks the copies of the events in the recording.
+
+A file contains each event twice: in a control step, and as a message of the channel `events`.
 
 After a damaged place, the replay resumes at the next robot state in the file. The steps between the
 damage and this state cannot be replayed.
@@ -86,8 +88,10 @@ class ReplayResult(NamedTuple):
 
     @property
     def same(self) -> bool:
-        """True if all replayed outputs equal the recorded outputs, and all events equal their
-        copies."""
+        """True if the replay found no difference.
+
+        All replayed outputs then equal the recorded outputs, and all events equal their copies.
+        """
         return self.comparison.same and not self.event_copies
 
 
@@ -139,7 +143,7 @@ is this factor times the size of the file, plus `MAX_BYTES`."""
 
 
 class _Source:
-    """Base class of the replays of a recording."""
+    """Base class of `RecordedRun` and `DisplayReplay`. It decodes recorded states of the robot."""
 
     def __init__(self, recording: Recording) -> None:
         self._recording = recording
@@ -157,9 +161,10 @@ class _Source:
 
     @contextmanager
     def state_errors(self) -> Iterator[None]:
-        """Convert the errors of a robot with an incomplete recorded state to `RecordingError`.
+        """Convert errors that an incomplete robot state causes in a `with` block.
 
-        A forged state may lack any part, so every use of the robot must be in such a `with` block.
+        The block then raises `RecordingError`. A forged recording may contain a robot state without
+        some of its parts. Therefore every use of the robot must be in such a `with` block.
         """
         try:
             yield
@@ -181,11 +186,11 @@ class _Source:
         number: int,
         tried: Callable[[Config], Config] | None = None,
     ) -> State | None:
-        """Decode `saved` if it is the robot's state before step `number`, and return the state.
+        """Return the robot's state before step `number`, decoded from `saved`.
 
-        Return None if `saved` is None or another state, or if it cannot be used. `tried` is None,
-        or a function that maps the configuration in the state to the configuration that the replay
-        tries instead.
+        Return None if `saved` is None, if it is the state before another step, or if it cannot be
+        used. If the replay uses another configuration, `tried` is the function that returns this
+        configuration for the recorded one.
         """
         if saved is None or saved.number != number:
             return None
@@ -206,8 +211,9 @@ class _Source:
 class RecordedRun(_Source):
     """The steps of a recording that can be replayed, and a robot that can replay them.
 
-    The caller must pass each step from `steps()` to `robot`, before it takes the next step. After
-    missing steps, the run resumes with another robot, from the next robot state in the file.
+    The caller must replay each step from `steps()` with `robot` before it requests the next step.
+    After missing steps, the replay resumes with another robot, from the next robot state in the
+    file.
     """
 
     def __init__(
@@ -221,8 +227,8 @@ class RecordedRun(_Source):
         Args:
             recording: the recording to replay.
             other: the configuration of the replay; None for the recorded configuration.
-            copies: object to which `steps()` passes the two copies of each event, or None. The
-                caller must call its method `end()`.
+            copies: if not None, `steps()` passes both copies of each event to this object. The
+                caller must call `copies.end()` after the last step.
 
         Raises:
             RecordingError: this version of acsard cannot use the recorded configuration or state.
@@ -284,8 +290,8 @@ class RecordedRun(_Source):
                 yield step
         if last is None:
             raise RecordingError(
-                f"{recording.path} has no steps, because it ends within its first second: choose "
-                "another recording"
+                f"{recording.path} has no readable steps: it ends within its first second, or its "
+                "steps are damaged. Choose another recording"
             )
         if self.number is None:
             raise RecordingError(
@@ -539,9 +545,11 @@ class EventCopies:
             )
 
     def _compare(self, last: bool, follows: bool = True) -> None:
-        """Report the first event of the newest batch that differs from its copy.
+        """Compare the events of the most recent batch with their copies, and store a difference.
 
-        `last` is true for the last batch. `follows` is true if no step is missing after the batch.
+        `last` is true for the last batch of the file: if the file was cut off, copies may be
+        missing. `follows` is false if steps are missing after the batch: the batch is then not
+        compared.
         """
         recording = self._recording
         if recording.damaged > self._damaged or not follows:

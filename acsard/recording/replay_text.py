@@ -56,7 +56,7 @@ def explain_verdict(other: bool) -> str:
         f"{computed} from the recorded inputs, and compares them with the recorded outputs: each "
         "line to the board; each odometry pose, rounded to 1 um; the mode, reason, link and source "
         "of each step; and each event with its text and its client. A checksum verifies the names "
-        "in the inputs.)"
+        "of sources, senders and clients in the inputs.)"
     )
 
 
@@ -124,7 +124,8 @@ def explain_settings(
 ) -> list[str]:
     """Return lines of text about the effects of changed settings in a replay.
 
-    They name the changed settings, the first line to the board that differs, and a new fault.
+    The text names the changed settings, the first line to the board that differs from the recorded
+    line, and the first fault that only the replayed robot has.
 
     Args:
         recorded: the recorded configuration.
@@ -177,8 +178,8 @@ def _speeds(recorded: int, replayed: int) -> str:
 def describe_outcome(comparison: Comparison) -> list[str]:
     """Return lines of text that compare the motion of the recorded and the replayed robot.
 
-    They contain the number of different lines to the board, the highest wheel speeds, the last
-    poses, and the largest distance between the two paths.
+    The text says how many lines to the board differ. It also contains the highest wheel speeds and
+    the last poses of both robots, and the largest distance between their paths.
     """
     rows = [
         f"{comparison.lines - comparison.lines_same} of {comparison.lines} lines to the board "

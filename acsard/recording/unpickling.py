@@ -140,7 +140,7 @@ class _Entry:
         values. From then on, the value must not grow."""
 
     def holds(self, parts: Sequence[_Entry]) -> None:
-        """Update the depth and the size for `parts`, which the caller will add to this value.
+        """Update the depth and the size before the caller adds `parts` to this value.
 
         Raises `ValueError` if the value must not grow, or if it exceeds a limit.
         """
@@ -226,7 +226,7 @@ class _Machine:
 
     def _top(self, count: int) -> list[_Entry]:
         if len(self._stack) < count:
-            raise IndexError("its stack is empty")
+            raise IndexError("an instruction takes more values than there are on the stack")
         taken = self._stack[-count:]
         del self._stack[-count:]
         return taken
@@ -273,7 +273,7 @@ class _Machine:
     def _extend(self, parts: list[_Entry]) -> None:
         whole = self._stack[-1]
         if type(whole.value) not in (list, deque):
-            raise TypeError("the state's pickle appends to an object that is not a list")
+            raise TypeError("an instruction appends to an object that is not a list")
         whole.holds(parts)
         whole.value.extend([part.value for part in parts])
 
@@ -310,7 +310,10 @@ class _Machine:
     def construct(self) -> None:
         kind, given = self._top(2)
         if not isinstance(kind.value, type) or not isinstance(given.value, tuple):
-            raise TypeError("an instruction calls an object that is not a class")
+            raise TypeError(
+                "an instruction calls an object that is not a class, or calls a class without a "
+                "tuple of arguments"
+            )
         entry = _Entry(None)
         entry.holds([given])
         self._copies(given)
@@ -321,8 +324,8 @@ class _Machine:
         kind, given = self._top(2)
         if not isinstance(kind.value, type) or given.value != ():
             raise TypeError(
-                "the state's pickle calls something that is not a class, or a class without the "
-                "arguments that it needs"
+                "an instruction makes an object of a value that is not a class, or makes an object "
+                "with arguments, which acsard never writes"
             )
         if not _is_part(kind.value):
             raise ValueError(f"{kind.value.__name__} cannot be constructed without values")
@@ -381,18 +384,19 @@ def _keys(entries: Sequence[_Entry]) -> None:
         if type(value) is tuple:
             if len(value) > MAX_KEY_PARTS or not all(map(_is_tuple_key_part, value)):
                 raise ValueError(
-                    "the robot state uses a tuple as a key that has other parts than a few texts "
-                    "and small numbers, which this acsard never writes"
+                    "the robot state uses a tuple as a key, and the tuple has more than "
+                    f"{MAX_KEY_PARTS} parts, or a part that is neither a text nor a small number; "
+                    "acsard never writes such a key"
                 )
         elif type(value) not in KEY_TYPES and not isinstance(value, Enum):
             raise ValueError(
-                f"the robot state has a dictionary with a {type(value).__name__} as a key, which "
-                "this version of acsard never writes"
+                f"the robot state uses a {type(value).__name__} as a key of a dictionary or as an "
+                "element of a set, which this version of acsard never writes"
             )
         elif type(value) is int and abs(value) >= MAX_KEY:
             raise ValueError(
-                "the robot state uses a number of 2^61 - 1 or more as a key, which acsard never "
-                "writes"
+                "the robot state uses a number with a magnitude of 2^61 - 1 or more as a key, "
+                "which acsard never writes"
             )
 
 
@@ -401,7 +405,10 @@ def _is_tuple_key_part(part: object) -> bool:
 
 
 def _is_part(kind: Any) -> bool:
-    """Return whether objects of the class `kind` can be rebuilt from their attributes alone."""
+    """Return whether objects of the class `kind` can be rebuilt from their attributes alone.
+
+    The constructor and other methods of the class need not run for this.
+    """
     plain = kind.__new__ is object.__new__ and kind.__reduce_ex__ is object.__reduce_ex__
     return plain and kind.__module__ != "builtins" and not hasattr(kind, "__setstate__")
 

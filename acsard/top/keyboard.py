@@ -3,13 +3,13 @@
 A terminal reports a key press but never its release. Each press therefore drives the robot for
 `KEY_HOLD_S`. From the third repeat (`REPEATS`) of a held key on, each repeat drives the robot
 for `REPEAT_S` only. When this time is over, `acsard drive` sends three zero commands and then
-nothing. If this program was not running for more than 0.5 s, the keys that the operator typed in
-that time do not drive the robot.
+nothing. If this program was paused for more than 0.5 s, the keys that the operator typed during the
+pause do not drive the robot.
 
 A key that was pressed before a stop must not drive the robot after the `clear`, even if an SSH
 connection pauses and the key seems to be released. So if the robot stops following while a key is
-held, this key no longer drives the robot. Driving keys work again after a key that stops the robot,
-unless something delayed that key, or after 1.5 s without a driving key.
+held, this key no longer drives the robot. Driving keys work again in two cases: the operator
+presses a key that stops the robot and arrives without delay, or no driving key arrives for 1.5 s.
 """
 
 from __future__ import annotations
@@ -59,7 +59,8 @@ BURST_S = 0.2
 read from the terminal may not return all delayed keys."""
 
 RELEASE_REASON = (
-    "the robot did not follow while this key was held: press space, then press the key again"
+    "you held this key while the robot could not drive, so the key is ignored: press space, then "
+    "press the key again"
 )
 """Text for the operator if a held key does not drive the robot although the robot could follow."""
 
@@ -139,11 +140,13 @@ class Keyboard:
     def end_hold(self, now: float) -> None:
         """Stop the robot, and ignore the key that is held at `now` (monotonic clock, s).
 
-        Call this when a state arrives that shows that the robot does not follow. If the operator
-        has begun to hold the key less than `SETTLED_S` ago, do nothing, because the state may be
-        older. If no key seems to be held, a network may be delaying the repeats of a held key. If
-        more than `MAX_BURST_KEYS` of them then arrive together, the key does not drive the robot
-        either.
+        Call this when a state arrives that shows that the robot does not follow. There are two
+        special cases:
+
+        - The operator began to hold the key less than `SETTLED_S` ago. Then do nothing, because the
+          state may be older than the key press.
+        - No key seems to be held. Then the network may be delaying the repeats of a held key. If
+          more than `MAX_BURST_KEYS` repeats arrive together later, ignore this key too.
         """
         held = self._held(now)
         if self._over or (held and now - self._begun <= SETTLED_S):
@@ -153,7 +156,7 @@ class Keyboard:
             self._stop(now)
 
     def ignores(self, now: float) -> bool:
-        """Return whether a key is held that does not drive the robot since a call of `end_hold`.
+        """Return whether the operator holds a key that is ignored because of `end_hold`.
 
         `now` is the present time on the monotonic clock, s.
         """

@@ -57,7 +57,7 @@ def motion(state: RobotState, width: int) -> list[Text]:
 
 
 def sources(state: RobotState, room: int, width: int) -> list[Text]:
-    """Return lines about each command source: priority, age of the last command, reason to wait.
+    """Return lines about each command source: its priority, last command's age, and status.
 
     If the sources need more than about `room` lines, the last line counts the sources that do not
     fit, and names the first of them. A line has at most `width` character cells.
@@ -70,7 +70,7 @@ def sources(state: RobotState, room: int, width: int) -> list[Text]:
         name = Text(clean(one.name))
         name.truncate(13, overflow="ellipsis", pad=True)
         said = [Text(f"{mark}{name.plain} {count(one.priority):>8}  {rough(one.age)}")]
-        said += folded(waits(one, state), width, 4)
+        said += folded(f"waits for: {waits(one, state)}", width, 4)
         if len(lines) > 1 and len(lines) + len(said) > room:
             break
         lines += [*said]

@@ -31,7 +31,7 @@ LINK_STYLES = {"up": "green", "booting": "yellow"}
 LATENCY_ROWS = {
     "period_lateness": (
         "period due → step",
-        "from the first unmet due time to the step's start",
+        "from the due time (or first missed one) to step start",
     ),
     "step_time": ("work of one step", "from the start of a step to the end of its work"),
     "command_age": ("arrival → each line", "from a command's arrival to each line that carries it"),

@@ -81,7 +81,9 @@ class Parts:
         head = self._buffer.find(b"\r\n\r\n", 0, MAX_HEAD)
         if head < 0:
             if len(self._buffer) >= MAX_HEAD:
-                raise ValueError("a picture has no header lines before it")
+                raise ValueError(
+                    f"the header of a picture is missing, or has {MAX_HEAD} bytes or more"
+                )
             return None
         begin = head + 4
         if found := _LENGTH.search(self._buffer, 0, head):
@@ -138,7 +140,7 @@ class Camera:
 
     @asynccontextmanager
     async def sending(self, token: str) -> AsyncIterator[None]:
-        """Count the `with` block as the sending of one picture, for the limits on sent pictures.
+        """Limit how many pictures are sent at the same time. Send one picture in the `with` block.
 
         If a limit is reached (`SENDS`, `SENDS_OF_TOKEN`), first wait until another picture has been
         sent. `token` is the client's token. Raises `TroubleError` after a wait of

@@ -26,9 +26,9 @@ NO_ROUTER_NOTE = (
 """Note to the page's users if the page's server is connected to a daemon instead of a router."""
 
 OWN_ROBOT_NOTE = (
-    "{endpoint} allows only exact keys, as every TLS endpoint does, so this page sees no other "
-    "robot. To see all robots of a router, run this page's server on the router's machine: "
-    "acsard web --connect tcp/127.0.0.1:7447 --id {robot}"
+    "{endpoint} uses TLS, and over TLS this page looks only for its own robot, because TLS "
+    "endpoints normally refuse keys with wildcards. To see all robots of a router, run this page's "
+    "server on the router's machine: acsard web --connect tcp/127.0.0.1:7447 --id {robot}"
 )
 """Note to the page's users if the page's server is connected over TLS. The server can then reach
 only its own robot."""

@@ -48,7 +48,7 @@ NO_DEVICE = (
     "check` in a terminal on the robot."
 )
 
-ABSENT_PORT = "configured, not there now"
+ABSENT_PORT = "configured, but it does not exist now"
 
 POSITIONS = "positions"
 
@@ -181,7 +181,9 @@ class Guide:
             job.leave()
 
     async def stop(self) -> Ending:
-        """Interrupt the running check or calibration, and return the result within about 1 s.
+        """Interrupt the running check or calibration, and wait up to 1 s for its end.
+
+        The result says whether it has ended.
 
         Call this whenever any client stops the robot. The daemon alone cannot stop the wheels
         during a check, because the check has opened the serial port in place of the daemon.
@@ -271,10 +273,10 @@ def boards(configured: str) -> list[Board]:
 def arguments(begin: Begin, reach: Reach, ports: Collection[str]) -> list[str]:
     """Return the arguments with which `acsard` runs the check or calibration `begin`.
 
-    A text from the browser becomes only the value of an option. `reach` contains the options that
-    connect a calibration to the daemon. `ports` are the ports that a check may use. Raises
-    `FrameError` if a value in `begin` is not in the set of permitted values, or is not a plain
-    Zenoh key.
+    A text from the browser becomes only the value of an option, so a browser cannot add options.
+    `reach` contains the options that connect a calibration to the daemon. `ports` are the ports
+    that a check may use. Raises `FrameError` if a value in `begin` is not in the set of permitted
+    values, or is not a plain Zenoh key.
     """
     config = [f"--config={reach.config}"] if reach.config else []
     if begin.begin == "check":

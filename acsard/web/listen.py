@@ -134,7 +134,8 @@ def open_sockets(listen: Sequence[Listen], next_port: bool) -> list[tuple[Listen
 def _ipv4_ports(listen: Sequence[Listen]) -> set[int]:
     """Return the ports at which a socket at `::` must not accept IPv4 connections.
 
-    These are the ports of the addresses in `listen` whose host is an IPv4 address or a name.
+    Another socket accepts the IPv4 connections there. These are the ports of the addresses in
+    `listen` whose host is an IPv4 address or a name.
     """
     return {one.port for one in listen if ":" not in one.host}
 
@@ -160,6 +161,6 @@ def _open_socket(one: Listen, next_port: bool, both: bool) -> tuple[Listen, sock
         opened.setblocking(False)
         return Listen(one.secure, one.host, port), opened
     raise InUseError(
-        f"cannot listen at {one.url}: {trouble}; stop the program that uses this address, or "
-        "choose another address with --address or the setting web.address"
+        f"cannot listen at {one.url}: {trouble}; if another program uses this address, stop that "
+        "program, or choose another address with --address or the setting web.address"
     ) from None

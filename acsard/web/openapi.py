@@ -59,16 +59,16 @@ def _raw(schema: Described) -> Any:
 
 
 def _value(key: str, kind: str) -> type[Struct]:
-    """Return the type of the WebSocket messages with the values of the bus key `key`.
+    """Return a new `Struct` type for the WebSocket messages about the bus key `key`.
 
-    `kind` is the name of the schema of these values.
+    Each message contains a value of the key. `kind` is the name of the schema of these values.
     """
     return msgspec.defstruct(
         VALUE_PREFIX + key.replace("/", "."),
         [
             ("value", _raw({"anyOf": [_ref(kind), {"type": "null"}]})),
             ("age", Annotated[float, Meta(ge=0, description="ms")]),
-            ("robot", Annotated[str, Meta(description="only for another robot")], ""),
+            ("robot", Annotated[str, Meta(description="absent for the page's own robot")], ""),
         ],
         namespace={
             "__doc__": "The newest message of this Zenoh key; null if the message is not readable."

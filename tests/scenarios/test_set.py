@@ -1,4 +1,4 @@
-"""Settings change in the middle of the robot's work: at a step's edge, safely, and logged."""
+"""An operator changes settings while the robot drives: between two steps, safely, and logged."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def world() -> World:
 
 
 def sets(world: World, **settings: Plain) -> ServiceReply:
-    """Dots in keys are written as two underscores."""
+    """Call `set` with these settings. Two underscores in a name stand for a dot."""
     wishes = {key.replace("__", "."): value for key, value in settings.items()}
     return world.call("set", msgspec.json.encode({"settings": wishes}))
 
@@ -38,7 +38,7 @@ def config(world: World) -> Config:
 
 
 def applied(world: World) -> list[tuple[float, float]]:
-    """Return when each line from now on was made, s, and its speed, m/s."""
+    """Return a list to which each later step with a line adds its time (s) and speed (m/s)."""
     found: list[tuple[float, float]] = []
 
     def note(outputs: Outputs) -> None:
@@ -50,7 +50,7 @@ def applied(world: World) -> list[tuple[float, float]]:
 
 
 def slopes(lines: list[tuple[float, float]]) -> list[float]:
-    """Return m/s2 from each line to the next."""
+    """Return the acceleration in m/s2 between each pair of consecutive lines."""
     return [(v - before) / (t - at) for (at, before), (t, v) in pairwise(lines)]
 
 
@@ -58,7 +58,7 @@ def test_a_daemon_without_a_file_keeps_nothing_and_sets_nothing(world: World) ->
     wishes = {"settings": {"limits.linear_speed": 0.4}, "keep": True}
     reply = world.call("set", msgspec.json.encode(wishes))
     told = (
-        "nothing is set: this daemon has no configuration file in which to keep settings; "
+        "no setting was changed: this daemon has no configuration file in which to keep settings; "
         "leave `keep` out of the request"
     )
     assert (reply.success, reply.message) == (False, told)

@@ -1,8 +1,8 @@
-"""deploy/zenoh is true: its router holds two robots and each client to their certificates.
+"""The router of deploy/zenoh restricts two robots and each client to their permissions.
 
-The router is Zenoh itself in router mode with router.json5. Only addresses and files differ, and a
-few lines in the router's process replace the storage plugin. The tests judge effects. No test waits
-to see a forbidden effect stay away: a request that is answered follows each attempt.
+The router is the Zenoh library in router mode with router.json5. Only addresses and files differ,
+and a few lines of code replace the storage plugin. The tests check effects. To see that nothing
+happens, a test sends a request after each attempt and waits for its answer.
 """
 
 from __future__ import annotations
@@ -194,7 +194,11 @@ class Member(Bus):
         self.root = f"acsard/{robot_id}"
 
     def ask(self, key: str, payload: object = None) -> list[Answered]:
-        """Return the robot's own answers, which are in JSON. A storage holds the published form."""
+        """Return the robot's own answers to a query.
+
+        They are in JSON. Answers from a storage of the router are left out, because they have the
+        encoding of the published message.
+        """
         data = self.payload(key, payload)
         found = []
         for reply in self.session.get(
@@ -248,9 +252,9 @@ class Fleet:
         self._stack.close()
 
     def robot(self, robot_id: str, name: str = "", *, ready: bool = True) -> Daemon:
-        """Return a daemon with robot.toml and the certificate of its id, quick to drive and report.
+        """Return a daemon with robot.toml and the certificate of its id, and with high rates.
 
-        robot2 is a peer instead, as README.md has it for a robot with programs of its own.
+        robot2 is a Zenoh peer, as README.md describes for a robot that runs other programs.
         """
         tables = tomllib.loads(ROBOT_FILE.read_text())
         if robot_id == "robot2":
@@ -264,7 +268,7 @@ class Fleet:
         return Daemon(self.where, config=tables, name=name or robot_id, ready=ready)
 
     def member(self, name: str, robot_id: str = "robot1") -> Member:
-        """Run a client with this certificate, set up as README.md has it for any language."""
+        """Connect a client with this certificate and README.md's settings for all languages."""
         config = client_config(self.endpoint)
         tls = tls_settings(self.where / name)
         config.insert_json5("transport/link/tls", json.dumps(tls))
@@ -276,16 +280,16 @@ class Fleet:
             self._fooled.set()
 
     def fooled(self) -> bool:
-        """Return whether the witness has since received a command or a forged message."""
+        """Return whether the witness received a command or forged message since the last call."""
         self.robots[0].ask("info")
         was = self._fooled.is_set()
         self._fooled.clear()
         return was
 
     def comes(self, look: Callable[[], bool], steps: int = 5) -> bool:
-        """Return whether `look` becomes true within this number of control periods.
+        """Return whether `look` returns True within `steps` control periods.
 
-        Periods are long compared with a delivery on one machine.
+        A period is long compared with the delivery of a message on one machine.
         """
         here = self.robots[0]
         begun = here.count("lines_sent")
@@ -327,14 +331,20 @@ class Visitor:
         self._answering = [ONE, TWO] if name in ANYBODY else [TWO] if name in ITSELF else []
 
     def _behind(self) -> None:
-        """Wait until all messages of this session have arrived: one route keeps them in order."""
+        """Wait until all messages of this session have arrived.
+
+        The messages of one route stay in order, so the answer to a query shows that.
+        """
         for root in self._answering:
             assert list(self._session.get(f"{root}/info", timeout=5.0))
         if len(self._answering) < 2:
             self._fleet.comes(lambda: False)
 
     def sent(self, verb: Verb, rows: Sequence[Try]) -> bool:
-        """Return whether a robot obeyed any of these, or the witness took one for a robot's."""
+        """Return whether any of these puts or deletes had an effect.
+
+        It has one if a robot obeys it, or if it reaches the witness like a message of a robot.
+        """
         fleet = self._fleet
 
         def commands() -> list[int]:
@@ -363,7 +373,7 @@ class Visitor:
         return done or fooled
 
     def asked(self, rows: Sequence[Try]) -> dict[str, bool]:
-        """Return the queries that got an answer."""
+        """Send these queries. Return for each whether an answer arrived."""
         waiting = {}
         for row in rows:
             replies: zenoh.handlers.FifoChannel[zenoh.Reply] = zenoh.handlers.FifoChannel(64)
@@ -414,9 +424,9 @@ class Visitor:
 
 
 def _restored(robot: Bus) -> bool:
-    """Clear and activate.
+    """Clear and activate the robot.
 
-    Returns False if another stop came meanwhile, which the clear did not name.
+    Returns False if another stop arrived meanwhile, because the clear named the earlier one.
     """
     if robot.state()["mode"] == "stopped" and not robot.get("srv/clear")["success"]:
         return False
@@ -570,7 +580,7 @@ async def test_a_page_over_tls_shows_its_own_robot_and_says_why_it_shows_no_othe
             await ours.say(subscribe="fleet")
             seen = await ours.find(lambda said: said.get("fleet"))
             assert [(one["robot"], one["mode"]) for one in seen["fleet"]] == [("robot1", "ready")]
-            assert "allows only exact keys" in seen["note"]
+            assert "over TLS this page looks only for its own robot" in seen["note"]
 
 
 # the files

@@ -1,4 +1,4 @@
-"""An invitation in a real browser admits the client on any network, or gives the reason."""
+"""An invitation link in a real browser admits the client on any network, or shows the reason."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Stranger:
         self.server, self.browser = server, browser
 
     def opens(self, token: str) -> None:
-        """Return the link of an invitation."""
+        """Open the link of an invitation with this token."""
         self.browser.open(f"{self.server.away}/#token={token}")
 
     def shows(self, name: str, words: str) -> None:
@@ -36,12 +36,12 @@ class Stranger:
 
     @property
     def tries(self) -> float:
-        """Return the number of requests that were refused for lack of a valid token."""
+        """The number of requests that the page has refused because they had no valid token."""
         counted = self.server.refused()
         return sum(counted.get(one, 0) for one in ("no_token", "bad_token", "too_fast"))
 
     def knocks_no_more(self, since: float, times: int) -> None:
-        """Check that the page stops trying after this number of refusals."""
+        """Wait for `times` refusals since `since`, and check that the page then stops trying."""
         until(lambda: self.tries >= since + times, 15.0, "it is refused")
         before = self.tries
         self.browser.js(f"new Promise(done => setTimeout(done, {NEXT_MS}))")
@@ -73,10 +73,12 @@ def stranger(server: Page, browser: Browser) -> Stranger:
 
 @contextmanager
 def silent(browser: Browser, path: str) -> Iterator[None]:
-    """Give no answer to the page's requests for that path."""
+    """Block the page's requests for this path while the body runs."""
     browser.ask("Network.setBlockedURLs", urls=[f"*/{path}"])
-    yield
-    browser.ask("Network.setBlockedURLs", urls=[])
+    try:
+        yield
+    finally:
+        browser.ask("Network.setBlockedURLs", urls=[])
 
 
 def test_an_invitation_outlives_a_network_that_fails(stranger: Stranger) -> None:
@@ -159,7 +161,7 @@ def test_a_link_with_fewer_permissions_is_used_only_after_a_question(
 def test_the_link_of_another_robot_still_names_it_after_the_invitation_was_accepted(
     stranger: Stranger,
 ) -> None:
-    """STOP by HTTP goes to the robot that the page shows, which it reads from the URL."""
+    """The page reads the robot from the URL, and STOP over HTTP must reach that robot."""
     browser, token = stranger.browser, stranger.server.invite("operator", "phone")
     browser.open(f"{stranger.server.away}/?robot=other#token={token}")
     until(lambda: "token" not in browser.js("location.href"), 15.0, "the token is used")

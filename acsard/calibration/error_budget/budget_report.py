@@ -120,14 +120,15 @@ def _track(budget: Budget, learned: float) -> str:
     if budget.learned_used:
         return (
             f"According to the gyro, drive.wheel_separation_multiplier should be {implied}. "
-            "Odometry uses this value while the gyro is silent; the configured value is "
+            "Odometry uses this value while no gyro messages arrive; the configured value is "
             f"{budget.multiplier:.3f}."
         )
     return (
         f"According to the gyro, drive.wheel_separation_multiplier should be {implied}. Odometry "
         f"uses the configured value, {budget.multiplier:.3f}. If the two values differ on the "
         "ground where the robot works, either run `acsard calibrate`, or set [odometry] "
-        "learned_track: odometry then uses the gyro's value while the gyro is silent."
+        "learned_track = true: odometry then uses the value that it learned from the gyro while no "
+        "gyro messages arrive."
     )
 
 

@@ -138,7 +138,10 @@ class Router(Listener):
     events = ROUTER_EVENTS
 
     def __init__(self, file: Path) -> None:
-        """Read the file. Raises `RouterFileError` if Zenoh does not accept the file."""
+        """Read the router's configuration file `file`.
+
+        Raises `RouterFileError` if the file cannot be read or is not a router's configuration.
+        """
         self._file = file
         try:
             # Read the file here, because Zenoh's error would not say why the file cannot be opened.
@@ -180,8 +183,8 @@ class Router(Listener):
         except zenoh.ZError as error:
             if not self._opens_elsewhere():
                 raise RouterFileError(
-                    f"{self._file} cannot be used: {reason(error)}; correct it, or provide the "
-                    "files that it names, readable for this user"
+                    f"{self._file} cannot be used: {reason(error)}; correct it, and make "
+                    "sure that this user can read the files that it names"
                 ) from error
             raise InUseError(
                 f"cannot listen on {self.where}: {reason(error)}; end the program that uses the "
@@ -190,9 +193,9 @@ class Router(Listener):
             ) from error
 
     def _opens_elsewhere(self) -> bool:
-        """Return whether Zenoh opens a session with free loopback ports.
+        """Return whether Zenoh accepts the file with other addresses: free ports on loopback.
 
-        If so, only the addresses in the file are wrong. Zenoh's own error does not show this.
+        If it does, only the addresses in the file are wrong. Zenoh's own error does not show this.
         """
         config = zenoh.Config.from_file(str(self._file))
         free = [ENDPOINT_ADDRESS.sub(r"\1/127.0.0.1:0", endpoint) for endpoint in self._endpoints]

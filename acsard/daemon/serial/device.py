@@ -42,7 +42,7 @@ class _Device(serial.Serial):  # type: ignore[misc]
         except OSError as error:
             raise serial.SerialException(f"read failed: {error}") from error
         if not data:
-            raise serial.SerialException("the serial device has hung up")
+            raise serial.SerialException("the serial device was disconnected")
         return data
 
 
@@ -132,10 +132,12 @@ def unlock(fd: int) -> None:
 def close(device: serial.Serial, *, lost: bool = False, wait_s: float = 0.0) -> None:
     """Discard unsent bytes, then unlock and close the device in a thread.
 
-    The thread is needed because a driver may take 30 s to close. If no thread can be started, the
-    next `open_raw` closes the device. After this call, the descriptor of `device` refers to
-    /dev/null, so the caller can close `device` itself without delay. If this process has no free
-    descriptor, the device stays open, and the caller closes it with the driver's delay.
+    A thread closes the device, because a driver may take 30 s to close it. If no thread can be
+    started, the next `open_raw` closes the device.
+
+    The caller must then close the object `device`. This takes no time, because the descriptor of
+    `device` now refers to /dev/null. There is one exception: if this process has no free
+    descriptor, `device` still refers to the device, and closing it may take 30 s.
 
     Args:
         device: the open device.

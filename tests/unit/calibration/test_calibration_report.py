@@ -44,7 +44,7 @@ def test_the_text_states_the_improvement_and_the_remaining_error() -> None:
     assert f"heading error after a turn of 360 deg: {REPORT.turn_error_before:.0f} deg now" in told
     assert "remaining error: skidding changes the effective track. This log determines " in told
     assert "with the new values\n(errors on drives that the fit did not use)\nrandom " in told
-    assert "give --distance METRES" in told
+    assert "give --distance METERS" in told
 
 
 def test_a_guided_calibration_does_not_advise_an_option_that_needs_a_log() -> None:

@@ -1,6 +1,6 @@
-"""Calibration names the error in a log: every wrong sign, side and unit, on whole logs.
+"""Calibration refuses whole logs with a wrong sign, side or unit, and says which one is wrong.
 
-A log must have enough movement, and the fit starts near the truth.
+It also requires enough movement in a log, and a fit that starts near the truth.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ WRONG = {
         ("sides", True, False, "left and right are swapped"),
         ("sides", False, True, "left and right are swapped"),
         ("sides", True, True, "left and right are swapped"),
-        ("ahead", True, True, "wheel speeds of both sides are negative ahead"),
+        ("ahead", True, True, "both sides are negative when the robot drives ahead"),
         ("left", True, False, "the left wheels turn backwards"),
         ("left", False, True, "the left wheels turn backwards"),
         ("right", True, False, "the right wheels turn backwards"),
@@ -104,14 +104,14 @@ def test_a_wrong_sign_unit_or_clock_is_refused_by_name(
 
 
 def test_rpm_are_refused_also_with_the_configuration_of_another_robot() -> None:
-    """The other robot may have larger wheels for its separation than the default robot."""
+    """The configured robot has larger wheels for its separation than the default robot."""
     with pytest.raises(RefusedError, match="rpm"):
         turn_units("yaw_rate", 1.9 * 2 * np.pi / 60, 1.9 * 2 * np.pi / 60, BASE)
     turn_units("yaw_rate", 1 / 3.5, 1 / 3.5, BASE)
 
 
 def odometry(robot: Drive) -> Drive:
-    """Return the log with the driver's own wheel odometry as its positions and turn rate."""
+    """Return a log whose positions and turn rate are the wheel odometry of the robot's driver."""
     turn = (robot.right - robot.left) * 0.05 / 0.45
     yaw = np.cumsum(turn) * 0.01
     ahead = np.exp(1j * (yaw - turn * 0.005))
@@ -131,7 +131,7 @@ def test_a_reference_computed_from_the_same_wheels_is_reported(gyro: bool, place
 
 
 def test_an_imu_that_lies_on_its_side_is_refused() -> None:
-    """The noise of the wrong axis adds up to less than a turn, although the robot turned."""
+    """The wrong axis measures only noise, although the robot turned several times."""
     rng = np.random.default_rng(0)
     lying = replace(DRIVE, gyro=rng.normal(0.0, 0.05, len(DRIVE.gyro)))
     with pytest.raises(RefusedError, match=r"but the wheels would turn.*IMU lies on its side"):

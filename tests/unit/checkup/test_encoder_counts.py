@@ -132,15 +132,19 @@ def test_more_counts_than_the_host_accepts_are_a_warning() -> None:
         assert encoder_counts.finding(board, []).verdict == "WARN"
 
 
-@pytest.mark.parametrize("configured", [1600, 2700, 3700, 12800])
-def test_wrong_configured_counts_are_found_by_the_speeds_and_corrected(configured: int) -> None:
+@pytest.mark.parametrize(
+    ("configured", "wrong"), [(1600, "100.0%"), (2700, "18.5%"), (3700, "13.5%"), (12800, "75.0%")]
+)
+def test_wrong_configured_counts_are_found_by_the_speeds_and_corrected(
+    configured: int, wrong: str
+) -> None:
     with Robot("no_sample", link_check="auto", encoder_counts=configured).board() as board:
         board.sampled = True
         board.replies = replies(3200)
         finding = encoder_counts.finding(board, [0])
     assert (finding.verdict, finding.keys) == ("FAIL", {"mcu.encoder_counts": 3200})
     assert finding.figure == f"3200, not {configured}"
-    assert "every distance would be wrong by" in finding.text
+    assert f"every distance would be wrong by {wrong}" in finding.text
 
 
 def test_counts_that_do_not_change_while_the_wheels_turn_are_to_be_switched_off() -> None:

@@ -1,7 +1,4 @@
-"""A restart of the board during the check is a finding of its own.
-
-The interrupted step is repeated.
-"""
+"""The check reports a restart of the board separately and repeats the interrupted step."""
 
 from __future__ import annotations
 
@@ -120,7 +117,7 @@ def test_a_supply_that_drops_each_time_a_motor_turns_is_named_after_few_tries() 
     assert robot.starts == 1 + AGAIN
     found = checked["restarts"]
     assert found.figure == "restarted, twice"
-    assert "while motor b (front left) turned, twice" in found.text
+    assert "twice while motor b (front left) turned" in found.text
     assert found.mend.startswith("use a separate supply for the board")
 
 
@@ -195,7 +192,7 @@ def reply(at_s: float, mcu_ms: int) -> Reply:
 
 
 def heard(*replies: Reply) -> Restarts:
-    """Return the restart detector after it has seen these replies."""
+    """Return a restart detector that has received these replies."""
     restarts = Restarts()
     for one in replies:
         assert restarts.look(b"", one.at_s, one) is None

@@ -214,7 +214,7 @@ def test_a_bag_with_an_impossible_time_is_read_up_to_that_time(
     log = write_mcap(tmp_path / "bag.mcap", [*messages, last])
     assert of_bag(tmp_path, log) == 0
     note = json.loads(capsys.readouterr().out)["notes"][0]
-    assert note.endswith("are used: the time of a message is 9223372036854775808 ns")
+    assert note.endswith("are used: a message has the impossible time 9223372036854775808 ns")
 
 
 @pytest.mark.slow
@@ -266,7 +266,7 @@ def test_the_options_of_a_bag_are_refused_for_a_csv_file(word: str, tmp_path: Pa
 
 
 def converted(name: str, where: Path, *words: str) -> str:
-    """Return the CSV file that a converter of the page makes, run as the page says."""
+    """Run a converter exactly as the page gives it, and return the CSV file that it makes."""
     (script,) = (block.text for block in blocks("python") if f"# {name}:" in block.text)
     (where / name).write_text(script)
     command = [sys.executable, name, *words, "drive.csv"]
@@ -319,7 +319,7 @@ def test_a_distance_is_a_length_in_metres(tmp_path: Path, word: str) -> None:
 
 
 def driving(*words: str) -> int:
-    """Return the exit code of `acsard calibrate` with these arguments and no terminal."""
+    """Return the exit code of a guided `acsard calibrate` with these arguments and no terminal."""
     args = parser(["calibrate"]).parse_args(["calibrate", *words])
     return int(args.main(args))
 
@@ -332,8 +332,8 @@ def driving(*words: str) -> int:
         (["--method", "positions"], "--positions KEY"),
         (["--method", "tape", "--positions", "sim/pose"], "leave one of them out"),
         (["--positions-at", "tcp/127.0.0.1:7447"], "--positions KEY"),
-        (["--positions", "odom"], "computes odom from the wheels themselves"),
-        (["--positions", "acsard/acsar/odom"], "computes odom from the wheels themselves"),
+        (["--positions", "odom"], "odom cannot show the errors of the wheels"),
+        (["--positions", "acsard/acsar/odom"], "odom cannot show the errors of the wheels"),
         (["--log", "drive.csv", "--method", "tape"], "--method is for a guided drive"),
         (["--log", "drive.csv", "--imu", "imu"], "--imu is for a guided drive"),
         (["--method", "tape", "--imu", "imu"], "--imu is for --method gyro, not for --method tape"),

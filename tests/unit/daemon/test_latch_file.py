@@ -1,4 +1,4 @@
-"""Tests of the latch file on disks that are full, fail, hang or hold another file."""
+"""Tests of the latch file on disks that are full, fail or hang, and of a file of another robot."""
 
 from __future__ import annotations
 
@@ -38,7 +38,10 @@ def config(where: Path) -> Config:
 
 @pytest.fixture
 def started() -> Iterator[Started]:
-    """Yield a function that starts latch files, and end them afterwards as a process would."""
+    """Yield a function that opens latch files.
+
+    Close them after the test as the daemon's end does.
+    """
     files: list[LatchFile] = []
 
     def start(where: Path) -> tuple[LatchFile, Latches]:
@@ -51,7 +54,7 @@ def started() -> Iterator[Started]:
 
 
 def end(file: LatchFile) -> None:
-    """End as a process ends: write for the last time and release the lock."""
+    """Close the latch file as the daemon's end does: write it a last time and release the lock."""
     file.close()
     if file._lock >= 0:
         os.close(file._lock)
@@ -151,7 +154,7 @@ def test_a_directory_that_cannot_be_written_starts_the_robot_stopped(
 
 
 def same(one: Latches, other: Latches) -> bool:
-    """Return whether two sets of latches differ in nothing but their numbers."""
+    """Return whether two sets of latches are equal apart from their numbers."""
 
     def plain(latches: Latches) -> Latches:
         stop, fault, inactive = (
@@ -234,6 +237,7 @@ def test_a_slow_start_does_not_overwrite_the_file_of_another_daemon(
     assert latches.stop
     goes.set()
     until(lambda: "another daemon stores the stop" in second.trouble)
+    assert "the daemon does not try again: correct this" in second.take_events()[-1].text
     assert (tmp_path / NAME).read_bytes() == encode("acsar", STOP)
 
 
@@ -280,7 +284,7 @@ def full(*words: object, **more: object) -> None:
 
 
 class Stuck:
-    """A disk that writes nothing until `goes` is set."""
+    """A disk that hangs: no write ends until `goes` is set."""
 
     def __init__(self) -> None:
         self.asked, self.goes, self.contents = threading.Event(), threading.Event(), list[bytes]()
@@ -501,7 +505,7 @@ def test_a_stop_that_was_written_during_a_sync_is_synced_before_the_end(
 def test_a_sync_that_hangs_is_reported_until_it_ends(
     tmp_path: Path, started: Started, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The stop is in the file, but a power cut would lose it."""
+    """The stop is in the file's cache but not on the disk, so a power cut would lose it."""
     goes = threading.Event()
     monkeypatch.setattr(module, "sync", lambda path: goes.wait(10.0))
     file, _ = started(tmp_path)

@@ -1,4 +1,7 @@
-"""The daemon names the settings that its next start would not have, and writes them if asked."""
+"""The daemon names the changed settings that its next start would lose.
+
+It writes them to the configuration file on request.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +37,7 @@ Started = Callable[..., SettingsFile]
 
 @pytest.fixture
 def started(monkeypatch: pytest.MonkeyPatch) -> Iterator[Started]:
-    """Yield a function that starts to watch a file, and end all of them afterwards."""
+    """Yield a function that starts to watch a file. End all watches after the test."""
     monkeypatch.setattr(module, "CHECK_PERIOD_S", 0.01)
     # A busy machine starts the process of an edit slowly.
     monkeypatch.setattr("acsard.host.config_edit_process.EDIT_TIMEOUT_S", 30.0)
@@ -148,7 +151,7 @@ OBEYED = Answer(7, True, "limits.linear_speed = 0.8 (was 0.5)")
 
 
 def result(made: SettingsFile, events: list[Event] | None = None) -> Request | Answer:
-    """Return the next result, long before any answer is overdue."""
+    """Return the next result, at a time when no answer is overdue."""
     found: list[Request | Answer] = []
 
     def look() -> bool:
@@ -161,7 +164,7 @@ def result(made: SettingsFile, events: list[Event] | None = None) -> Request | A
 
 
 def check(made: SettingsFile) -> None:
-    """Request a change that can be written."""
+    """Request to write a change that the file accepts."""
     made.keep(REQUEST, 0)
     assert result(made) is REQUEST
 
@@ -245,7 +248,7 @@ def test_nothing_is_set_if_the_file_cannot_be_changed(
     before = file.read_text()
     made.keep(replace(REQUEST, settings=settings or REQUEST.settings), 0)
     message = refusal(made)
-    assert message.startswith("nothing is set: ")
+    assert message.startswith("no setting was changed: ")
     assert words in message
     assert ("edit the file by hand" in message) is by_hand, "one remedy, which fits"
     assert file.read_text() == before
@@ -256,7 +259,9 @@ def test_nothing_is_set_if_the_daemon_has_no_file(started: Started) -> None:
     made.keep(REQUEST, 0)
     answer = result(made)
     assert isinstance(answer, Answer)
-    assert answer.message.startswith("nothing is set: the daemon runs without a configuration file")
+    assert answer.message.startswith(
+        "no setting was changed: the daemon runs without a configuration file"
+    )
 
 
 @pytest.mark.slow
@@ -335,7 +340,7 @@ def test_a_disk_that_hangs_gets_an_answer_and_a_late_result_changes_nothing(
     assert isinstance(answer, Answer)
     assert not answer.success
     assert "the disk did not answer within 2.5 s" in answer.message
-    assert answer.message.startswith(OBEYED.message if obeyed else "nothing is set")
+    assert answer.message.startswith(OBEYED.message if obeyed else "no setting was changed")
     hangs.set()
     until(lambda: made._results.waiting)
     assert made.results(0, []) == []
@@ -356,8 +361,8 @@ def test_a_thread_that_cannot_be_started_is_named_in_the_answer_at_once(
     assert answer == Answer(
         REQUEST.id,
         False,
-        "nothing is set: the daemon could not start the thread that changes the file (can't start "
-        "new thread); restart acsard, or send the request without `keep`",
+        "no setting was changed: the daemon could not start the thread that changes the file "
+        "(can't start new thread); restart acsard, or send the request without `keep`",
     )
     assert made.results(module.REPLY_TIMEOUT_NS + 1, []) == []
 
@@ -400,7 +405,7 @@ def test_a_write_that_ends_after_its_overdue_answer_is_logged_also_if_it_fails(
 
 @pytest.mark.slow
 def test_a_request_that_the_robot_received_is_not_reported_as_not_set(made: SettingsFile) -> None:
-    """While a speed limit is in force, a `set` may wait for the step after the one before it."""
+    """While a speed limit applies, a `set` request may wait for a further step."""
     check(made)
     assert made.results(module.REPLY_TIMEOUT_NS + 1, []) == []
     assert made.defers_answer(OBEYED)
@@ -447,7 +452,7 @@ def test_a_request_that_is_checked_too_late_is_not_obeyed(made: SettingsFile) ->
     (answer,) = made.results(module.REPLY_TIMEOUT_NS + 1, [])
     assert isinstance(answer, Answer)
     assert not answer.success
-    assert answer.message.startswith("nothing is set")
+    assert answer.message.startswith("no setting was changed")
 
 
 def test_too_many_requests_are_refused_and_overdue_ones_take_no_more_time(
@@ -559,7 +564,7 @@ def test_the_directory_is_on_the_disk_before_the_answer(
 def test_the_text_is_computed_where_the_priority_cannot_be_lowered(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The unit of the service blocks the system call."""
+    """The service's systemd unit blocks this system call, and the daemon must work without it."""
 
     def refuse(increment: int) -> int:
         raise PermissionError(errno.EPERM, os.strerror(errno.EPERM))
@@ -578,7 +583,10 @@ def test_the_text_is_computed_where_the_priority_cannot_be_lowered(
 def test_git_does_not_read_the_repository_of_another_user(
     file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its configuration names programs, which would run with the rights of the daemon."""
+    """A repository's configuration can name programs that git runs.
+
+    They would run with the daemon's rights.
+    """
     tracked(file)
     assert config_file.is_tracked(file)
     monkeypatch.setenv("GIT_TEST_ASSUME_DIFFERENT_OWNER", "1")

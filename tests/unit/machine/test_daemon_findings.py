@@ -143,7 +143,10 @@ S = 10**9
 
 
 def seen(apart: float, trip: float = 0.0, here: bool = False, **counters: int) -> Running:
-    """Return the view of a daemon whose clock is `apart` s ahead, queried within `trip` s."""
+    """Return the doctor's view of a daemon.
+
+    The daemon's clock is `apart` s ahead, and the query took `trip` s.
+    """
     state = replace(STATE, stamp=Time.from_ns(NOW + int(apart * S)), counters=counters)
     return Running(INFO, Config(), state, state, NOW, int(trip * S), (), here)
 
@@ -323,8 +326,8 @@ def test_a_sound_link_says_which_lines_were_judged(
     state = replace(STATE, counters={"lines": 104, "lines_sent": 1000})
     (finding,) = link(Running(INFO, config, before, state, 0))
     assert finding.level == "ok"
-    assert ("no line to or from the board is lost" in finding.text) is answers_are_counted
-    assert ("lines to the board were not judged" in finding.text) is not answers_are_counted
+    assert ("almost all lines to and from the board arrive" in finding.text) is answers_are_counted
+    assert ("cannot check the lines to the board" in finding.text) is not answers_are_counted
 
 
 @pytest.mark.parametrize("state", ["booting", "stale"])
@@ -435,7 +438,8 @@ def test_a_bumper_that_only_limits_lets_the_robot_drive_away_before_a_clear() ->
     state = replace(STATE, bumpers=[True])
     *_, finding = link(Running(INFO, config, state, state, 0))
     assert finding.mend.startswith(
-        "drive straight away from the obstacle; if the robot is stopped, release it at the robot"
+        "drive the robot in a straight line away from the obstacle; if the robot is stopped, "
+        "release it at the robot"
     )
 
 
@@ -513,7 +517,7 @@ def test_the_last_causes_of_lateness_are_warnings_only_if_periods_are_missed_now
         "it is 2", "it is 3", "it is 4",
     ]  # fmt: skip
     assert (
-        "missed control periods just before 2027-01-15 08:00:05 UTC: by 0.14 s, because"
+        "missed control periods just before 2027-01-15 08:00:05 UTC: it was late by 0.14 s, because"
         in findings[-1].text
     )
     row = DiagnosticStatus(1, "acsard: control loop", "600 of 6000 periods missed", "acsar", [])

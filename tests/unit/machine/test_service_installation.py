@@ -1,4 +1,4 @@
-"""Tests of the service's files and steps, and of the places from which it can run."""
+"""Tests of the service's files and installation steps, and of where acsard may be installed."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def test_a_service_is_refused_in_a_home_directory_and_outside_a_venv(
 
 def test_outside_a_venv_the_reason_of_the_refusal_is_not_a_hidden_directory() -> None:
     told = unusable_location("/usr", "/usr", PROGRAM)
-    assert "does not run from a venv" in told
+    assert "which is not a venv" in told
     assert "home directories" not in told
     assert "home directories" in unusable_location("/home/anna/venv", "/usr", PROGRAM)
 
@@ -113,7 +113,7 @@ ALL = [UNIT_FILE, GATEWAY_FILE, PAGE_FILE, STOP_FILE, RULES, OWN]
 
 
 def there(**other: bytes | None) -> Found:
-    """Return a machine with all files installed, except for these."""
+    """Return a machine with all files installed. `other` replaces the content of some files."""
     names = {
         "unit": UNIT_FILE,
         "gateway": GATEWAY_FILE,
@@ -199,7 +199,7 @@ def test_all_unchanged_files_are_removed() -> None:
 
 
 def test_a_missing_unit_is_not_disabled() -> None:
-    """The machine was upgraded from a version without TLS gateway and page."""
+    """The machine has an older version, which had no units for the TLS gateway and the page."""
     leaving, *_ = uninstalling(ALL, there(gateway=None, page=None), force=False)
     assert leaving == Run(("systemctl", "disable", "--now", UNIT))
 

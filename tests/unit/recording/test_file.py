@@ -1,4 +1,4 @@
-"""A damaged recording gives all its whole chunks and never a traceback."""
+"""Every complete chunk of a damaged recording can be read, and no damage causes a traceback."""
 
 from __future__ import annotations
 
@@ -86,9 +86,9 @@ def test_the_mcap_library_reads_a_recording(tape: Tape, whole: Path) -> None:
 
 
 def on_a_machine(tape: Tape) -> None:
-    """Replace the times by those of a quiet machine.
+    """Replace the times of the recorded steps by times as on a quiet machine.
 
-    A step is some tens of us late, and a read is noticed some us late.
+    A step is some tens of µs late, and each read is some µs older than its step.
     """
     dice = random.Random(1)
     for at, taken in enumerate(tape.taken):
@@ -179,7 +179,10 @@ SECTOR = 512
 def test_a_power_cut_in_the_middle_of_a_sync_costs_nothing_of_the_syncs_before(
     tape: Tape, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Any sectors of a sync may reach the disk, also at the end of a chunk or of the file."""
+    """When the power fails, any of the sectors of the last sync may be on the disk.
+
+    The sync may also be the one at the end of a chunk or of the file.
+    """
     path, cut, now = tmp_path / "part.mcap", tmp_path / "cut.mcap", tape.taken[0].inputs.now
     monkeypatch.setattr("acsard.recording.file.CHUNK_NS", 3 * NS_PER_S)
     synced: list[bytes] = []
@@ -246,7 +249,11 @@ def test_a_file_that_was_cut_before_its_first_chunk_is_refused_with_a_message(
         told = str(refused.value)
         assert (str(path) in told, told.isprintable()) == (True, True)
         if not tail:
-            lacks = "has no steps" if size >= config_end else "the beginning of the file is missing"
+            lacks = (
+                "has no readable steps"
+                if size >= config_end
+                else "the beginning of the file is missing"
+            )
             assert lacks in told
 
 
@@ -281,7 +288,7 @@ def test_all_undamaged_chunks_of_a_damaged_file_are_read(
 def test_a_chunk_whose_head_is_damaged_costs_nothing(
     place: int, hit: int, whole: Path, tmp_path: Path
 ) -> None:
-    """Each byte of the type and the length is damaged in turn."""
+    """The test damages each byte of the type and of the length in turn."""
     bad, path = bytearray(whole.read_bytes()), tmp_path / "head.mcap"
     bad[chunks(bad)[hit][0] + place] ^= 0x41
     path.write_bytes(bad)
@@ -289,7 +296,7 @@ def test_a_chunk_whose_head_is_damaged_costs_nothing(
 
 
 def test_two_neighbouring_damaged_chunks_cost_no_other_chunk(whole: Path, tmp_path: Path) -> None:
-    """The first chunk claims the length of both, and its content is damaged as well."""
+    """The first chunk's header gives the length of both, and its content is damaged as well."""
     bad, path = bytearray(whole.read_bytes()), tmp_path / "two.mcap"
     (begin, middle), (_, end) = chunks(bad)[1:3]
     bad[begin + 1 : begin + 9] = (end - begin - 9).to_bytes(8, "little")

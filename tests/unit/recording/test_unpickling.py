@@ -1,4 +1,4 @@
-"""A pickled robot is read back, and pickles from others are refused without any effect."""
+"""acsard reads back a robot that it pickled, and refuses other pickles without any effect."""
 
 from __future__ import annotations
 
@@ -45,7 +45,10 @@ def limits() -> None:
 
 @pytest.fixture(scope="module")
 def said() -> dict[str, str]:
-    """Return the refusal of each attack; it is empty for one that was read or had an effect."""
+    """Return the refusal of each attack.
+
+    The refusal is empty if the attack was read or had an effect.
+    """
     done = subprocess.run(
         [sys.executable, "-m", "tests.unit.recording.attacks"],
         capture_output=True, text=True, check=True, preexec_fn=limits,
@@ -107,7 +110,7 @@ def test_a_tuple_whose_hash_could_be_forged_is_refused_as_a_key(key: object) -> 
 @each("sign", [1, -1])
 def test_a_number_is_refused_as_a_key_if_its_hash_could_be_forged(sign: int) -> None:
     unpickle(pickled({sign * (MAX_KEY - 1): 1}), part_class)
-    with pytest.raises(ValueError, match=r"a number of 2\^61 - 1 or more as a key"):
+    with pytest.raises(ValueError, match=r"a magnitude of 2\^61 - 1 or more as a key"):
         unpickle(pickled({sign * MAX_KEY: 1}), part_class)
 
 

@@ -1,4 +1,4 @@
-"""The page lists the boards, and may start only a few commands with a few values each."""
+"""The page lists the boards. It may start only a few commands with a few permitted values."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_a_configured_port_that_is_missing_is_offered_as_missing(
 ) -> None:
     monkeypatch.setattr("acsard.web.guide.serial_devices", lambda: [MEGA])
     first = boards("/dev/none")[0]
-    assert (first.port, first.what) == ("/dev/none", "configured, not there now")
+    assert (first.port, first.what) == ("/dev/none", "configured, but it does not exist now")
 
 
 def test_the_simulator_is_listed_once_whatever_is_configured(
@@ -55,7 +55,7 @@ def test_the_simulator_is_listed_once_whatever_is_configured(
 def test_the_configured_port_is_the_first_choice(
     configured: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A page that shows the simulator must not select a real port by itself."""
+    """A page of a simulated robot must not preselect a real port."""
     monkeypatch.setattr("acsard.web.guide.serial_devices", lambda: [MEGA, HELD])
     assert boards(configured)[0].port == configured
 
