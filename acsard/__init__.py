@@ -22,7 +22,7 @@ Where to look: each package may import only the packages below it in this list.
     foxglove/        `acsard foxglove`: a live server for Foxglove
     report/          `acsard recording report`: turns a recording into an HTML page
     top/             `acsard top`, `acsard drive` and `acsard fleet`: the robot in a terminal
-    web/             `acsard web`: the robot's page, in a process of its own
+    web/             `acsard web`: the robot's page, in a separate process
     calibration/     `acsard calibrate`: calibrates from a recorded drive or a new one;
                      `acsard accuracy`: how much each cause contributes to the odometry's error
     machine/         tools for the administrator of the computer: `acsard doctor`, certificates for
@@ -55,7 +55,7 @@ Inside `core/`, in the same order:
     core/config/     turns acsard.toml into one frozen Config, or into errors that name the key
                      and the remedy
     core/values.py   the values in SI units: Instant, Twist, Pose, Command, Inputs, Outputs
-    core/formatting.py  safe text, figures, durations and counts for every message
+    core/formatting.py  safe text, numbers, durations and counts for every message
     core/thinning.py    reduces long curves and paths to a bounded number of points
 
 Three invariants hold, and each is tested:

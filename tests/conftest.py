@@ -70,11 +70,12 @@ One worker runs all of them and `bench`, one after the other: they would disturb
 
 
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
-    """Use three processes for the README's command, two for the marked tests, and one otherwise.
+    """Choose the number of test processes.
 
-    Tests of real processes mostly wait, so two workers leave two cores half idle. Most marked tests
-    run several daemons each: three of them at once take all the time of two cores, and then the
-    tests of real time fail. A single process shows the output that tests print.
+    Three run the whole suite, because tests of real processes mostly wait. Two run the marked
+    tests: most of these start several daemons, so three processes would use all the time of two
+    cores and tests of real time would fail. Tests that print, and parts of the suite, run in this
+    process only.
     """
     part = config.args_source is not pytest.Config.ArgsSource.TESTPATHS
     marked, _, left_out = config.option.markexpr.partition("not")
@@ -94,11 +95,11 @@ def _unit(nodeid: str) -> str:
 
 
 class _ByUnit(LoadScopeScheduling):  # type: ignore[misc]
-    """Distribute whole units of tests.
+    """Distributes whole units (files or groups of files) to the test processes.
 
-    After each test xdist counts every test that the worker was ever given. Handing out 7,000 tests
-    one by one therefore costs as much time as many tests. The unit follows from the path alone,
-    because with pytest 9.2 the main process no longer learns a test's mark `xdist_group`.
+    After each test xdist counts all the tests of the process, so handing out 7,000 tests one by one
+    is slow. The path alone decides the unit, because with pytest 9.2 the main process no longer
+    receives a test's mark `xdist_group`.
     """
 
     def _split_scope(self, nodeid: str) -> str:
@@ -111,7 +112,10 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> _ByUnit:
 
 
 def _all_but_some_are_slow(items: list[pytest.Item]) -> None:
-    """Leave most variations of a test to the marked tests, and most of these to the nightly job."""
+    """Mark most variations of a test as slow, and most of these as nightly.
+
+    A normal run then tries only a few variations. The nightly job tries all of them.
+    """
     seen, left = Counter[str](), Counter[str]()
     for item in items:
         one_in = item.get_closest_marker("variations")
@@ -137,7 +141,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def _rank(item: pytest.Item) -> int:
-    """Return the place of a test's unit in the order, because the longest units come first."""
+    """Return a sort key that puts the tests of the longest units first."""
     unit = _unit(item.nodeid)
     if unit in ("loud", "systemd"):
         return 0 if unit == "loud" else 1

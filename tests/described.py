@@ -45,7 +45,7 @@ def answers(path: str, method: str, status: int, media: str, body: Any) -> bool:
 
 
 def kinds(frames: Iterable[Any]) -> set[str]:
-    """Return the kinds of these frames. Fails if no description, or more than one, fits a frame."""
+    """Return the kinds of these frames. Fails unless exactly one description matches each frame."""
     found = set()
     for frame in frames:
         (kind,) = [name for name, judge in FRAMES.items() if judge.is_valid(frame)] or [frame]
@@ -58,11 +58,11 @@ def kinds(frames: Iterable[Any]) -> set[str]:
 
 
 def spoilt(frame: dict[str, Any]) -> list[dict[str, Any]]:
-    """Yield copies of the frame with a field missing or with a value of the wrong type."""
+    """Return invalid copies of the frame: each lacks one field or has a wrong value in it."""
     without = [{key: one for key, one in frame.items() if key != name} for name in frame]
     return without + [frame | {name: NO_VALUE} for name in frame]
 
 
 def taken(frame: dict[str, Any]) -> bool:
-    """Return whether the frame matches its description."""
+    """Return whether the frame matches the document's description of frames."""
     return bool(_FRAME.is_valid(frame))

@@ -1,8 +1,8 @@
 """Helpers for the parameter sets of tests.
 
-`@each` is like `parametrize`, but makes one test of all sets, because ten thousand tests of a
-microsecond take longer to distribute and report than to run. A failure names its parameter set.
-`more` marks a set that only the nightly job runs.
+`@each` is like `parametrize`, but one test loops over all sets. Ten thousand tests of a microsecond
+would take longer to distribute and report than to run. A failure names its parameter set. `more`
+marks a set that only the nightly job runs.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ STORY_S = 60.0
 
 
 def more(*values: Any) -> Any:
-    """Return a parameter set that makes a test try more random cases, for the nightly job."""
+    """Return a parameter set with more random cases, which only the nightly job runs."""
     return pytest.param(*values, marks=[pytest.mark.slow, pytest.mark.nightly])
 
 
 def run(test: Coroutine[Any, Any, None]) -> None:
-    """Run a test that is a coroutine in an event loop of its own."""
+    """Run a coroutine test in a new event loop, with a time limit of `STORY_S`."""
 
     async def story() -> None:
         async with asyncio.timeout(STORY_S):

@@ -1,12 +1,12 @@
-"""`python -m tests.loaded`: run the test command several times under the hardest conditions.
+"""`python -m tests.loaded`: run the test command several times on a busy machine, unattended.
 
-It prints the time of each run. Four busy loops run at the same time with the same priority. The
-tests start as nohup and a script's `&` start a program: there is no terminal, standard input is
-empty, SIGINT and SIGHUP are ignored, and LC_ALL is C. They run as a plain user; if root starts this
-program, that is the user nobody, which must be able to run this Python. The exit code is 0 if no
-run failed.
+Four busy loops run at the same time with the same priority. The test command has no terminal and no
+input, ignores SIGINT and SIGHUP as under nohup, and has LC_ALL=C. If root starts this program, the
+tests run as the user nobody, who must be able to run this Python. The program prints the time of
+each run. The exit code is 0 if no run failed.
 
-`python -m tests.loaded -n 1 -- tests/system` runs one part once; the words after `--` go to pytest.
+`python -m tests.loaded -n 1 -- tests/system` runs one part of the tests once; the words after `--`
+go to pytest.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class Run(NamedTuple):
 
     @property
     def again(self) -> list[str]:
-        """Return the tests that failed while no core was free and were run again."""
+        """Return the output lines of tests that failed on a busy machine and were repeated."""
         return re.findall(r"^RERUN .*$", self.said, re.M)
 
 
@@ -62,20 +62,20 @@ def loops(count: int) -> Iterator[None]:
 
 
 def plain_user() -> dict[str, object]:
-    """Return the arguments that make Popen start a process of a user without rights."""
+    """Return the arguments with which Popen starts a process as nobody, if this user is root."""
     if os.geteuid() != 0:
         return {}
     return {"user": NOBODY, "group": NOBODY, "extra_groups": []}
 
 
 def unattended() -> None:
-    """Ignore signals as nohup and `&` do; called in the child process."""
+    """Ignore SIGINT and SIGHUP, as nohup does. Popen calls this in the child process."""
     for number in (signal.SIGINT, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
 
 
 def environment(home: Path) -> dict[str, str]:
-    """Return the environment of a plain user who can write only to a home directory."""
+    """Return a minimal environment in which all writable directories are below `home`."""
     kept = {key: os.environ[key] for key in ("PATH", "VIRTUAL_ENV") if key in os.environ}
     return kept | {
         "HOME": str(home),
@@ -87,7 +87,7 @@ def environment(home: Path) -> dict[str, str]:
 
 
 def run(home: Path, words: list[str], within: float) -> Run:
-    """Run the test command once. Ends it, with all processes it started, when its time is up."""
+    """Run the test command once. Kill it with all its processes after `within` seconds."""
     command = [sys.executable, "-m", "pytest", "-q", "-o", f"cache_dir={home}/cache", *words]
     log, begun = home / "log", time.monotonic()
     with (

@@ -53,9 +53,9 @@ def wanted() -> list[str]:
 
 
 def resolved(python: str, machine: str, held: dict[str, str]) -> dict[str, tuple[str, str]]:
-    """Return the version and hash of each distribution that pip would install on that platform.
+    """Return the version and hash of each distribution that pip would install on this platform.
 
-    The given versions constrain pip.
+    `held` maps distributions to versions that pip must use.
     """
     platforms = [f"manylinux_2_{minor}_{machine}" for minor in range(GLIBC, 4, -1)]
     platforms += [f"manylinux2014_{machine}"]

@@ -1,6 +1,6 @@
-"""List every command that the pages ask the reader to type, with the check that runs it.
+"""Lists every command that the documentation asks the reader to type, with the test that runs it.
 
-A command on a page that is missing here fails a test.
+A test fails if a command of the documentation is missing in this list.
 """
 
 from __future__ import annotations
@@ -58,7 +58,10 @@ def text_of(page: str) -> str:
 
 
 def blocks(*languages: str) -> list[Block]:
-    """Return the fenced blocks of all pages that are in these languages, or in any."""
+    """Return the fenced code blocks of all pages.
+
+    `languages` selects blocks by their language; without it all blocks are returned.
+    """
     return list(_blocks(languages))
 
 
@@ -98,7 +101,7 @@ class Elsewhere(NamedTuple):
 
 
 class InCi(NamedTuple):
-    """A command that .ci/run contains, in these words."""
+    """A command that `.ci/run` contains literally."""
 
     words: str
 
@@ -553,7 +556,7 @@ COMMANDS: dict[str, How] = {
 def promises() -> list[list[str]]:
     """Return the arguments of each pytest call on the pages.
 
-    There is one per row of the table of promises, and one per call in a block.
+    The calls come from the table of promises, one per row, and from code blocks.
     """
     spans = []
     for row in re.findall(r"^\| .* \|$", text_of("tests/README.md"), re.M):

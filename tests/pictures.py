@@ -35,7 +35,8 @@ LOOKS = ("light", "dark")
 def write(directory: Path, sizes: Sequence[str] = tuple(SIZES), *, both: bool = True) -> list[Path]:
     """Write the pictures, with names like `phone-dark-drive.png`, and return their paths.
 
-    Only light ones are written unless `both` is set. Console output of the page is an error.
+    Dark pictures are written only if `both` is set. Fails if the page writes to the browser's
+    console.
     """
     directory.mkdir(parents=True, exist_ok=True)
     with (
@@ -70,7 +71,7 @@ def _drive(bus: Bus) -> None:
 
 
 def show(browser: Browser, view: str) -> None:
-    """Take that one picture if the view has contents."""
+    """Open this view of the page, and wait until it has contents."""
     browser.js(f"document.getElementById('tab-{view}').click()")
     rows = {"robots": "#cards a", "set": "#settings div", "status": "#parts li"}
     if row := rows.get(view):
@@ -106,7 +107,7 @@ class _States:
         self.there, self.browser, self.seen = there, browser, seen
 
     def look(self, state: str, mode: str, hint: str = "") -> None:
-        """Wait until the page shows the mode and the hint, then look."""
+        """Wait until the page shows this mode and hint, then call `seen` for the named state."""
         until(lambda: self.browser.text("mode") == mode, 10.0, mode)
         until(lambda: hint in self.browser.text("hint"), 10.0, hint)
         self.seen(self.browser, state)
@@ -114,7 +115,7 @@ class _States:
         until(lambda: self.browser.text("mode") == mode, 5.0, f"{mode} to the end")
 
     def look_at_a_board(self) -> None:
-        """Look at the page of a robot whose board answers, lies and is unplugged."""
+        """Show the states of a robot whose board works, reports wrong speeds, or is unplugged."""
         browser, look = self.browser, self.look
         with (
             Peer(self.there / "mcu") as board,
@@ -173,7 +174,7 @@ class _States:
             self.seen(browser, "stop-unconfirmed")
 
     def look_as_others(self) -> None:
-        """Look at a camera, as a viewer, at another robot, and at a daemon that ends."""
+        """Show a camera, a viewer's page, a robot without a daemon, and a daemon that ends."""
         browser, look, tls = self.browser, self.look, self.there / "tls"
         Authority.make(tls, "test", 1, [NAME]).issue(tls, "robot", [NAME], 1)
         with closing(Stream()) as stream:
@@ -215,7 +216,7 @@ class _States:
                     page.signal(signal.SIGCONT)
 
     def look_at_no_board(self) -> None:
-        """Look at the page of a robot whose board was never there."""
+        """Show the page of a robot without a board."""
         with (
             Daemon(self.there, self.there / "none", name="bare") as daemon,
             Page(daemon, self.there) as page,
@@ -225,9 +226,9 @@ class _States:
 
 
 def states(seen: Callable[[Browser, str], None]) -> None:
-    """Call `seen` with a page that shows the view *Drive*, in each state, and the state's name.
+    """Call `seen(browser, name)` for each state of the view *Drive* on a phone.
 
-    Each time the robot and the page stay in that state until `seen` returns.
+    The robot and the page stay in the state until `seen` returns.
     """
     with tempfile.TemporaryDirectory() as place, browsing(options=TRUSTING) as browser:
         browser.size(*PHONE)
@@ -262,7 +263,7 @@ def report(directory: Path) -> list[Path]:
 
 
 def _recorded(path: Path) -> Path:
-    """Record two minutes: two clients drive, one is stopped, and links and wheels fail."""
+    """Record two minutes of driving by two clients, with a stop, lost links and wheel faults."""
     tape, world = recorded_world(Config())
     two_drivers(world)
     happenings(world, random.Random(1))

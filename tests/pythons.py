@@ -1,11 +1,13 @@
 """`python -m tests.pythons PYTHON...`: check that Python versions replay each other's recordings.
 
-The Python that runs this program records ten minutes through every fault of the simulator. It
-records them on the plain link, and on the checked link with counts and a gyro, each from the start
-and from a state in the middle. Each PYTHON (a path) then replays these recordings and
-`tests/recordings`. It does so in a venv of its own with the dependencies of the service, and
-records ten minutes that this Python replays. One line is printed per file. The exit code is 0 if
-every line, mode and pose is the same to the last bit.
+First this Python records ten minutes with every fault of the simulator. It records them on the
+plain link, and on the checked link with counts and a gyro. Each file exists twice: one begins at
+the start, and one in the middle, with a stored state.
+
+Then each PYTHON (a path) replays these files and `tests/recordings`, in a new venv with the
+dependencies of the service. It also records ten minutes, which this Python replays. The program
+prints a line per file. The exit code is 0 if all lines, modes and poses are identical to the last
+bit.
 """
 
 from __future__ import annotations
@@ -64,7 +66,7 @@ def record(where: Path, seconds: float) -> list[Path]:
 
 
 def installed(python: str, where: Path) -> str:
-    """Create a venv and return its Python."""
+    """Create a venv with acsard's dependencies for this Python. Return the path of its Python."""
     subprocess.run([python, "-m", "venv", where], check=True)
     pip = [str(where / "bin/pip"), "install", "--quiet", "--disable-pip-version-check"]
     subprocess.run([*pip, "-r", str(ROOT / "deploy/systemd/requirements.lock")], check=True)
@@ -82,7 +84,7 @@ def run(python: str, *words: str) -> str:
 
 
 def replays(python: str, paths: Sequence[Path], expected: re.Pattern[str] = VERDICT) -> bool:
-    """Return whether each verdict of that Python is as expected. Prints a line for each."""
+    """Replay the files with this Python and print a line for each. Return whether all are right."""
     version, same = run(python, "-V"), True
     for path in paths:
         said = run(python, "-m", "acsard", "recording", "replay", str(path))

@@ -38,7 +38,7 @@ WARNED = replace(
 
 
 def screens(width: int) -> dict[str, list[str]]:
-    """Return the lines of each screen, by verb."""
+    """Return the lines of each screen, by the name of the command."""
     states = {"robot2": WAITING, "robot3": WARNED}
     robots = [
         replace(test_fleet_table.ROW, robot_id=name, state=one) for name, one in states.items()

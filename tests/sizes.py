@@ -1,6 +1,6 @@
 """`python -m tests.sizes` prints the lines of each package of `acsard` and its longest modules.
 
-No size is a limit. A module or a function far longer than the others may lack an idea.
+There is no limit. A module or function that is far longer than the others may need to be split.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The parts of the pages and of the router's file that follow from the table of keys and roles.
+"""Writes parts of the pages and of the router's file from the table of keys and roles.
 
 `python -m tests.tables` writes them, and `tests/test_tables.py` compares them.
 """
@@ -96,7 +96,7 @@ A key of another role and use needs a new rule there and a row here.
 
 
 def router_file(text: str) -> str:
-    """Return the file with the keys of each rule, and the rules of each role, from the table."""
+    """Return the router's configuration: keys of each access rule, and rules of each role."""
     for rule, keys in _rule_keys().items():
         lines = "".join(f'          "{key}",\n' for key in keys)
         text = _replaced(
@@ -142,12 +142,12 @@ def _rule_keys() -> dict[str, list[str]]:
 
 
 def _marked(mark: str, table: str) -> Callable[[str], str]:
-    """Return a function that puts the table between the marks of a page."""
+    """Return a function that replaces the table below this mark in a page's text."""
     return lambda text: _replaced(rf"(^<!-- {mark}: .* -->\n)(?:\|.*\n)*", table, text)
 
 
 def _replaced(pattern: str, part: str, text: str) -> str:
-    """Return the text with `part` behind the first group of the only match."""
+    """Replace the only match of the pattern by its first group followed by `part`."""
     changed, count = re.subn(pattern, lambda found: found[1] + part, text, flags=re.M)
     assert count == 1, f"{count} places match {pattern}"
     return changed

@@ -1,6 +1,6 @@
-"""The files in deploy/ros2 describe the same robot to ROS as the defaults of acsard do.
+"""The files in deploy/ros2 describe the robot to ROS with the same numbers as acsard's defaults.
 
-Nothing here needs ROS. These tests do not show that ROS itself accepts the files.
+The tests do not need ROS. They do not show that ROS itself accepts the files.
 """
 
 from __future__ import annotations
@@ -324,7 +324,7 @@ def test_the_launch_file_has_its_arguments_and_no_broadcaster() -> None:
 def launched(namespace: str, monkeypatch: pytest.MonkeyPatch) -> dict[str, dict[str, Any]]:
     """Run the launch file with stand-ins for ROS's `launch` and `launch_ros`.
 
-    Returns the nodes by executable.
+    Returns the launched nodes, keyed by executable.
     """
     modules = ("launch", "launch.actions", "launch.conditions", "launch.substitutions")
     for module in (*modules, "launch_ros", "launch_ros.actions"):
@@ -349,9 +349,9 @@ def hardware(nodes: dict[str, dict[str, Any]]) -> dict[str | None, str | None]:
 
 
 def resolved(topic: str, namespace: str, remappings: list[tuple[str, str]]) -> str:
-    """Return the name to which ROS resolves a topic in a process with these remappings.
+    """Return the full name of a topic in a ROS process with these remappings.
 
-    The remappings hold for every node of the process.
+    The remappings apply to every node of the process.
     """
 
     def full(name: str) -> str:
@@ -385,7 +385,7 @@ def test_the_launch_file_puts_the_namespace_before_every_topic(
 def test_ros2_control_uses_the_robot_s_joint_topics_in_the_right_direction(
     namespace: str, prefix: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The controller runs inside the process of ros2_control_node, which has its own remappings."""
+    """Check the remappings of ros2_control_node, because the controller runs inside its process."""
     nodes = launched(namespace, monkeypatch)
     manager, parameters = nodes["ros2_control_node"], hardware(nodes)
     ours = {f"{prefix}/{row.name}": row.direction for row in ros_names(RosConfig())}
@@ -472,7 +472,7 @@ def row_names() -> list[str]:
 
 
 def test_each_row_of_diagnostics_falls_into_exactly_one_group_of_the_aggregator() -> None:
-    """The aggregator's rule: a name begins with one of `startswith`, to the letter."""
+    """The aggregator puts a row into a group if its name begins with an entry of `startswith`."""
     names = row_names()
     assert len(set(names)) == 12
     for name in names:
@@ -533,9 +533,9 @@ def test_the_toml_of_the_readme_is_accepted() -> None:
 
 
 def test_the_readme_starts_a_bridge_over_the_network_below_the_robot_s_namespace() -> None:
-    """If the bridge has no namespace, it shows nothing of a robot that has one.
+    """Over the network each robot has a namespace.
 
-    Over the network each robot has one.
+    A bridge without this namespace would show ROS nothing of the robot.
     """
     lines = re.findall(r"^zenoh-bridge-ros2dds .*-e .*$", (FILES / "README.md").read_text(), re.M)
     assert lines
@@ -543,9 +543,9 @@ def test_the_readme_starts_a_bridge_over_the_network_below_the_robot_s_namespace
 
 
 def test_drive_py_begins_and_ends_with_zeros() -> None:
-    """Over the bridge a zero counts for a second after the last speed.
+    """Over the bridge a sender is armed only if it sends no speed for a second after its zero.
 
-    The zeros therefore continue for longer than that.
+    The zeros therefore continue for longer than a second.
     """
     text = (FILES / "drive.py").read_text()
     (zeros,) = re.findall(r"^ZEROS_S = ([\d.]+)$", text, re.M)

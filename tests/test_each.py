@@ -1,4 +1,4 @@
-"""One test for many sets runs all of them, and says which one failed."""
+"""A test that `each` runs with many parameter sets runs all of them and names those that fail."""
 
 from __future__ import annotations
 

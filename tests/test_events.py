@@ -16,7 +16,7 @@ NAMES = get_args(EventName)
 
 
 def named() -> set[str]:
-    """Return the string literals at the places where an event or a log line has its name."""
+    """Return the name of each event and log line in the code of acsard."""
     found = set()
     for path in (ROOT / "acsard").rglob("*.py"):
         code = path.read_text(encoding="utf-8")

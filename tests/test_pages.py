@@ -1,7 +1,6 @@
-"""Commands, files, links and toml on the pages are right, as far as static checks can tell.
+"""Static checks find no wrong command, file, link or TOML on the pages.
 
-The commands themselves are run by `tests/system/test_pages.py`, or by the checks that
-`tests/pages.py` names.
+`tests/system/test_pages.py`, or the checks that `tests/pages.py` names, run the commands.
 """
 
 from __future__ import annotations
@@ -112,7 +111,7 @@ parser = cache(cli.parser)
 
 
 def calls(command: str) -> Iterator[list[str]]:
-    """Return the words after each `acsard` of a command, also inside a shell's argument."""
+    """Return the words after each `acsard` of a command, including those inside `sh -c "..."`."""
     words = shlex.split(command)
     while words:
         end = words.index("&&") if "&&" in words else len(words)
@@ -131,7 +130,7 @@ def test_a_call_of_acsard_has_the_options_it_is_given(command: str) -> None:
 
 
 def inline() -> Iterator[tuple[str, list[str]]]:
-    """Yield each inline mention of a command: the page and the words after `acsard`."""
+    """Yield each command in the running text of pages: the page and the words after `acsard`."""
     for page in PAGES:
         for span in re.findall(r"`acsard\s([^`]+)`", prose(page)):
             yield page, span.split()
@@ -218,7 +217,7 @@ def test_every_javascript_block_is_on_a_page_whose_examples_are_run(language: st
 
 
 def test_the_subscribers_of_other_languages_in_the_readme_are_those_that_are_run() -> None:
-    """`tests/system/test_languages.py` runs these blocks with a key of its own."""
+    """`tests/system/test_languages.py` runs these blocks with another key."""
     calls = re.findall(r"`(session\.declare\w+\([^`]+)`", prose("README.md"))
     sources = [
         text_of(f"deploy/clients/{file}")
@@ -235,7 +234,7 @@ def test_the_subscribers_of_other_languages_in_the_readme_are_those_that_are_run
 
 
 def anchors(text: str) -> set[str]:
-    """Return the link targets of headings on a code forge: lower-case, - for spaces."""
+    """Return the link targets of headings as a code forge makes them: lower case, - for spaces."""
     titles = re.findall(r"^#+ (.+)$", text, re.M)
     return {re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-") for title in titles}
 
@@ -270,15 +269,15 @@ def test_every_file_that_a_recipe_names_is_there() -> None:
 
 
 def recipe(begin: str, end: str) -> set[str]:
-    """Return the files that this part of the page for developers names."""
+    """Return the files that the developers' page names between two texts."""
     part = prose("acsard/README.md").partition(begin)[2].partition(end)[0]
     return files_in("\n".join(re.findall(r"`([^`\s]+)`", part)))
 
 
 def files_with(pattern: str, *rooms: str) -> set[str]:
-    """Return the files below these directories that contain the text.
+    """Return the files below these directories whose text matches the pattern.
 
-    The names are written as the recipes write them.
+    The names are relative and without `acsard/`, as on the developers' page.
     """
     files = [file for room in rooms for file in (ROOT / room).rglob("*") if file.is_file()]
     texts = [(file, file.read_bytes()) for file in files if file.suffix != ".pyc"]
@@ -321,7 +320,10 @@ READS_BAGS = {"calibration/ros_bag_log.py", "deploy/calibration/README.md"}
 def test_a_recipe_names_every_file_that_must_change(
     part: str, pattern: str, some: str, beyond: set[str]
 ) -> None:
-    """Check a recipe's list of files. `beyond` are files that use this one alone."""
+    """Compare a recipe's files with the files that match a pattern of its subject.
+
+    `beyond` are files that match this pattern and need no change.
+    """
     knowing = files_with(pattern, "acsard", "deploy")
     assert {some, *beyond} <= knowing
     assert knowing - beyond <= recipe(f"## Add a {part}", "\n## ")

@@ -1,8 +1,8 @@
 """Every drive in `tests/recordings` replays with the same result as when it was recorded.
 
-A failure names the first output that changed. If the change is wanted, `python -m tests.recordings`
-rewrites the recordings that were made with the simulator. The words of reasons and events may
-change without that, because these recordings keep the words of older versions.
+A failure names the first output that changed. If this change is intended, `python -m
+tests.recordings` makes the recordings of the simulator again. The texts of reasons and events may
+change without new recordings, because the recordings keep the texts of older versions.
 """
 
 from __future__ import annotations

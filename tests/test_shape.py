@@ -1,7 +1,7 @@
 """The structure of the code follows rules: the core is pure, and imports point one way.
 
-The contracts in `pyproject.toml`, checked by `lint-imports`, say which room may import which, and
-that nothing in `acsard/core/` imports a clock, a socket, a thread, asyncio or logging.
+`lint-imports` checks the contracts in `pyproject.toml`. They say which package may import which
+other one, and that `acsard/core/` imports no clock, socket, thread, asyncio or logging.
 """
 
 from __future__ import annotations

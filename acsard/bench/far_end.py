@@ -40,7 +40,10 @@ class Part(msgspec.Struct, frozen=True):
 
 
 class NumberedMcu(FakeMcu):
-    """A simulated board that reports the speeds of `staircase()`, whatever speeds are commanded."""
+    """A simulated board that reports the speeds of `staircase()`, not the commanded speeds.
+
+    Successive lines have different speeds, so the benchmark can recognize each line.
+    """
 
     def __init__(self, config: Config, now_ns: int) -> None:
         super().__init__(config, now_ns)

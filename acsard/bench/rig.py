@@ -60,8 +60,8 @@ def ended(who: str, code: int, said: str = "") -> MendableError:
 def daemon_ended(code: int, log: Path) -> MendableError:
     """Return an error that says why the daemon ended by itself.
 
-    `code` is its exit code. The error quotes the daemon's last message in the file `log`. If there
-    is such a message and the code is one of `Exit` except 0, the benchmark ends with the same exit
+    `code` is its exit code. The error quotes the daemon's last message in the file `log`. If the
+    file contains a message, and `code` is an error code in `Exit`, the benchmark ends with the same
     code.
     """
     lines = log.read_text(errors="replace").splitlines()

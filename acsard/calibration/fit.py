@@ -157,11 +157,11 @@ def condition(normal: Floats) -> float:
 
 
 def huber(residuals: Floats | Complexes, least: float) -> Floats:
-    """Return Huber's weight of each residual: 1 up to `HUBER_LIMIT` standard deviations, less
-    above.
+    """Return Huber's weight of each residual, with which outliers have less influence on a fit.
 
-    The standard deviation is taken as 1.4826 times the median absolute residual, but at least
-    `least`.
+    The weight is 1 for a residual of up to `HUBER_LIMIT` standard deviations, and less for a larger
+    one. The standard deviation is estimated as 1.4826 times the median absolute residual, but it is
+    at least `least`.
     """
     size = np.abs(residuals)
     scale = max(least, 1.4826 * float(np.median(size)) if len(size) else 0.0)
@@ -222,7 +222,10 @@ leaves out whole runs.
 
 
 def student_factor(free: Floats | float) -> Floats:
-    """Return the variance of Student's t with max(`free`, 3) degrees of freedom."""
+    """Return the factor by which to increase a variance that was estimated from few values.
+
+    The factor is the variance of Student's t with max(`free`, 3) degrees of freedom.
+    """
     free = np.maximum(3.0, free)
     return np.asarray(free / (free - 2))
 
@@ -245,11 +248,10 @@ class Fit(Struct, frozen=True):
     """Prior standard deviation of each parameter that has one."""
 
     def without(self, blocks: Mask) -> Floats:
-        """Return the parameters that fit the log without the blocks in the mask `blocks`.
+        """Return approximately the parameters that fit the log without the blocks in a mask.
 
-        A block is a few seconds of driving.
-
-        The result is an approximation: one linear step from `parameters`, without another fit.
+        A block is a few seconds of driving. The mask `blocks` is True for each block to leave out.
+        The result is one linear step away from `parameters`, so no new fit is needed.
         """
         rest = self.normal[~blocks].sum(axis=0) + self.prior_normal
         found = self.parameters.copy()
@@ -257,10 +259,11 @@ class Fit(Struct, frozen=True):
         return found
 
     def marginal(self) -> Floats:
-        """Return the matrix on the left-hand side of the normal equations of the wheel parameters.
+        """Return the matrix of the normal equations, reduced to the wheel parameters.
 
-        The other fitted parameters are eliminated by a Schur complement. The matrix includes the
-        constraints and the prior information. There are two cases:
+        Its condition number shows how well the log separates the wheel radii from the track. A
+        Schur complement eliminates the other fitted parameters. The matrix includes the constraints
+        and the prior information. There are two cases:
 
         - If the fit used positions, the shape is (3, 3). The unknowns are the left radius, the
           right radius and the inverse track.
@@ -301,12 +304,12 @@ class Fit(Struct, frozen=True):
         )
 
     def _changes(self, group: npt.NDArray[np.int64]) -> tuple[Floats, Floats]:
-        """Leave out each group of blocks in turn, and return the changes of the parameters.
+        """Return how the parameters change if a group of blocks is left out, for each group.
 
-        The second result contains the variances of the parameters, from a jackknife over the
-        groups. They are widened to those of Student's t, with the degrees of freedom of
+        `group` contains the number of the group of each block. The second result contains the
+        variances of the parameters, from a jackknife over the groups. If there are few groups,
+        `student_factor()` makes the variances larger. Its degrees of freedom are those of
         Satterthwaite (An approximate distribution of estimates of variance components, 1946).
-        `group` contains the number of the group of each block.
         """
         change = np.array(
             [self.without(group == number) - self.parameters for number in np.unique(group)]
@@ -392,7 +395,10 @@ def _weight(part: Evidence) -> float:
 def _known(
     parameters: Floats, held: Sequence[Held], usual: Mapping[Parameter, float]
 ) -> tuple[Floats, Floats]:
-    """Return the normal equations of the constraints `held` and the prior deviations `usual`."""
+    """Return the terms that constraints and prior information add to the normal equations.
+
+    `held` contains the constraints, and `usual` the prior standard deviations of the parameters.
+    """
     normal, score = np.zeros((PARAMETER_COUNT, PARAMETER_COUNT)), np.zeros(PARAMETER_COUNT)
     for index, deviation in usual.items():
         normal[index, index] = deviation**-2

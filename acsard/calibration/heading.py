@@ -1,7 +1,8 @@
-"""Compares the turns of the wheels with a heading sensor: a gyro, or the yaw of a position source.
+"""Compares turns of the robot, computed from the wheels, with turns that a heading sensor measures.
 
-The comparison uses the equation of Antonelli, Chiaverini & Fusco (A calibration method for odometry
-of mobile robots based on the least-squares technique, 2005):
+The heading sensor is a gyro, or the yaw of a position source. The comparison uses the equation of
+Antonelli, Chiaverini & Fusco (A calibration method for odometry of mobile robots based on the
+least-squares technique, 2005):
 
     turn = g_r phi_r - g_l phi_l,    g_r = R_r / L,    g_l = R_l / L
 
@@ -67,7 +68,7 @@ GRID_S, FURTHEST_S = 0.02, 2.0
 """Step of the search for the heading sensor's delay, and the largest delay that is tried, s."""
 
 DEGREES_RATIO = 10.0
-"""Limit for the ratio of the turns in the column yaw to the turns of the wheels.
+"""Limit for the ratio of the turns in the column yaw to the robot's turns according to the wheels.
 
 A column yaw with a larger ratio is refused, because its values are in degrees.
 """
@@ -236,7 +237,10 @@ def _biases(run: Run) -> Rests:
 
 
 def _mean(samples: Floats) -> tuple[float, float]:
-    """Return the mean of the gyro samples of a standstill without outliers, and its variance."""
+    """Return the mean of the gyro samples of a standstill, and the variance of this mean.
+
+    Outliers are left out.
+    """
     off = np.abs(samples - np.median(samples))
     steps = np.diff(np.unique(samples))
     step = float(steps.min()) if len(steps) else 0.0
@@ -251,7 +255,7 @@ def _mean(samples: Floats) -> tuple[float, float]:
 
 
 def _bias_std(rested: Sequence[Rests], seconds: Sequence[float]) -> float:
-    """Return the standard deviation of the mean bias error over all runs, rad/s.
+    """Return the standard deviation of the error of the gyro bias, averaged over all runs, rad/s.
 
     `rested` contains the standstills of each run, and `seconds` the length of each run, s.
     """
@@ -280,9 +284,10 @@ def _sums(rate: Floats, steps: Floats) -> Floats:
 def offset(found: Sequence[Heading], driven: Sequence[Run]) -> float:
     """Return the delay of a heading sensor's recorded times relative to those of the wheels, s.
 
-    The result is the delay, from -`FURTHEST_S` to `FURTHEST_S`, for which the turns of the sensor
-    correlate best with the turns of the wheels. It is 0 if the sensor or the wheels show no turns.
-    `found` contains the sensor's headings in each of the runs `driven`.
+    `found` contains the heading that the sensor measured in each run, and `driven` contains the
+    runs. The result is the delay for which the turns of the sensor correlate best with the robot's
+    turns according to the wheels. It is between -`FURTHEST_S` and `FURTHEST_S`. It is 0 if the
+    sensor or the wheels show no turns.
     """
     reach = round(FURTHEST_S / GRID_S)
     scores, sizes = np.zeros((2, 2 * reach + 1)), np.zeros(2)
@@ -311,7 +316,10 @@ def offset(found: Sequence[Heading], driven: Sequence[Run]) -> float:
 
 
 def _correlation(later: Floats, earlier: Floats, reach: int) -> Floats:
-    """Return the correlation for shifts from -reach to reach. At a positive shift, `later` lags."""
+    """Return the correlation of two series for each shift from -`reach` to `reach` samples.
+
+    If the maximum is at a positive shift, `later` lags behind `earlier`.
+    """
     size = 1 << (len(later) + reach).bit_length()
     spectrum = np.fft.rfft(later, size) * np.conj(np.fft.rfft(earlier, size))
     whole = np.fft.irfft(spectrum, size)
@@ -321,8 +329,9 @@ def _correlation(later: Floats, earlier: Floats, reach: int) -> Floats:
 def rows(headings: Headings | None, driven: Sequence[Run], parts: Sequence[Block]) -> Rows:
     """Return the motion of the robot in intervals of about `INTERVAL_S` s.
 
-    The intervals are parts of the blocks `parts`. An interval is left out unless the samples of the
-    heading sensor cover it without a gap. If `headings` is None, no interval is left out.
+    The intervals are parts of the blocks `parts`. The result contains only the intervals that the
+    heading sensor covers with samples from begin to end. If `headings` is None, it contains all
+    intervals.
     """
     squares = [_signed_square_integral(run) for run in driven]
     found: list[tuple[Floats, ...]] = []
@@ -366,9 +375,10 @@ def rates(rows: Rows, by_wheels: Floats) -> Rates:
 
 
 def without_constant_rate(rows: Rows) -> Rows:
-    """Return `rows` without the part of each column that is proportional to the intervals' length.
+    """Subtract a constant rate from each column of `rows`, and return the result.
 
-    An unknown constant gyro bias then has no effect on a comparison with the wheels. The column
+    The constant rate is the change of the column per second, fitted by least squares. A constant
+    gyro bias, which is unknown, then has no effect on a comparison with the wheels. The column
     `seconds` does not change.
     """
     share = rows.seconds / float(rows.seconds @ rows.seconds)
@@ -443,8 +453,9 @@ def _weight(rows: Rows, residual: Floats, by_wheels: Floats) -> Floats:
 def bias(rows: Rows, by_wheels: Floats) -> float:
     """Return the gyro's bias, rad/s, from a comparison with the wheels.
 
-    The bias is the mean of the turn rate of the gyro minus the turn rate of the wheels.
-    `by_wheels` contains the turn in each interval of `rows` according to the wheels, rad.
+    The bias is the mean difference between the turn rate of the gyro and the robot's turn rate
+    according to the wheels. `by_wheels` contains the robot's turn in each interval of `rows`
+    according to the wheels, rad.
     """
     seconds, found = rows.seconds, 0.0
     off = rows.turned - by_wheels
@@ -455,12 +466,12 @@ def bias(rows: Rows, by_wheels: Floats) -> float:
 
 
 def side_factors(rows: Rows, base: Base, *, in_place: bool = False) -> Floats:
-    """Return the two factors with which the turns of the wheels fit the heading sensor best.
+    """Return a factor for the left wheels, and a factor for the right wheels.
 
-    The first factor is that of the left wheels, the second that of the right wheels. A factor is
-    wheel radius / effective track, divided by the configured wheel radius / wheel separation
-    (`base.radius_per_separation`). It is negative if the sign of this side's wheel speeds, or the
-    sign of the sensor, is wrong.
+    With these factors, the robot's turns according to the wheels (`by_sides`) fit the heading
+    sensor best. A factor is wheel radius / effective track, divided by the configured wheel radius
+    / wheel separation (`base.radius_per_separation`). It is negative if the wheel speeds of this
+    side, or the sensor, have the wrong sign.
 
     If the robot only turns in place (`in_place`), the log does not show the ratio of the two
     factors. Both factors are then equal.

@@ -1,4 +1,4 @@
-"""Reads the bytes of a CSV file into columns of numbers and the runs that they belong to.
+"""Reads the bytes of a CSV file into columns of numbers, and finds the run of each row.
 
 The header names the columns in any order, and may give units, such as "t [ms]" and "yaw_rate
 (deg/s)". A cell may be empty, so that sensors of different rates share a file. Rows that cannot be
@@ -111,13 +111,13 @@ def bounded(columns: dict[str, Floats]) -> Iterator[str]:
 
 
 def spikes(values: Floats, order: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
-    """Return a mask of the values that are spikes. `order` contains the indices sorted by time.
+    """Return a mask of the spikes: values far above their neighbors, which were recorded wrongly.
+
+    `values` is in the order of the file. `order` contains the indices of the values sorted by time.
+    A spike is far above its neighbors in both orders. A correct value may be far above its
+    neighbors in only one of them, for example if the rows of the file are shuffled.
 
     If fewer than 1 / `FEW_VALUES` values are above `SLOW`, no value counts as a spike.
-
-    A spike differs from its neighbors both in the order of the file and in the order of time. A
-    correct value may differ from its neighbors in one of these orders, for example if the rows of
-    the file are shuffled.
     """
     sizes = np.abs(values)
     moving = sizes[sizes > SLOW]
@@ -130,7 +130,10 @@ def spikes(values: Floats, order: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_
 
 
 def _alone(sizes: Floats, usual: float) -> npt.NDArray[np.bool_]:
-    """Return a mask of the values that exceed `SPIKE` * `usual`, and `SPIKE` * each neighbor."""
+    """Return a mask of the values that are far above `usual` and far above both neighbors.
+
+    Far above means more than `SPIKE` times as large. NaN values do not count as neighbors.
+    """
     held = np.flatnonzero(np.isfinite(sizes))
     seen = np.concatenate([[0.0], sizes[held], [0.0]])
     around = np.maximum(np.maximum(seen[:-2], seen[2:]), usual)

@@ -69,10 +69,10 @@ class Multipliers(Struct, frozen=True):
         return self.relative_deviations().ratio
 
     def apart(self, base: Base) -> float:
-        """Return the distance of these multipliers from those of `base`, in standard deviations.
+        """Return how far these multipliers are from those of `base`, in standard deviations.
 
-        Combinations of multipliers that no sensor measures stay as configured, so they add
-        nothing.
+        Chance alone hardly explains a large distance. Combinations of multipliers that no sensor
+        measures stay as configured, so they do not add to the distance.
         """
         off = self.values - (base.track, base.left, base.right)
         return math.sqrt(off @ np.linalg.solve(self.covariance + TOLERANCE**2 * np.eye(3), off))
@@ -149,7 +149,10 @@ class Tape(Struct, frozen=True):
 
 
 class Extent(Struct, frozen=True):
-    """The extent of a run's path according to the wheels."""
+    """Length of a run's path, and straight-line distance from its start to its end.
+
+    Both are computed from the wheels.
+    """
 
     distance: float
     """Straight-line distance from start to end, m."""
@@ -158,8 +161,10 @@ class Extent(Struct, frozen=True):
 
     @property
     def straight(self) -> float:
-        """`distance` / `length`, which is 1 for a straight path; 0 if `distance` <=
-        `MIN_TAPE_M`."""
+        """Ratio of `distance` to `length`: 1 for a straight path, less for a curved path.
+
+        The value is 0 if `distance` is not greater than `MIN_TAPE_M`.
+        """
         return self.distance / self.length if self.distance > MIN_TAPE_M else 0.0
 
 

@@ -5,9 +5,9 @@ measured heading or position and the heading or position that the wheels give fo
 `Windows.search` finds the noise for which the residuals of all windows have the greatest
 likelihood. The comment above `Windows` has the equations.
 
-Some errors last for a whole turn, for example if the track changes with the turn rate. The
-residuals of a window are therefore seconds apart, so that most of an error of this kind falls
-between two residuals.
+Some errors last for a whole turn of the robot, for example if the track changes with the turn rate.
+The residuals of a window are therefore several seconds apart, so that most turns fit between two
+residuals.
 """
 
 from __future__ import annotations
@@ -225,9 +225,9 @@ class Windows(Struct, frozen=True):
     def at_least(self, noise: Floats) -> Floats:
         """Return `noise`, increased so that it is not too small for other drives.
 
-        `MIN_NOISE_RATIO` and `MIN_CHANGING_FRACTION` give minima. If few residuals show the noise
-        of `DISTANCE`, `YAW` or `SKID`, this noise is also increased like the variance of Student's
-        t.
+        Only the noise of `DISTANCE`, `YAW` and `SKID` is increased. It is first multiplied by
+        `student_factor()`, which is large if few residuals show this noise. It is then raised to
+        the minimum that `MIN_NOISE_RATIO` and `MIN_CHANGING_FRACTION` define.
         """
         # Windows overlap by half, so each residual counts as half a degree of freedom.
         shares = np.linalg.inv(self.covariance(noise))[:, None] @ self.effects
@@ -283,15 +283,14 @@ class Noise(Struct, frozen=True):
         return self.log_likelihood_gain > min(SURE_DEVIATIONS * self.gain_std, CERTAIN_GAIN)
 
     def heading(self) -> tuple[float, float]:
-        """Return the standard deviations of the heading after `REPORT_DISTANCE_M` m of driving,
-        rad.
+        """Return two standard deviations of the heading after `REPORT_DISTANCE_M` m, rad.
 
         The first number is due to the configured noise, the second number to the found noise.
         """
         return self._after(Source.YAW, Source.RATIO, Source.SKID)
 
     def distance(self) -> tuple[float, float]:
-        """Return the standard deviations of the distance after `REPORT_DISTANCE_M` m of driving, m.
+        """Return two standard deviations of the driven distance after `REPORT_DISTANCE_M` m, m.
 
         The first number is due to the configured noise, the second number to the found noise.
         """
@@ -452,11 +451,14 @@ class _Window(Struct, frozen=True):
     """Covariance of the residuals due to the uncertain bias of the gyro; 0 without a gyro."""
 
     def projected(self, known: Deviations) -> tuple[Floats, Floats, Floats]:
-        """Return three arrays, from which the unknown start pose is projected out.
+        """Return the residuals and their covariances, independent of the unknown start pose.
+
+        The effect of the start pose is projected out of these three results:
 
         - the residuals
-        - their covariance for each `Source` if the noise of this source is 1
-        - their covariance due to the uncertainty `known` and the uncertain bias of the gyro
+        - for each `Source`, the covariance of the residuals if the noise of this source is 1
+        - the covariance of the residuals due to the uncertain geometry (`known`) and the uncertain
+          bias of the gyro
         """
         distance, turn, track = self.motion.distance, self.motion.turn, self.motion.track
         sides = np.maximum(np.abs(distance), track / 2 * np.abs(turn))
@@ -542,7 +544,7 @@ def _by_headings(
     t: Floats, at: Floats, heading: Heading, way: Path, track: float, headings: Headings,
     parameters: Floats,
 ) -> _Window:  # fmt: skip
-    """Return a window whose residuals are the heading of the sensor minus that of the wheels.
+    """Return a window whose residuals are measured headings minus headings from the wheels.
 
     `t` are times on the wheels' clock, and `at` the same moments on the sensor's clock.
     """
@@ -562,11 +564,12 @@ def _by_headings(
 def _by_places(
     t: Floats, at: Floats, place: Complexes, way: Path, track: float, parameters: Floats
 ) -> Iterator[_Window]:
-    """Yield a window of position residuals, unless one of the times `t` has no position.
+    """Yield a window of position residuals: measured position minus the path of the robot.
 
-    Each position belongs to the nearest of the times `t`. A residual is the median of (position
-    minus aligned path) over the positions of one time. `place` contains the positions (x + iy, m),
-    and `at` their times, s. `t` and `at` are times on the clock of the positions.
+    The path is first shifted and rotated so that it fits the positions best. Each position belongs
+    to the nearest of the times `t`. The residual at a time is the median of the differences of its
+    positions. If a time has no position, nothing is yielded. `place` contains the positions (x +
+    iy, m), and `at` their times, s. `t` and `at` are times on the clock of the positions.
     """
     group = np.searchsorted((t[1:] + t[:-1]) / 2, at)
     numbers = range(len(t))

@@ -1,10 +1,11 @@
-"""Compares the path of the wheels with positions from any source.
+"""Compares the robot's path, computed from the wheels, with measured positions from any source.
 
 The path of each block (a few seconds) is first shifted and rotated so that it fits the positions
-best. The remaining differences are the evidence for the fit. The start pose, the frame and the yaw
-are therefore not needed. Places are complex numbers x + iy in m.
+best. The comparison therefore needs neither the start pose nor the frame or the yaw of the
+positions. The remaining differences are the evidence for the fit. Places are complex numbers x + iy
+in m.
 
-The fit needs a track that is nearly right. `search` finds parameters from which the fit can start.
+The fit must start from a track that is nearly right. `search` finds such starting parameters.
 """
 
 from __future__ import annotations
@@ -42,7 +43,10 @@ SPEED_HALF_INTERVAL_S = 0.05
 
 
 def extent(places: Complexes) -> float:
-    """Return the width plus the height of the bounding box of `places` (x + iy), m."""
+    """Return how far apart some places are, m.
+
+    The result is the width plus the height of the bounding box of `places` (x + iy, m).
+    """
     return float(np.ptp(places.real) + np.ptp(places.imag))
 
 
@@ -58,7 +62,10 @@ class Segment(Struct, frozen=True):
 
 
 class WheelSteps(Struct, frozen=True):
-    """The rolling of a run's wheels, divided into the steps from which the path is computed."""
+    """The angles by which the wheels rolled in a run, step by step.
+
+    The path of the robot is computed from these steps.
+    """
 
     t: Floats
     """Times at which the steps begin and end, s. There is one more time than there are steps."""
@@ -155,7 +162,7 @@ def jumps(run: Run) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
 
 
 def wheel_steps(run: Run, fine_s: float = STEP_S) -> WheelSteps:
-    """Return the rolling of the wheels in steps of about `fine_s` s.
+    """Return the angles by which the wheels rolled in steps of about `fine_s` s.
 
     If the samples of the wheels are further apart, a step is the interval between two samples.
     """
@@ -232,7 +239,7 @@ Paths = Sequence[Path] | Mapping[int, Path]
 
 
 class Aligned(Struct, frozen=True):
-    """The positions of a segment, compared with the path of the wheels.
+    """The positions of a segment, compared with the path that was computed from the wheels.
 
     The path was shifted and rotated so that it fits the positions best.
     """
@@ -250,9 +257,10 @@ class Aligned(Struct, frozen=True):
 
 
 def aligned(segments: Sequence[Segment], paths: Paths, parameters: Floats) -> Iterator[Aligned]:
-    """Yield the positions of each segment, compared with the path of the wheels.
+    """Yield the positions of each segment, compared with the path computed from the wheels.
 
-    The path is first shifted and rotated so that it fits the positions best. Outliers weigh less.
+    The path is first shifted and rotated so that it fits the positions best. Outliers have smaller
+    weights.
     """
     for segment in segments:
         place, derivatives = paths[segment.run].at(segment.t, parameters)
@@ -279,8 +287,8 @@ def evidence(
 ) -> Evidence:
     """Return the evidence of the positions: their contribution to the normal equations of the fit.
 
-    The path is linearized at `parameters`, with which `paths` must have been computed. `blocks` is
-    the number of blocks.
+    The caller must have computed `paths` with the same `parameters`. `blocks` is the number of
+    blocks (a few seconds of driving each).
     """
     normal, score = (
         np.zeros((blocks, PARAMETER_COUNT, PARAMETER_COUNT)),
@@ -298,7 +306,11 @@ def evidence(
 
 
 def spread(segments: Sequence[Segment], paths: Paths, parameters: Floats) -> float:
-    """Return the RMS distance of the positions from the aligned paths, m. Outliers weigh less."""
+    """Return the RMS distance of the positions from the paths computed from the wheels, m.
+
+    Each path is first shifted and rotated so that it fits the positions best. Outliers have smaller
+    weights.
+    """
     squares, count = 0.0, 0
     for part in aligned(segments, paths, parameters):
         squares += float(np.sum(np.abs(part.residual) ** 2))
@@ -373,7 +385,7 @@ class StartingPoint(Struct, frozen=True):
 
     parameters: Floats
     unexplained: float
-    """Fraction of the variance of the positions that the path of the wheels does not explain."""
+    """Fraction of the positions' variance that the path from the wheels does not explain."""
 
 
 # The search tries tracks from a tenth to thirty times the configured one. It also tries reversed
@@ -435,9 +447,10 @@ def _local_minima(tried: Sequence[StartingPoint]) -> list[StartingPoint]:
 
 
 def _penalty(point: StartingPoint, sides: Floats | None) -> float:
-    """Return 1, or more if the robot of `point` is unusual.
+    """Return a factor with which `search` prefers starting points that describe a usual robot.
 
-    `sides` is the result of `heading.side_factors()`, or None.
+    The factor is 1 for a usual robot. It is larger if the robot turns unusually much or little, or
+    if turns or wheels are reversed. `sides` is the result of `heading.side_factors()`, or None.
     """
     signed = (
         point.parameters[[Parameter.LEFT, Parameter.RIGHT]]
@@ -455,9 +468,10 @@ def _penalty(point: StartingPoint, sides: Floats | None) -> float:
 
 
 def _turn(parameters: Floats) -> float:
-    """Return the robot's turn if only the right wheels roll, by 1 rad.
+    """Return the robot's turn if only the right wheels roll, relative to the configured geometry.
 
-    The turn is divided by `Base.radius_per_separation`.
+    The value is 1 if the robot turns as the configured wheel radius and wheel separation predict
+    without multipliers.
     """
     return float(parameters[Parameter.INVERSE_TRACK] * parameters[Parameter.RIGHT])
 
@@ -479,9 +493,11 @@ def _tried(
 ) -> StartingPoint:
     """Return the starting point for a shape of the path, with the wheel size that fits best.
 
-    `shape` contains three numbers: the sign of the left wheels' rolling, the ratio of configured to
-    true track, and the delay of the positions, s. The ratio is negative if the robot turns opposite
-    to its wheels.
+    `shape` contains three numbers:
+
+    - 1, or -1 if the speeds of the left wheels have the wrong sign
+    - the ratio of configured to true track, which is negative if all turns are reversed
+    - the delay of the positions, s
     """
     parameters = base.start()
     parameters[[Parameter.LEFT, Parameter.RIGHT, Parameter.INVERSE_TRACK, Parameter.DELAY]] = (

@@ -308,7 +308,10 @@ def _sides(columns: dict[str, Floats], notes: Notes) -> tuple[Floats, Floats]:
 
 
 def _apart(columns: dict[str, Floats], front: str, rear: str) -> float:
-    """Return how much two wheels of a side differ, as a fraction of the rolled distance."""
+    """Return how much the front and the rear wheel of a side differ, as a fraction of their speed.
+
+    Raises `LogError` if they differ by more than `MAX_DIFFERENCE`.
+    """
     seen = np.isfinite(columns[front]) & np.isfinite(columns[rear])
     starts = np.arange(0, int(seen.sum()), SUMMED_ROWS)
     if not len(starts):
@@ -423,7 +426,11 @@ def _remove_repeats(drives: Iterable[tuple[str, Streams]], notes: Notes) -> None
 
 
 def _repeats(streams: Streams, what: str) -> tuple[Mask, Mask]:
-    """Return two masks: samples that repeat the previous one, and samples with rolling wheels."""
+    """Return two masks of the samples in the columns `what`.
+
+    The first mask selects samples that repeat the previous sample. The second mask selects samples
+    at times at which the wheels roll.
+    """
     t, *values = streams[what]
     if not len(t):
         return np.zeros(0, dtype=bool), np.zeros(0, dtype=bool)
@@ -536,7 +543,10 @@ def blocks(driven: Sequence[Run], shortest_s: float) -> list[Block]:
 
 
 def _turned(run: Run, begin: float, end: float, left: Floats, right: Floats) -> bool:
-    """Return whether the wheels of one side rolled by `MIN_BLOCK_ROLL`, ahead plus backwards."""
+    """Return whether the wheels of one side rolled by `MIN_BLOCK_ROLL` or more, in any direction.
+
+    Motion to and fro does not cancel.
+    """
     if max(abs(left[1] - left[0]), abs(right[1] - right[0])) >= MIN_BLOCK_ROLL:
         return True
     a, b = np.searchsorted(run.t, (begin, end))

@@ -351,9 +351,10 @@ def _known(best: Candidate, odometry: OdometryConfig) -> Deviations:
 def _noise(
     best: Candidate, known: Deviations, odometry: OdometryConfig, *, present: bool
 ) -> Noise | None:
-    """Return the odometry noise of the log.
+    """Return the odometry noise that the log shows.
 
-    The geometry is the configured one if `present` is true, and otherwise the fitted one.
+    The odometry is computed with the configured geometry if `present` is true, and otherwise with
+    the fitted geometry.
     """
     made, fitted = best.made, best.fitted
     held = folds(fitted, made.parts, drives(made.runs), best.rate)
@@ -517,7 +518,10 @@ def _cuts(driven: Sequence[Run]) -> Iterator[str]:
 
 
 def _too_good(made: Prepared, fitted: Fit, log: Log) -> Iterator[str]:
-    """Yield a sentence for each sensor that was probably computed from the wheels."""
+    """Yield a sentence for each sensor whose values were probably computed from the wheels.
+
+    Such values cannot calibrate the wheels.
+    """
     rows, headings, base = made.rows, made.headings, made.base
     if headings is not None:
         off = rows.turned - heading.turned(rows, base, fitted.parameters)

@@ -67,7 +67,7 @@ class Operator(Protocol):
     """Interface through which the check informs and asks the operator, a person near the robot."""
 
     def doing(self, text: str) -> None:
-        """Show what the check does now. `text` stays until the next call of this method."""
+        """Show the current activity. `text` remains visible until the next call of this method."""
 
     def ask(self, question: str, answers: Sequence[str]) -> str | None:
         """Ask a question. Return one of `answers`, or None if there is no operator to answer."""
@@ -105,8 +105,8 @@ class Board:
     """The board that is checked, with its replies and the results of the steps.
 
     It is a context manager, which opens the serial line (`wire`) at the beginning and closes it at
-    the end. Before it closes the line, it sends zero speeds, unless a motor runs away
-    (`runaway_seen`).
+    the end. Before it closes the line, it sends zero speeds. If a motor runs away
+    (`runaway_seen`), it sends nothing, so that the board's watchdog can stop the motor.
     """
 
     def __init__(
@@ -178,7 +178,10 @@ class Board:
         self.forget()
 
     def forget(self) -> None:
-        """Discard all received lines and the signs of a restart. Keep the results of the steps."""
+        """Discard all received lines, and reset the detector of restarts.
+
+        The results of the steps remain unchanged.
+        """
         self.restarts, self._unanswered_s = Restarts(), 0.0
         for heard in (self._lines, self.replies, self.unrecognized_lines):
             heard.clear()
@@ -271,9 +274,10 @@ class Board:
         self.restarts.sent(motors, self.sent_s)
 
     def zeros(self) -> None:
-        """Send zero speeds as a line with a final comma, and again as a line without one.
+        """Send zero speeds in two lines: one ends with a comma, and the other does not.
 
-        If `sealed` is true, also send them as a line with a checksum.
+        Some firmware obeys only one of the two endings. If `sealed` is true, also send a line with
+        a checksum.
         """
         self._commanded = ZERO
         plain = self._codecs[True].stop + self._codecs[False].stop
@@ -281,7 +285,10 @@ class Board:
         self.restarts.sent(ZERO, self.now_s)
 
     def answers_within(self, seconds: float) -> bool:
-        """Send zero speeds until the board answers. Return False if it does not in `seconds` s."""
+        """Send zero speeds until the board answers, for `seconds` s at most.
+
+        Return whether the board has answered.
+        """
         before, end_s = len(self.replies), self.now_s + seconds
         while len(self.replies) == before:
             if self.now_s >= end_s:
@@ -324,8 +331,9 @@ class Board:
         """Send lines with the speeds `motors`, rad/s, for `seconds` s, and return the replies.
 
         `period_s` is the time from one line to the next, s; 0 means `self.period_s`. Raises
-        `StoppedError` if the board falls silent while `armed` is true, because a motor could then
-        run away unnoticed. Also raises the errors of `listen`.
+        `StoppedError` if the board falls silent, because a motor could then run away unnoticed.
+        This applies only after the check has seen all motors stand still (`self.armed`). Also
+        raises the errors of `listen`.
         """
         period_s = period_s or self.period_s
         end_s = self.now_s + seconds
@@ -367,8 +375,8 @@ class Board:
     def listen(self, seconds: float) -> list[Reply]:
         """Receive data for `seconds` s, and return the replies that arrived in this time.
 
-        Raises `RestartedError` if the board restarts, and `StoppedError` if a motor runs away while
-        `armed` is true.
+        Raises `RestartedError` if the board restarts. Raises `StoppedError` if a motor runs away
+        after the check has seen all motors stand still (`self.armed`).
         """
         end_ns = self.wire.now_ns() + ceil(seconds * NS_PER_S)
         if self.now_s - self._listened_s > BEAT_NS / NS_PER_S:
@@ -437,7 +445,9 @@ class Board:
     def silent_s(self) -> float:
         """Time since the board's last reply, s.
 
-        It is 0 before the first reply. It is also 0 after a motor has run away (`runaway_seen`).
+        It is 0 before the first reply. It is also 0 after a motor has run away (`runaway_seen`):
+        the check sends lines to a silent board until it answers, but after a runaway it must send
+        nothing.
         """
         return self.now_s - self.replies[-1].at_s if self.replies and not self.runaway_seen else 0.0
 
@@ -470,10 +480,9 @@ class Board:
 
         Raises `StoppedError` if a motor keeps turning, or if the board falls silent.
 
-        If a motor does not stop in time, try lines with the other ending: a comma or none. Some
-        firmware stops motor d only at lines with one of the two endings. If only motor d kept
-        turning without slowing down, and it stops now, change `comma`, so that all later lines have
-        this ending.
+        Some firmware stops motor d only at lines with one of the two endings: a comma or none. So
+        if a motor does not stop in time, also send zeros with the other ending. If motor d alone
+        kept its speed before, and stops now, all later lines have this ending (`comma`).
         """
         began_s = self.now_s
         if self.settles(self.comma):
@@ -496,7 +505,7 @@ class Board:
         raise StoppedError(outcomes.find("stop: turns", motors=motors, seconds=seconds))
 
     def _unheard_s(self, since_s: float) -> float:
-        """Return the time since the last reply, but at most since the time `since_s`, s."""
+        """Return the time since the last reply or since `since_s`, whichever is later, s."""
         heard = motion.since(self.replies[-1:], since_s)
         return self.now_s - (heard[-1].at_s if heard else since_s)
 

@@ -36,10 +36,13 @@ def changes(findings: Sequence[Finding], config: Config, port: str = "") -> Chan
     """Return the suggested values that differ from the configuration `config`.
 
     They come from the findings. If a board answered, `mcu.port` gets the value `port`, unless
-    `port` is "". If the suggested values contradict each other, for example because the lines
-    would be too long for the control rate, the result leaves out suggestions that switch on a
-    setting in `OPTIONAL_KEYS`. If that is not enough, `control.rate` gets the value "auto",
-    provided that this helps.
+    `port` is "".
+
+    Suggested values can contradict each other. For example, lines with a checksum may be too long
+    for the control rate. Then the function tries two remedies, one after the other:
+
+    1. Leave out suggestions that switch on a setting in `OPTIONAL_KEYS`.
+    2. Set `control.rate` to "auto". If this does not help, leave `control.rate` unchanged.
     """
     wanted: Changes = {"mcu.port": port} if port and answered(findings) else {}
     for finding in findings:
@@ -117,7 +120,7 @@ def report(
     """Return the report of a check.
 
     The check has passed if the board answered, if every step was run and judged, and if no step
-    failed. In the report, None takes the place of an empty `written`, `error` or `withheld`.
+    failed. If `written`, `error` or `withheld` is "", the report contains None for it.
     """
     judged = answered(findings) and not lateness.unjudged(findings)
     passed = judged and not any(

@@ -54,10 +54,11 @@ def broken_lines(comma: bool, sealed: bool, motors: Sequence[int]) -> list[tuple
 
 
 def finding(board: Board, motors: Sequence[int]) -> Finding:
-    """Send damaged lines, and return the finding that names the kinds that moved a motor.
+    """Send damaged lines, and return a finding that says whether such a line moved a motor.
 
-    `motors` are the numbers of the motors that are known to follow commands. The damaged lines
-    command speeds for these motors, which must stand still. If `motors` is empty, nothing is sent.
+    The finding names the kinds of damage that the board did not reject. `motors` are the numbers of
+    the motors that are known to follow commands. The damaged lines command speeds for these motors,
+    which must stand still. If `motors` is empty, nothing is sent.
     """
     if not motors:
         return outcomes.find("damaged lines: untested")

@@ -1,8 +1,9 @@
 """Steps of the check that find out how the board communicates.
 
 The steps find out the baud rate, the form of the lines, whether the board supports the checked
-link, and the rate and the delay of the replies. They send only zeros and questions, so no motor
-turns. They store their results in the `Board`, for the later steps.
+link, and the rate and the delay of the replies. They send only zero speeds and requests for the
+board's identification, so no motor turns. They store their results in the `Board`, for the later
+steps.
 """
 
 from __future__ import annotations
@@ -61,8 +62,8 @@ def _knock(board: Board, seconds: float) -> bool:
 def identity(board: Board) -> Finding:
     """Ask the board for its identification, and store its `NAME=VALUE` fields in the `Board`.
 
-    The identification is optional for the board. Raises `StoppedError` if only the question itself
-    comes back, because then no board answers.
+    The identification is optional for the board. Raises `StoppedError` if the port only returns the
+    request itself as an echo, because then no board answers.
     """
     board.unrecognized_lines.clear()
     # Ask up to three times, because the question or its answer may be lost.
@@ -207,9 +208,9 @@ def rate(board: Board) -> Finding:
 def trip(board: Board) -> Finding:
     """Measure the time from the sending of a line to the arrival of the board's reply.
 
-    Boards that report by their own clock do not reply to single lines. For such a board, the
-    finding says that the step was skipped. It says that the step was not judged if an earlier step
-    could not measure the rate of the replies.
+    A free-running board does not reply to single lines, so its finding says that the step was
+    skipped. If an earlier step could not measure the rate of the replies, the finding says that the
+    step was not judged.
     """
     if not board.paced:
         return lateness.finding("round trip", board.lateness.since(0.0))

@@ -2,7 +2,7 @@
 
 The emergency stop and the bumpers are called the inputs of the board. The board reports them in
 status lines (`core/link/board_status.py`). This step is the last step of the check, because the
-emergency stop cuts the motors, and some motor drivers must be enabled again afterward.
+emergency stop switches the motors off, and some motor drivers must be enabled again afterward.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ def finding(board: Board, operator: Operator, safety: SafetyConfig) -> Finding:
     """Let the operator press each input, and check that the board reports each press and release.
 
     The inputs are the emergency stop and the bumpers that the configuration requires or that the
-    board reports. The operator sees a bumper's configured place on the robot as its name, or its
-    number if the configuration gives no places. The inputs are not tested if no operator is ready.
+    board reports. A bumper is named by its configured place on the robot, or by its number if the
+    configuration contains no places. The inputs are not tested if no operator is ready.
     """
     board.ask(REPORT_TIMEOUT_S)
     estop = safety.estop == "required" or (safety.estop == "auto" and 0 in board.inputs)

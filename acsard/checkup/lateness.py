@@ -70,7 +70,7 @@ def is_doubtful(found: TimingFinding, late_s: float) -> bool:
 
 
 def finding(name: str, late_s: float) -> Finding:
-    """Return the finding that this computer ran the step `name` too late for a judgment.
+    """Return a finding which says that the step `name` is not judged because it ran too late.
 
     `late_s` is the longest delay of this computer during the step, s.
     """
@@ -78,7 +78,7 @@ def finding(name: str, late_s: float) -> Finding:
 
 
 def judged(found: Finding) -> bool:
-    """Return whether a finding judges its step: False if this computer ran the step too late."""
+    """Return False if the finding says that the step was not judged, otherwise True."""
     return found.figure != outcomes.OUTCOMES_BY_NAME[NOT_JUDGED].figure
 
 

@@ -102,7 +102,10 @@ def finding(board: Board) -> Finding:
 
 
 def _period_s(board: Board) -> float:
-    """Return the daemon's control period, or a longer one that the wire and board can follow."""
+    """Return the time from one line to the next in the count of lost lines, s.
+
+    It is the daemon's control period, or longer if the wire or the board is too slow for this.
+    """
     longest = line_bytes(board.comma, board.sealed, board.sampled)
     period_s = 1 / min(board.rate_hz, highest_rate(board.baud_rate, longest, COMFORTABLE_USE))
     if not board.own_clock and board.gap_s > 1.5 * period_s:
@@ -135,7 +138,7 @@ def _left_out(replies: Sequence[Reply]) -> int:
 
 
 def _silence_s(board: Board, replies: Sequence[Reply]) -> float:
-    """Return the longest gap between two replies, or 0 if the daemon would tolerate the gap."""
+    """Return the longest gap between two replies, s, or 0 if the daemon tolerates such a gap."""
     longest = max(_gaps(replies), default=0.0)
     quiet_s = max(0.1, 4 / board.rate_hz, 3 * board.mcu.reply_period)
     return longest if longest > max(quiet_s, SILENCE_FACTOR * board.gap_s) else 0.0
@@ -193,8 +196,8 @@ def direction(board: Board, operator: Operator, motors: Sequence[int]) -> Findin
     """Find out whether lines are lost on the way to the board, or replies on the way back.
 
     The motors turn briefly, several times. `motors` are the numbers of the motors that turn as
-    commanded: their encoders show which lines arrived. If the board replies to lines, and at most
-    `MAX_LOSS` of them are lost, return None, and do not turn the motors.
+    commanded: their encoders show which lines arrived. Do nothing and return None for a prompted
+    board that loses no more than the fraction `MAX_LOSS` of the lines.
     """
     if not (board.own_clock or board.lost > MAX_LOSS):
         return None
@@ -252,7 +255,7 @@ def pulsed(board: Board, motors: Sequence[int]) -> PulseCounts | None:
 
 
 def _whole(board: Board, since_s: float) -> bool:
-    """Return whether no report since `since_s` is missing. The board must have its own clock."""
+    """Return whether all reports of a free-running board since the time `since_s` have arrived."""
     times = [reply.at_s for reply in motion.since(board.replies, since_s - board.gap_s)]
     return all(after - before < 1.5 * board.gap_s for before, after in pairwise(times))
 

@@ -186,9 +186,10 @@ def trend(replies: Sequence[Reply], now_s: float, gap_s: float) -> Motors:
 def grain_s(steady: Sequence[Reply], motors: Sequence[int]) -> float:
     """Return the resolution of the reported speeds, expressed as a time, s.
 
-    The reported speeds jump, because the firmware computes them from whole encoder counts. The
-    result is the time in which a motor at `SPEED` turns by the angle of one jump. `steady` are
-    replies that arrived while `motors` turned at `SPEED`. Return 0 for fewer than five replies.
+    The reported speeds jump even at a steady speed, because the firmware computes them from whole
+    encoder counts. A jump times the time between two replies is an angle. The result is the time in
+    which a motor at `SPEED` turns by this angle. `steady` are replies that arrived while `motors`
+    turned at `SPEED`. Return 0 for fewer than five replies.
     """
     if len(steady) < 5:
         return 0.0
@@ -199,7 +200,7 @@ def grain_s(steady: Sequence[Reply], motors: Sequence[int]) -> float:
 
 
 def fastest(replies: Sequence[Reply], above: float) -> tuple[int, float] | None:
-    """Return a motor that surely turns faster than `above` rad/s, or None if no motor does.
+    """Return a motor that several replies show to be faster than `above` rad/s, or None.
 
     The result is a pair: the number of the motor, and its mean speed in the last replies, rad/s. A
     single reply proves nothing, because it may be damaged, or show one count of a coarse encoder.

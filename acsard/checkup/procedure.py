@@ -122,10 +122,10 @@ def run(
     unjudged: set[str] = set()
 
     def once(finding: Finding | None) -> None:
-        """Call `tell` with a finding if it is the first with its name.
+        """Call `tell` with the first finding of each name, and ignore later findings of that name.
 
-        If the first finding does not judge its step, also call `tell` with the first later finding
-        of this name that does.
+        There is one exception. If the first finding says that its step was not judged, also call
+        `tell` with the next finding that judges the step.
         """
         if finding is None:
             return
@@ -238,7 +238,10 @@ class _Steps:
         self._board.armed = True
 
     def _turn(self, motor: int) -> Finding:
-        """Test one motor. Ask the operator only if this computer did not run the test too late."""
+        """Test one motor, then ask the operator which wheel turned.
+
+        The question is omitted if this computer ran the test too late.
+        """
         board, operator, channels = self._board, self._operator, self._channels
         operator.doing(f"{motor_name(board.mcu, motor)} turns: briefly, then forward and back")
 
@@ -257,7 +260,11 @@ class _Steps:
         self._take(doing, partial(self._in_time, step))
 
     def _in_time(self, step: Step) -> Finding | None:
-        """Run a step again while its finding is doubtful because this computer was too late."""
+        """Run a step. Repeat it if this computer was too late for a reliable finding.
+
+        After the last permitted repetition, return a finding which says that the step was not
+        judged. Raises `StoppedError` if the step ends the check.
+        """
         board, saved, late_s = self._board, self._board.saved_results, 0.0
         for _ in range(1 + min(LATE_AGAIN, self._late_left)):
             if late_s:
@@ -313,7 +320,8 @@ class _Steps:
     def _tried(self, step: Step) -> Finding | None:
         """Run a step. Raise `RestartedError` if the board restarted during the step.
 
-        A restart may be the cause of a bad finding, so wait until a silent board answers.
+        A bad finding can come from a restart. So after a bad finding, if the board is silent, wait
+        until it sends a line, which can show the restart.
         """
         try:
             finding = step()

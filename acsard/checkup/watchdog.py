@@ -150,9 +150,10 @@ def measured(board: Board, motors: Sequence[int], stop: Run) -> Bounds:
 
 
 def _asked(board: Board, motors: Sequence[int], stop: Run, bounds: Bounds) -> Bounds:
-    """Narrow the bounds of the time for which motors run on, by bisection.
+    """Measure by bisection for how long motors run on after the last line.
 
-    `bounds` are the first bounds. `stop` is the behavior of the motors in an ordinary stop.
+    Return a lower and an upper bound of this time, s. The search begins with `bounds`. `stop` is
+    the behavior of the motors in an ordinary stop.
     """
     least_s, most_s = bounds
     # Each run halves the interval between the bounds, unless this computer is late.

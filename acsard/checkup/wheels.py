@@ -142,9 +142,10 @@ def encoder_finding(mcu: McuConfig, channel: Channel) -> Finding:
 
 
 def _whose(mcu: McuConfig, channel: Channel) -> str:
-    """Return the suffix for the name of the check's outcome, such as ", motor".
+    """Return the end of the outcome's name that says which part is at fault, such as ", motor".
 
-    The suffix depends on the wheel and the direction that the operator has seen.
+    Only the wheel and the direction that the operator saw can distinguish a wrong motor from a
+    wrong encoder. Return "" for a kind of result that needs no such distinction.
     """
     wheel, sign = wheel_of(mcu, channel.motor)
     seen = channel.wheel
@@ -288,7 +289,10 @@ def channel(board: Board, motor: int) -> Channel:
 
 
 def _both_ways(board: Board, motor: int) -> Channel:
-    """Turn a motor forward and back, unless a probe shows that its encoder does not follow."""
+    """Turn a motor forward and back.
+
+    First probe the motor. If its own encoder does not move with it, do not turn the motor further.
+    """
     shown = probe(board, motor)
     if shown is not None:
         return Channel(motor, shown, ZERO, probed=True)
@@ -304,10 +308,10 @@ def _both_ways(board: Board, motor: int) -> Channel:
 
 
 def probe(board: Board, motor: int) -> Motors | None:
-    """Turn a motor slowly and briefly, to find out whether its own encoder follows.
+    """Turn a motor slowly and briefly, to find out whether its own encoder moves with it.
 
-    Return None if the encoder follows. The motor may then still turn. Otherwise stop the motor, and
-    return the speeds of the four encoders in the probe, rad/s.
+    If so, return None; the motor may still turn then. Otherwise stop the motor, and return the
+    speeds of the four encoders in the probe, rad/s.
     """
     # The firmware may drive a motor without a working encoder to full speed, but the probe is too
     # short for that. If the encoder does not follow, repeat the probe, because a coarse encoder may
@@ -332,7 +336,10 @@ def _probe(board: Board, motor: int, speed: float) -> Motors | None:
     began_s = board.now_s
 
     def shown() -> Motors:
-        """Return each encoder's mean speed in the probe, without the earlier coasting, rad/s."""
+        """Return each encoder's mean speed in the probe, rad/s.
+
+        The movement of a motor that still coasted when the probe began is subtracted.
+        """
         seconds = board.now_s - began_s
         ran = motion.covered(board.replies, began_s)
         sure = [max(0.0, abs(ran[m]) - abs(coasting[m]) * seconds) for m in range(4)]

@@ -110,7 +110,8 @@ def _actions(
 ) -> Iterator[tuple[str, argparse.Action]]:
     """Yield pairs: the name of a subcommand, and one of its options or arguments.
 
-    An option of an action, such as `recording show`, belongs to the subcommand `recording`.
+    For an option of an action, such as `recording show`, the name is that of the subcommand,
+    `recording`.
     """
     for action in parser._actions:
         yield verb, action

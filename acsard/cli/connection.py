@@ -31,7 +31,7 @@ SEVERAL_IDS = "; several ids separated by commas, or '*' for all robots"
 
 
 def add_bus(parser: argparse.ArgumentParser, more: str = "") -> None:
-    """Add the options of a subcommand that connects to a daemon: which robot, and where.
+    """Add the options that select a robot and the address of its daemon.
 
     `more` is appended to the help text of `--id`.
     """
@@ -164,10 +164,9 @@ def explained(
     Args:
         look: function that returns why no message has arrived yet, or "" to print nothing. It is
             called once if no message arrives in the first `after_s` s.
-        ceased: function that returns why no further message arrives, or "" to print nothing. It is
-            called after each `after_s` s without a message, until a reason has been printed. After
-            the next message it is called again. None explains only the silence before the first
-            message.
+        ceased: function for a later silence. It returns why no further message arrives, or "" to
+            print nothing. It is called each `after_s` s of the silence, until it has returned a
+            reason. If `ceased` is None, no reason for a later silence is printed.
         after_s: time without a message after which a reason is printed, s.
         timeout_s: time without a message after which the block ends by itself, s. If no message
             has arrived by then, the reason is printed before the block is left.

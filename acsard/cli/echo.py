@@ -111,8 +111,8 @@ class Quota:
     def __init__(self, most: int | None, robots: Collection[str]) -> None:
         """Allow `most` messages of each robot, or any number if `most` is None.
 
-        `robots` contains the ids of the robots that must reach this number before `used_up` is
-        true. If `robots` is empty, each robot that has sent a printed message must reach it.
+        `used_up` is true when each robot in `robots` has reached this number. If `robots` is empty,
+        the robots of the printed messages are used instead.
         """
         self._most, self._robots, self._counts = most, robots, dict[str, int]()
 

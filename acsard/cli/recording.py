@@ -564,7 +564,10 @@ def _when(text: str) -> When:
 
 @contextmanager
 def _progress(recording: Recording) -> Iterator[Callable[[int], None]]:
-    """Yield a function that shows on a terminal up to which time has been read."""
+    """Yield a function that shows on a terminal which part of a recording has been read.
+
+    The function takes the time of the last step that was read.
+    """
     if not sys.stderr.isatty():
         yield lambda wall_ns: None
         return

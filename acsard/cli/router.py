@@ -43,7 +43,7 @@ def main(args: argparse.Namespace) -> int:
 
 
 async def _kept(file: str, log: Log) -> int:
-    """Keep a router process running, and return 0 after a signal.
+    """Run a router process, and restart it whenever it ends. Return 0 after a signal.
 
     If the router cannot use its configuration or its certificates, return its exit code.
     """

@@ -160,10 +160,10 @@ def _duration_of_changes(message: str) -> str:
 
 
 def _limits(pairs: Mapping[str, Sequence[str]], at: int) -> LimitsConfig:
-    """Return the default limits with the changes in `pairs`.
+    """Return the limits after or before a change, so that the caller can find the lowered limits.
 
-    `pairs` maps the key of each changed limit to the pair (new value, old value). `at` is 0 for
-    limits with the new values, and 1 for limits with the old values.
+    `pairs` maps the key of each changed limit to the pair (new value, old value). `at` is 0 for the
+    new values, and 1 for the old values. All other limits have their default values.
     """
     return LimitsConfig(
         **{key.removeprefix(LIMITS_PREFIX): float(pair[at]) for key, pair in pairs.items()}

@@ -105,8 +105,8 @@ class Commander:
             command, and before the first command after each silence longer than
             `RELEASE_TIMEOUT_NS`. The daemon requires a zero before a sender may move the robot, so
             set this for a sender that never sends zeros itself. No zero is sent after a shorter
-            silence: a button may still be held, and after a stop and a `clear`, a zero would let
-            this button drive the robot.
+            silence, because the person may still hold a button. After a stop and a `clear`, such a
+            zero would arm the sender, and the held button would drive the robot again.
         connected_ns: the monotonic time of the sender's connection, ns. Set this for a sender that
             may connect while a button is held. If its first command arrives within
             `RELEASE_TIMEOUT_NS` after this time, no zero is sent before that command. None means
@@ -309,7 +309,7 @@ def objection(state: RobotState, source: str, sender: str) -> str:
 
 
 def no_command(source: str) -> str:
-    """Return the text that says that the daemon receives no command of the source `source`."""
+    """Return the message for the operator if no command of `source` reaches the daemon."""
     return (
         f"the daemon receives no command of source {source}; `acsard top` shows whether the daemon "
         "refuses commands"

@@ -73,9 +73,9 @@ class Fleet:
             robot: A client of any robot on the same bus.
             ids: The ids of the robots. The id "*" stands for all robots. A robot that is named here
                 is never dropped.
-            most: Maximum number of robots. When it is reached, a new robot replaces a robot without
-                a liveliness token that `ids` does not name. If there is none, the new robot is left
-                out.
+            most: Maximum number of robots. When it is reached, a new robot replaces a robot that
+                `ids` does not name and whose liveliness token is absent. If there is no such robot,
+                the new robot is left out.
             forget_s: Time without a state, s, after which a robot is dropped. A robot that `ids`
                 names, or whose liveliness token is present, is never dropped.
         """

@@ -110,10 +110,10 @@ class Follower:
         return True
 
     def age(self, now: float) -> float:
-        """Return the time since the last state that proved that the daemon runs, s.
+        """Return the time since the running daemon last sent a state, s.
 
-        Before the first such state, return the time since this object was created. `now` is the
-        present time, s.
+        An old state from the storage of a router does not count. Before the first state, return the
+        time since this object was created. `now` is the present time, s.
         """
         return max(0.0, now - self.last_seen)
 

@@ -217,10 +217,11 @@ class Client:
                 self._put(0.0, 0.0, None)
 
     def forward(self, linear: float, angular: float, *, stamp_ns: int | None = None) -> None:
-        """Send a command of another sender, without a zero before it.
+        """Send a command that this program has received, for example from a panel of Foxglove.
 
-        `linear` is in m/s, and `angular` in rad/s (left is +). `stamp_ns` is the time of the
-        command on the clock of that sender, ns; None if that sender has no clock.
+        Unlike `send`, this method never sends a zero in place of the command. `linear` is in m/s,
+        and `angular` in rad/s (left is +). `stamp_ns` is the time of the command on the clock of
+        the panel, ns. If it is None, the command gets the present time of this computer.
         """
         with self._spacing.wait():
             self._put(linear, angular, stamp_ns)

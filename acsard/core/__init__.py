@@ -1,1 +1,4 @@
-"""The robot as a pure function. No module of this package does I/O or reads a clock."""
+"""The core of the daemon: time, bytes and commands go in as arguments, and decisions come out.
+
+No module of this package does I/O or reads a clock.
+"""

@@ -6,9 +6,9 @@ bytes in the same way as the MCU, and passes a line only if all of these conditi
 - The line has the complete format, no wheel exceeds `limits.wheel_speed`, and the checksum is
   correct if the line has a checksum. With `link_check = "require"`, a line that moves a wheel must
   have a checksum.
-- No wheel is faster than in the last line sent, and no wheel turns the other way. This does not
-  apply if there is a fresh command, the link is up and the mode is `driving` (rule 2 of
-  `acsard/README.md`).
+- No wheel is faster than in the last line sent, and no wheel has changed its direction since that
+  line. This does not apply if there is a fresh command, the link is up and the mode is `driving`
+  (rule 2 of `acsard/README.md`).
 - Without a link, all wheel speeds are zero.
 - All wheel speeds are zero before the first fresh command, and when the last fresh command is older
   than the longest ramp to rest plus `RAMP_MARGIN_NS`.
@@ -192,7 +192,8 @@ class Guard:
 def _ramp_ns(config: Config, *, stop: bool) -> int:
     """Return the time to brake from the highest speed to rest, ns.
 
-    If `stop` is true, the robot brakes at the stop deceleration. Jerk limits do not affect braking.
+    If `stop` is true, the robot brakes at the stop deceleration, otherwise at the normal
+    deceleration. Jerk limits do not affect braking.
     """
     limits, drive = config.limits, config.drive
     sides = drive.left_wheel_radius_multiplier + drive.right_wheel_radius_multiplier

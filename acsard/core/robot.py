@@ -294,7 +294,11 @@ class Robot:
     # The outcome of the previous line.
 
     def _settle(self, inputs: Inputs) -> None:
-        """Undo the effect of the last line on the limiter if the line was not written."""
+        """Bring the state of the limiter into line with the last line that was written.
+
+        If the guard replaced the last line by zeros, the limiter continues from zero. If the last
+        line was not written, the limiter continues from the line before it.
+        """
         if inputs.guard_trip:
             # The guard has replaced the line with the stop line, which contains zeros.
             self._limiter.cut()
@@ -672,7 +676,11 @@ class Robot:
 
 
 def _input(why: str) -> str:
-    """Return the key of `INPUT_NAMES` for the cause `why` of a latch, or ""."""
+    """Return the input of the board that caused a latch, as a key of `INPUT_NAMES`.
+
+    `why` is the cause of the latch, as text. The result is "" if no input of the board caused the
+    latch.
+    """
     if why in (PRESSED_REASON, SILENT_REASON):
         return "estop"
     if why == DRIVER_FAULT_REASON:

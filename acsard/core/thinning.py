@@ -1,8 +1,8 @@
 """Containers that store long curves, bands and paths in bounded memory.
 
 A curve is a value over time, a band is a state over time, and a path is a series of poses. Times
-are in s and never decrease. A full container merges neighboring entries and halves its resolution.
-A curve keeps every peak.
+are in s and never decrease. A full container halves its resolution: a curve or a band merges
+neighboring entries, and a path drops places. A curve keeps every peak.
 """
 
 from __future__ import annotations
@@ -127,7 +127,7 @@ class Band:
         """Create an empty band that keeps at most `most` spans.
 
         `ranks` lists the kinds of state, the most important first. If two spans are merged, the
-        result has the more important kind of the two.
+        result has the more important kind of the two. Raises `ValueError` if `most` is less than 2.
         """
         if most < 2:
             raise ValueError(f"a band must keep at least 2 spans, not {most}")
@@ -188,9 +188,8 @@ class Place(NamedTuple):
 class Track:
     """A path that keeps only some of the places that are added to it.
 
-    Each place that is not kept is less than `2 * self.stride` m away from a kept place. Two kinds
-    of places are exceptions, because they are dropped in any case: places that are too old, and
-    places before a jump.
+    Each place that is not kept is less than `2 * self.stride` m away from a kept place. This does
+    not apply to places that are too old, nor to places before a jump: the path drops all of them.
     """
 
     def __init__(
@@ -206,7 +205,8 @@ class Track:
             most: the largest number of kept places. If there are more, the minimum distance is
                 doubled.
             stride: the minimum distance between neighboring kept places at first, m.
-            lasts: the age, s, compared with the newest place, from which on a place is dropped.
+            lasts: the largest age of a kept place, s. The age of a place is the time from this
+                place to the newest place.
             jump: a distance, m. If a new place is farther than this from the previous place, all
                 earlier places are dropped.
         """

@@ -67,10 +67,11 @@ def encode(robot: str, latches: Latches) -> bytes:
 def decode(robot: str, data: bytes) -> Latches:
     """Return the latches in `data`, the content of the latch file of the robot with the id `robot`.
 
-    Each latch is marked as kept over a restart. Raises `LatchFileError` for content that is
-    damaged, of another version or of another robot. An incomplete file counts as damaged, because a
-    power cut may leave only a part of the file. A file with a missing or unknown field name counts
-    as damaged too, because one wrong letter in a name could otherwise make a stop disappear.
+    In each latch, `kept` is true, because the latch is from before the present run of the daemon.
+    Raises `LatchFileError` for content that is damaged, of another version or of another robot. An
+    incomplete file counts as damaged, because a power cut may leave only a part of the file. A file
+    with a missing or unknown field name counts as damaged too, because one wrong letter in a name
+    could otherwise make a stop disappear.
     """
     if not data.strip(b"\0 \r\n"):
         raise LatchFileError("it is empty")
@@ -200,9 +201,9 @@ class Handover:
     """
 
     def __init__(self, latches: Latches, keeper: LatchKeeper | None) -> None:
-        """Begin with the latches with which the robot starts. The keeper must have these already.
+        """Record `latches`, with which the robot starts. `keeper` must have stored them already.
 
-        If `keeper` is None, latches are not stored.
+        If `keeper` is None, latches are never stored.
         """
         self.latches = latches
         self._keeper = keeper
@@ -265,7 +266,10 @@ class Handover:
 
 
 def _plain(content: Any) -> Any:
-    """Return the content as JSON data, without the field `earlier` of each latch with one cause."""
+    """Return the content of a latch file as JSON data.
+
+    The field `earlier` contains the earlier causes of a latch. It is left out if it is empty.
+    """
     match msgspec.to_builtins(content):
         case dict() as fields:
             pairs = fields.items()

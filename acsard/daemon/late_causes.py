@@ -64,17 +64,27 @@ class Lateness(Struct, frozen=True, omit_defaults=True):
     or if no search was made."""
 
     def explains(self, duration_ns: int, share: float = CAUSE_FRACTION) -> bool:
-        """Return whether a duration is at least the share `share` of the lateness."""
+        """Return whether a delay is long enough to count as a cause of the lateness.
+
+        Its duration must be at least `share` times the lateness.
+        """
         return duration_ns >= share * self.late_ns
 
     @property
     def computed(self) -> bool:
-        """Whether the control loop's thread ran or was ready for at least half of the lateness."""
+        """Whether a slow processor can explain the lateness.
+
+        It can if the control loop's thread ran or waited for a processor for at least half of the
+        lateness.
+        """
         return self.explains(self.loop.ran_ns + self.loop.waited_ns)
 
     @property
     def slept(self) -> bool:
-        """Whether the control loop's thread slept for at least `SLEPT_FRACTION` of the lateness."""
+        """Whether a wait for a disk can explain the lateness.
+
+        It can if the control loop's thread slept for at least `SLEPT_FRACTION` of the lateness.
+        """
         return self.explains(self.late_ns - self.loop.ran_ns - self.loop.waited_ns, SLEPT_FRACTION)
 
 
@@ -111,7 +121,8 @@ def heat(late: Lateness) -> str:
     """Return the cause in words if a hot processor slowed the control loop down, else "".
 
     Three signs show heat: a `thermal_throttle` count that has risen, a cooling device that slows
-    the processor, and on a Raspberry Pi one of the bits 1 to 3 of `get_throttled`.
+    the processor, and on a Raspberry Pi one of the bits 1 to 3 of `get_throttled`. These bits do
+    not count at a low supply voltage, because the firmware then sets them too.
     """
     hotter = late.after.conditions.throttled > late.before.conditions.throttled
     return heat_text(late.after.conditions, hotter) if late.computed else ""
@@ -120,9 +131,9 @@ def heat(late: Lateness) -> str:
 def heat_text(now: Conditions, hotter: bool = False) -> str:
     """Return the cause in words if heat slows the processor down, else "".
 
-    One of two signs is enough: `now.slowed_by_heat` says that heat slows the processor down at this
-    moment, and `hotter` says that the kernel's count of such slow-downs has risen since an earlier
-    reading.
+    One of two signs is enough. `now.slowed_by_heat` is true if heat slows the processor down at
+    this moment. `hotter` is true if the kernel has counted further slow-downs by heat since an
+    earlier reading.
     """
     return "the processor is too hot and runs slower" if now.slowed_by_heat or hotter else ""
 

@@ -64,7 +64,7 @@ The further event waits for the next log line about missed periods (`Event.news`
 
 MAX_QUEUED = 16
 """Size of two queues: the late periods that wait for the thread, and the events that wait for a
-call of `news`. A newer item displaces the oldest one."""
+call of `take_events`. A newer item displaces the oldest one."""
 
 
 class Late(Struct, frozen=True):
@@ -83,10 +83,10 @@ class Late(Struct, frozen=True):
 
     @property
     def thread_times(self) -> Scheduled:
-        """Two durations of the control loop's thread, ns.
+        """Time for which the control loop's thread ran, and time for which it waited to run, ns.
 
-        They are how long the thread ran, and how long it was ready but waited for a processor. Both
-        are measured from the step before the late period to the late step.
+        The thread waits to run while no processor is free for it. Both times are measured from the
+        step before the late period to the late step.
         """
         before, after = scheduled(self.before), scheduled(self.after)
         return Scheduled(after.ran_ns - before.ran_ns, after.waited_ns - before.waited_ns)

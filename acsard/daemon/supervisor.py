@@ -71,8 +71,9 @@ async def keep_running(
 ) -> int:
     """Run `acsard` with the arguments `words`, and restart it whenever it ends.
 
-    Return the exit code if the process ends with a code that is final according to `kind`.
-    Otherwise run until this task is cancelled. `log` is called with an event before each restart.
+    If the process ends with an exit code that `kind` declares final, do not restart it, but return
+    this code. Otherwise run until this task is cancelled. `log` is called with an event before each
+    restart.
     """
     final = kind.final | kind.final_at_first
     while True:

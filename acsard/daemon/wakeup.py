@@ -91,7 +91,7 @@ class Ticker(_Timer):
         """Return how many periods have ended since the last call, and when the first of them ended.
 
         Also set the timer for the next period. `now_ns` is the present monotonic time, ns. If no
-        period has ended, the result is `NO_PERIOD` or has `expired` = 0.
+        period has ended, `expired` is 0 in the result.
         """
         if not self._rang and now_ns < self._due_ns:
             return NO_PERIOD
@@ -158,9 +158,9 @@ class Wakeup:
     def stop(self) -> None:
         """Report that the bus has a stop. Any thread may call this method.
 
-        The first stop runs a step. Further stops then wait for the next step. This ends when a step
-        has run at the end of a period, or has returned a `Next` in which `accepts_early_command` is
-        True.
+        The first stop runs a step. Further stops wait for the next step, so that a flood of stops
+        does not run a flood of steps. A stop can run a step again after a step that ran at the end
+        of a period, or that returned `accepts_early_command` = True.
         """
         if not self._stop_pending:
             self._stop_pending = True

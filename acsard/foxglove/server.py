@@ -168,7 +168,7 @@ class Settings:
         """Make one queued change. If no change waits, query the settings if a viewer needs them.
 
         Return the settings that have changed. This call waits for at most two replies of the
-        daemon. `here` is false if the daemon is gone.
+        daemon. `here` says whether the daemon is present; if not, the settings are not queried.
         """
         wishes = self._wishes.pop()
         if wishes is not None:

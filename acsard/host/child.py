@@ -102,8 +102,8 @@ class Limits(Struct, frozen=True):
 def limit(pid: int, limits: Limits) -> None:
     """Set the limits of the child with the process id `pid`.
 
-    If the child's hard limit of memory is already lower than `limits.memory_bytes`, it stays.
-    The kernel will also kill this child before other processes if the computer runs out of memory.
+    If the child's hard limit of memory is already lower than `limits.memory_bytes`, the lower limit
+    remains. If the computer runs out of memory, the kernel kills this child before other processes.
     """
     try:
         with suppress(OSError):

@@ -1,4 +1,4 @@
-"""Finds the names and addresses by which other programs know this process and its machine."""
+"""Finds the names and addresses that identify this process and its machine to other programs."""
 
 from __future__ import annotations
 

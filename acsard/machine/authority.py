@@ -98,10 +98,9 @@ class Authority:
     def permits(self, address: str) -> bool:
         """Return whether this authority may sign a certificate for a host name or IP address.
 
-        The certificate of an authority that acsard has made lists the permitted names and the
-        permitted networks. The certificate of an authority from another program may list only names
-        or only networks. It then permits all addresses of the kind that it does not list. It may
-        also list excluded names and networks.
+        The authority's certificate may list permitted and excluded host names and networks. If it
+        lists no permitted names, all names are permitted that it does not exclude. The same holds
+        for networks. An authority that acsard has made lists permitted names and networks.
         """
         try:
             constraints = self._certificate.extensions.get_extension_for_class(x509.NameConstraints)
@@ -230,7 +229,7 @@ def _general_name(address: str) -> x509.GeneralName:
 def _within(address: str, subtree: x509.GeneralName) -> bool:
     """Return whether the name constraint `subtree` includes `address`, by the rules of OpenSSL.
 
-    Both must be IP addresses, or both must be host names.
+    If `subtree` is a network, `address` must be an IP address. Otherwise both must be host names.
     """
     if isinstance(subtree, x509.IPAddress):
         return ipaddress.ip_address(address) in ipaddress.ip_network(str(subtree.value))

@@ -170,8 +170,8 @@ def keys(config: Config, directory: Path) -> dict[str, object]:
     """Return values of `bus.listen` and `bus.tls` with which other machines can connect over TLS.
 
     The new `bus.listen` contains the endpoints of `config`, the present configuration. If none of
-    them uses TLS, the new `bus.listen` also contains a TLS endpoint at port `PORT`. The new
-    `bus.tls` is `directory`, which contains the robot's certificate.
+    these endpoints uses TLS, the new `bus.listen` also contains a TLS endpoint at port `PORT`. The
+    new `bus.tls` is `directory`, which contains the robot's certificate.
     """
     listen = list(config.bus.listen)
     if not any(endpoint.startswith("tls/") for endpoint in listen):

@@ -152,10 +152,10 @@ def _marked(part: Path) -> tuple[Kind, str] | None:
 
 
 class Run(Struct):
-    """State of the directory of recordings in one run of the daemon.
+    """Facts about the recordings of one run of the daemon, which outlast a disk error.
 
-    A disk error ends the `RecordingDirectory`. The next `RecordingDirectory` of this run of the
-    daemon gets the same object.
+    After a disk error, the daemon makes a new `RecordingDirectory`. All `RecordingDirectory`
+    objects of one run of the daemon share the same `Run`.
     """
 
     numbers: set[int] = field(default_factory=set)
@@ -262,9 +262,10 @@ class RecordingDirectory:
                 self._retain_before(part, found.st_mtime_ns)
 
     def _retain_before(self, part: Path, cut_ns: int) -> None:
-        """Give the class `near` to older `plain` files that ended within a minute of a crash.
+        """Give the retention class `near` to files that ended within a minute of a crash.
 
-        The crash cut off the file `part` at the wall-clock time `cut_ns`, ns since 1970.
+        Only `plain` files that are older than `part` get this class. The crash cut off the file
+        `part` at the wall-clock time `cut_ns`, ns since 1970.
         """
         for path in listed(self._directory):
             # Another process may have just removed the file.
@@ -367,7 +368,8 @@ class RecordingDirectory:
     def trim(self, now: Instant | None, refused: bool = False) -> None:
         """Delete recordings to comply with the limits on total size, age and free disk space.
 
-        `.part` files are never deleted. This method also updates `file_bytes`.
+        `.part` files are never deleted. This method also updates `file_bytes`, the size limit of
+        a single file.
 
         Args:
             now: the present time; None if the time is not known, so that no file counts as too old.

@@ -168,7 +168,7 @@ def csv_rows(step: Step, outputs: Outputs) -> Iterator[str]:
 def measured_csv_rows(step: Step, outputs: Outputs) -> Iterator[str]:
     """Yield the rows of a step for the CSV table that `acsard calibrate` reads.
 
-    The columns are those of `MEASURED_CSV_HEADER`. A row has no line break. `outputs` are the
+    `MEASURED_CSV_HEADER` names the columns. The rows have no line breaks. `outputs` are the
     replayed outputs of the step.
     """
     for sample in step.inputs.gyro:

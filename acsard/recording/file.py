@@ -270,8 +270,10 @@ class RecordingWriter:
 
     @property
     def size(self) -> int:
-        """Number of bytes that were written to the file so far, without the messages that wait for
-        the next `flush`."""
+        """Number of bytes that were written to the file so far.
+
+        Messages that the next `flush` will write do not count.
+        """
         return self._file.tell()
 
     def add(self, topic: Topic, wall_ns: int, data: bytes) -> None:
@@ -558,7 +560,10 @@ def rewrite(recording: Recording, path: Path, cut: str = "open") -> int:
 
 
 def is_part(part: Recording, recording: Recording) -> bool:
-    """Return whether `recording` has the metadata and all the messages of `part`."""
+    """Return whether `recording` has the metadata and all the messages of `part`.
+
+    No data is lost if `recording` then replaces `part`.
+    """
     if part.about != recording.about:
         return False
     return Counter(part.messages()) <= Counter(recording.messages())

@@ -126,7 +126,7 @@ GROWING_HEAD = _head(0, 0, 0, 0, _ENDLESS)
 
 
 class GrowingChunk:
-    """A chunk that is being written. It takes messages, and returns compressed bytes."""
+    """A chunk that is being written. It compresses messages to bytes that the caller writes."""
 
     def __init__(self) -> None:
         self._compressor = zstandard.ZstdCompressor(
@@ -277,11 +277,12 @@ def _blocks(data: bytes, at: int) -> Iterator[tuple[int, bytes, bool]]:
 
 
 def _messages(data: bytearray) -> tuple[list[Message], int, int]:
-    """Return the triple (complete messages at the beginning of `data`, their size, `wanted`).
+    """Decode the complete messages at the beginning of `data`.
 
-    The size and `wanted` are in bytes. `wanted` is the size of the next message, or of its header
-    if the header is not complete yet. It exceeds `MAX_MESSAGE_BYTES` if the next message is
-    damaged.
+    Returns:
+        A triple: the messages, their total size in `data`, and the size of the next message, both
+        in bytes. While the header of the next message is incomplete, the last number is the size
+        of a header. If the next message is damaged, it is greater than `MAX_MESSAGE_BYTES`.
     """
     messages: list[Message] = []
     at = 0
@@ -414,9 +415,10 @@ def _read(stream: io.BytesIO, at: int, opcode: int, claimed: int, size: int) -> 
 
 
 def _is_intact(stream: io.BytesIO, at: int, end: int) -> bool:
-    """Return whether an attachment has a correct checksum, or 0, which means no checksum.
+    """Return whether the checksum of an attachment is correct.
 
-    `at` and `end` are the offsets at which the attachment begins and ends.
+    An attachment with the checksum 0 has no checksum, so the result is True. `at` and `end` are the
+    offsets at which the attachment begins and ends.
     """
     stream.seek(at)
     record = stream.read(end - at)
@@ -425,7 +427,10 @@ def _is_intact(stream: io.BytesIO, at: int, end: int) -> bool:
 
 
 class _Chunks:
-    """Reads chunks, and finds the next complete chunk. Limits the work for incomplete chunks."""
+    """Reads chunks, and finds the next complete chunk.
+
+    The work for incomplete chunks is limited, because a forged file may contain thousands of them.
+    """
 
     # In a hostile file thousands of incomplete chunks may share the same blocks, and each chunk
     # unpacks to megabytes. So the limit on the work is proportional to the file's size, and no part

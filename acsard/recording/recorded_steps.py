@@ -106,7 +106,7 @@ class BlackBox(Protocol):
 
     @property
     def status(self) -> Recording:
-        """Status of the recording."""
+        """Directory of the recordings, present problem, and number of steps not recorded."""
 
 
 class RecordedOutputs(Struct, frozen=True):

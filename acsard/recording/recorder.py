@@ -173,7 +173,7 @@ class Recorder:
             self._slow, self._lost_before = True, self._lost
 
     def died(self, inputs: Inputs) -> None:
-        """Keep the inputs of the step in which the daemon failed. `close` records them."""
+        """Store the inputs of the step in which the daemon failed, so that `close` records them."""
         self._failed_inputs = inputs
 
     @property

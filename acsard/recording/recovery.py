@@ -97,7 +97,10 @@ def _has_configuration(part: Path) -> bool:
 
 
 def _has_chunks(part: Path) -> bool:
-    """Return whether the file has the header of a chunk, even if the chunk is unreadable."""
+    """Return whether the file has the header of a chunk, even if the chunk is unreadable.
+
+    Such a file is not deleted, because another version may be able to read its data.
+    """
     return any(True for _ in chunk_places(part.read_bytes(), 0))
 
 
@@ -120,9 +123,11 @@ def _copy(recording: Recording, part: Path, whole: Path, cut: str) -> bool:
 
 
 def _finish_in_place(recording: Recording, part: Path, cut: str) -> bool:
-    """Overwrite incomplete data with the end of the file, and write true headers of the chunks.
+    """Finish the file `part` without a copy, and return True.
 
-    Return False, and leave the file unchanged, if the disk has no room for the end.
+    The end record and the MCAP footer overwrite the incomplete data at the end of the file. Chunks
+    that were being written get their true headers. If the disk has no room for the end record,
+    leave the file unchanged, and return False.
     """
     # Readable data is not removed to make room, because on some disks this does not help.
     builder = EndRecordBuilder(recording.about)
@@ -152,10 +157,11 @@ def _finish_in_place(recording: Recording, part: Path, cut: str) -> bool:
 
 
 def _writes(before: bytes, last: EndRecord) -> tuple[list[tuple[int, bytes]], int]:
-    """Return the writes (offset, data) that finish a file, and the size of the finished file.
+    """Return the data to write to a file in order to finish it, and the size of the finished file.
 
-    `before` is the present content of the file, and `last` is its future end record. If an earlier
-    recovery has already written the end of the file, the writes contain only chunk headers.
+    The data is a list of pairs (offset in the file, bytes). `before` is the present content of the
+    file, and `last` is its future end record. If an earlier recovery has already written the end
+    record and the footer, the list contains only chunk headers.
     """
     # The first write is the end of the file, because the disk may have no room for the end.
     heads: list[tuple[int, bytes]] = []
@@ -195,7 +201,10 @@ def _put(stream: FileIO, at: int, data: bytes) -> None:
 
 
 def _end(last: EndRecord, index: Index, at: int) -> bytes:
-    """Return the end of an MCAP file, which the caller writes at the offset `at`."""
+    """Return the last bytes of an MCAP file: end record, summary section and footer.
+
+    The caller writes them at the offset `at`.
+    """
     # The summary section does not repeat the schema and the channels, because the disk may be
     # nearly full. It has the statistics, because some readers treat a file without statistics as
     # empty.

@@ -1,7 +1,8 @@
 """Decides which recordings are deleted, and which are retained because of an incident.
 
-A recording is protected if an incident, such as a fault, happened in the recording or within a
-minute of it. Only the newest `MAX_KEPT_FILES` recordings with an incident are protected.
+An incident, such as a fault, protects the recording in which it happened. It also protects
+recordings that ended or began less than a minute before or after it. If more than `MAX_KEPT_FILES`
+recordings contain an incident, only the newest of them stay protected.
 
 - An unprotected recording is deleted when it is too old.
 - Recordings leave some free space to other programs (`Disk.spare`). If less space is free,
@@ -112,6 +113,8 @@ class Bounds(NamedTuple):
 def file_size_limit(bound: int, own: int, disk: Disk) -> int:
     """Return the size limit of one recording file, bytes.
 
+    The limit is a small fraction of the space that all recordings may use.
+
     Args:
         bound: the limit on the total size of all recordings, bytes.
         own: the present total size of all recordings, bytes.
@@ -221,10 +224,10 @@ class ClockWatch(Struct):
 
 
 class IncidentWindow(Generic[File]):
-    """Finds the files that an incident protects.
+    """Decides the retention class of each file while the daemon records.
 
-    An incident protects the file in which it happens, and the files that ended or began less than a
-    minute before or after the incident.
+    An incident protects the file in which it happens. It also protects the files that ended less
+    than a minute before the incident, or began less than a minute after it.
     """
 
     def __init__(self) -> None:
@@ -236,7 +239,7 @@ class IncidentWindow(Generic[File]):
         """Monotonic time of the last incident, ns."""
 
     def begin(self, now_ns: int) -> None:
-        """Register the beginning of a new file, and set its class `kind`.
+        """Register the beginning of a new file, and set `kind` to its first retention class.
 
         `now_ns` is the present monotonic time, ns.
         """

@@ -202,10 +202,10 @@ def encode(first: int, taken: Sequence[FinishedStep]) -> bytes:
 
 
 def _times(taken: Sequence[FinishedStep], mono_ns: int, offset_ns: int) -> Iterator[list[int]]:
-    """Yield the times of each row in a list, ns.
+    """Yield one list of times for each step, ns.
 
-    A list begins with `Row.now` and `Row.offset`. Then it has the age and the offset of each read
-    of the row.
+    The list begins with the values of `Row.now` and `Row.offset`. For each read of the step, the
+    list then contains two values: the time from the read to the step, and the offset of the read.
     """
     tick_ns = mono_ns
     for inputs, _, _ in taken:
@@ -328,8 +328,9 @@ def _sent(row: Row) -> bytes | None:
 
 
 def _instant(batch: Batch, mono_ns: int, offset: int) -> Instant:
-    """Return an instant; `offset` is a `Row.offset` or a `Read.offset` of the batch.
+    """Return the monotonic time `mono_ns` together with the wall-clock time of the same moment.
 
+    `offset` is the `Row.offset` or `Read.offset` that gives the difference between the two times.
     Raises `ValueError` if a time is out of range.
     """
     ahead_ns = batch.offset_ns + offset * batch.unit

@@ -53,9 +53,9 @@ class Series(Recording):
     def messages(self) -> Iterator[tuple[Topic, int, bytes]]:
         """Yield the triple (topic, wall-clock time in ns since 1970, data) of each message.
 
-        The messages of all files follow each other. After the last message, `damaged` counts the
-        damaged places of all files. `ended`, `cut`, `why` and `unfinished` describe the last file.
-        Raises `RecordingError` if a file is not a readable recording.
+        The files are read one after the other, in their order. After the last message, `damaged`
+        is the number of damaged places in all files. `ended`, `cut`, `why` and `unfinished`
+        describe the last file. Raises `RecordingError` if a file is not a readable recording.
         """
         self.damaged, self.ended, self.cut, self.why = 0, False, "", ""
         self.unfinished = None

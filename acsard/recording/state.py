@@ -1,8 +1,8 @@
 """Encodes a `Robot` between two steps as bytes, and decodes such bytes.
 
-The module also applies another configuration to a decoded robot. In each run of the daemon, every
-recording file begins with an encoded robot, but the first file may lack it. About every 20 s a file
-contains another encoded robot, so that a replay can go on after a damaged place.
+The module also applies another configuration to a decoded robot. A recording file begins with an
+encoded robot; only the first file of a run of the daemon may begin without one. About every 20 s a
+file contains another encoded robot, so that a replay can go on after a damaged place.
 
 `freeze` uses pickle, which takes a fraction of a millisecond. `thaw` uses `unpickling.py` instead,
 because a forged file could run code through pickle.
@@ -136,8 +136,10 @@ def thaw(data: bytes) -> State:
 
 
 def short(error: Exception) -> str:
-    """Return the text of an error, cut to `MAX_ERROR_LENGTH` characters and without control
-    characters."""
+    """Return the text of an error without control characters.
+
+    The text has at most `MAX_ERROR_LENGTH` characters.
+    """
     # The text may quote a forged file.
     return printable(str(error))[:MAX_ERROR_LENGTH]
 
@@ -145,9 +147,9 @@ def short(error: Exception) -> str:
 def part_class(module: str, name: str) -> type:
     """Return the class with the name `name` in the module `module`, for `unpickle`.
 
-    Raises `ValueError` if objects of this class cannot be parts of a robot, or if `name` is not a
-    class that this module defines. A module that is not loaded is not imported, and causes the same
-    error.
+    Raises `ValueError` if objects of this class cannot be parts of a robot, or if `module` does not
+    define this class. Also raises `ValueError` if `module` is not loaded, because this function
+    imports nothing.
     """
     if (module, name) in OTHER_PARTS:
         return OTHER_PARTS[module, name]
@@ -179,7 +181,7 @@ def adopt(robot: Robot, begun: Robot, other: Robot) -> None:
 
 
 class _Walk:
-    """Walks through the three robots of `adopt()`, and visits each object of `robot` once."""
+    """Does the work of `adopt()`: visits each part of the recorded robot once, and changes it."""
 
     def __init__(self) -> None:
         self._visited: dict[int, Any] = {}

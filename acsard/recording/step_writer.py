@@ -260,10 +260,10 @@ class StepWriter:
         self._add_checkpoint(self._writing, start, now)
 
     def _look_back(self, directory: RecordingDirectory, now: Instant) -> None:
-        """Register the last files of the previous run of the daemon in `_incidents`.
+        """Register recent files of the previous run of the daemon in `_incidents`.
 
-        An incident at the beginning of this run then protects those files. An incident in one of
-        them protects the first file of this run.
+        An incident at the beginning of this run then protects the recent files. An incident in one
+        of the recent files protects the first file of this run.
         """
         for path, kind, ended_ns in directory.just_ended(now):
             self._incidents.earlier(path, kind, ended_ns)

@@ -135,7 +135,7 @@ class LinkLosses:
 
 
 class ReasonChanges:
-    """Makes the entries `reason`: the reason of the robot's mode changes, but the mode does not."""
+    """Makes an entry `reason` when the reason of the robot's mode changes without the mode."""
 
     def __init__(self) -> None:
         self._mode = self._reason = ""
@@ -178,7 +178,7 @@ _IDENTITY = re.compile(re.escape(IDENTITY) + rb"([^\r\n]*)[\r\n]")
 
 
 class BoardIdentity:
-    """Makes the entries `board` from the lines with which a microcontroller names itself.
+    """Makes an entry `board` when the board sends a line with its name.
 
     The board sends such a line after its start, and when the daemon asks for its name. The robot
     reports the line as an event only if the link was up. If the link was lost before the line
@@ -231,7 +231,7 @@ class _Waiting(Struct):
 
 
 class WaitingSenders:
-    """Makes the entries `waits`: a sender sends speeds, but the robot follows another sender."""
+    """Makes an entry `waits` when a sender sends speeds, but the robot follows another sender."""
 
     def __init__(self, priorities: Mapping[str, int]) -> None:
         """Prepare for the first step. `priorities` maps each source's name to its priority."""
@@ -287,14 +287,18 @@ class WaitingSenders:
         return len(self._waiting) < MAX_WAITING
 
     def _known(self, source: str) -> bool:
-        """Return whether `_commander` names exactly one sender, which uses the source `source`."""
+        """Return whether it is known which sender of the source `source` the robot follows.
+
+        It is known if `_commander` contains a single sender, and this sender uses `source`.
+        """
         return self._commander.startswith(f"{source} (") and ", " not in self._commander
 
     def _why(self, waiting: str, followed: str) -> str:
-        """Return why the source `waiting` waits for `followed`, for example "which came first".
+        """Return a text that says why the robot follows `followed` and not `waiting`.
 
-        Return "" if a priority is not known, or if `waiting` has the higher priority. With the
-        higher priority, the source does not wait: the robot refuses its commands.
+        An example is "which came first". The arguments are names of sources. The text is "" if a
+        priority is unknown, or if `waiting` has the higher priority. In the second case the source
+        does not wait, because the robot refuses its commands for another reason.
         """
         one, other = self._priorities.get(waiting), self._priorities.get(followed)
         if one is None or other is None or one > other:
@@ -473,9 +477,10 @@ emergency stop or a battery stop. A wheel fault does not count as a fault."""
 
 
 def is_serious(text: str) -> bool:
-    """Return whether a summary counts a stop, a bumper hit or a fault.
+    """Return whether the text of a summary mentions a stop, a bumper hit or a fault.
 
-    `text` is the result of `summary`. A stop may also be an emergency stop or a battery stop.
+    `text` is the result of `summary`. Emergency stops and battery stops are stops too, but a wheel
+    fault is not a fault.
     """
     # Ignore the names of the clients, because a name may look like a fault.
     return SERIOUS_SUMMARY.search(text.partition(" (stopped by ")[0]) is not None

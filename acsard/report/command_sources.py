@@ -1,7 +1,7 @@
 """Determines the state of each command source over time.
 
-The state says whether the source drove the robot, waited, was refused or was silent. It comes with
-the reason in words.
+The state says whether the source drove the robot, waited, sent commands without effect, was refused
+or was silent. A reason in words explains the state.
 """
 
 from __future__ import annotations

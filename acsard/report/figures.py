@@ -145,7 +145,7 @@ DRIVES_STATE = "drives"
 
 
 class BandStyle(NamedTuple):
-    """Appearance of the bands for one state, in the picture of the command sources.
+    """Color and fill pattern of the bands that show one state of a command source over time.
 
     The state "drives" has a separate style for each source that drove the robot.
     """
@@ -164,7 +164,7 @@ class BandStyle(NamedTuple):
         return f"{self.source} {self.kind}".strip()
 
     def of(self, row: Row) -> list[Span]:
-        """Return the spans in a row that are drawn with this style."""
+        """Return the spans of time in `row` that are drawn as bands with this style."""
         name, spans = row
         applies = self.source in ("", name)
         return [span for span in spans if span.kind == self.kind] if applies else []
@@ -266,7 +266,10 @@ def _with_gaps(places: list[Place]) -> list[Place]:
 
 
 def _spread(places: list[Place]) -> list[Place]:
-    """Return about `HEADING_ARROWS` places, at about equal distances along the path."""
+    """Return the places on the path at which arrows show the robot's heading.
+
+    There are about `HEADING_ARROWS` places, at about equal distances along the path.
+    """
     distances = [0.0]
     for before, after in pairwise(places):
         metres = 0.0 if after.new else math.hypot(after.x - before.x, after.y - before.y)

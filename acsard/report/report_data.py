@@ -69,7 +69,7 @@ class Mark(Struct, frozen=True):
 
     @property
     def words(self) -> str:
-        """The text, and the number of events if it is larger than 1."""
+        """The text of the event, and the number of equal events that the log combined, if any."""
         return f"{self.text}{how_often(self.text, self.count)}"
 
 
@@ -146,9 +146,10 @@ class Lateness:
         """Number of control periods without a step."""
 
     def at_once(self) -> None:
-        """Process an extra line that the daemon sent immediately for a fresh command.
+        """Process an early line, which the daemon sent between two control periods.
 
-        This line replaces the line of the next control period.
+        The daemon sends it, for example, for a fresh command. It replaces the line of the next
+        control period.
         """
         self._ahead += 1
 
@@ -265,7 +266,7 @@ class SerialCounts:
         self._sent += sent
 
     def _end(self, received: tuple[int, int]) -> None:
-        """Add the counts of the present second to the curves and totals.
+        """Add the counts of the second that has just ended to the curves and totals.
 
         `received` is a pair: the numbers of accepted and of dropped lines since the daemon's start.
         """

@@ -30,7 +30,10 @@ class RobotReader:
         self._errors = errors
 
     def check(self, outputs: Outputs) -> None:
-        """Check that all speeds in the outputs are numbers. They may be infinite or NaN."""
+        """Check that all speeds in the outputs have a numeric type.
+
+        A forged recording may contain other types. Infinite speeds and NaN are permitted.
+        """
         with self._errors():
             for speeds, twist in (
                 (outputs.speeds, outputs.applied),

@@ -175,9 +175,9 @@ class JsonPrompt:
         self.progress(min(0.99, self._found / 16))
 
     def result(self, text: str) -> None:
-        """Send the result `text`. From now on, a silence of the other program is harmless.
+        """Send the result `text`. Call this only when nothing moves any more.
 
-        The caller promises that nothing moves any more.
+        From now on, a silence of the other program does not interrupt the subcommand.
         """
         self._moves = False
         self.progress(1.0)
@@ -281,7 +281,11 @@ class JsonPrompt:
             raise
 
     def _heard_out(self) -> str:
-        """Return why the subcommand must be interrupted, or "" at the end of the `with` block."""
+        """Read lines from standard input until the end of the `with` block, then return "".
+
+        Return a reason to interrupt the subcommand if the input ends before, if a line is too long,
+        or if no line arrives in time.
+        """
         held, heard_s = b"", time.monotonic()
         while not self._left:
             if self._readable(POLL_S):

@@ -95,8 +95,8 @@ class Prompt(Protocol):
     def start(self, text: str, by_key: bool = False) -> None:
         """Show a text, and wait until the person starts a drive.
 
-        After the start, any key press stops the drive. `by_key` says whether this is the intended
-        end of the drive.
+        After the start, any key press stops the drive. If `by_key` is true, the person is expected
+        to end the drive this way. Otherwise the drive ends by itself, and a key press aborts it.
         """
 
     def number(self, ask: Ask) -> float:

@@ -108,7 +108,7 @@ def last_report_lines(seen: Teleop, width: int) -> list[str]:
 
 
 def released(seen: Teleop) -> bool:
-    """Return whether the robot stands still and no longer follows the source of this drive.
+    """Return whether the robot stands still and no longer follows this drive's command source.
 
     Return False if no state has arrived. A robot without a measured speed counts as standing still.
     """
@@ -130,7 +130,7 @@ def silence(seen: Teleop) -> str:
 
 
 def reason(state: RobotState) -> str:
-    """Return the reason of the robot's mode, without the name of the mode before it."""
+    """Return the reason of the robot's mode, without the name of the mode at its beginning."""
     return printable(state.reason.removeprefix(f"{state.mode}: "))
 
 

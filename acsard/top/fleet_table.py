@@ -69,10 +69,10 @@ def table(rows: Sequence[Row], width: int, height: int | None = None) -> list[st
 
 
 def shortened(names: Sequence[str], room: int) -> list[str]:
-    """Return the names, with a part replaced by "…" in each name of more than `room` characters.
+    """Return the names, each with at most `room` characters.
 
-    The part begins at the same position in each long name. It is near the middle of the shortened
-    names, unless another position keeps more names distinct.
+    In a longer name, "…" replaces a part. The "…" is at the same position in all shortened names:
+    near the middle, or at another position if that keeps more names distinct.
     """
     if all(len(name) <= room for name in names):
         return list(names)
@@ -131,9 +131,9 @@ def _absence(row: Row) -> str:
 
 
 def _order(row: Row) -> tuple[int, str]:
-    """Return the sort key of a robot: urgent robots come first (see `URGENT`).
+    """Return the sort key of a robot. Urgent robots come first (see `URGENT`).
 
-    The mode of a robot that is gone or silent does not count.
+    The key of a robot that is gone or silent depends on this fact, and not on its last mode.
     """
     what = _absence(row) or ("" if row.state is None else row.state.mode)
     if what in URGENT:
@@ -148,7 +148,7 @@ class Roster(Fleet):
     def rows(self) -> list[Row]:
         """Send the queries that are due, and return one row per robot.
 
-        In the rows, `here` is False and not None for a robot that was never present.
+        Unlike in the rows of `Fleet`, `here` is False for a robot that was never present, not None.
         """
         self.ask(self.due())
         return [replace(row, here=bool(row.here)) for row in super().rows()]
@@ -181,7 +181,7 @@ class Roster(Fleet):
 
     @property
     def seen(self) -> str:
-        """A sentence with the number of visible robots, or "" if the user named the robots."""
+        """A sentence with the number of robots that are present; "" if the user named them."""
         with self._lock:
             here = sum(bool(one.here) for one in self._known.values())
         return count_text(self._robot.where.endpoint, here) if ALL_ROBOTS in self._ids else ""

@@ -62,7 +62,7 @@ def screen(seen: ScreenData, width: int, height: int | None = None) -> Group:
 
 
 def _unmeasured(state: RobotState) -> RobotState:
-    """Drop the speeds, which are outdated while the link to the board is not up."""
+    """Return `state` without its speeds, which are outdated while the link is not up."""
     return replace(state, linear=math.nan, angular=math.nan, wheels=[])
 
 

@@ -156,8 +156,9 @@ def _screen(console: Console) -> Live:
 def _hold(shows: Callable[[list[bool]], bool]) -> None:
     """Call `shows` repeatedly until it returns False or a signal arrives.
 
-    The argument of `shows` is a list, to which Ctrl-Z adds an element. Then `shows` must close the
-    screen and return True, and this program is suspended. The next call follows when it resumes.
+    The argument of `shows` is an empty list. When the user presses Ctrl-Z, an element is added to
+    this list. Then `shows` must close the screen and return True, and this program is suspended.
+    When the user resumes the program, `shows` is called again.
     """
     _be_lenient()
     suspend: list[bool] = []

@@ -117,7 +117,7 @@ class Acceptor:
                 one.cut()
 
     def spoke(self, transport: asyncio.BaseTransport | None, body: StreamReader) -> None:
-        """End the time limit `REQUEST_TIMEOUT_S` of a connection.
+        """Stop the timer that closes a connection whose client sends no complete request headers.
 
         Call this when the headers of a request have arrived. `transport` identifies the connection,
         and `body` is the stream from which the body of the request is read.
@@ -135,7 +135,7 @@ class Acceptor:
             one.pool.prove(one, who.token)
 
     def tidy(self, valid: Collection[str]) -> None:
-        """Cut each connection whose token is missing in `valid` for the second call in a row.
+        """Cut each connection whose token is missing in `valid` at this and the previous call.
 
         `valid` contains the digests of all valid tokens. Call this method once a second. Between
         the first and the second call, a WebSocket client has time to receive the reason.
@@ -238,8 +238,9 @@ class Acceptor:
     def _has_room(self, now: float) -> bool:
         """Return whether a TLS handshake may start now. `now` is in s on the event loop's clock.
 
-        If `HANDSHAKES_AT_ONCE` handshakes are running, first abort one of them. If the handshake
-        to abort is younger than `MIN_ABORT_AGE_S`, return False instead.
+        If `HANDSHAKES_AT_ONCE` handshakes are running, first abort the oldest handshake of the
+        network that has the most. If this handshake is younger than `MIN_ABORT_AGE_S`, do not abort
+        it, and return False.
         """
         if len(self._starting) < HANDSHAKES_AT_ONCE:
             return True
@@ -350,7 +351,7 @@ class _Connection(asyncio.Protocol):
                 self._socket.shutdown(socket.SHUT_RDWR)
 
     def spoke(self, body: StreamReader) -> None:
-        """Record that the head of a request has arrived, which ends the time limit of the head."""
+        """Record that the headers of a request have arrived, and stop the timer for them."""
         self._head, self._body = 0, body
         self._cancel_timer()
 

@@ -208,10 +208,12 @@ class Admission:
             await asyncio.sleep(REFUSAL_DELAY_S)
 
     async def _admit(self, request: web.Request, row: Route | None) -> bool:
-        """Check a request; return True if it must be delayed because it exceeds a rate limit.
+        """Check a request. Return True if the caller must delay it because of a rate limit.
 
-        Raises `RefusedError` if the client may not use the path, or exceeds its rate limit while
-        `row.waits` is false. `row` is None for an unknown path.
+        `row` is the route of the request, or None for an unknown path. If the client exceeds its
+        rate limit, a request to a route with `row.waits` is delayed, and any other request is
+        refused. Raises `RefusedError` for a refused request, and if the client may not use the
+        path.
         """
         said = request_facts(request)
         here = place(said, self._names | {own_address(request)}) == "here"

@@ -262,7 +262,10 @@ class Files:
 
 
 def _read(paths: Sequence[Path], kind: str, stamp: tuple[tuple[int, int], ...]) -> File:
-    """Read the first path, and include the text of the other paths as `INLINED` says."""
+    """Read a file of the page, and insert the files that `INLINED` lists for it.
+
+    The first path belongs to the file itself, and the other paths to the inserted files.
+    """
     whole, *parts = paths
     body, policy = whole.read_bytes(), ""
     for part in parts:

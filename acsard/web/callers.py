@@ -111,9 +111,13 @@ class RequestFacts(Struct, frozen=True):
 def place(facts: RequestFacts, names: Collection[str]) -> Place:
     """Return "here" if the client is on the robot and requests a loopback name, otherwise "away".
 
-    `names` are the robot's names and addresses, in lower case. Raises `RefusedError` for a request
-    through a proxy. Otherwise, raises it for a request from "away" that uses plain HTTP, or that
-    requests a host which is not in `names`.
+    `names` are the robot's names and addresses, in lower case.
+
+    Raises `RefusedError` in three cases:
+
+    - The request came through a proxy.
+    - The client is "away" and uses plain HTTP.
+    - The client is "away" and requests a host that is not in `names`.
     """
     if facts.proxied:
         raise RefusedError(
@@ -153,9 +157,9 @@ def require_own_origin(facts: RequestFacts) -> None:
 def by_listed_page(facts: RequestFacts, origins: Collection[str]) -> bool:
     """Return whether a web page of an origin in `web.origins` made the browser send this request.
 
-    `origins` are the origins in `web.origins`. Return False for the robot's own page, even if its
-    origin is one of them: the server must accept the cookies of the robot's own page, but it
-    ignores the cookies of the listed pages.
+    `origins` are the origins in `web.origins`. The server ignores the cookies of such a page, but
+    it must accept the cookies of the robot's own page. So return False for the robot's own page,
+    even if `web.origins` contains its origin.
     """
     if facts.origin is None or facts.origin.lower() == _own_origin(facts):
         return False

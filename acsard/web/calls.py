@@ -65,7 +65,7 @@ class Calls:
         interrupt_guide: Callable[[], Awaitable[Ending]],
         is_known: Callable[[str], bool],
     ) -> None:
-        """Create the limits for calls, with none in use.
+        """Create an instance that has no running calls.
 
         Args:
             robots: object with the connection to the daemon.
@@ -296,7 +296,10 @@ def _require_stop(verb: str, robot: str) -> None:
 
 
 def _named(client: Client, robot: str, who: Identity) -> Client:
-    """Return a bus client for a robot, which logs the calls under the name of the client `who`."""
+    """Return a bus client for a robot, with a name that contains the name of `who`.
+
+    The robot's daemon logs the calls of the bus client under this name.
+    """
     other = client.sibling(robot)
     other.name = f"{who.name}@page"
     return other

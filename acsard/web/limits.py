@@ -128,6 +128,9 @@ class Sockets(Generic[C]):
 
     If a network has `MAX_TCP_OF_NETWORK` connections without a valid token, each new connection
     from this network displaces the oldest of them, even if the maximum is not reached.
+
+    In these rules, a connection that exceeds `MAX_TCP_OF_TOKEN` counts as a connection without a
+    valid token.
     """
 
     def __init__(self, most: int) -> None:
@@ -180,7 +183,8 @@ class Sockets(Generic[C]):
         """Record that the connection `one` has shown the valid token `token`.
 
         `token` is "" for a client on the robot itself. A later token of the same connection
-        replaces the earlier token, because a browser may get another token.
+        replaces the earlier token, because a browser may get another token. If the later token has
+        `MAX_TCP_OF_TOKEN` connections already, the connection still counts under the earlier token.
         """
         network, before = self._networks.get(one), self._known.get(one)
         if network is None:
@@ -215,7 +219,7 @@ class Sockets(Generic[C]):
         return [one for one, token in self._shown.items() if token and token not in valid]
 
     def strangers(self) -> list[C]:
-        """Return all connections that count as connections without a valid token."""
+        """Return the connections without a valid token, and those beyond `MAX_TCP_OF_TOKEN`."""
         return [one for network in self._strangers.values() for one in network]
 
     def _fewer(self, token: str) -> None:

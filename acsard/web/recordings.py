@@ -115,10 +115,10 @@ class BlackBox:
             raise _unread(place, error) from None
 
     async def found(self, name: str) -> tuple[Path, tuple[int, int]]:
-        """Return the path of the recording `name`, and a stamp that shows changes of the file.
+        """Return the path of the recording `name`, and the version of its file.
 
-        The stamp is the pair (modification time in ns, size in bytes). Raises `RefusedError` if the
-        recording does not exist.
+        The version is the pair (modification time in ns, size in bytes). Raises `RefusedError` if
+        the recording does not exist.
         """
         place = self._place()
 
@@ -269,10 +269,10 @@ class Reports:
     def ask(self, path: Path, stamp: tuple[int, int]) -> ReportState:
         """Return the progress of the report of a recording. Start drawing the report if needed.
 
-        While the report of another recording is being drawn, return the state "busy". A failed
-        report is drawn again, and so is the report of a recording that has changed since. However,
-        the first call for a recording after its drawing has ended returns the result of that
-        drawing. `path` and `stamp` are the results of `BlackBox.found()`.
+        While the report of another recording is being drawn, return the state "busy". When a
+        drawing has ended, the next call returns its result, even if the drawing failed. A later
+        call draws the report again if the drawing failed, or if the recording has changed since.
+        `path` and `stamp` are the results of `BlackBox.found()`.
         """
         one, now_ns = self._one, clock.mono_ns()
         if one is not None and not one.ended and one.path != path:

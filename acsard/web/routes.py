@@ -100,7 +100,7 @@ class Route(Struct, frozen=True):
 
 
 def asked(topic: Topic) -> bool:
-    """Return whether the page's server has a path for the last value of the key of `topic`."""
+    """Return whether a program can query the last message of `topic` over HTTP."""
     own = topic.direction in ("out", "query") and "<key>" not in topic.key
     return own and topic.query in ROLES
 

@@ -193,7 +193,7 @@ def _about(options: ServerOptions) -> About:
 
 
 def _certified(options: ServerOptions) -> tuple[ssl.SSLContext | None, set[str]]:
-    """Return the TLS context, and the names and addresses of this machine for the network.
+    """Return the TLS context, and the names and addresses by which others reach this machine.
 
     Return None and an empty set if no address uses HTTPS. Raises `MendableError` if the certificate
     is not usable.

@@ -105,10 +105,10 @@ class Vault:
         return frozenset(one.digest for one in self.all() if one.ends > now_s)
 
     def unknown_to(self, service: Path = SERVICE_DIRECTORY) -> str:
-        """Return a warning if the service `acsard-web` of this machine reads another token file.
+        """Return a warning if the service `acsard-web` of this machine ignores these tokens.
 
-        Return "" if the service reads this token file or is not installed. `service` is the state
-        directory of the service.
+        This is the case if the service reads another token file. Return "" if the service reads
+        this token file or is not installed. `service` is the state directory of the service.
         """
         if self.path.parent == service or not os.path.lexists(service):
             return ""

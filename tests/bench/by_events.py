@@ -2,10 +2,12 @@
 
     python -m tests.bench.by_events --config FILE --port DEVICE
 
-It sends a line every period, and at once for a command. A thread of its own publishes feedback when
-it arrives, so that a locked bus delays nothing. It uses asyncio, a kernel timer and a hand-over to
-that thread: two wake-ups a period while the polled driver has one, and a third for each command.
-The time that acsard takes beyond this is the time of its decisions.
+It sends one line in each control period, and a line immediately when a command arrives. A separate
+thread publishes the odometry, so that a locked bus does not delay the loop.
+
+The process wakes up twice in each period: for the kernel timer in asyncio, and for the handover to
+the thread. Each command causes a third wake-up. The polled driver wakes up once in each period. If
+acsard needs more processor time than this driver, its decisions cause the difference.
 """
 
 from __future__ import annotations
@@ -35,7 +37,7 @@ from tests.bench.polled import Robot, session_of
 
 
 class Sender:
-    """A thread that publishes the messages left for it, as `acsard/daemon/bus/outlets.py` does."""
+    """A thread that publishes messages from a queue, as `acsard/daemon/bus/outlets.py` does."""
 
     def __init__(self, publisher: zenoh.Publisher) -> None:
         self._publisher = publisher
@@ -57,7 +59,7 @@ class Sender:
 
 
 class Loop(asyncio.Protocol):
-    """The reactions to the end of a period, to a command, and to feedback."""
+    """Writes a line when a period ends or a command arrives, and decodes the feedback."""
 
     def __init__(self, port: serial.Serial, sender: Sender, period_ns: int) -> None:
         self.robot = Robot()
@@ -105,7 +107,7 @@ async def run(config: dict[str, Any], port: serial.Serial) -> None:
 
 
 def main() -> None:
-    """Run the program, with the arguments of `polled.py`."""
+    """Parse `--config` and `--port`, and run the driver."""
     parser = argparse.ArgumentParser()
     parser.add_argument("--config", type=Path)
     parser.add_argument("--port")

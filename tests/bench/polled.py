@@ -2,12 +2,13 @@
 
     python -m tests.bench.polled --config FILE --port DEVICE [--drain]
 
-It is a ros2_control hardware interface in small, with a line each way per cycle. Every cycle takes
-at most one line from the port and leaves the rest in its buffer, publishes the odometry, and writes
-the newest command on the tick. With --drain every cycle takes all lines and keeps the newest: the
-obvious fix of the original. It has none of a robot's safety functions (no limits, no timeouts, no
-checks), only the parts that take time. The wire format and the keys are acsard's, so that the same
-rig measures both.
+This is a small copy of a ros2_control hardware interface, which reads and writes one line per
+cycle. Every cycle reads at most one line from the port and leaves the rest in the buffer, publishes
+the odometry, and writes the newest command. With --drain every cycle reads all lines and uses the
+newest, which is the obvious improvement of the original.
+
+The program has no safety functions (limits, timeouts, checks), because only the parts that cost
+time matter here. It uses acsard's wire format and keys, so the same rig measures both programs.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ RADIUS, SEPARATION = 0.05, 0.30
 
 
 def line_for(linear: float, angular: float) -> bytes:
-    """Return the line on the wire for one command."""
+    """Return the serial line that sends the wheel speeds of this twist, in m/s and rad/s."""
     right = (linear + angular * SEPARATION / 2) / RADIUS
     left = (linear - angular * SEPARATION / 2) / RADIUS
     wheels = zip("abcd", (right, left, left, right), strict=True)
@@ -40,7 +41,7 @@ def line_for(linear: float, angular: float) -> bytes:
 
 
 class Robot:
-    """Pose, the newest command, and the bytes that have not been read yet."""
+    """The robot's pose, its newest command, and the received bytes that are not decoded yet."""
 
     def __init__(self) -> None:
         self.x = self.y = self.yaw = self.linear = self.angular = 0.0
@@ -48,13 +49,13 @@ class Robot:
         self.buffer = b""
 
     def on_command(self, sample: zenoh.Sample) -> None:
-        """Keep the newest command; it waits for the next tick."""
+        """Store the newest command. The main loop writes it at the next tick."""
         message = msgspec.msgpack.decode(sample.payload.to_bytes())
         linear = message.get("linear", {}).get("x", 0.0)
         self.line = line_for(linear, message.get("angular", {}).get("z", 0.0))
 
     def read(self) -> bool:
-        """Return one line, if a whole one has arrived."""
+        """Decode one line from the buffer. Return whether the buffer contained a whole line."""
         line, end, rest = self.buffer.partition(b"\n")
         if not end:
             return False
@@ -67,7 +68,7 @@ class Robot:
         return True
 
     def update(self, dt: float) -> dict[str, object]:
-        """Integrate the speeds and publish the odometry."""
+        """Integrate the speeds over `dt` seconds, and return the odometry message."""
         self.x += self.linear * math.cos(self.yaw) * dt
         self.y += self.linear * math.sin(self.yaw) * dt
         self.yaw += self.angular * dt
@@ -84,7 +85,7 @@ class Robot:
 
 
 def session_of(config: dict[str, Any]) -> tuple[zenoh.Session, str, str]:
-    """Return a session, the prefix of its keys, and the source of commands."""
+    """Open a Zenoh session. Also return the prefix of its keys and the command source's name."""
     settings = zenoh.Config()
     settings.insert_json5("mode", '"peer"')
     settings.insert_json5("listen/endpoints", json.dumps(config["bus"]["listen"]))

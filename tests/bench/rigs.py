@@ -1,4 +1,4 @@
-"""The shared parts of the benchmarks: a program on the rig of `acsard bench`, and its figures."""
+"""Helpers of the benchmarks: run a program on the rig of `acsard bench`, and compute statistics."""
 
 from __future__ import annotations
 
@@ -29,7 +29,10 @@ DRAINING = (*POLLED, "--drain")
 
 
 def trees() -> dict[str, Sequence[str]]:
-    """Return the commands of acsard and of the source trees in $ACSARD_BESIDE, a list like PATH."""
+    """Return the command lines that start acsard from this checkout and from other checkouts.
+
+    $ACSARD_BESIDE lists the directories of the other checkouts, separated like those in PATH.
+    """
     others = os.environ.get("ACSARD_BESIDE")
     named = [Path(other) for other in others.split(os.pathsep)] if others else []
     return {"acsard": ACSARD} | {
@@ -45,7 +48,7 @@ def config(rate: float = 100.0, reply_period: float = 0.0) -> Config:
 
 
 def sibling(one: Config, number: int) -> Config:
-    """Return the same robot under another name and address."""
+    """Return a copy of the configuration with another robot id and another bus address."""
     name, bus = RobotConfig(f"{one.robot.id}-{number}"), BusConfig(listen=(free_endpoint(),))
     return replace(one, robot=name, bus=bus)
 
@@ -59,7 +62,7 @@ def rig(
     free_running: float = 0.0,
     wire_baud_rate: int = 0,
 ) -> Iterator[Rig]:
-    """Run the program until its link is up."""
+    """Start a program and a simulated board. The body runs when the link between them is up."""
     with TemporaryDirectory(prefix="acsard-bench-") as where:
         file = write(one, Path(where))
         with Rig(
@@ -74,24 +77,27 @@ def rig(
 
 
 def driven(one: Config, words: Sequence[str], seconds: float, seed: int) -> Record:
-    """Send commands for this many seconds, and return the record."""
+    """Send commands to the program for this many seconds, and return the record of all messages."""
     with rig(one, words) as running:
         running.command(seconds, staircase, seed)
         return running.end()
 
 
 def waits_us(record: Record) -> list[float]:
-    """Return the times from a command to its first byte on the port."""
+    """Return the time from each command to the first byte of its line on the port, in us."""
     return [wait / 1000 for wait in command_waits(record)]
 
 
 def delays_us(one: Config, record: Record) -> list[float]:
-    """Return the times from a feedback line's last byte to its odometry in this process."""
+    """Return the time from each feedback line's last byte on the wire to its odometry, in us.
+
+    The odometry counts when this process receives it from the bus.
+    """
     return [fed.delay_ns / 1000 for fed in feedback_fates(one, record)]
 
 
 def share(values: Sequence[float], part: float) -> float:
-    """Return the value that `part` of all values do not exceed."""
+    """Return the quantile `part` (0 to 1) of the values, for example 0.99 for p99."""
     return sorted(values)[min(len(values) - 1, int(part * len(values)))]
 
 
@@ -105,7 +111,10 @@ def in_turns(ways: Mapping[str, Callable[[], float]], rounds: int) -> dict[str, 
 
 
 def schedule(pid: int, policy: int, priority: int = 0) -> None:
-    """Give every thread of a process this policy; raises PermissionError if not permitted."""
+    """Set the kernel scheduling policy of every thread of a process.
+
+    Raises PermissionError if this user may not do that.
+    """
     for task in os.listdir(f"/proc/{pid}/task"):
         os.sched_setscheduler(int(task), policy, os.sched_param(priority))
 
@@ -116,7 +125,7 @@ HOGS_S = 120
 
 @contextmanager
 def all_cores_busy(wanted: bool) -> Iterator[None]:
-    """Run a process for each core that does nothing but compute."""
+    """Run one busy loop per core while the body runs, if `wanted` is set."""
     busy = f"import time\nend = time.monotonic() + {HOGS_S}\nwhile time.monotonic() < end: pass"
     words = [sys.executable, "-c", busy]
     number = len(os.sched_getaffinity(0)) if wanted else 0

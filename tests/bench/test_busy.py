@@ -1,12 +1,14 @@
-"""Print the latencies of a busy machine and of a quiet one in one table.
+"""Print the latencies on a busy machine and on a quiet one in one table.
 
     pytest -s -m bench tests/bench/test_busy.py
 
-On the busy machine each core has a process that does nothing but compute, at the same priority. The
-two ends of the measurement have a higher priority, because the daemon is measured: with the loop's
-real-time scheduling that its unit permits, and without. A last case adds a flood: a program that
-puts commands as fast as it can. Each quiet and busy case alternates with one that records, whose
-thread shares the interpreter with the loop.
+On the busy machine each core runs a busy loop at the daemon's normal priority. The measuring
+process has a higher priority, because its own delays must not appear in the figures. The test runs
+once with the real-time scheduling that the systemd unit permits to the daemon's loop, and once
+without it.
+
+Some cases add a flood: a client that sends commands as fast as it can. Other cases record the
+drive, because the recorder's thread shares the Python interpreter with the loop.
 """
 
 from __future__ import annotations
@@ -36,7 +38,7 @@ AHEAD = 60
 
 @contextmanager
 def ahead_of_all() -> Iterator[None]:
-    """Raise the priority of all threads of this process, as far as that is permitted."""
+    """Give all threads of this process a real-time priority, or skip the test if not permitted."""
     try:
         schedule(os.getpid(), os.SCHED_FIFO, AHEAD)
     except PermissionError:
@@ -49,7 +51,10 @@ def ahead_of_all() -> Iterator[None]:
 
 @contextmanager
 def flooded(one: Config, wanted: bool) -> Iterator[None]:
-    """Run a client that puts zeros on another source as fast as one process can."""
+    """Run a client that floods another command source with zeros while the body runs.
+
+    If `wanted` is False, no client runs.
+    """
     if not wanted:
         yield
         return

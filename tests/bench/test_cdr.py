@@ -1,8 +1,8 @@
-"""Print the time of CDR encoding and that of rosbags in the same run.
+"""Compare the time of acsard's CDR encoding with the time of the library rosbags.
 
     pytest -s tests/bench/test_cdr.py
 
-Figures of two runs cannot be compared.
+Both are measured in the same run, because the speed of the machine differs between runs.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ ROUNDS, CALLS = 41, 200
 def side_by_side(
     ours: Callable[[], object], theirs: Callable[[], object]
 ) -> tuple[float, float, float]:
-    """Return the median microseconds of both, and the median of their ratios per round.
+    """Return the median time of each function in us, and the median of the ratios theirs / ours.
 
-    The two take turns within a round, so that a disturbance of the machine slows both.
+    Each round calls both functions, so that a disturbance of the machine slows both.
     """
 
     def one(call: Callable[[], object]) -> float:
@@ -65,7 +65,7 @@ def test_a_message_takes_the_time_printed_here(message: Message) -> None:
 
 
 def test_odometry_is_encoded_no_slower_than_by_rosbags() -> None:
-    """The oracle's message is built beforehand, with covariances as arrays: encoding alone."""
+    """Compare only the encoding: the message for rosbags is built before the measurement."""
     message = odometry("odom", "base_link")
     codec, name = Cdr(Odometry), ROS_NAMES[Odometry]
     theirs = built(message, name)

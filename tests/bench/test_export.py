@@ -1,9 +1,9 @@
-"""Print the time and the memory that the export of an hour's recording takes.
+"""Print the time and the memory that the export of an hour's recording needs.
 
     pytest -s -m bench tests/bench/test_export.py
 
-The recording is an hour of driving at 100 Hz in virtual time. The daemon's own program exports the
-file.
+The recording is an hour of driving at 100 Hz in virtual time. The test runs `acsard recording
+export` on it, and compares the memory with that of a minute's recording.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ PAGE_MB = 120.0
 
 
 class Streamed:
-    """A recorder that writes continuously, because an hour does not fit into memory."""
+    """A recorder that writes to its file all the time, because an hour does not fit into memory."""
 
     status = Recording("file")
 
@@ -65,7 +65,10 @@ class Streamed:
 
 
 def recorded(path: Path, seconds: float) -> Path:
-    """Drive at 20 commands a second, with another speed every half minute."""
+    """Record a simulated drive of `seconds` in virtual time, and return the path of the file.
+
+    The commanded speed changes every 15 s.
+    """
     config = replace(Config(), record=replace(Config().record, directory=str(path.parent)))
     box = Streamed(path, config, START)
     world = World(config, recorder=box)
@@ -97,7 +100,7 @@ print(time.process_time(), int(status.partition("VmHWM:")[2].split()[0]) / 1024)
 
 
 def cost(*words: str) -> Cost:
-    """Return the cost of one run of the program."""
+    """Run `acsard` with these arguments. Return its run time, processor time and peak memory."""
     ended = finish([sys.executable, "-c", MEASURED, *words], ROOT, within=1500.0)
     assert ended.code == 0, ended
     processor, megabytes = map(float, ended.out.splitlines()[-1].split())

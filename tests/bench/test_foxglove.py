@@ -1,8 +1,9 @@
-"""Print the cost of a viewer of all topics for `acsard foxglove` and for the daemon.
+"""Print the processor time that a viewer of all topics costs `acsard foxglove` and the daemon.
 
     pytest -s -m bench tests/bench/test_foxglove.py
 
-Processor times are the kernel's own. Spans with and without a viewer alternate, with one daemon.
+Measurements with and without a viewer alternate on one daemon. The kernel counts the processor
+time.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ ROUNDS, SPAN_S = 5, 3.0
 
 
 class Cost(NamedTuple):
-    """The cost of a span in % of a core, and the daemon's periods."""
+    """Processor time of both processes during a measurement, % of a core, and the periods."""
 
     bridge: float
     daemon: float
@@ -34,7 +35,7 @@ class Cost(NamedTuple):
 
 
 def cost(daemon: Daemon, bridge: Shows, bus: Bus) -> Cost:
-    """Return the cost of the next span."""
+    """Wait for `SPAN_S` seconds, and return the cost of this time."""
     pids = bridge.pid, daemon.pid
     first, before = bus.state(), [cpu_seconds(pid) for pid in pids]
     waited = waited_for_a_core(daemon.pid)

@@ -2,10 +2,10 @@
 
     pytest -s -m bench tests/bench/test_rate.py
 
-The rate is that of the whole daemon on a simulated microcontroller in another process, with one
-subscriber of odometry, and a line and a reply every period. `control.rate` allows at most 1000 Hz
-and the rate that the baud rate carries; `unlimited.py` describes how these limits are lifted. The
-search doubles the rate, then halves the interval.
+The whole daemon runs on a simulated microcontroller in another process, with one subscriber of
+odometry. Each control period has one line and one reply. Normally `control.rate` allows at most
+1000 Hz, and the baud rate limits it further; `unlimited.py` describes how the test removes these
+limits. The search doubles the rate until too many periods are missed, and then bisects.
 """
 
 from __future__ import annotations
@@ -35,14 +35,17 @@ PRIORITY = 50
 
 
 def taken(running: Rig) -> tuple[float, int, int]:
-    """Return the time in s, the periods missed and the feedback lines so far, all of one moment."""
+    """Return the time of a `state` in s, and its counts of missed periods and feedback lines."""
     state = running.state()
     counters = state.counters
     return state.stamp.to_ns() / 1e9, counters.get("missed_periods", 0), counters["lines"]
 
 
 def scheduled(running: Rig, realtime: bool) -> None:
-    """Schedule the daemon as real-time, or take even its own real-time scheduling away."""
+    """Give the whole daemon a real-time priority, or remove the one that it gave to its loop.
+
+    Skips the test if this user may not do that.
+    """
     policy, priority = (os.SCHED_FIFO, PRIORITY) if realtime else (os.SCHED_OTHER, 0)
     try:
         schedule(running.process.pid, policy, priority)

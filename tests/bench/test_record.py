@@ -1,11 +1,12 @@
-"""Print the recorder's cost for the loop, in processor time and lateness, on and off in turn.
+"""Print how much processor time and lateness the recorder adds to the control loop.
 
     pytest -s -m bench tests/bench/test_record.py
 
-Lateness: ten rounds of two daemons, one after the other in alternating order, each driven at 20
-commands a second. Processor time: twenty pairs of new processes, two at once, so that other work of
-the machine costs both alike. It is the kernel's own account, of all threads. A last measurement is
-at rest. The benchmark takes nine minutes.
+Two daemons, one with and one without a recorder, receive 20 commands a second. For the lateness
+they run one after the other, in ten rounds of alternating order. For the processor time they run at
+the same time, in twenty pairs, so that other programs of the machine slow both equally. The kernel
+counts the processor time of all their threads. A last measurement has a robot at rest. The
+benchmark takes nine minutes.
 """
 
 from __future__ import annotations
@@ -51,7 +52,7 @@ class Cost(NamedTuple):
 
 
 def processor_s(pid: int) -> float:
-    """Return the processor time of all current threads, to the ns."""
+    """Return the processor time of all current threads of a process, s. Its resolution is 1 ns."""
     tasks = Path(f"/proc/{pid}/task").glob("*/schedstat")
     return sum(int(task.read_text().split()[0]) for task in tasks) / 1e9
 
@@ -61,7 +62,7 @@ def size(where: Path) -> int:
 
 
 def cost(where: Path, records: bool) -> Cost:
-    """Return the cost of one daemon that drives."""
+    """Run a daemon that drives a simulated robot, and return what this costs."""
     where.mkdir(parents=True)
     words = ["--record", str(where / "record")] if records else []
     with running(where, words=words) as (daemon, bus), bus.commanding(0.3):
@@ -77,7 +78,7 @@ def cost(where: Path, records: bool) -> Cost:
 
 
 def pair(where: Path, first: bool) -> tuple[float, float]:
-    """Return % of a core without and with recording, of two daemons that drive at once."""
+    """Run two daemons at once, without and with recording. Return the % of a core of each."""
     with ExitStack() as stack:
         pids: dict[bool, int] = {}
         for records in (first, not first):

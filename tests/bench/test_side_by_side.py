@@ -1,14 +1,16 @@
-"""Compare acsard with the original driver's method and with the least that an event loop can do.
+"""Compare acsard with the original driver's method and with a minimal event loop.
 
     pytest -s -m bench tests/bench/test_side_by_side.py
 
-Latencies are measured in turns on the same rig in the same minute. Processor time is measured of
-two programs that run at once, each beside the polled one, so that other work of the machine costs
-both alike. With ACSARD_BESIDE=DIRECTORY:DIRECTORY the acsard of other checkouts takes part as well.
-The test asserts ratios and counts, and prints the figures themselves. The polled program
-(`polled.py`) waits for its 100 Hz tick, half a period on average. Once a reply has been late, it is
-a line behind for ever; draining fixes that, and is measured as well. A busy machine adds the same
-wake-up times to all, which makes the ratios of latencies smaller; the assertions leave room for it.
+Latency: the programs run one after the other on the same rig. Processor time: each program runs at
+the same time as the polled one, so that other programs of the machine slow both equally. The test
+prints the figures, and asserts only ratios and counts. With ACSARD_BESIDE=DIRECTORY:DIRECTORY it
+also measures the acsard of other checkouts.
+
+The polled program (`polled.py`) acts only at its 100 Hz tick, so a command waits half a period on
+average. After one late reply it always reads the line before the newest one. Its option `--drain`
+corrects that, and the test measures this variant too. On a busy machine the ratios of latencies are
+smaller, because every program waits longer for a core. The asserted ratios allow for that.
 """
 
 from __future__ import annotations
@@ -60,7 +62,10 @@ def line(name: str, values: list[float]) -> str:
 
 
 def times_as_long(what: str, one: list[list[float]], other: list[list[float]]) -> float:
-    """Return the median of the rounds' ratios of medians, and print it."""
+    """Print and return how many times longer `one` takes than `other`.
+
+    This is the median over the rounds of the ratio of the two medians.
+    """
     by_round = [median(a) / median(b) for a, b in zip(one, other, strict=True) if a and b]
     rounds = ", ".join(f"{one:.1f}" for one in by_round)
     print(f"{what}: {median(by_round):.2f} times as long at p50 (by round {rounds})")
@@ -93,7 +98,7 @@ def test_commands_and_feedback_are_many_times_faster_than_polled() -> None:
 
 
 def shares_of_a_pair(words: Sequence[str], seed: int) -> tuple[float, float]:
-    """Return the shares of a core of a program and of the polled one, which run at once."""
+    """Run a program and the polled program at the same time. Return the share of a core of each."""
     one = config()
     with ExitStack() as stack:
         ours = stack.enter_context(rig(one, words))
@@ -104,7 +109,10 @@ def shares_of_a_pair(words: Sequence[str], seed: int) -> tuple[float, float]:
 
 
 def test_what_a_commanded_robot_costs_at_the_same_time_as_polled() -> None:
-    """Both run at once under the same load, so other work of the machine costs both alike."""
+    """Measure the processor time of each program while the polled program runs at the same time.
+
+    Other programs of the machine then slow both equally. The test limits the ratio.
+    """
     ways = trees() | {"by events": BY_EVENTS}
     pairs: dict[str, list[tuple[float, float]]] = {name: [] for name in ways}
     for number in range(PAIRS):
@@ -125,9 +133,10 @@ def test_what_a_commanded_robot_costs_at_the_same_time_as_polled() -> None:
 
 
 def standing(waiting: list[int], per_second: int) -> list[int]:
-    """Return the standing backlog: the least number of newer lines waiting in each second.
+    """Return the smallest number of waiting newer lines in each second of samples.
 
-    A stall of the whole machine makes lines wait once; a backlog is never caught up.
+    A stall of the machine makes lines wait only once, so the minimum hides it. A real backlog
+    remains.
     """
     seconds = [waiting[i : i + per_second] for i in range(0, len(waiting), per_second)]
     return [min(second) for second in seconds if len(second) == per_second]

@@ -1,10 +1,12 @@
-"""Compare the step time of the full odometry with that of the simplest, in the same run.
+"""Compare the step time of the full odometry with that of the simplest odometry, in the same run.
 
-The added time is that of sample times, quantization, covariance, the consistency check and the
-gyro. It is today's session and odometry less a reader, a decoder, an arc by arrival time and a
-first-order covariance. The link's bookkeeping counts as added too, though it is older. A step is
-the control loop's step on a received line, with odometry encoded for one subscriber; the bus itself
-is not included. The test compares processor time, which a busy machine does not change.
+The full odometry adds sample times, quantization, covariance, the consistency check and the gyro.
+The test measures the time that they add: the time of today's session and odometry, minus the time
+of a simple odometry (`Simplest`). The session's bookkeeping of the link is counted as added, too.
+
+A step is one step of the control loop on a received line. It includes encoding the odometry for one
+subscriber, and excludes the bus. The test compares processor time, which is the same on a busy
+machine.
 """
 
 from __future__ import annotations
@@ -60,7 +62,7 @@ ALL = Config(
 
 
 class Timed:
-    """A method of one object, the number of its calls, and their total time, ns."""
+    """Wraps a method of one object, and counts its calls and their total processor time in ns."""
 
     def __init__(self, owner: object, name: str) -> None:
         self._call: Callable[..., object] = getattr(owner, name)
@@ -77,7 +79,7 @@ class Timed:
 
 
 class Simplest:
-    """Integrate a line's speeds along an arc since the previous line; first-order covariance."""
+    """The simplest odometry: it moves along an arc at each line, with a first-order covariance."""
 
     def __init__(self) -> None:
         self._lines, self._codec = LineReader(), Codec(WheelMap())
@@ -108,7 +110,7 @@ class Simplest:
 
 
 class Run:
-    """A robot that drives at random, and the time of its steps with a line."""
+    """A simulated robot that drives at random, and the time of those steps that receive a line."""
 
     def __init__(self, config: Config) -> None:
         self.world = made = World(config)
@@ -151,7 +153,10 @@ class Run:
         setattr(made.loop, "step", timed)  # noqa: B010
 
     def drive(self, seed: int) -> dict[str, float]:
-        """Return us per line of a step that has one, and of each part in it, over `SECONDS`."""
+        """Drive for `SECONDS`, and return the processor time in us per received line.
+
+        The keys of the dictionary are the whole step, its parts, and the simplest odometry.
+        """
         self.took, calls = dict.fromkeys(self.took, 0), self.lines.calls
         chance, left = random.Random(seed), SECONDS
         while left > 0.0:
@@ -164,7 +169,10 @@ class Run:
 
 
 def test_what_a_step_has_grown_by_is_told_beside_what_it_may() -> None:
-    """The time stays below the allowed one. The asserted bound keeps it from growing further."""
+    """Print the added time beside the allowed time.
+
+    The asserted bound is higher than the allowed time, and keeps the added time from growing.
+    """
     run, rounds = Run(ALL), []
     for seed in range(ROUNDS):
         found = run.drive(seed)

@@ -2,9 +2,9 @@
 
     pytest -s -m bench tests/bench/test_transports.py
 
-The figure is the processor time of the daemon's process per control cycle, by the kernel's own
-account. The transports take turns within one daemon. The simulated microcontroller is another
-process, except with many robots: there each daemon has its own inside.
+The cost is the processor time of the daemon's process per control cycle, as the kernel counts it.
+One daemon uses the transports one after the other. The simulated microcontroller is a separate
+process. In the test with many robots each daemon simulates its microcontroller itself.
 """
 
 from __future__ import annotations
@@ -120,7 +120,10 @@ def test_the_cost_of_more_subscribers() -> None:
 
 
 def missed_and_due(running: Rig) -> tuple[int, float]:
-    """Return the periods missed so far, and those due since 1970, both of one moment."""
+    """Return the number of missed periods and of all periods, from one `state` message.
+
+    Periods are counted from 1970, so only differences are meaningful.
+    """
     state = running.state()
     return state.counters.get("missed_periods", 0), state.stamp.to_ns() / 1e9 * config().rate_hz
 
@@ -166,7 +169,7 @@ def test_the_cost_of_more_robots() -> None:
 
 
 class Nobody:
-    """A stand-in without a loop to wake."""
+    """A stand-in for the control loop. The bus notifies it of commands, and it does nothing."""
 
     def command(self) -> None: ...
 
@@ -176,7 +179,10 @@ class Nobody:
 def encoded(
     monkeypatch: pytest.MonkeyPatch, keys: Sequence[str], one: Config, count: int
 ) -> Counter[str]:
-    """Return how often each encoding was made for `count` messages with these subscribers."""
+    """Publish `count` messages, and return how often the bus encoded them in each format.
+
+    `keys` are the keys of the subscribers.
+    """
     made: Counter[str] = Counter()
 
     def counting(message: Message, form: encodings.Format) -> bytes:

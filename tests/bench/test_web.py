@@ -1,4 +1,4 @@
-"""Print the cost of the robot's page, and the time of a command through it: figures, and ratios."""
+"""Print the processor time of the robot's page, and the delay of a command through the page."""
 
 from __future__ import annotations
 
@@ -80,13 +80,13 @@ COMMANDS = 300
 
 @pytest.fixture
 def peer(tmp_path: Path) -> Iterator[Peer]:
-    """Run an independent serial peer."""
+    """Run a simulated board in another process."""
     with Peer(tmp_path / "mcu") as peer:
         yield peer
 
 
 def subscribed() -> list[tuple[str, int]]:
-    """Return the subscriptions of an open page, whatever its view: keys and rates."""
+    """Return the keys that an open page subscribes to, and their rates in Hz."""
     script = (PAGE_DIRECTORY / "main.js").read_text()
     pairs = re.findall(r'\["([\w/]+)", (\d+)\]', script)
     pairs += re.findall(r'link\.subscribe\("([\w/]+)", (\d+)', script)
@@ -95,7 +95,11 @@ def subscribed() -> list[tuple[str, int]]:
 
 
 def watched(page: Page, daemon: Daemon, bus: Bus) -> tuple[float, int, Periods, float]:
-    """The page's share of a core and kB, the daemon's periods and lateness (us, p99)."""
+    """Measure for `SECONDS` while the page is viewed.
+
+    Returns the page server's share of a core and its memory in kB, and the daemon's control periods
+    and their p99 lateness in us.
+    """
     first, cpu, at = bus.state(), cpu_seconds(page.pid), time.monotonic()
     time.sleep(SECONDS)
     share = (cpu_seconds(page.pid) - cpu) / (time.monotonic() - at)
@@ -141,13 +145,13 @@ def test_twenty_viewers_cost_the_page_and_not_the_robot(tmp_path: Path) -> None:
 
 
 def lines_with(peer: Peer, speed: float, after: float) -> float | None:
-    """Return when the first line with this wheel speed came."""
+    """Return when the board received the first line with this speed after `after`, or None."""
     want = f"ap{speed:05.2f},".encode()
     return next((h.at for h in peer.lines[-50:] if h.at >= after and h.line.startswith(want)), None)
 
 
 async def measured(peer: Peer, send: Callable[[float], object]) -> list[float]:
-    """Return the ms from a command to its line's first byte on the port, for commands at 20 Hz."""
+    """Send commands at 20 Hz. Return the time in ms from each one to its line at the board."""
     found = []
     for n in range(COMMANDS):
         linear = 0.2 if n % 2 else 0.25
@@ -202,13 +206,16 @@ FINGER = """for (const kind of ["pointerdown", "pointermove", "pointerup"])
 
 
 class Finger:
-    """A finger on the page's stick, in a real browser, timed against the far end of the port."""
+    """A simulated finger on the page's stick in a real browser.
+
+    It measures the time until the board receives the resulting line.
+    """
 
     def __init__(self, browser: Browser, peer: FarPeer) -> None:
         self.browser, self.peer = browser, peer
 
     def waited(self, does: Callable[[], object], wanted: Callable[[float], bool]) -> float:
-        """Return the ms from an action to the first byte of a line with a wanted wheel speed."""
+        """Call `does`. Return the ms until a line whose wheel speed fulfils `wanted`."""
         begun, wall = time.monotonic(), time.time()
         does()
         at = float(self.browser.js("window.finger")) / 1000 - wall + begun
@@ -220,7 +227,7 @@ class Finger:
         return 1000 * (until(line, 5.0, "the finger's line") - at)
 
     def moved_to(self, y: float, speed: float) -> float:
-        """Push the stick there; return the ms until the wheels are commanded to this speed."""
+        """Push the stick to `y`. Return the ms until the board receives this speed in rad/s."""
         return self.waited(lambda: self.browser.push(0, y), lambda told: abs(told - speed) < 0.5)
 
     def press(self) -> None:
@@ -231,7 +238,11 @@ class Finger:
 
 @pytest.mark.skipif(CHROMIUM is None, reason="needs chromium-headless-shell")
 def test_a_finger_on_the_stick_is_soon_on_the_port(tmp_path: Path) -> None:
-    """The browser sends the wanted speed 20 times a second, and a release at once."""
+    """Measure the delay from a finger's press, move or lift to the line on the port.
+
+    The browser sends the wanted speed 20 times a second. It sends a release immediately, so the
+    robot does not wait for the command timeout.
+    """
     fast = dict.fromkeys(("linear_acceleration", "linear_deceleration"), 100.0)
     fast["linear_stop_deceleration"] = 100.0
     with (

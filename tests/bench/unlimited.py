@@ -1,10 +1,10 @@
-"""The daemon at any control rate: for finding the highest, not for driving.
+"""Run the daemon at any control rate, to find the highest possible rate. Do not drive with it.
 
     python -m tests.bench.unlimited --config FILE --port DEVICE --rate HZ
 
-The configuration file is read and checked as always. The rate and the baud rate are set afterwards,
-where no check sees them: a frozen struct checks its values when it is decoded, not when it is
-copied. Everything that runs then is the product.
+The program reads and checks the configuration file as usual, and then replaces the rate and the
+baud rate. The struct checks its values when it is decoded, but not when it is copied, so no check
+rejects the new values. Everything else is the unchanged daemon.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ BAUD_RATE = 4_000_000
 
 
 def main() -> None:
-    """Run until a signal."""
+    """Run the daemon until it receives SIGINT or SIGTERM."""
     parser = argparse.ArgumentParser()
     parser.add_argument("--config")
     parser.add_argument("--port")

@@ -1,7 +1,7 @@
-"""The board on the bench: the firmware's machine code in libsimavr, and a host at its port.
+"""Run the firmware's machine code in libsimavr, with a test program (`Host`) at its serial port.
 
-No parser of acsard's is used here. Every wait has a deadline, and the process is ended by its own
-id.
+This module uses no parser of acsard, so an error in acsard cannot hide one in the firmware. Every
+wait has a deadline.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class UnavailableError(Exception):
 
 
 def missing() -> str:
-    """Return the tools that the real firmware needs and that are missing here, or ""."""
+    """Return the reason why this machine cannot build the real firmware, or "" if it can."""
     tools = [tool for tool in ("make", "gcc", "avr-gcc", "avr-size") if shutil.which(tool) is None]
     if tools:
         return f"no {', '.join(tools)} (Debian: make gcc gcc-avr avr-libc binutils-avr)"
@@ -68,20 +68,20 @@ def _run(words: Sequence[str | Path], cwd: Path) -> str:
 
 
 def build_firmware(where: Path, *defines: str) -> Path:
-    """Return the ELF, made as the README says; prints its size."""
+    """Build the firmware with the README's command, print its size, and return the ELF file."""
     out = _run(["make", f"BUILD={where}", f"DEFINES={' '.join(defines)}"], FIRMWARE)
     print(*(line for line in out.splitlines() if "Full" in line), sep="\n")
     return where / "firmware.elf"
 
 
 def build_library(where: Path, *defines: str) -> Path:
-    """Build the hardware-independent part of the firmware for this machine."""
+    """Build the hardware-independent part of the firmware as a library for this machine."""
     _run(["make", f"BUILD={where}", f"DEFINES={' '.join(defines)}", "host"], FIRMWARE)
     return where / "libfirmware.so"
 
 
 def build_runner(where: Path) -> Path:
-    """Build the bench."""
+    """Build the runner: the program that simulates the board with libsimavr."""
     source = Path(__file__).with_name("runner.c")
     flags = ["-std=gnu11", "-O2", "-Wall", "-Wextra", "-Werror"]
     flags += [f"-I{place}/simavr" for place in _INCLUDES if Path(place, "simavr").exists()]
@@ -91,7 +91,7 @@ def build_runner(where: Path) -> Path:
 
 
 class Motor(NamedTuple):
-    """The true state of one motor."""
+    """The state of one simulated motor, independent of what the firmware reports."""
 
     duty: float
     """-1 to 1, as the bridge applies it."""
@@ -122,7 +122,10 @@ class Wire(NamedTuple):
 
 
 class Status(NamedTuple):
-    """The true state of the board. `*_ns` are in the board's own time unless noted."""
+    """The state of the simulated board, independent of what the firmware reports.
+
+    `*_ns` are in the board's simulated time unless noted.
+    """
 
     virtual_ns: int
     wall_ns: int
@@ -165,7 +168,10 @@ class Status(NamedTuple):
 
 
 class Board:
-    """A board that has booted when entered. Leaving it ends it in any case."""
+    """A simulated board, used as a context manager.
+
+    Entering it starts the board and waits until it has booted. Leaving it ends the process.
+    """
 
     def __init__(self, runner: Path, firmware: Path, *options: str) -> None:
         self._words = [str(runner), *options, str(firmware)]
@@ -202,7 +208,7 @@ class Board:
                 stream.close()
 
     def command(self, words: str) -> dict[str, Any]:
-        """Send the runner a command; runner.c lists them."""
+        """Send a command to the simulation and return its answer. runner.c lists the commands."""
         assert self.process.stdin is not None
         self.process.stdin.write(words.encode() + b"\n")
         self.process.stdin.flush()
@@ -211,16 +217,16 @@ class Board:
         return answer
 
     def plug(self) -> str:
-        """Open a new port, in place of any old one; return its path."""
+        """Plug the board in again, with a new serial port. Return the path of the port."""
         self.path = self.command("plug")["pty"]
         return self.path
 
     @contextmanager
     def in_steps(self) -> Iterator[None]:
-        """Let the board's time pass only in `step` while entered.
+        """Let the board's simulated time pass only in `step` while the body runs.
 
-        The board then never waits for its host, nor the host for the board. The motors, the
-        watchdog and the pace of the lines are the same on a busy machine as on an idle one.
+        Board and host then never wait for each other, so the motors, the watchdog and the timing of
+        the lines are the same on a busy machine as on an idle one.
         """
         self.command("pause")
         self.stepped = True
@@ -231,12 +237,12 @@ class Board:
             self.command("resume")
 
     def step(self, ms: int) -> None:
-        """Let this much of the board's time pass, as fast as this machine can."""
+        """Advance the board's simulated time by `ms`, as fast as this machine can compute it."""
         assert self.stepped, "this board's time is the wall clock's"
         self.command(f"bench {ms}")
 
     def status(self) -> Status:
-        """Return the true state."""
+        """Return the current state of the simulated board."""
         told = self.command("status")
         told["motors"] = tuple(Motor(**motor) for motor in told["motors"])
         told["to_board"] = Wire(**told["to_board"])
@@ -267,7 +273,7 @@ class Board:
 
 
 def passes(board: Board, ms: float) -> Status:
-    """Return the state after this much of the board's time."""
+    """Wait until `ms` of the board's simulated time have passed, and return the state."""
     end = board.status().virtual_ns + ms * MS
     if board.stepped:
         board.step(math.ceil(ms))
@@ -279,7 +285,7 @@ def passes(board: Board, ms: float) -> Status:
 
 
 def speeds_line(speeds: Sequence[float]) -> bytes:
-    """Return a plain line without its end."""
+    """Return the plain line for these wheel speeds in rad/s, without CR LF."""
     return ",".join(
         f"{letter}{'n' if speed < 0 else 'p'}{abs(speed):05.2f}"
         for letter, speed in zip("abcd", speeds, strict=True)
@@ -287,13 +293,13 @@ def speeds_line(speeds: Sequence[float]) -> bytes:
 
 
 def checked(line: bytes, sequence: int, letters: str = "") -> bytes:
-    """Return the line with its suffix."""
+    """Return the line with the checked link's suffix: sequence number, letters and checksum."""
     line += b"#%02X" % sequence + letters.encode()
     return line + b"*%04X" % binascii.crc_hqx(line, 0)
 
 
 class Identity(NamedTuple):
-    """The board's identity, and its counters since it booted."""
+    """The fields of the board's identity line. The counters begin when the board boots."""
 
     counts: int
     watchdog_ms: int
@@ -307,7 +313,7 @@ class Identity(NamedTuple):
 
 
 def read_identity(line: bytes) -> Identity:
-    """Return the identity in a line. Fails unless all of it is there, in its order."""
+    """Decode an identity line. Fails if a field is missing or in the wrong place."""
     name, version, *words = line.decode().split(" ")
     assert (name, version) == ("!acsard-mcu", "1"), line
     told = dict(word.split("=") for word in words)
@@ -332,7 +338,7 @@ class Reply(NamedTuple):
 
 
 def read_reply(line: bytes, at: float = 0.0) -> Reply:
-    """Return the reply in a line. Fails unless it is right to the byte."""
+    """Decode a reply. Fails if its checksum is wrong or its format differs from the contract."""
     plain, mark, suffix = line.partition(b"#")
     assert len(plain) == 31, line
     speeds = [float(plain[i + 2 : i + 7]) for i in range(0, 32, 8)]
@@ -355,10 +361,10 @@ def read_reply(line: bytes, at: float = 0.0) -> Reply:
 
 
 class Host:
-    """A program at the board's port that a test controls.
+    """A program at the board's serial port, controlled by a test.
 
-    It keeps the pace of the wall clock. With a board that is `stepped`, it keeps the pace of the
-    board: each of its waits lets that time pass there.
+    Its waits are in real time. If the board is `stepped`, each wait advances the board's simulated
+    time instead.
     """
 
     def __init__(self, path: str, board: Board | None = None) -> None:
@@ -397,7 +403,7 @@ class Host:
         self.sent_ns = time.monotonic_ns()
 
     def lines(self, wait: float = 0.0) -> list[tuple[float, bytes]]:
-        """Return the received lines without their ends. Waits up to that time for the first."""
+        """Return the received lines without CR LF. Waits at most `wait` s for the first one."""
         if self._stepped is not None:
             self._stepped.step(round(1000 * wait))
         while select.select([self._fd], [], [], wait)[0]:
@@ -411,7 +417,7 @@ class Host:
         return [(now, line.removesuffix(b"\r")) for line in ends]
 
     def says(self, text: bytes, within: float = 3.0) -> bytes:
-        """Return the first line that contains `text`."""
+        """Return the first line that contains `text`. Fails if none comes within `within` s."""
         deadline = time.monotonic() + within + PATIENCE_S
         heard: list[bytes] = []
         while time.monotonic() < deadline:
@@ -422,7 +428,7 @@ class Host:
         raise AssertionError(f"not within {within:g} s: {text!r}; heard {heard[-5:]}")
 
     def ask(self, line: bytes, within: float = 3.0) -> Reply:
-        """Send a line and wait for its answer, which is the next line to come."""
+        """Send a line, and return the next received line, decoded as its reply."""
         self.lines()
         self.send(line)
         deadline = time.monotonic() + within + PATIENCE_S
@@ -432,7 +438,10 @@ class Host:
         raise AssertionError(f"no answer within {within:g} s to {line!r}")
 
     def identity(self) -> Identity:
-        """Ask for the board's identity; again if half a reply to another host came before it."""
+        """Ask for the board's identity and return it.
+
+        It asks again if the answer follows the rest of a reply to another host.
+        """
         self.lines()
         while True:
             self.send(b"?")
@@ -441,7 +450,7 @@ class Host:
                 return read_identity(line)
 
     def stop(self, within: float = 3.0) -> None:
-        """Send stops until one is answered: after a boot the board accepts nothing else."""
+        """Send stops until the board answers one. After a boot the board accepts nothing else."""
         deadline = time.monotonic() + within + PATIENCE_S
         self._stopped = False
         self.lines()
@@ -458,10 +467,10 @@ class Host:
     def drive(
         self, speeds: Speeds, seconds: float, letters: str = "S", period: float = 0.01
     ) -> list[Reply]:
-        """Send checked lines at an even pace for that time; return all replies.
+        """Send checked lines with these speeds in rad/s at an even rate. Return all replies.
 
-        The first call sends a stop before. It starts again if other work of this machine delayed
-        it, because the board would stop.
+        The first call sends a stop first, because the board requires it. If this machine delays the
+        lines so much that the board would stop its motors, the time starts again.
         """
         replies: list[Reply] = []
         if not self._stopped:

@@ -1,4 +1,4 @@
-"""The firmware, its host library and the bench, each built once per session."""
+"""Fixtures: the firmware, its library and the simulator, each built once per session."""
 
 from __future__ import annotations
 
@@ -38,9 +38,9 @@ BATTERY, CURRENT = 0, 1
 
 @contextmanager
 def wired_board(runner: Path, wired: dict[int, Path], baud: int = 115200) -> Iterator[Board]:
-    """Run a board with every input, a battery of 24 V and no current.
+    """Run a board that has every input, a battery of 24 V and a current of 0 A.
 
-    It has reported that nothing is pressed.
+    The body runs after the board has reported that the emergency stop is not pressed.
     """
     with Board(runner, wired[baud], "--baud", str(baud)) as board:
         for pin in (ESTOP, *BUMPERS):
@@ -53,7 +53,7 @@ def wired_board(runner: Path, wired: dict[int, Path], baud: int = 115200) -> Ite
 
 @pytest.fixture(scope="session")
 def library(tmp_path_factory: pytest.TempPathFactory) -> ctypes.CDLL:
-    """The firmware's logic, compiled for this machine."""
+    """The hardware-independent part of the firmware, compiled for this machine."""
     lacking = [tool for tool in ("make", "gcc") if shutil.which(tool) is None]
     if lacking:
         pytest.skip(f"no {' and no '.join(lacking)}")
@@ -62,14 +62,17 @@ def library(tmp_path_factory: pytest.TempPathFactory) -> ctypes.CDLL:
 
 @pytest.fixture(scope="session")
 def coarse_library(library: ctypes.CDLL, tmp_path_factory: pytest.TempPathFactory) -> ctypes.CDLL:
-    """The firmware's logic for an encoder of 96 counts a turn, given as a product."""
+    """The same library for an encoder with 96 counts per turn.
+
+    The definition is a product (`2 * 4 * 12`), as a user may write it.
+    """
     where = tmp_path_factory.mktemp("coarse")
     return ctypes.CDLL(str(build_library(where, "'-DCOUNTS_PER_TURN=2 * 4 * 12'")))
 
 
 @pytest.fixture(scope="session")
 def firmware(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The ELF as a user builds it."""
+    """The firmware's ELF file, built with the default settings."""
     lacking = missing()
     if lacking:
         pytest.skip(lacking)
@@ -78,13 +81,13 @@ def firmware(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def hanging_firmware(firmware: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The ELF with additional lines that make it hang."""
+    """The ELF file of a firmware with test code: on a command its main loop hangs."""
     return build_firmware(tmp_path_factory.mktemp("hanging"), "-DTEST_HANG")
 
 
 @pytest.fixture(scope="session")
 def wired(firmware: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[int, Path]:
-    """The ELF with every input, for two baud rates."""
+    """The ELF files of the firmware with every input, by baud rate."""
     return {
         baud: build_firmware(
             tmp_path_factory.mktemp(f"wired_{baud}"), *ALL_INPUTS, f"-DBAUD_RATE={baud}UL"
@@ -95,7 +98,7 @@ def wired(firmware: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[int,
 
 @pytest.fixture(scope="session")
 def runner(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The bench."""
+    """The program that simulates the board."""
     lacking = missing()
     if lacking:
         pytest.skip(lacking)
@@ -104,20 +107,20 @@ def runner(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def board(runner: Path, firmware: Path) -> Iterator[Board]:
-    """The board, just powered on, with four different motors."""
+    """A simulated board that has just booted. Its four motors have different free speeds."""
     with Board(runner, firmware, "--free-speed", FREE_SPEEDS) as board:
         yield board
 
 
 @pytest.fixture
 def host(board: Board) -> Iterator[Host]:
-    """A host at its port."""
+    """A test program at the serial port of `board`."""
     with Host(board.path, board) as host:
         yield host
 
 
 @pytest.fixture
 def in_steps(board: Board) -> Iterator[None]:
-    """Let the board's time pass only while its host waits."""
+    """Let the simulated time of `board` pass only when the test program waits."""
     with board.in_steps():
         yield

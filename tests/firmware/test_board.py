@@ -1,6 +1,6 @@
-"""The firmware's machine code on the bench keeps the contract and reports true values.
+"""The firmware's machine code, run in a simulator, drives the motors and reports them correctly.
 
-The board's own time is judged. The time by this machine's clock is printed next to it.
+The tests assert times of the board's simulated clock, and print real times next to them.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def is_off(status: Status) -> bool:
 
 
 def stays_off(board: Board, ms: int) -> Status:
-    """Check that for this board time no motor gets any voltage."""
+    """Check that no motor gets any voltage for `ms` of the board's simulated time."""
     before = board.status()
     assert is_off(before)
     after = passes(board, ms)
@@ -72,7 +72,7 @@ def stays_off(board: Board, ms: int) -> Status:
 
 
 def is_still(board: Board) -> Status:
-    """Wait until no motor turns any more."""
+    """Wait until no motor turns or has voltage, and return the board's state."""
 
     def look() -> Status | None:
         status = board.status()
@@ -222,9 +222,9 @@ def test_garbage_does_not_feed_the_watchdog(board: Board, host: Host) -> None:
 
 
 def test_after_a_boot_the_board_refuses_every_line_until_a_stop(board: Board, host: Host) -> None:
-    """A host that has not noticed the reset still sends speeds.
+    """The board answers each refused line with its identity.
 
-    The board answers with its identity.
+    So a host that did not notice the reset and still sends speeds cannot move the robot.
     """
     lines = (speeds_line(DRIVE), checked(speeds_line(DRIVE), 1, "S"), speeds_line((0, 0, 0, 0.01)))
     for refused, line in enumerate(lines):
@@ -273,7 +273,7 @@ def test_the_board_counts_lines_refusals_and_watchdog_stops(board: Board, host: 
 
 
 def reached(board: Board, host: Host, speeds: Speeds, seconds: float = 1.0) -> list[Reply]:
-    """Drive, and return the replies once the speed is reached."""
+    """Drive for `seconds` to reach the speeds, and return the replies of the following 0.5 s."""
     host.drive(speeds, seconds)
     return host.drive(speeds, 0.5)
 
@@ -329,7 +329,10 @@ def test_a_bridge_changes_direction_only_at_zero_duty(board: Board, host: Host) 
 def test_a_cut_removes_the_voltage_before_it_changes_the_direction(
     board: Board, host: Host
 ) -> None:
-    """For a driver with one direction input, low means reverse."""
+    """Check that the direction input never changes while the motor has voltage.
+
+    A driver with one direction input reverses when that input falls.
+    """
     for _ in range(3):
         host.drive((30.0, -30.0, 20.0, -40.0), 0.25)
         assert all(abs(motor.duty) > 0.3 for motor in board.status().motors)
@@ -480,7 +483,10 @@ def test_the_counts_wrap_and_go_on(board: Board, host: Host) -> None:
 
 
 def test_damaged_and_lost_bytes_cost_lines_and_nothing_else(board: Board, host: Host) -> None:
-    """Every 83rd byte has a wrong bit, every 211th is lost: the valid checked lines drive on."""
+    """The board drives on with the valid lines, at the commanded speeds only.
+
+    Every 83rd byte has a wrong bit, and every 211th byte is lost.
+    """
     board.command("noise to 83")
     board.command("drop to 211")
     replies = host.drive(DRIVE, 2.0)
@@ -495,7 +501,10 @@ def test_damaged_and_lost_bytes_cost_lines_and_nothing_else(board: Board, host: 
 
 
 def test_a_host_that_never_pauses_is_answered_and_controlled(board: Board, host: Host) -> None:
-    """Lines back to back are more than the board can answer, and it still keeps its time."""
+    """The host sends lines without pauses, which are more than the board can answer.
+
+    The board still answers many of them, and controls the speeds on time.
+    """
     line = checked(speeds_line(DRIVE), 0, "S") + b"\r\n"
     replies: list[Reply] = []
     host.stop()
@@ -542,7 +551,7 @@ def test_the_board_counts_every_edge_of_fast_wheels(
 def test_an_overflow_of_the_receive_buffer_does_not_damage_the_next_line(
     runner: Path, hanging_firmware: Path
 ) -> None:
-    """The main loop pauses for 60 ms, in which twice as many bytes come as the buffer holds."""
+    """The main loop pauses for 60 ms, and twice as many bytes arrive as the buffer can store."""
     with Board(runner, hanging_firmware) as board, Host(board.path) as host:
         lines = b"".join(checked(ZERO, i) + b"\r\n" for i in range(12))
         host.write(b"!p\r\n" + lines)
@@ -586,7 +595,10 @@ def test_opening_the_port_resets_a_board_with_auto_reset(board: Board, host: Hos
 
 
 def test_the_bench_detects_a_speed_that_was_not_commanded(board: Board, host: Host) -> None:
-    """A plain line accepts a digit with a wrong bit as another digit."""
+    """Check that the simulator notices when the board executes a speed that the host did not send.
+
+    Wrong bits cause this on the plain link, where a damaged digit can look like another digit.
+    """
     host.stop()
     board.command("noise to 37")
     lines = 0
@@ -630,7 +642,7 @@ def test_the_bench_can_mute_and_freeze_the_board(board: Board, host: Host) -> No
 
 
 def is_cut(board: Board, host: Host, speeds: Speeds, within: float) -> Status:
-    """Drive on until a wheel that does not obey has cut all motors."""
+    """Drive until the firmware switches off all motors because one wheel does not obey."""
     began = board.status().virtual_ns
     while (status := board.status()).running or not status.off_ns > began:
         assert (status.virtual_ns - began) / MS < 1000 * within, status.motors
@@ -639,7 +651,7 @@ def is_cut(board: Board, host: Host, speeds: Speeds, within: float) -> Status:
 
 
 def stays_cut(board: Board, host: Host) -> None:
-    """The board answers lines and moves nothing, until the host was silent."""
+    """Check that the board answers lines but keeps the motors off until the host was silent."""
     before = board.status()
     replies = host.drive(DRIVE, 0.7)
     assert len(replies) >= 60
@@ -721,7 +733,10 @@ def test_a_reset_frees_motors_that_were_cut(board: Board, host: Host) -> None:
 
 @in_steps
 def test_a_healthy_robot_is_never_cut(board: Board, host: Host) -> None:
-    """Quick reversals, and wheels that are heavy, blocked and released, or knocked."""
+    """The firmware never switches off the motors of a healthy robot.
+
+    The test reverses quickly, and makes wheels heavy, blocks and releases them, and knocks them.
+    """
     host.drive(DRIVE, 0.2)
     for i, speed in enumerate((40.0, -40.0, 1.0, -1.0, 60.0, -60.0, 0.0, 99.0, -99.0, 0.2, -30.0)):
         board.command(f"load a {0.9 * (i % 2)}")
@@ -766,7 +781,7 @@ def test_coarse_encoders_are_driven_reported_and_never_cut(runner: Path, tmp_pat
 def test_at_the_lowest_pwm_frequency_the_duty_rises_to_the_top(
     runner: Path, tmp_path: Path
 ) -> None:
-    """Here the duty and its rise together exceed 16 bits."""
+    """At this frequency the sum of the duty and its step upwards exceeds 16 bits."""
     slow = build_firmware(tmp_path, "-DPWM_HZ=250UL")
     with Board(runner, slow) as board, Host(board.path) as host:
         host.drive((49.0, -49.0, 49.0, 49.0), 0.4)

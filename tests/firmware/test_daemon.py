@@ -1,6 +1,6 @@
-"""The real daemon drives the firmware's real machine code, behind a port, in real time.
+"""The real daemon drives the firmware's machine code in a simulator, in real time.
 
-The tests judge the board's own counts and the true state of the simulated motors. A plain client of
+The tests compare its odometry with the counts and the motion of the simulated motors. A client on
 the bus sends the commands.
 """
 
@@ -66,7 +66,7 @@ soak = pytest.mark.soak
 
 
 class Rig(NamedTuple):
-    """A board, its daemon and a client of it."""
+    """A simulated board, the daemon that drives it, and a client on the bus."""
 
     board: Board
     daemon: Daemon
@@ -77,7 +77,7 @@ class Rig(NamedTuple):
 def running(
     board: Board, where: Path, mcu: Mcu, port: Path | str = "", **tables: Mapping[str, object]
 ) -> Iterator[Rig]:
-    """Run a daemon at the board's port and a client of it, until the link is up."""
+    """Run a daemon on the board's port and a client. The body runs when the link is up."""
     config = {"mcu": mcu, "log": {"format": "json"}, **tables}
     with Daemon(where, port or board.path, config) as daemon, Bus(daemon.endpoint) as bus:
         bus.linked()
@@ -85,18 +85,18 @@ def running(
 
 
 def turns(board: Board, speed: float) -> Status | None:
-    """Return the state when all wheels have that speed, rad/s."""
+    """Return the board's state if all wheels have this speed in rad/s, otherwise None."""
     status = board.status()
     return status if all(abs(motor.speed - speed) < 0.1 for motor in status.motors) else None
 
 
 def drives(board: Board, linear: float = 0.5, within: float = 5.0) -> Status:
-    """Return the state when the robot goes straight at that speed."""
+    """Wait until the robot drives straight at this speed in m/s. Return the board's state."""
     return until(lambda: turns(board, linear / RADIUS), within, f"it drives at {linear} m/s")
 
 
 def stands(board: Board) -> Status:
-    """Return the state when no wheel turns any more, to the last count."""
+    """Wait until no wheel turns or has voltage. Return the board's state."""
 
     def look() -> Status | None:
         status = board.status()
@@ -107,9 +107,9 @@ def stands(board: Board) -> Status:
 
 
 def gives_way(bus: Bus, commander: Commander, linear: float = 0.5) -> None:
-    """Send zeros until they count, then a speed.
+    """Send zeros until the sender is armed, and then a speed in m/s.
 
-    The zeros of a sender that is known only by its key count after a second.
+    A sender that is known only by its key must send zeros for a second before it is armed.
     """
     commander.wish = ZERO
     until(lambda: "send a zero first" not in bus.state()["reason"], 5.0, "neutral")
@@ -117,9 +117,9 @@ def gives_way(bus: Bus, commander: Commander, linear: float = 0.5) -> None:
 
 
 def moves_nothing(board: Board, since: Status, ms: float) -> None:
-    """Check that no motor was commanded to turn since then, nor is for this time.
+    """Check that the firmware has commanded no motion since `since`, and wait `ms` more of it.
 
-    Coasting motors are braked.
+    Motors that coasted at a reset are braked, so they turn only a little further.
     """
     status = passes(board, ms)
     assert status.wanted_ns < since.virtual_ns + BOOT_NS, "not for a moment"
@@ -129,7 +129,7 @@ def moves_nothing(board: Board, since: Status, ms: float) -> None:
 
 
 def drive_about(board: Board, commander: Commander, length_s: float) -> None:
-    """Drive leg after leg, then neutral."""
+    """Drive the legs of `LEGS` one after the other for `length_s`, and end with a zero."""
     end = board.status().virtual_ns + length_s * 1000 * MS
     for leg in itertools.cycle(LEGS):
         commander.wish = twist(*leg)
@@ -139,12 +139,15 @@ def drive_about(board: Board, commander: Commander, length_s: float) -> None:
 
 
 def skipped(status: Status) -> str:
-    """Return the virtual time lost, in words for a failure: such a board is not realistic."""
+    """Return a text with the simulated time that this busy machine skipped.
+
+    A test that fails prints it, because a board that skips time is not realistic.
+    """
     return f"{status.skipped_ns / MS:.0f} ms skipped for want of a faster machine"
 
 
 def account(board: Board) -> Identity:
-    """Return the board's counters. No other program may have its port open."""
+    """Return the board's counters. No other program may have the board's port open."""
     with Host(board.path) as host:
         return host.identity()
 
@@ -162,13 +165,13 @@ class Path2D(NamedTuple):
 
 
 def pose(message: Any) -> tuple[float, float, float]:
-    """Return x, y and yaw of an odometry message."""
+    """Return x (m), y (m) and yaw (rad) of an odometry message."""
     position, turn = message["pose"]["pose"]["position"], message["pose"]["pose"]["orientation"]
     return position["x"], position["y"], 2 * math.atan2(turn["z"], turn["w"])
 
 
 def went(odom: Sequence[Any]) -> Path2D:
-    """Return the sum of the messages' motion, from the origin."""
+    """Return the distance and turn of a series of odometry messages that starts at the origin."""
     distance = total = 0.0
     x, y, yaw = 0.0, 0.0, 0.0
     for message in odom:
@@ -182,14 +185,17 @@ def went(odom: Sequence[Any]) -> Path2D:
 
 
 def truly(status: Status) -> Path2D:
-    """Return the path by the simulated encoders."""
+    """Return the true distance and turn, computed from the simulated encoders."""
     a, b, c, d = (motor.counts * ANGLE * RADIUS for motor in status.motors)
     right, left = (a + d) / 2, (b + c) / 2
     return Path2D((right + left) / 2, (right - left) / TRACK)
 
 
 def leap(odom: Sequence[Any], fastest: float) -> float:
-    """Return by how many m the longest step between two messages exceeds one at `fastest` m/s."""
+    """Return the longest jump of the odometry, in m.
+
+    A jump is the distance between two messages beyond the distance at `fastest` m/s.
+    """
     most = -math.inf
     for before, after in itertools.pairwise(odom):
         (x, y, _), (to_x, to_y, _) = pose(before), pose(after)
@@ -199,7 +205,7 @@ def leap(odom: Sequence[Any], fastest: float) -> float:
 
 
 class Errors(NamedTuple):
-    """Relative errors of odometry."""
+    """Relative errors of the odometry and the wheel angles, compared with the simulated motors."""
 
     distance: float
     yaw: float
@@ -215,7 +221,7 @@ class Errors(NamedTuple):
 
 
 def errors(odom: Following, wheels: Following, true: Status) -> Errors:
-    """Return the errors of odometry for a robot that now stands."""
+    """Return the relative errors of the odometry. The robot must be at rest."""
     now = time.monotonic()
     odom.find(lambda message: True, 3.0, "odometry at rest", after=now)
     turned = wheels.find(lambda message: True, 3.0, "wheels at rest", after=now).value["position"]
@@ -308,17 +314,17 @@ def test_when_the_daemon_is_killed_the_motors_stop(
 
 
 def by_pin(board: Board) -> None:
-    """A person presses its button."""
+    """Reset the board as a person does who presses its reset button."""
     board.command("reset")
 
 
 def by_a_hang(board: Board) -> None:
-    """Its main loop hangs, until its own watchdog resets it."""
+    """Make the main loop of the firmware hang, so that the hardware watchdog resets the board."""
     board.command("type !l")
 
 
 def unheard(board: Board) -> None:
-    """The reset pin resets it, and the boot line is lost."""
+    """Reset the board through its pin, and lose the line that it sends after the boot."""
     lines = board.status().from_board.lines
     board.command("lose from 100")
     board.command("reset")
@@ -327,10 +333,10 @@ def unheard(board: Board) -> None:
 
 
 def resets(rig: Rig, how: Callable[[Board], None], unseen: float) -> None:
-    """The board resets while the robot drives and its commander continues.
+    """Reset the board while the robot drives, and check that it stops and its odometry stays right.
 
-    No line reported `unseen` m of its way: odometry may miss those, but nothing else, and may add
-    none.
+    The commander sends on all the time. `unseen` is the distance in m that the board does not
+    report. The odometry may lack at most this distance, and may not add any.
     """
     board, _, bus = rig
     with bus.follow("odom") as odom:
@@ -404,10 +410,10 @@ def test_a_board_that_hung_does_not_move_before_neutral(
 
 
 def drives_in_the_end(board: Board, bus: Bus, commander: Commander) -> None:
-    """Wait until the robot drives.
+    """Wait until the robot drives, and release it if it waits.
 
-    If this machine was so busy that the link was lost or the board seemed silent, the robot waits
-    for zeros or for `clear`.
+    On a busy machine the link may have been lost. Then the robot waits for zeros or for `clear`,
+    and this function sends them.
     """
 
     def look() -> Status | None:
@@ -477,7 +483,10 @@ def test_a_press_at_the_robot_stops_it_and_clear_is_refused_until_the_release(
 def test_a_bad_wire_costs_lines_and_no_wheel_a_wrong_speed(
     board: Board, tmp_path: Path, mcu: Mcu, length_s: float
 ) -> None:
-    """Wrong bits in every sixth to fourth line, and lost bytes in as many, each way."""
+    """In each direction, one line in four to six has a wrong bit, and later a lost byte.
+
+    On the checked link the robot drives on and executes no wrong speed.
+    """
     is_checked = mcu is STRICT
     with running(board, tmp_path, mcu) as (_, _, bus), bus.commanding(0.5) as commander:
         drives(board)
@@ -515,9 +524,10 @@ def test_a_bad_wire_costs_lines_and_no_wheel_a_wrong_speed(
 
 
 def bad_wire(board: Board, fault: str, length_s: float) -> tuple[Status, Status, list[float]]:
-    """Damage lines both ways for a while.
+    """Damage lines in both directions for `length_s`.
 
-    Return the board's status before and after, and the speeds of all motors in between, rad/s.
+    `fault` is "noise" (wrong bits) or "drop" (lost bytes). Returns the board's status before and
+    after, and the speeds of all motors in between, rad/s.
     """
     before = board.status()
     board.command(f"{fault} to 211")
@@ -531,7 +541,7 @@ def bad_wire(board: Board, fault: str, length_s: float) -> tuple[Status, Status,
 
 
 def rejects(bus: Bus) -> dict[str, int]:
-    """Return the number of refused lines, by reason."""
+    """Return the number of lines that the daemon refused, by reason."""
     counters = bus.state()["counters"]
     return {name: count for name, count in counters.items() if name.startswith("line_")}
 
@@ -540,14 +550,17 @@ def rejects(bus: Bus) -> dict[str, int]:
 def test_a_lost_link_is_restored_and_the_commander_must_be_neutral_first(
     board: Board, tmp_path: Path, mcu: Mcu
 ) -> None:
-    """The board falls silent, then its plug is pulled; the commander never stops sending."""
+    """First the board falls silent, then its plug is pulled. The commander sends all the time.
+
+    The daemon restores the link, and the robot does not move until the commander sends zeros.
+    """
     port = tmp_path / "mcu"
     port.symlink_to(board.path)
     with running(board, tmp_path, mcu, port) as (_, daemon, bus), bus.commanding(0.5) as commander:
         with bus.follow("state") as states:
 
             def link(word: str, since: float) -> float:
-                """Return the ms until the link had that state."""
+                """Wait until `state` reports this link. Return the time since `since` in ms."""
                 seen = states.find(
                     lambda state: state["link"] == word, 3.0, f"link {word}", after=since
                 )

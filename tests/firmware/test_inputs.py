@@ -1,4 +1,4 @@
-"""The firmware's machine code reads its inputs, reports them beside replies, and stops motors."""
+"""The firmware reads its inputs, sends status lines between its replies, and stops the motors."""
 
 from __future__ import annotations
 
@@ -45,17 +45,17 @@ def host(board: Board) -> Iterator[Host]:
 
 
 def reports(host: Host) -> list[BoardStatus]:
-    """Return the status lines that have come."""
+    """Return the status lines that the host has received since the last call."""
     return [decode_status(line, True) for _, line in host.lines() if line.startswith(STATUS)]
 
 
 def awaited(host: Host, wanted: BoardStatus) -> None:
-    """Wait for that status line."""
+    """Wait for a status line with exactly these fields."""
     until(lambda: wanted in reports(host), 5.0, f"{wanted}")
 
 
 def asks(board: Board, host: Host, speeds: Speeds, ms: float) -> None:
-    """Send these speeds every 20 ms for that time of the board."""
+    """Send these speeds every 20 ms for `ms` of the board's simulated time."""
     end = board.status().virtual_ns + ms * MS
     while (due := board.status().virtual_ns + 20 * MS) < end:
         host.send(speeds_line(speeds))
@@ -83,7 +83,7 @@ def test_each_input_is_reported_in_its_field(board: Board, host: Host) -> None:
 def test_the_battery_s_voltage_is_that_at_the_divider(
     board: Board, host: Host, millivolts: int, volts: float
 ) -> None:
-    """56 kilohms above 10 kilohms. A step of the converter is 0.03 V."""
+    """The divider has 56 kilohms above 10 kilohms. One step of the converter is 0.03 V."""
     board.command(f"analog {BATTERY} {millivolts}")
     passes(board, 1000)
     reports(host)
@@ -203,7 +203,7 @@ def test_a_board_that_starts_while_pressed_moves_nothing_until_a_zero_after_the_
 
 
 def test_bumpers_and_the_driver_s_fault_do_not_remove_the_voltage(board: Board, host: Host) -> None:
-    """The daemon decides what a bumper does."""
+    """The board only reports bumpers and driver faults. The daemon decides how to react."""
     host.send(STOP)
     for pin in BUMPERS:
         board.command(f"contact {pin} open")
@@ -224,7 +224,10 @@ def test_bumpers_and_the_driver_s_fault_do_not_remove_the_voltage(board: Board, 
 def test_each_line_has_its_reply_and_no_status_line_is_within_one(
     runner: Path, wired: dict[int, Path], baud: int, period: int, letters: str | None, least: int
 ) -> None:
-    """Plain lines, checked ones, and ones with counts, which fill the wire at 9600 baud."""
+    """The host sends plain lines, checked lines, and checked lines that ask for counts.
+
+    At 9600 baud the replies with counts leave little room for status lines.
+    """
     with wired_board(runner, wired, baud) as board, Host(board.path) as host:
         host.says(b"!status")
         sent, got, told, pressed = 0, list[Reply](), list[BoardStatus](), False
@@ -260,7 +263,10 @@ def test_each_line_has_its_reply_and_no_status_line_is_within_one(
 
 
 def test_no_status_line_takes_the_place_of_a_reply(board: Board, host: Host) -> None:
-    """Lines back to back are more than the board can answer, so no room is left for a second."""
+    """The host sends lines without pauses, so the board always has a reply to send.
+
+    It sends the status lines when the host pauses.
+    """
     host.send(STOP)
     host.write((checked(STOP, 0, "S") + b"\r\n") * 250)
     passes(board, 1200)
@@ -277,7 +283,11 @@ def test_no_status_line_takes_the_place_of_a_reply(board: Board, host: Host) -> 
 
 
 def test_a_board_without_inputs_sends_no_status_line(runner: Path, firmware: Path) -> None:
-    """`python -m tests.firmware.unchanged COMMIT` compares its machine code."""
+    """A firmware that is built without inputs sends only replies.
+
+    `python -m tests.firmware.unchanged COMMIT` compares its machine code with that of an older
+    commit.
+    """
     with Board(runner, firmware) as board, Host(board.path) as host:
         before = board.status().from_board.bytes
         host.ask(STOP)

@@ -1,4 +1,7 @@
-"""The firmware's other pure parts, compiled for this machine: watchdog, speed, control, bridge."""
+"""The firmware's hardware-independent parts besides the parser, compiled for this machine.
+
+They are the watchdog, the speed measurement, the speed control and the motor bridge.
+"""
 
 from __future__ import annotations
 
@@ -63,13 +66,13 @@ class SupervisorC(ctypes.Structure):
 
 @pytest.fixture(scope="session")
 def logic(library: ctypes.CDLL) -> ctypes.CDLL:
-    """The library with its types declared."""
+    """The firmware's library, with the argument types of its C functions declared."""
     return told(library)
 
 
 @pytest.fixture(scope="session")
 def coarse(coarse_library: ctypes.CDLL) -> ctypes.CDLL:
-    """The library for a coarse encoder."""
+    """The same library for an encoder with few counts per turn."""
     return told(coarse_library)
 
 
@@ -133,7 +136,10 @@ def test_a_tripped_watchdog_stays_tripped_when_the_clock_wraps(logic: ctypes.CDL
 def readings(
     rate: float, every: float, seconds: float, start: int = 0, jitter: float = 0.0
 ) -> Iterator[tuple[int, int, int]]:
-    """Return count, time of its last edge, and time, for a wheel at `rate` counts a second."""
+    """Yield the readings of an encoder that turns at `rate` counts per second.
+
+    Each reading is the count, the time of its last edge and the present time, both in clock ticks.
+    """
     rng = random.Random(1)
     now, count, edge = 0.0, 0, 0.0
     while now < seconds:
@@ -180,7 +186,10 @@ def test_the_measured_speed_of_a_wheel_that_stopped_falls_to_zero(
 
 
 def test_the_first_edges_after_a_rest_make_no_spike(logic: ctypes.CDLL) -> None:
-    """The wheel starts at 1 rad/s somewhere within a window."""
+    """A resting wheel starts at 1 rad/s in the middle of a window.
+
+    The measured speed does not exceed 1 rad/s.
+    """
     for late in range(1, 10):
         wheel = SpeedC()
         at = ctypes.addressof(wheel)
@@ -195,7 +204,10 @@ def test_the_first_edges_after_a_rest_make_no_spike(logic: ctypes.CDLL) -> None:
 
 
 def edges_of(angle: Callable[[float], float], seconds: float, step: float) -> list[tuple[int, int]]:
-    """Return the time and the new count of each edge of such an angle (in counts)."""
+    """Return the time (ticks) and the new count of each encoder edge.
+
+    `angle` gives the wheel's angle in counts at a time in s. `step` is the resolution in s.
+    """
     found, last = [], math.floor(angle(0.0))
     for i in range(round(seconds / step)):
         now = math.floor(angle(i * step))
@@ -208,7 +220,11 @@ def edges_of(angle: Callable[[float], float], seconds: float, step: float) -> li
 def said_of(
     library: ctypes.CDLL, edges: Iterable[tuple[int, int]], windows: Iterable[int], start: int = 0
 ) -> Iterator[tuple[int, float, int, int]]:
-    """Yield counts turned, reported speed, window and time, for a wheel with these edges."""
+    """Feed these edges to the firmware's speed measurement, once per window.
+
+    Yields the counts turned in the window, the reported speed (rad/s), the length of the window and
+    the time (both in ticks).
+    """
     wheel = SpeedC()
     at = ctypes.addressof(wheel)
     waiting = list(edges)[::-1]
@@ -236,7 +252,10 @@ PITCH = math.tau / COUNTS_PER_TURN
 def test_for_any_edges_the_measured_speed_is_at_most_what_the_window_allows(
     logic: ctypes.CDLL, steps: list[tuple[int, int]], windows: list[int], start: int
 ) -> None:
-    """Edges come at random times, some reversing, some microseconds apart."""
+    """Edges come at random times, some reversing, some only microseconds apart.
+
+    The measured speed is at most that of one count more than the window has.
+    """
     times = itertools.accumulate(step for step, _ in steps)
     counts = itertools.accumulate(way for _, way in steps)
     before, way = 0.0, 0
@@ -288,7 +307,7 @@ def test_a_trembling_wheel_s_measured_speed_is_bounded_by_its_true_speed(
 def test_a_coarse_encoder_measures_the_true_speed_also_at_low_speed(
     coarse: ctypes.CDLL, speed: float
 ) -> None:
-    """With 96 counts a turn, 0.2 rad/s gives one count in 330 ms."""
+    """With 96 counts a turn, a wheel at 0.2 rad/s makes one count in 330 ms, or many windows."""
     edges = edges_of(lambda t: speed / math.tau * 96 * t, 20.0, 1e-4)
     for every in (0.005, 0.01, 0.02):
         told = list(said_of(coarse, edges, [round(every * TICKS)] * round(20.0 / every)))
@@ -310,7 +329,7 @@ def test_a_quick_start_after_a_long_rest_is_measured_without_delay(logic: ctypes
 def test_the_first_edge_after_a_rest_longer_than_the_clock_gives_no_high_speed(
     logic: ctypes.CDLL,
 ) -> None:
-    """Its 32 bits wrap in 36 minutes; then an edge long ago would look recent."""
+    """The 32-bit clock wraps in 36 minutes. An edge before a longer rest must not look recent."""
     rests = [2**32 // 32] * 32
     far = sum(rests)
     edges = [(1000, 1), (far + 15_000, 2), (far + 25_000, 3)]
@@ -381,7 +400,7 @@ def test_at_rest_the_duty_decays_to_zero(logic: ctypes.CDLL) -> None:
 def test_a_bridge_reverses_only_at_rest_and_its_duty_rises_slowly_and_falls_at_any_rate(
     logic: ctypes.CDLL, steps: list[int | None]
 ) -> None:
-    """None means off, as by the watchdog, between two ticks and without a tick of its own."""
+    """In `steps`, None switches the bridge off between two ticks, as the watchdog does."""
     bridge = BridgeC(0, 0, 0)
     at = ctypes.addressof(bridge)
     rested, driven = REVERSE_TICKS, 0
@@ -448,7 +467,7 @@ class Wheel:
         self.limited = False
 
     def run(self, target: float, ms: int) -> bool:
-        """Run for this time, or until the motor is switched off; return whether it was."""
+        """Run for `ms`, or until the firmware switches the motor off. Return whether it did so."""
         for _ in range(ms // 5):
             self._turn()
             if self._control(target):
@@ -533,7 +552,10 @@ def test_a_wheel_that_shows_no_counts_is_switched_off_after_a_second_of_full_vol
 
 
 def test_a_dead_channel_counts_as_a_dead_encoder(logic: ctypes.CDLL) -> None:
-    """The encoder counts one up and one down."""
+    """With one dead channel the encoder counts one up and one down, for ever.
+
+    The firmware then switches the motor off.
+    """
     supervisor = SupervisorC()
     at = ctypes.addressof(supervisor)
     logic.supervise_start(at)
@@ -570,10 +592,11 @@ def test_a_healthy_wheel_is_never_switched_off(
     is_coarse: bool,
     actions: list[tuple[float, int, float, float | None]],
 ) -> None:
-    """The wheel may be light or heavy, strong or weak, and has much friction.
+    """Try wheels that are light or heavy and motors that are strong or weak, with much friction.
 
-    A heavy one carries the whole robot; strong and weak compare with the specification. It is
-    driven, reversed, pushed with half of its stall force, and knocked if light.
+    A heavy wheel carries the whole robot. A strong or weak motor is faster or slower than
+    specified. The test drives and reverses the wheel, and pushes it with half of the motor's stall
+    force. It also knocks light wheels.
     """
     library, counts = (coarse, 96) if is_coarse else (logic, COUNTS_PER_TURN)
     wheel = Wheel(library, lag=lag, free_speed=free_speed, counts=counts)

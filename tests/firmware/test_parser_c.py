@@ -1,6 +1,6 @@
-"""The firmware's parser takes all of a line or nothing, as the host's does.
+"""The firmware's parser accepts a whole line or refuses it, as the daemon's parser does.
 
-It is compiled for this machine.
+The parser is compiled for this machine.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class RecordC(ctypes.Structure):
 
 
 class Command(NamedTuple):
-    """The contents of a line."""
+    """The decoded fields of a line to the board."""
 
     hundredths: tuple[int, ...]
     checked: bool = False
@@ -70,7 +70,7 @@ class Command(NamedTuple):
 
 
 class Parser:
-    """The C functions with Python's types."""
+    """The firmware's C functions for lines, with Python types as arguments and results."""
 
     def __init__(self, library: ctypes.CDLL) -> None:
         self._parse = library.line_parse
@@ -96,7 +96,7 @@ class Parser:
         self._command = CommandC()
 
     def parse(self, line: bytes) -> Command | None:
-        """Return the command in a line. A refused line leaves the earlier contents unchanged."""
+        """Decode a line. Return None, and check that nothing changes, if the parser refuses it."""
         command = self._command
         before = bytes(command)
         if not self._parse(line, len(line), ctypes.addressof(command)):
@@ -105,7 +105,7 @@ class Parser:
         return Command(tuple(command.hundredths), command.checked, command.sample, command.sequence)
 
     def lines(self, data: bytes) -> list[bytes]:
-        """Return the lines in a stream; the reader keeps an incomplete one."""
+        """Return the whole lines in these bytes. The reader stores an incomplete line."""
         got = []
         for byte in data:
             length = self._feed(self._pointer, byte)
@@ -128,7 +128,7 @@ class Parser:
         return int(self._reader.too_long)
 
     def identity(self, lines: int, refused: int, trips: int, runaways: int, reset: bytes) -> bytes:
-        """Return the identity line, with its end."""
+        """Return the identity line, with CR LF."""
         record = RecordC(lines, refused, trips, runaways)
         out = ctypes.create_string_buffer(128)
         length = self._identity(out, ctypes.addressof(record), reset)
@@ -136,13 +136,13 @@ class Parser:
         return out.raw[:length]
 
     def counted_up(self, count: int) -> int:
-        """Return the next count."""
+        """Return the counter after one more event. It stays at its largest value."""
         counter = ctypes.c_uint16(count)
         self._count_up(ctypes.addressof(counter))
         return counter.value
 
     def reply(self, command: Command, ms: int, counts: list[int], hundredths: list[int]) -> bytes:
-        """Return the answer, with its end."""
+        """Return the board's reply to this command, with CR LF."""
         asked = CommandC((0,) * 4, command.checked, command.sample, command.sequence)
         reading = ReadingC(ms, tuple(counts), tuple(hundredths))
         out = ctypes.create_string_buffer(64)
@@ -160,9 +160,9 @@ FIGURE = re.compile(rb"[pn]\d\d\.\d\d(?!\d)")
 
 
 def said(line: bytes) -> tuple[int, ...] | None:
-    """Return the speeds that the host's own parser reads from a plain line, hundredths of a rad/s.
+    """Return the speeds that the daemon's parser reads from a plain line, hundredths of a rad/s.
 
-    This requires numbers as the host writes them: the board accepts no others.
+    Returns None unless each number has the daemon's format, because the board accepts no other.
     """
     if len(FIGURE.findall(line)) != 4:
         return None
@@ -310,7 +310,7 @@ def test_lower_case_and_a_wrong_check_are_refused(parser: Parser) -> None:
 
 
 def flipped(rng: random.Random, checked_lines: bool) -> tuple[bytes, list[tuple[int, ...]]]:
-    """Return three lines, with one wrong bit in the middle one, and the values sent."""
+    """Return three random lines, one bit of the second one inverted, and the intended speeds."""
     sent, data = [], []
     for i in range(3):
         hundredths = [rng.randrange(-9999, 10000) for _ in range(4)]
@@ -326,7 +326,7 @@ def flipped(rng: random.Random, checked_lines: bool) -> tuple[bytes, list[tuple[
 
 
 def wrong_values(parser: Parser, count: int, checked_lines: bool) -> int:
-    """Return how many of `count` single-bit errors put a speed in force that was never sent."""
+    """Return how many of `count` single-bit errors make the parser accept unsent speeds."""
     rng = random.Random(count)
     wrong = 0
     for _ in range(count):
@@ -354,9 +354,10 @@ def test_no_single_bit_error_in_checked_lines_puts_a_wrong_speed_in_force(
 
 
 def test_no_part_of_a_line_is_valid_after_a_byte_became_a_line_end(parser: Parser) -> None:
-    """There is one exception: the start of the check, without which the plain line remains.
+    """Damage turns one byte of a line into a line end, and neither part is then a valid line.
 
-    It takes two errors or more to turn `#` into a line end.
+    There is one exception. If the `#` before the suffix becomes a line end, the plain line remains.
+    That needs at least two bit errors.
     """
     for line in (checked(SEED_LINE, 7, "S"), checked(SEED_LINE + b",", 7), SEED_LINE):
         (whole,) = parser.stream(line + b"\r\n")

@@ -1,4 +1,4 @@
-"""The firmware's contacts, measured values and status lines, compiled for this machine."""
+"""The firmware's debounced contacts, measurements and status lines, compiled for this machine."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Build = Callable[..., "Inputs"]
 
 
 class Inputs:
-    """The C functions for one build, and a status of its own."""
+    """The firmware's functions for inputs, with a separate state for each test."""
 
     def __init__(self, library: ctypes.CDLL) -> None:
         u8, u16, u32 = ctypes.c_uint8, ctypes.c_uint16, ctypes.c_uint32
@@ -36,7 +36,7 @@ class Inputs:
         self.boot()
 
     def boot(self) -> None:
-        """Forget all."""
+        """Reset the state, as a boot of the board does."""
         self.milliseconds = 0
         self._library.status_start(self._status)
 
@@ -47,7 +47,7 @@ class Inputs:
         return pressed
 
     def sample(self, levels: int, readings: Sequence[int] = ()) -> BoardStatus | None:
-        """Let a millisecond pass. Return the fields of the line that is due then, or None."""
+        """Read the inputs once and advance the time by 1 ms. Return the line due then, if any."""
         self.milliseconds += 1
         for analog, value in enumerate(readings):
             self._library.status_reading(self._status, analog, value)
@@ -55,7 +55,7 @@ class Inputs:
         return self.line()
 
     def line(self) -> BoardStatus | None:
-        """Return the fields of the line that is due now, or None."""
+        """Return the fields of the status line that is due now, or None."""
         length = self._library.status_line(self._status, self.milliseconds, self._out)
         if not length:
             return None
@@ -65,14 +65,14 @@ class Inputs:
         return decode_status(line[:-2], True)
 
     def lines(self, levels: int, length_ms: int, readings: Sequence[int] = ()) -> list[BoardStatus]:
-        """Return the lines of that time."""
+        """Keep these inputs for `length_ms`, and return the status lines of that time."""
         every = [self.sample(levels, readings) for _ in range(length_ms)]
         return [one for one in every if one is not None]
 
 
 @pytest.fixture(scope="module")
 def build(library: ctypes.CDLL, tmp_path_factory: pytest.TempPathFactory) -> Build:
-    """Build the library with these definitions, once."""
+    """Return a function that builds the library with given preprocessor definitions, once each."""
     built: dict[tuple[str, ...], ctypes.CDLL] = {}
 
     def one(*defines: str) -> Inputs:
@@ -126,7 +126,7 @@ def test_a_press_is_reported_before_the_fault_of_a_driver_that_lost_its_supply(
 
 
 def test_no_contact_is_reported_before_its_state_is_known(inputs: Inputs) -> None:
-    """A false press at a boot would stop the robot until `clear`."""
+    """If the board reported a press too early at boot, the robot would wait for a `clear`."""
     inputs.boot()
     assert inputs.lines(CLOSED, 19) == []
     assert inputs.lines(CLOSED, 1) == [BoardStatus(estop=False, bumpers=(False,) * 4)]
@@ -140,7 +140,7 @@ def test_no_contact_is_reported_before_its_state_is_known(inputs: Inputs) -> Non
 def test_a_contact_is_released_only_by_20_free_samples_and_pressed_by_three(
     inputs: Inputs, runs: list[tuple[bool, int]]
 ) -> None:
-    """Three, of which no two have 20 free ones in a row between them."""
+    """Three pressed samples press a contact if no run of 20 free samples is between them."""
     inputs.boot()
     inputs.lines(CLOSED, 25)
     samples: list[bool] = [False] * 25
@@ -233,7 +233,10 @@ def test_the_driver_fault_input_can_be_active_low_or_active_high(build: Build, h
 def test_volts_and_amperes_are_those_of_the_divider_and_the_sensor(
     inputs: Inputs, battery: int, current: int
 ) -> None:
-    """By a calculation of its own: 10 kilohms of 66, and 40 mV per ampere around 2.5 V."""
+    """Compare with an independent calculation for the divider and the current sensor.
+
+    The divider is 10 kilohms of 66. The sensor gives 40 mV per ampere around 2.5 V.
+    """
     inputs.boot()
     inputs.sample(CLOSED, (battery, current))
     inputs.milliseconds = 1000

@@ -1,4 +1,4 @@
-"""The firmware's page: its Arduino example, its status lines and its table of settings are true."""
+"""The README of the firmware is right: its Arduino example, status lines and table of settings."""
 
 from __future__ import annotations
 

@@ -1,11 +1,11 @@
-"""Compare the firmware's machine code, and the daemon's line, with those of an older commit.
+"""Compare the firmware's machine code and the daemon's lines with those of an older commit.
 
     python -m tests.firmware.unchanged COMMIT
 
 The first part builds the firmware of both checkouts with each set of definitions that tests use,
-without inputs. The second part drives a robot in virtual time with each kind of old board, and
-compares each byte that the daemon sends and receives, with its time. The exit code is 1 if anything
-differs.
+apart from those with inputs. The second part drives a robot in virtual time with each kind of board
+that knows no inputs. It compares all bytes that the daemon sends and receives, and their times. The
+exit code is 1 if anything differs.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ def machine_code(tree: Path, where: Path) -> list[str]:
 
 
 def wire(tree: Path) -> list[str]:
-    """Return a line for each kind of old board: the number of lines and the digest of the bytes."""
+    """Return the number of lines and a digest of the bytes for each board without inputs."""
     words = [sys.executable, "-c", DRIVE]
     env = os.environ | {"PYTHONPATH": str(tree)}
     done = subprocess.run(words, cwd=tree, env=env, check=True, text=True, stdout=subprocess.PIPE)

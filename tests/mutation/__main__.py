@@ -4,19 +4,19 @@
     python -m tests.mutation --safety [--jobs 2]
     python -m tests.mutation --only PATH [PATH ...] [--sample N] [--jobs 2]
 
-The first form draws a seeded sample of all mutants of the core. Tests must notice 95 % of them.
-`--safety` tries every mutant of the modules in `SAFETY`, and tests must notice 98 %. So does
-`--only`, for the modules whose path contains one of these.
+A mutant is the source with one small fault. The first form tries a random sample of all mutants of
+the core. Tests must notice 95 % of them. `--safety` tries every mutant of the modules in `SAFETY`,
+and tests must notice 98 %. `--only` does the same for the modules whose path contains a PATH.
 
-Each mutant runs alone, in a process of its own. The tests of the core (`TESTS` in `trials.py`) that
-execute its statement run there until one fails: those of its own module first, then the others, the
-quickest first, and no more than `MOST_SECONDS` of the others. The output has each mutant that no
-test noticed, and the reason where `equivalent.py` lists it as one that no test can notice. The exit
-status is 1 when tests noticed too few.
+Each mutant runs alone in its own process, until a test fails. Only tests of the core (`TESTS` in
+`trials.py`) that execute the changed statement run. The tests of the same module come first, then
+the others, the fastest first, for at most `MOST_SECONDS`. The output lists each mutant that no test
+noticed, with the reason if `equivalent.py` says that no test can notice it. The exit status is 1 if
+the tests noticed too few.
 
-Why not mutmut or cosmic-ray: both run with this code. But mutmut (3.8) leaves out everything
-outside a function, which is every table and constant. Most mutants of cosmic-ray (8.7) are
-of the kind `a << b` for two floats, which any test notices. Neither draws a sample.
+The tools mutmut and cosmic-ray are not suitable. mutmut (3.8) leaves out all code outside
+functions, which is every table and constant. Most mutants of cosmic-ray (8.7) are like `a << b` for
+two floats, which every test notices. Neither tool draws a sample.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ MOST_LEFT_OUT = 5
 
 
 def sources() -> list[str]:
-    """The modules of the core."""
+    """Return the paths of the modules of the core."""
     found: list[Path] = []
     for path in CORE:
         found += [ROOT / path] if path.endswith(".py") else sorted((ROOT / path).glob("*.py"))
@@ -74,7 +74,10 @@ def sources() -> list[str]:
 
 
 def drawn(pool: list[Mutant], seed: int) -> list[Mutant]:
-    """All mutants shuffled by the seed; an edit moves only those of the lines it changes."""
+    """Return all mutants in a random order that depends on the seed.
+
+    The order follows from each mutant's key. So an edit of the source moves only its own mutants.
+    """
     met: Counter[str] = Counter()
     lots: list[tuple[bytes, Mutant]] = []
     for mutant in pool:

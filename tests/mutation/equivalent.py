@@ -1,4 +1,7 @@
-"""Mutants no test can notice: how they are printed (without the line), and why."""
+"""Lists mutants that no test can notice, and the reason for each.
+
+A mutant's key is its printed description without the line number.
+"""
 
 # ruff: noqa: E501 - as they are printed
 

@@ -1,10 +1,10 @@
-"""The small faults a module may have: one changed, swapped or dropped piece of its syntax each.
+"""Creates mutants: copies of a module with one small change, swap or omission.
 
-An index and a whole number up to `LARGE` is changed by 1, any larger number by a quarter. A float
-is multiplied by 1.25 and by 0.8.
+An index or an integer up to `LARGE` changes by 1, and a larger number by a quarter. A float is
+multiplied by 1.25 and by 0.8.
 
-Not mutated: texts (words for people), annotations, and `zip(strict=...)` and `frozen=...` (checks
-of what is always so).
+Strings are not changed, because they are messages for people. Annotations, `zip(strict=...)` and
+`frozen=...` are not changed, because they do not affect correct programs.
 """
 
 from __future__ import annotations
@@ -46,12 +46,12 @@ MEMBERS = {"Mode": list(Mode.__members__)}
 
 
 class Mutant(NamedTuple):
-    """One fault.
+    """A module with one small fault.
 
     Attributes:
         path: The module, relative to the project.
         line: The line of the fault.
-        statement: The line where its statement starts, or 0 if it is outside of functions.
+        statement: The first line of the statement with the fault, or 0 outside of functions.
         key: The description that `equivalent.py` uses. It has no line number.
         text: The source of the module with the fault in it.
     """
@@ -64,7 +64,7 @@ class Mutant(NamedTuple):
 
 
 def variants(node: ast.AST, parent: ast.AST, field: str) -> Iterator[ast.AST]:
-    """Return the nodes that may replace this node, one for each fault."""
+    """Return the syntax nodes that a mutant may have in place of this node."""
 
     def made(kind: type, **changed: Any) -> Any:
         parts = {name: getattr(node, name) for name in node._fields} | changed
@@ -134,13 +134,16 @@ def variants(node: ast.AST, parent: ast.AST, field: str) -> Iterator[ast.AST]:
 def places(
     node: ast.AST, scope: str = "", statement: int = 0, inside: bool = False
 ) -> Iterator[tuple[ast.AST, str, ast.AST, str, int]]:
-    """Yield the parent, its field, the node, its scope and the line of its statement.
+    """Yield every place in the syntax tree where a mutant may differ.
+
+    Each item is the parent node, its field, the node, its scope, and the first line of its
+    statement.
 
     Args:
-        node: The node below which faults may be.
+        node: The root of the searched tree.
         scope: The names of the classes and functions around it.
-        statement: The line of the statement around it, or 0 outside of functions.
-        inside: Whether it is part of a function.
+        statement: The first line of the statement around it, or 0 outside of functions.
+        inside: Whether the node is part of a function.
     """
     if isinstance(node, ast.FunctionDef | ast.ClassDef):
         scope += f".{node.name}" if scope else node.name
@@ -160,7 +163,10 @@ def places(
 
 
 def traced(root: Path, path: str) -> str:
-    """Return a module that adds the line of each statement of a function to the set `executed`."""
+    """Return the source of a module that records its executed lines in the set `executed`.
+
+    It records the first line of each statement inside a function.
+    """
     tree = ast.parse((root / path).read_text(encoding="utf-8"))
     inside = {line for *_, line in places(tree)} - {0}
     for node in ast.walk(tree):
@@ -176,7 +182,7 @@ def traced(root: Path, path: str) -> str:
 
 
 def put(parent: ast.AST, field: str, old: ast.AST, new: ast.AST) -> None:
-    """Let the parent hold `new` where it held `old`."""
+    """Replace the child `old` of the syntax node `parent` by `new`."""
     value = getattr(parent, field)
     if isinstance(value, list):
         value[next(i for i, child in enumerate(value) if child is old)] = new
@@ -185,7 +191,7 @@ def put(parent: ast.AST, field: str, old: ast.AST, new: ast.AST) -> None:
 
 
 def mutants(root: Path, path: str) -> Iterator[Mutant]:
-    """All mutants of one module."""
+    """Yield all mutants of one module."""
     tree = ast.parse((root / path).read_text(encoding="utf-8"))
     original = ast.unparse(tree)
     for parent, field, node, scope, statement in list(places(tree)):
@@ -201,7 +207,7 @@ def mutants(root: Path, path: str) -> Iterator[Mutant]:
 
 
 def change(before: str, after: str) -> str:
-    """Return the changed words with their neighbours, in one line."""
+    """Return the difference of two sources in one line, with some text around it."""
     old, new = before.splitlines(), after.splitlines()
     while old and new and old[0] == new[0]:
         del old[0], new[0]
@@ -217,6 +223,6 @@ def change(before: str, after: str) -> str:
 
 
 def common(one: str, other: str) -> int:
-    """How many characters both begin with."""
+    """Return the length of the common prefix of two strings."""
     pairs = enumerate(zip(one, other, strict=False))
     return next((i for i, (a, b) in pairs if a != b), min(len(one), len(other)))

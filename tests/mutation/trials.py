@@ -1,12 +1,13 @@
-"""Runs the tests of the core on one mutant at a time, each in a process that is quick to start.
+"""Runs the tests of the core on one mutant at a time, each in a forked process.
 
-This process imports the libraries, acsard and the tests once, and collects the tests. Each trial is
-a fork of it. The tests run first without a mutant, to measure which test executes which statement,
-and how long it takes. After that a mutant meets only the tests that execute its statement: those of
-its own module first, then the others, the quickest first.
+The parent process imports all modules and collects the tests once, so a fork starts quickly. First
+the tests run without a mutant, to measure which statements each test executes and how long it
+takes. Then each mutant is run only with the tests that execute its statement. The tests of its own
+module come first, then the others, the fastest first.
 
-A mutant of a statement in a function replaces the code of that function, which is there already.
-A mutant of a statement that an import executes needs new imports, and takes a second longer.
+If the mutant is inside a function, the fork replaces the code object of that function. If the
+mutant is in code that an import executes, the fork imports everything again, which takes a second
+longer.
 """
 
 from __future__ import annotations
@@ -64,13 +65,13 @@ did not end."""
 
 
 def mirror(path: str) -> str:
-    """Return the test module of a module."""
+    """Return the path of the test module that belongs to a module."""
     inside = Path(path).relative_to("acsard")
     return f"tests/unit/{inside.with_name('test_' + inside.name).as_posix()}"
 
 
 def enter(root: Path) -> None:
-    """Import acsard and the tests from the copy of the project at `root` from now on."""
+    """Make later imports of acsard and tests read the copy of the project at `root`."""
     os.chdir(root)
     sys.path.insert(0, str(root))
     for module in [name for name in sys.modules if name.partition(".")[0] in ("acsard", "tests")]:
@@ -78,7 +79,10 @@ def enter(root: Path) -> None:
 
 
 class Planted:
-    """An import finder: it gives modules other sources, and each a set `executed`."""
+    """An import finder that loads modules from the given sources instead of their files.
+
+    Each loaded module has a variable `executed`, the set in which it records its executed lines.
+    """
 
     def __init__(self, sources: dict[str, str]) -> None:
         self.executed: dict[str, set[int]] = {path: set() for path in sources}
@@ -102,7 +106,7 @@ class Planted:
 
 
 def codes(code: CodeType) -> Iterator[CodeType]:
-    """Yield the code of each function of a module and of its classes, without lambdas."""
+    """Yield the code object of each function of a module, including methods but not lambdas."""
     for inner in code.co_consts:
         if isinstance(inner, CodeType) and not inner.co_name.startswith("<"):
             if inner.co_flags & 1:  # CO_OPTIMIZED: a function, not the body of a class
@@ -112,10 +116,13 @@ def codes(code: CodeType) -> Iterator[CodeType]:
 
 
 class Trials:
-    """A pytest plugin: it takes the place of the loop over the tests, and tries mutants instead."""
+    """A pytest plugin that tries mutants instead of running each collected test once."""
 
     def __init__(self, root: Path, paths: list[str], work: Callable[[Trials], None]) -> None:
-        """`work` calls `measure` and then `verdicts`, when the tests are collected."""
+        """Store `work`, which `run` calls when the tests are collected.
+
+        `work` must call `measure` first and then `verdicts`.
+        """
         self.failed: set[str] = set()
         self._root, self._work = root, work
         self._seconds: dict[str, float] = {}
@@ -127,7 +134,7 @@ class Trials:
         self.items: dict[str, pytest.Item] = {}
 
     def run(self) -> None:
-        """Collect the tests and do the work."""
+        """Collect the tests, and call `work`."""
         if pytest.main([*PYTEST, *TESTS], [self]) != 0:
             raise RuntimeError("the tests cannot be collected")
 
@@ -158,7 +165,10 @@ class Trials:
             self._failed_here(report.nodeid)
 
     def measure(self, parts: int) -> None:
-        """Run all tests without a mutant, this many at once."""
+        """Run all tests without a mutant, in `parts` processes at once.
+
+        Stores each test's time and executed statements, and the names of tests that fail.
+        """
         for part in range(parts):
             self._fork(partial(self._measure, list(self.items)[part::parts], part))
         for _ in range(parts):
@@ -172,7 +182,7 @@ class Trials:
                 self._reached.setdefault(place, set()).update(tests)
 
     def verdicts(self, sample: list[Mutant], jobs: int) -> Iterator[tuple[Mutant, int]]:
-        """Yield each mutant and its verdict, as they come."""
+        """Try the mutants in `jobs` processes. Yield each one with its verdict as it finishes."""
         left, running = iter(sample), dict[int, Mutant]()
         while True:
             while len(running) < jobs and (mutant := next(left, None)) is not None:
@@ -247,7 +257,10 @@ class Trials:
         item.config.hook.pytest_runtest_protocol(item=item, nextitem=following_item)
 
     def _replace(self, mutant: Mutant) -> bool:
-        """Give the functions the code of the mutant; return False if one cannot take it."""
+        """Replace the code objects of the module's functions by those of the mutant.
+
+        Returns False if that is not possible, for example if a function has other free variables.
+        """
         found: dict[str, list[CodeType]] = {}
         for code in codes(compile(mutant.text, mutant.path, "exec", dont_inherit=True)):
             found.setdefault(code.co_qualname, []).append(code)
@@ -265,7 +278,7 @@ class Trials:
         return True
 
     def _afresh(self, mutant: Mutant, tests: list[str]) -> int:
-        """Import acsard and the tests again, with the mutant, and run these tests."""
+        """Import the mutant and everything else again, and run these tests. Return the verdict."""
         enter(self._root)
         sys.meta_path.remove(self._planted)
         Planted({mutant.path: mutant.text})
@@ -278,7 +291,7 @@ class Trials:
 
 
 class _Afresh:
-    """A pytest plugin: it runs these tests alone, in this order."""
+    """A pytest plugin that runs only these tests, in this order."""
 
     def __init__(self, trials: Trials, tests: list[str]) -> None:
         self._trials, self._tests = trials, tests

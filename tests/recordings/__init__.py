@@ -1,5 +1,5 @@
-"""Recorded drives that `tests/test_recordings.py` replays, each a file of `acsard run --record`.
+"""Recorded drives, which `tests/test_recordings.py` replays.
 
-The file of a robot that behaved oddly may be stored here unchanged. `python -m tests.recordings`
-made those that are here now.
+Each file is the output of `acsard run --record`. `python -m tests.recordings` wrote the present
+ones. You can also store the unchanged recording of a robot that behaved oddly.
 """

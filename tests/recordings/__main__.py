@@ -1,4 +1,7 @@
-"""Rewrite the recordings. Do it when a change of behaviour is wanted, and give the reason."""
+"""Rewrite the recordings after an intended change of the robot's behaviour.
+
+Give the reason for the change in the commit.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +24,7 @@ CHECKED = replace(
 
 
 def quiet(world: World) -> None:
-    """Two clients command the robot, and it gets a stop and a clear."""
+    """Drive without faults: two clients command the robot, and one stops and clears it."""
     world.drive(0.5, 0.3, 2.0, source="nav")
     world.drive(0.3, -0.8, 2.0, source="teleop")
     world.call("stop")
@@ -33,7 +36,7 @@ def quiet(world: World) -> None:
 
 
 def stuck(world: World) -> None:
-    """A wheel's encoder stops counting: the wheel is left out, then a fault is reported."""
+    """Stop a wheel's encoder. The pose leaves this wheel out, and then a fault is latched."""
     world.drive(0.5, 0.0, 1.0)
     with world.mcu.stuck_encoder(0):
         world.hold(0.5, 0.4, seconds=3.0)

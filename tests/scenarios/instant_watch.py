@@ -1,4 +1,7 @@
-"""A watch for worlds in virtual time, in which the kernel's counters mean nothing."""
+"""A replacement for the diagnosis of late periods, for tests in virtual time.
+
+In virtual time the kernel's counters of this process mean nothing.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,7 @@ from acsard.host.kernel_counters import Reading, Scheduled
 
 
 class InstantWatch(LateWatch):
-    """A watch that knows at once that other programs caused each late period."""
+    """A diagnosis that immediately reports other programs as the cause of each late period."""
 
     def period(self, now_ns: int, late_ns: int, missed: int) -> None:
         if missed:

@@ -1,4 +1,4 @@
-"""Programs that send commands over a network with delays, stamped by clocks that may be set."""
+"""Simulated programs that send commands over a delayed network, stamped by adjustable clocks."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ AHEAD_NS = NS_PER_S // 2
 
 
 class Speaker:
-    """A program that commands `app`. Its clock is `ahead` seconds ahead."""
+    """A program that commands the source `app`. Its clock is `ahead` s ahead of the robot's."""
 
     def __init__(self, world: World, way: Way, name: str = "a", ahead: float = 0.0) -> None:
         self.world, self.way, self.name, self.ahead = world, way, name, ahead
@@ -42,17 +42,17 @@ class Speaker:
         """The id of the Zenoh session that stamps its messages."""
 
     def slew(self, rate: float) -> None:
-        """Set the rate of its clock from now on."""
+        """Let the program's clock run at `rate` seconds per second from now on."""
         self.ahead += (self.rate - 1.0) * (self.world.now_ns - self._slewed_ns) / NS_PER_S
         self.rate, self._slewed_ns = rate, self.world.now_ns
 
     @property
     def gained(self) -> float:
-        """The seconds that its clock has gained since its slewing began."""
+        """The seconds that the program's clock has gained since the last call of `slew`."""
         return (self.rate - 1.0) * (self.world.now_ns - self._slewed_ns) / NS_PER_S
 
     def message(self, linear: float) -> tuple[float, int, int]:
-        """Return its current message: speed, stamp by its clock, number."""
+        """Create the next message: speed in m/s, stamp by the program's clock in ns, and number."""
         self._sent += 1
         world = self.world
         slewed = (self.rate - 1.0) * (world.now_ns - self._slewed_ns)
@@ -91,13 +91,13 @@ class Speaker:
         self.deliver(self.message(linear))
 
     def hold(self, linear: float, seconds: float, hz: float = 20.0) -> None:
-        """Send at this rate for this time."""
+        """Send this speed in m/s at `hz` for `seconds`."""
         for _ in range(round(seconds * hz)):
             self.send(linear)
             self.world.run(1 / hz)
 
     def open(self, linear: float = 0.4, hz: float = 20.0) -> None:
-        """Send zeros for a second, then drive on until the robot does."""
+        """Send zeros for 1 s, then a speed for 1 s. Check that the robot drives at the end."""
         self.hold(0.0, 1.0, hz)
         self.hold(linear, 1.0, hz)
         assert self.world.state.mode == "driving", (self.way, self.world.state.reason)
@@ -111,10 +111,11 @@ def over(
     seconds: float,
     hz: float = 20.0,
 ) -> tuple[float, int]:
-    """Send `speed(t)` m/s for `seconds` over a network that delivers in order after `delay(t)` s.
+    """Send commands through a network that delays them, and return how old they were when obeyed.
 
-    Returns the age on arrival of the oldest speed that the robot obeyed, s, and how many speeds it
-    obeyed. `t` is the time since the call, s.
+    A command sent `t` seconds after the call has the speed `speed(t)` in m/s. It arrives `delay(t)`
+    seconds later, or later still to keep the order. Returns the age on arrival of the oldest speed
+    that the robot obeyed, in s, and the number of speeds that it obeyed.
     """
     start_ns, queue = world.now_ns, deque[tuple[int, tuple[float, int, int]]]()
     sent: dict[int, tuple[tuple[float, int, int], float]] = {}
@@ -154,13 +155,16 @@ def over(
 
 
 def moved(world: World, since_ns: int) -> bool:
-    """Return whether a line that turns a wheel went out since then."""
+    """Return whether the daemon has sent a line with a wheel speed since `since_ns`."""
     still = b"ap00.00,bp00.00,cp00.00,dp00.00\r\n"
     return any(at_ns >= since_ns and line != still for at_ns, line in world.port.sent)
 
 
 def backlog(dice: random.Random, speaker: Speaker, age: float, span: float, poured: float) -> None:
-    """Deliver the messages of `span` seconds, the last of them `age` seconds old."""
+    """Deliver a backlog of messages, sent over `span` seconds, the last one `age` seconds ago.
+
+    The backlog arrives within `poured` seconds.
+    """
     world, hz = speaker.world, dice.choice((10.0, 20.0, 50.0))
     now_ns, held = world.now_ns, []
     zeros = pauses = 0

@@ -45,15 +45,18 @@ LOSSES = {"link_down", "link_booting", "link_stale", "link_late", "link_heard"}
 
 
 def plain(name: str) -> str:
-    """Return the name of an event, with one name for all losses of the link."""
+    """Return the name of an event; all losses of the link get the same name."""
     return "link" if name in LOSSES else name
 
 
 class Tape:
-    """A recorder in memory."""
+    """A recorder that stores all steps in memory."""
 
     def __init__(self, every: int = 0) -> None:
-        """`every` is the number of steps between two states that it records without being asked."""
+        """`every` is the number of steps between two stored robot states; 0 stores none.
+
+        A test can also set `cut`, which stores one state at the next step.
+        """
         self._every = every
         self.taken: list[FinishedStep] = []
         self.states: dict[int, bytes] = {}
@@ -74,7 +77,7 @@ class Tape:
     def died(self, inputs: Inputs) -> None: ...
 
     def steps(self, first: int = 0) -> list[Step]:
-        """Return the steps of a recording from that step on."""
+        """Return the recorded steps from number `first` on, encoded and decoded again."""
         starts = range(first, len(self.taken), BATCH)
         return [s for at in starts for s in decode(encode(at, self.taken[at : at + BATCH]))]
 
@@ -86,10 +89,12 @@ class Tape:
         apart: bool = True,
         end: int | None = None,
     ) -> None:
-        """Write the file that the daemon would have written, from the start or from a state.
+        """Write the file that the daemon would write.
 
-        The file ends before the step `end`, or with the last step if `end` is None.
-        With `apart` each second has a chunk of its own, which the daemon does not do.
+        The file begins at the step `first`. Any step but the first one needs a stored state, which
+        the file then contains. The file ends before the step `end`, or with the last step if `end`
+        is None. With `apart` each second has a separate chunk in the file, unlike in a file of the
+        daemon.
         """
         now = self.taken[first].inputs.now
         text = "\n".join(document(effective(config))) + "\n"
@@ -121,13 +126,13 @@ class Tape:
 def recorded_world(
     config: Config | None = None, *, every: int = 0, **options: Any
 ) -> tuple[Tape, World]:
-    """Return a tape and the world that it records, which has these options."""
+    """Return a recorder in memory, and a new world with these options that it records."""
     tape = Tape(every=every)
     return tape, World(config, recorder=tape, **options)
 
 
 def chunks(data: bytes | bytearray) -> list[tuple[int, int]]:
-    """Return where each chunk's record of a file begins and ends, as the format itself says."""
+    """Return the start and end of each chunk in a file, found by the MCAP format alone."""
     found, at = [], 8
     while at < len(data) - 8:
         opcode, length = struct.unpack_from("<BQ", data, at)
@@ -151,7 +156,7 @@ INPUTS = {"estop", "bumpers"}
 
 
 def every_fault(mcu: FakeMcu) -> list[tuple[str, Callable[[], Fault]]]:
-    """Yield each fault of the simulator as a context manager."""
+    """Yield the name of each fault of the simulator, and a context manager that causes it."""
     plain = [(name, getattr(mcu, name)) for name in FAULTS if name not in INPUTS]
     cases = WITH_ARGUMENTS.items()
     return plain + [
@@ -160,7 +165,10 @@ def every_fault(mcu: FakeMcu) -> list[tuple[str, Callable[[], Fault]]]:
 
 
 def drive_through_faults(world: World, seconds: float, seed: int = 1) -> list[str]:
-    """Drive with each fault in turn for half a second, then through all other happenings."""
+    """Drive with each fault in turn for half a second, then cause all other events, and repeat.
+
+    Returns the names of the faults.
+    """
     dice, end_ns, had = random.Random(seed), world.now_ns + int(seconds * 1e9), []
     while True:
         for name, fault in every_fault(world.mcu):
@@ -178,7 +186,11 @@ def drive_through_faults(world: World, seconds: float, seed: int = 1) -> list[st
 
 
 def happenings(world: World, dice: random.Random) -> None:
-    """Cause each other happening once."""
+    """Cause each event that is not a fault of the simulator once.
+
+    Examples are a stop, a stall, a blocked port, a jump of the wall clock, and a reset of the
+    board.
+    """
     world.call("stop")
     world.hold(0.5, seconds=2.1)  # a clear that names no latch is refused for 2 s
     assert world.call("clear").success

@@ -29,7 +29,7 @@ def long(count: int) -> object:
 
 
 def cleared(way: Way, *names: str) -> tuple[World, list[Speaker]]:
-    """Provide a world after `stop` and `clear`, and senders whose clocks it knows."""
+    """Return a world after `stop` and `clear`, and senders whose delays the daemon has proved."""
     world = quiet()
     speakers = [Speaker(world, way, name) for name in names]
     for speaker in speakers:
@@ -47,7 +47,10 @@ def cleared(way: Way, *names: str) -> tuple[World, list[Speaker]]:
 @pytest.mark.parametrize("count", [2, more(30), long(100)])
 @pytest.mark.parametrize("way", get_args(Way))
 def test_the_zeros_of_one_program_never_arm_another(way: Way, count: int) -> None:
-    """One client sends zeros at 10 Hz, the other always 0.5 m/s: it moved 2.1 m in 5 s."""
+    """One client sends only zeros and another one only speeds, and the robot stays at rest.
+
+    Before this rule the robot moved 2.1 m in 5 s.
+    """
     for seed in range(count):
         dice = random.Random(seed)
         world = quiet()
@@ -69,10 +72,10 @@ def test_the_zeros_of_one_program_never_arm_another(way: Way, count: int) -> Non
 def test_programs_whose_stamps_come_from_several_routers_never_arm_each_other(
     count: int,
 ) -> None:
-    """One program sends zeros, and another one always sends speeds.
+    """One program sends only zeros and another one only speeds, and the robot stays at rest.
 
-    The session that stamps their messages changes between those of two routers and that of the
-    program. Some messages have no stamp.
+    The Zenoh session that stamps a message changes between two routers and the program itself. Some
+    messages have no stamp.
     """
     for seed in range(count):
         dice = random.Random(seed)
@@ -130,7 +133,10 @@ def test_a_shared_sender_that_many_senders_displaced_must_still_return_to_neutra
 @pytest.mark.parametrize("pauses", [(1.1, 1.1, 5.0), pytest.param((60.0,), marks=pytest.mark.slow)])
 @pytest.mark.parametrize("way", get_args(Way))
 def test_a_pause_arms_no_sender(way: Way, pauses: tuple[float, ...]) -> None:
-    """A user ran `ros2 topic pub -r 10 /cmd_vel`, Ctrl-C, and the same line again: 2.0 m."""
+    """A sender that pauses after a `clear` and sends speeds again does not move the robot.
+
+    A user repeated `ros2 topic pub -r 10 /cmd_vel` after Ctrl-C, and the robot moved 2.0 m.
+    """
     world, (speaker,) = cleared(way, "a")
     since_ns = world.now_ns
     for pause in pauses:
@@ -234,7 +240,10 @@ def test_after_clear_a_held_key_has_no_effect_until_it_is_released(way: Way) -> 
 @pytest.mark.slow
 @pytest.mark.parametrize("count", [4, more(60)])
 def test_a_proven_zero_of_one_program_never_arms_the_delayed_speeds_of_another(count: int) -> None:
-    """One program sends one plain zero, the other 0.5 m/s with a header through heavy jitter."""
+    """One program sends one zero, and another one sends speeds with a header through heavy jitter.
+
+    The robot stays at rest.
+    """
     for seed in range(count):
         dice = random.Random(seed)
         world = quiet()
@@ -254,7 +263,10 @@ def test_a_proven_zero_of_one_program_never_arms_the_delayed_speeds_of_another(c
 @pytest.mark.slow
 @each("stall", [0.02, 0.1])
 def test_a_zero_from_before_a_restart_of_the_board_arms_no_sender(stall: float) -> None:
-    """A clear, a zero and the restart come while the loop stands. One step then obeys them all."""
+    """A clear, a zero and a restart of the board arrive while the control loop is stalled.
+
+    The next step reads all of them. Afterwards the sender must still send a new zero.
+    """
     world = quiet()
     world.drive(0.4, seconds=0.5)
     world.call("stop")
@@ -282,7 +294,11 @@ def test_a_zero_from_before_a_restart_of_the_board_arms_no_sender(stall: float) 
 def test_a_stall_of_the_daemon_does_not_count_as_a_pause_after_another_sender_s_zero(
     way: Way, pause: float
 ) -> None:
-    """The first step after the stall begins before the bus has delivered what waited."""
+    """Two programs share a sender identity: one sends a zero, the other one speeds.
+
+    The daemon stalls after the zero. Its next step begins before the bus delivers the waiting
+    speeds. The robot stays at rest.
+    """
     config = Config(commands=CommandsConfig(neutral_pause=pause))
     world = World(config)
     world.run(1.0)

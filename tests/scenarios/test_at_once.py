@@ -30,12 +30,12 @@ def world() -> World:
 
 
 def sent_after(world: World, at_ns: int) -> list[int]:
-    """Return when lines left since `at_ns`, in ns after it."""
+    """Return the times in ns from `at_ns` to each line that the daemon has sent since then."""
     return [sent - at_ns for sent, _ in world.port.sent if sent >= at_ns]
 
 
 def between_ticks(world: World, ms: float) -> None:
-    """Run until this many ms after a tick."""
+    """Run until `ms` after the start of the next control period."""
     world.run((world.next_period_ns - world.now_ns) / 1e9)
     world.run(ms / 1e3)
 

@@ -1,4 +1,4 @@
-"""The battery, as the simulated board reports it, in the whole daemon."""
+"""The whole daemon, with a simulated board that reports its battery."""
 
 from __future__ import annotations
 

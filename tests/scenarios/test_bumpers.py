@@ -1,4 +1,4 @@
-"""The bumpers and the motor drivers, as the board reports them, in the whole daemon."""
+"""The whole daemon, with a simulated board that reports bumpers and faults of motor drivers."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ COMMANDS = ((0.8, 0.5), (-0.8, 0.5), (0.8, 0.0), (-0.8, 0.0), (0.0, 2.0), (0.05,
 
 
 class Lines:
-    """Follows a world, and notes the first line of the period in which a bumper was pressed."""
+    """Finds the first line that the daemon sends after a bumper is pressed."""
 
     def __init__(self, world: World) -> None:
         self.world = world
@@ -36,13 +36,13 @@ class Lines:
         world.watch = self.look
 
     def begin(self) -> None:
-        """Forget the lines and the speeds so far."""
+        """Forget all earlier lines and speeds."""
         self.world.port.sent.clear()
         self.applied.clear()
         self._lines = 0
 
     def look(self, outputs: Outputs) -> None:
-        """Note the step in which the daemon learns of the press."""
+        """Remember the time of the step in which the daemon reads the press."""
         pressed = any(self.world.loop.robot.snapshot(outputs.now.mono_ns).bumpers or ())
         if pressed > self._before:
             self.pressed_ns, self._first = outputs.now.mono_ns, self._lines
@@ -52,7 +52,10 @@ class Lines:
 
     @property
     def first(self) -> tuple[int, bytes]:
-        """Time from the press to the first line that left after it, ns, and that line."""
+        """The first line after the press, and the time in ns from the press to this line.
+
+        The time comes first in the tuple.
+        """
         at_ns, line = self.world.port.sent[self._first]
         return at_ns - self.pressed_ns, line
 

@@ -1,8 +1,9 @@
-"""Bursts of lost lines in a drive of 450 m, from the simulated wheels to `state`, with counts.
+"""The odometry of a drive of 450 m with bursts of lost lines, on a link with encoder counts.
 
     pytest -s -m soak tests/scenarios/test_bursts.py
 
-`unit/mcu/test_bursts.py` has the same with plain lines.
+The tests compare `state` with the simulated robot. `unit/mcu/test_bursts.py` does so for plain
+lines.
 """
 
 from __future__ import annotations
@@ -20,7 +21,10 @@ EVERY_S = 30.0
 
 
 def drive(seed: int, seconds: float) -> tuple[float, float, int]:
-    """Return the error of the final pose in m, the m driven, and the number of lost lines."""
+    """Drive for `seconds`. Return the final position error, the distance, and the lost lines.
+
+    The error and the distance are in m.
+    """
     mcu = McuConfig(link_check="require", encoder_counts=COUNTS)
     made = World(Config(sim=SimConfig(encoder_counts=COUNTS), mcu=mcu))
     chance = random.Random(seed)

@@ -1,4 +1,4 @@
-"""A robot with coarse encoders drives about, and nothing tells the daemon their counts."""
+"""A robot drives with coarse encoders, whose counts per turn the daemon does not know."""
 
 from __future__ import annotations
 
@@ -13,7 +13,10 @@ from tests.scenarios.world import World
 
 
 def driven(counts: int, reporting: bool) -> World:
-    """Drive about for ten seconds and stop. The board reports by its own clock or when prompted."""
+    """Return a robot that has driven at random for ten seconds and stopped.
+
+    `reporting` selects a free-running board instead of a prompted one.
+    """
     world, dice = World(Config(sim=SimConfig(encoder_counts=counts))), random.Random(4)
     with world.mcu.free_running(0.01) if reporting else nullcontext():
         world.run(0.5)
@@ -25,7 +28,7 @@ def driven(counts: int, reporting: bool) -> World:
 
 
 def off(world: World) -> float:
-    """Return the distance of the pose from the truth, m."""
+    """Return the distance between the daemon's pose and the simulated robot, in m."""
     state, true = world.state, world.mcu.vehicle.pose
     return math.hypot(state.x - true.x, state.y - true.y)
 

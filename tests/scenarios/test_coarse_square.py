@@ -1,7 +1,8 @@
-"""With `mcu.encoder_counts`, encoders end a square where their raw counter says.
+"""With `mcu.encoder_counts`, the odometry is as exact as the raw counts of the encoders allow.
 
-The raw counter is the true whole counts of the simulated encoders, through the same kinematics. Run
-the table with `pytest -m "slow or not slow" -s tests/scenarios/test_coarse_square.py`.
+The robot drives a square. The tests compare the pose of the daemon with a pose that is computed
+directly from the whole counts of the simulated encoders. Run the table with `pytest -m "slow or not
+slow" -s tests/scenarios/test_coarse_square.py`.
 """
 
 from __future__ import annotations
@@ -19,7 +20,10 @@ from tests.scenarios.world import World
 
 
 class Square:
-    """A square of 20 m, driven by the clock, with the pose of the raw counter beside it."""
+    """A drive along a square of 20 m with timed commands.
+
+    It computes a second pose from the raw encoder counts.
+    """
 
     def __init__(self, link: str, counts: int, stalls: bool, seed: int) -> None:
         mcu = McuConfig(
@@ -55,7 +59,7 @@ class Square:
                 self.world.stall(self._dice.uniform(0.05, 0.15))
 
     def _count(self, outputs: Outputs) -> None:
-        """Advance the raw counter up to now."""
+        """Advance the pose of the raw counts to the present."""
         angles = self.world.mcu.vehicle.angles
         counts = [math.floor(angle / math.tau * self._counts + 0.5) for angle in angles]
         a, b, c, d = (now - then for now, then in zip(counts, self._before, strict=True))
@@ -65,7 +69,7 @@ class Square:
         self._path.advance((right + left) / 2, (right - left) / 0.30)
 
     def errors(self) -> tuple[float, float, float, float]:
-        """Return m and degrees off the truth: first the daemon's, then the raw counter's."""
+        """Return the final errors in m and degrees, of the daemon and then of the raw counts."""
         state = self.world.state
         ours, raw = self._off(Pose(state.x, state.y, state.yaw)), self._off(self._path.pose)
         return *ours, *raw

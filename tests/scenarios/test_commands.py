@@ -1,4 +1,4 @@
-"""Clients command, wait or are refused; `state` always gives the reason."""
+"""Clients send commands, wait or are refused, and `state` always gives the reason."""
 
 from __future__ import annotations
 
@@ -227,7 +227,10 @@ def test_stamps_that_zenoh_replaces_are_only_counted(world: World) -> None:
 
 @pytest.mark.slow
 def test_failed_hardware_holds_the_robot_and_the_reason_is_reported(world: World) -> None:
-    """ros2_control's hardware sends these zeros for ever, while Nav2 goes on."""
+    """ros2_control sends zeros for ever after a hardware fault, while Nav2 sends speeds.
+
+    The robot stays at rest, and after a few seconds the reason in `state` names ros2_control.
+    """
     world.send(0.0, source="nav")
     world.send(0.0, source="ros2_control")
     world.run(0.3)
@@ -255,7 +258,10 @@ def test_failed_hardware_holds_the_robot_and_the_reason_is_reported(world: World
 
 @pytest.mark.parametrize("way", ["rmw", "bridge"])
 def test_the_first_try_of_a_ros_user_is_answered_in_words(world: World, way: Way) -> None:
-    """`ros2 topic pub -r 10 /cmd_vel` sends a speed from the first message on."""
+    """`ros2 topic pub -r 10 /cmd_vel` sends only speeds, so the robot does not move.
+
+    The reason in `state` and an event say that the sender must send a zero first.
+    """
     Speaker(world, way).hold(0.5, 5.0, hz=10.0)
     assert world.state.x == 0.0
     assert "send a zero first: app must send a zero" in world.state.reason
@@ -312,7 +318,7 @@ def test_state_is_published_ten_times_a_second_and_immediately_on_change(world: 
 
 
 def test_commands_that_a_newer_one_follows_before_the_step_are_counted(world: World) -> None:
-    """The commands of another source count on their own."""
+    """The newest command of each source is not counted as superseded."""
     world.send_together([0.1, 0.2, 0.3])
     world.send_together([0.4], source="teleop")
     world.run(0.1)
@@ -347,7 +353,10 @@ def test_shutting_down_ramps_to_rest_and_obeys_no_client(world: World) -> None:
 
 
 class Person:
-    """A person who commands `nav` in one of the three ways. Two of them are two senders."""
+    """A person who commands the source `nav` by one of the three routes.
+
+    Each instance is a separate sender.
+    """
 
     def __init__(self, world: World, via: Via, name: str) -> None:
         self.world, self.via, self.name = world, via, name
@@ -379,7 +388,7 @@ class Person:
         self.world.bus.arrivals.append(arrival)
 
     def drive(self, linear: float) -> None:
-        """Send zeros for a good second, then a speed at 20 Hz until the robot drives."""
+        """Send zeros for 1.2 s, then a speed at 20 Hz for 0.5 s. Check that the robot drives."""
         for _ in range(24):
             self.send(0.0)
             self.world.run(0.05)

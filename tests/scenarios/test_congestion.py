@@ -1,4 +1,4 @@
-"""Outdated commands do not count on a network with growing or constant delays."""
+"""The robot ignores outdated commands on networks with growing or constant delays."""
 
 from __future__ import annotations
 
@@ -32,7 +32,11 @@ def bound(way: Way, seconds: float) -> float:
 
 
 def driven_over(way: Way, delay: Callable[[float], float], seconds: float) -> tuple[float, int]:
-    """A sender opens on a good link and drives, with a pause of 0.5 s in every 5 s."""
+    """Drive first without delays and then over this network.
+
+    The sender sends zeros for 0.5 s in every 5 s. Returns the largest age of an obeyed speed in s,
+    and the number of obeyed speeds.
+    """
     world = quiet()
     speaker = Speaker(world, way)
     speaker.open()
@@ -79,7 +83,7 @@ def test_a_delay_that_jumps_and_stays_is_not_mistaken_for_a_clock_adjustment(
 @pytest.mark.nightly
 @pytest.mark.parametrize("way", STAMPED)
 def test_no_shape_of_congestion_makes_the_robot_obey_an_old_command(way: Way) -> None:
-    """Growth of 1 to 10 % and plateaus of 0.5 to 30 s follow one another, with jitter."""
+    """The delay grows by 1 to 10 % of the time, and jumps by 0.5 to 30 s, with jitter."""
     for seed in range(6):
         dice = random.Random(seed)
         share, plateau = dice.uniform(0.01, 0.1), dice.choice((0.5, 1.0, 3.0, 10.0, 30.0))
@@ -166,7 +170,10 @@ def test_state_counts_the_milliseconds_by_which_a_foreign_clock_was_adjusted() -
 @pytest.mark.slow
 @pytest.mark.parametrize("way", ["rmw", "header", "zenoh"])
 def test_a_zenoh_clock_that_stands_still_after_it_was_set_back_is_an_adjustment(way: Way) -> None:
-    """Zenoh's clock never goes back: after its wall clock was set back by 3 s it nearly stands."""
+    """After a wall clock is set back by 3 s, Zenoh's stamps nearly stand still for 3 s.
+
+    The daemon treats that as an adjusted clock, and the sender drives again after its next zeros.
+    """
     world = quiet()
     speaker = Speaker(world, way)
     speaker.open()
@@ -188,7 +195,10 @@ def test_a_zenoh_clock_that_stands_still_after_it_was_set_back_is_an_adjustment(
 def test_an_older_command_that_arrives_after_a_newer_one_is_not_obeyed(
     way: Way, timeout: float
 ) -> None:
-    """The defect moved the robot 0.26 m, and 2.5 m at a timeout of 5 s."""
+    """A delayed speed that arrives after a newer zero does not move the robot.
+
+    A former defect moved the robot by 0.26 m, and by 2.5 m with a timeout of 5 s.
+    """
     world = World(Config(commands=CommandsConfig(sources=(Source("app", 50, timeout),))))
     world.run(0.3)
     speaker = Speaker(world, way)
@@ -208,7 +218,10 @@ def test_an_older_command_that_arrives_after_a_newer_one_is_not_obeyed(
 
 @pytest.mark.parametrize("way", ["client", "signed", "rmw"])
 def test_a_numbered_command_that_comes_twice_is_obeyed_once(way: Way) -> None:
-    """Without numbers, equal stamps may be two commands of a coarse clock."""
+    """The network delivers one command 40 times, and the robot ignores the repetitions.
+
+    Only numbers allow that. Equal stamps without numbers may be two commands of a coarse clock.
+    """
     world = quiet()
     speaker = Speaker(world, way)
     speaker.open()
@@ -240,7 +253,10 @@ def test_numbers_alone_keep_the_order_too() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("way", ["signed", "rmw"])
 def test_lost_commands_are_not_mistaken_for_a_pause(way: Way) -> None:
-    """After a loss of 2.2 s the daemon believed any constant delay, and obeyed commands 5 s old."""
+    """The network loses all commands for 2.2 s and then delays them by 5 s: none is obeyed.
+
+    A former defect accepted any constant delay after such a loss.
+    """
     world = quiet()
     speaker = Speaker(world, way)
     speaker.open()
@@ -259,7 +275,10 @@ def test_lost_commands_are_not_mistaken_for_a_pause(way: Way) -> None:
 @each("period", [2.1, 4.9])
 @each("way", STAMPED)
 def test_a_slow_sender_drives_a_source_with_a_long_timeout(way: Way, period: float) -> None:
-    """Commands that were further apart than 2 s never proved their delays."""
+    """A sender with 2.1 or 4.9 s between commands drives a source with a timeout of 5 s.
+
+    In a former version, senders with more than 2 s between commands could not prove their delays.
+    """
     world = World(Config(commands=CommandsConfig(sources=(Source("app", 50, 5.0),))))
     world.run(0.3)
     speaker = Speaker(world, way)
@@ -273,7 +292,10 @@ def test_a_slow_sender_drives_a_source_with_a_long_timeout(way: Way, period: flo
 @pytest.mark.nightly
 @each("way", STAMPED)
 def test_the_old_commands_of_a_slow_sender_are_not_followed(way: Way) -> None:
-    """It sends every 3 s with a timeout of 5 s, and the network begins to take 20 s."""
+    """A sender sends every 3 s to a source with a timeout of 5 s.
+
+    The delay of the network then rises to 20 s, and the robot ignores those commands.
+    """
     world = World(Config(commands=CommandsConfig(sources=(Source("app", 50, 5.0),))))
     world.run(0.3)
     speaker = Speaker(world, way)
@@ -296,7 +318,11 @@ def test_the_old_commands_of_a_slow_sender_are_not_followed(way: Way) -> None:
 def test_a_sender_recovers_from_a_clock_set_back_during_a_lost_or_repeated_command(
     way: Way, trouble: str
 ) -> None:
-    """The sender was refused for as many minutes as its clock was set back by seconds."""
+    """The sender's clock is set back by 30 s while a command is lost or arrives twice.
+
+    The robot drives again after the sender's next zeros. In a former version it refused the sender
+    for 30 minutes.
+    """
     world = quiet()
     speaker = Speaker(world, way)
     speaker.open(0.3)

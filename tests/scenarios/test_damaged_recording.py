@@ -1,4 +1,4 @@
-"""A replay and an export go on behind a damaged place of a long recording, and report its cost."""
+"""A replay and an export continue after damage in a recording, and report the lost steps."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def record(where: Path, seconds: int) -> list[Path]:
 
 @pytest.fixture(scope="module")
 def long(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a recording of 10 minutes."""
+    """A recording of 10 minutes."""
     (path,) = record(tmp_path_factory.mktemp("record"), 60 * MINUTES)
     return path
 
@@ -79,9 +79,9 @@ def harmed(path: Path, new: Path, place: int, length: int) -> Path:
 
 
 def places(path: Path, count: int, seed: int = 1) -> list[tuple[int, int]]:
-    """Return random places in the file, and the size of each.
+    """Return random positions in the file, and the number of bytes to damage at each one.
 
-    No place is in a state of the robot, because damage there costs no step.
+    The positions avoid the stored robot states, because damage there loses no step.
     """
     dice, data = random.Random(seed), path.read_bytes()
     states = [range(*span) for span in spans_of_states(data)]
@@ -90,14 +90,17 @@ def places(path: Path, count: int, seed: int = 1) -> list[tuple[int, int]]:
 
 
 def spans_of_states(data: bytes) -> list[tuple[int, int]]:
-    """Return the beginning and the end of each chunk with a state of the robot."""
+    """Return the start and end position of each chunk that contains a robot state."""
     found = [place.chunk for place in walk(data) if place.chunk is not None]
     state = CHANNEL_NUMBERS["state"]
     return [(c.begin, c.end) for c in found if [m.channel for m in c.messages] == [state]]
 
 
 def judge(path: Path, new: Path, place: int, length: int) -> float:
-    """Replay the damaged file, and return the share of the steps that are compared."""
+    """Replay a copy with `length` damaged bytes at `place`, and check the reported gaps.
+
+    Returns the share of the steps that the replay could still compare.
+    """
     whole = sum(1 for _ in steps(Recording(path)))
     recording = Recording(harmed(path, new, place, length))
     result = replay_file(recording)
@@ -135,7 +138,7 @@ def test_damage_to_a_state_of_the_robot_costs_no_step(long: Path, tmp_path: Path
 
 
 def test_damage_at_the_beginning_of_a_file_costs_nothing(long: Path, tmp_path: Path) -> None:
-    """Each damage is in another part: the magic bytes, the metadata, and the configuration."""
+    """Damage one byte of the magic bytes, the metadata or the configuration. No step is lost."""
     data = long.read_bytes()
     whole = [step.number for step in steps(Recording(long))]
     for word in (b"MCAP0", b"acsar", b"mono_ns", b"[limits]", b"wheel_radius = 0.0"):
@@ -179,7 +182,10 @@ def test_replay_and_export_exit_with_their_own_code_and_name_the_missing_part(
 def test_another_configuration_stays_in_force_after_a_damaged_section(
     long: Path, tmp_path: Path
 ) -> None:
-    """The recorded robot got other limits on its way, and they stay changed too."""
+    """A replay with another limit still uses this limit after the damaged section.
+
+    It also still uses the limits that the operator changed during the recording.
+    """
     begin, end = chunks(long.read_bytes())[22]
     recording = Recording(harmed(long, tmp_path / "harmed.mcap", (begin + end) // 2, 1))
     other = replace(Config(), limits=replace(Config().limits, angular_speed=0.3))
@@ -199,7 +205,10 @@ def test_another_configuration_stays_in_force_after_a_damaged_section(
 def test_damage_that_hides_the_end_of_a_file_is_not_reported_as_a_truncation(
     long: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The damage covers the head of the last chunk with its length, and the content after it."""
+    """The damage covers the header of the last chunk, with its length, and half of its content.
+
+    The replay reports that it cannot find the end of the recording.
+    """
     begin, end = chunks(long.read_bytes())[-1]
     new = harmed(long, tmp_path / "harmed.mcap", begin, (end - begin) // 2)
     recording = Recording(new)
@@ -265,7 +274,7 @@ def test_a_series_goes_on_with_the_state_at_the_beginning_of_its_next_file(
 def test_a_recovered_copy_of_a_damaged_recording_is_replayed_up_to_the_same_gap(
     long: Path, tmp_path: Path
 ) -> None:
-    """The copy has no damaged place any more, but the steps are missing all the same."""
+    """The copy contains no damage, but the lost steps are still missing."""
     begin, end = chunks(long.read_bytes())[22]
     recording = Recording(harmed(long, tmp_path / "harmed.mcap", (begin + end) // 2, 1))
     rewrite(recording, tmp_path / "copy.mcap")

@@ -1,4 +1,4 @@
-"""The emergency stop at the robot, as the board reports it, in the whole daemon."""
+"""The whole daemon, with a simulated board that reports its emergency stop button."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ MOST = [25, pytest.param(1000, marks=[pytest.mark.soak, pytest.mark.timeout(3600
 
 
 class Watch:
-    """Follows a world, and notes when it was stopped and which lines left."""
+    """Finds the time at which the robot is stopped, and the daemon's lines after it."""
 
     def __init__(self, world: World) -> None:
         self.world = world
@@ -37,31 +37,31 @@ class Watch:
         world.watch = self.look
 
     def begin(self) -> None:
-        """Forget the lines so far."""
+        """Forget all earlier lines."""
         self.world.port.sent.clear()
         self._lines = 0
 
     def look(self, outputs: Outputs) -> None:
-        """Note the step in which the robot is stopped: its line is the first one that counts."""
+        """Remember the step that stops the robot. `waited_ns` and `moved` use later lines."""
         if outputs.mode == "stopped" != self._before:
             self.stopped_ns, self._first = outputs.now.mono_ns, self._lines
         self._before, self._lines = outputs.mode, len(self.world.port.sent)
 
     @property
     def waited_ns(self) -> int:
-        """Time from the step that stopped the robot to the first line that left, ns."""
+        """The time in ns from the step that stopped the robot to the first line after it."""
         return self.world.port.sent[self._first][0] - self.stopped_ns
 
     @property
     def moved(self) -> bool:
-        """Whether a line since then moves a wheel."""
+        """Whether a line since that step has a wheel speed."""
         lines = list(self.world.port.sent)[self._first :]
         assert lines
         return any(not line.startswith(ZERO) for _, line in lines)
 
 
 def into(world: World, mode: str) -> None:
-    """Bring a robot that is ready into this mode."""
+    """Bring a ready robot into this mode: driving, stopped, inactive or fault."""
     if mode == "driving":
         world.drive(0.8, 0.5, seconds=0.5)
     elif mode == "stopped":
@@ -126,7 +126,11 @@ def test_each_press_is_a_zero_line_within_a_period_and_no_release_moves_the_robo
 @pytest.mark.slow
 @pytest.mark.parametrize("count", MOST)
 def test_a_press_on_the_ramp_of_a_stop_is_a_zero_line_within_a_period(count: int) -> None:
-    """The mode does not change, so only the press itself asks for a line."""
+    """A client stops the robot, and during the ramp a person presses the button.
+
+    A zero line follows within a period. The mode is `stopped` already, so only the press can
+    request the line.
+    """
     world, dice = World(), random.Random(count)
     pressed_ns: list[int] = []
 

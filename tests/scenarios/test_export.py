@@ -1,7 +1,7 @@
-"""An export has the messages that the bus had during the recording, one for one.
+"""An export contains exactly the messages that the bus had during the recording.
 
-It is checked twice: as the messages that the export makes of a recording, and as a file, byte by
-byte and as independent readers decode it.
+The tests compare the messages that the export creates. They also compare the exported file, byte by
+byte and through independent readers.
 """
 
 from __future__ import annotations
@@ -67,9 +67,9 @@ Said = dict[str, list[Any]]
 
 
 def driven(config: Config) -> tuple[World, Tape]:
-    """Drive with faults and everything else that happens to a robot.
+    """Drive with faults and all other events. Return the world and its recorder.
 
-    The client in it subscribed to everything.
+    A client has subscribed to every key.
     """
     tape, world = recorded_world(config, wanted=EVERY_KEY)
     world.bus.publish("tf_static", world.loop.report.tf_static())
@@ -100,7 +100,7 @@ def exported(recording: Recording) -> Said:
     ],
 )
 def recorded(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Any:
-    """A drive, and its recording."""
+    """A drive, its recorder in memory, and the recording of it."""
     world, tape = driven(request.param)
     path = tmp_path_factory.mktemp("export") / "drive.mcap"
     tape.write(path, request.param)
@@ -109,7 +109,7 @@ def recorded(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFa
 
 @pytest.fixture(scope="module")
 def both(recorded: Any) -> Any:
-    """The published messages, and those of the export."""
+    """The world with the published messages, its recorder, and the exported messages."""
     world, tape, recording = recorded
     return world, tape, exported(recording)
 
@@ -124,7 +124,7 @@ def file(recorded: Any) -> Path:
 
 
 def assert_same(then: Sequence[Message], now: Sequence[Message]) -> None:
-    """Compare message for message; the failure names the first difference."""
+    """Compare two lists of messages. The failure shows the first difference."""
     for number, (one, other) in enumerate(zip(then, now, strict=False)):
         assert one == other, f"message {number}"
     assert len(then) == len(now) > 0
@@ -162,7 +162,10 @@ COUNTED = {"lines_rejected", "missed_periods", "command_refused", "new_sender"}
 
 
 def happened(world: World) -> list[Any]:
-    """Return each event once."""
+    """Return all published events, each one once.
+
+    Consecutive `events` messages contain the same events again.
+    """
     told: list[Any] = []
     for events in world.bus.published["events"]:
         assert isinstance(events, Events)
@@ -221,7 +224,7 @@ def commanded(source: str) -> str:
 
 
 def replay_file(world: World, tape: Tape) -> Said:
-    """Return an independent client's messages of each topic except the log, in ROS's form."""
+    """Return the messages that a client received or sent, by ROS topic, except those of the log."""
     found: Said = defaultdict(list)
     for key in BY_KEY:
         found[BY_KEY[key].topic("")] = [_as_told(one) for one in world.bus.published[key]]
@@ -235,7 +238,10 @@ def replay_file(world: World, tape: Tape) -> Said:
 
 
 def _as_told(message: Message) -> Any:
-    """Return the message without the daemon's measurements of itself."""
+    """Return the message without those values that an export cannot contain.
+
+    These are the daemon's measurements of its own process, for example its latencies.
+    """
     if isinstance(message, DiagnosticArray):
         left_out = MEASURED_ROWS | {"acsard: recording"}
         rows = [row for row in message.status if row.name not in left_out]
@@ -254,7 +260,7 @@ def _float32(value: float) -> float:
 
 
 def name_of(data: bytes) -> str:
-    """Return the name in a line of the log."""
+    """Return the event name in a CDR-encoded message of the topic `log`."""
     # CDR: four bytes of encapsulation, eight of the stamp, the level padded to four, the name.
     return data[20 : 19 + int.from_bytes(data[16:20], "little")].decode()
 
@@ -286,14 +292,20 @@ def test_the_file_has_each_message_that_was_published_to_the_byte(
 
 
 def by_mcap_ros2(path: Path, reader: Any) -> Iterator[tuple[str, Any]]:
-    """Return topics and messages, decoded by the definitions in the file, with the MCAP library."""
+    """Return the topics and messages of a file, as the library mcap_ros2 decodes them.
+
+    It uses only the message definitions in the file.
+    """
     with path.open("rb") as stream:
         for one in reader(stream, decoder_factories=[DecoderFactory()]).iter_decoded_messages():
             yield one.channel.topic, one.decoded_message
 
 
 def by_rosbags(path: Path) -> Iterator[tuple[str, Any]]:
-    """Return the same by another library that knows no type beforehand."""
+    """Yield the topics and messages of a file, as the library rosbags decodes them.
+
+    It knows no message type beforehand and uses only the definitions in the file.
+    """
     store: Any = get_typestore(Stores.EMPTY)
     with path.open("rb") as stream:
         for schema, channel, message in NonSeekingReader(stream).iter_messages():
@@ -309,7 +321,7 @@ def fields(kind: type[msgspec.Struct]) -> tuple[str, ...]:
 
 
 def same(told: Any, ours: Any) -> bool:
-    """Compare field by field, down to the numbers."""
+    """Return whether two messages are equal in every field. NaN equals None."""
     if isinstance(ours, msgspec.Struct):
         return all(same(getattr(told, name), getattr(ours, name)) for name in fields(type(ours)))
     if isinstance(ours, (list, tuple)):

@@ -47,7 +47,10 @@ def forge_row(
     dice: random.Random,
     forge: Callable[[OccasionalFields], OccasionalFields | None],
 ) -> None:
-    """Forge one row, out of those for which `forge` returns other values than None."""
+    """Replace one random row of the recorded steps by a forged one.
+
+    `forge` returns the forged fields of a row, or None if the row has nothing to forge.
+    """
     places: list[tuple[int, int, OccasionalFields]] = []
     for number, (topic, _, data) in enumerate(messages):
         if topic == "steps":
@@ -65,7 +68,7 @@ def forge_row(
 
 
 def forge_status(messages: Messages, dice: random.Random, place: int) -> None:
-    """Forge the reason or the source that a row holds; `place` is its index in the status."""
+    """Forge the reason or the source of one row. `place` is its index in the row's `status`."""
 
     def forge(rare: OccasionalFields) -> OccasionalFields | None:
         if rare.status is None:
@@ -144,9 +147,10 @@ def added_event(messages: Messages, dice: random.Random) -> None:
 
 
 def input_name(field: str, part: str) -> Forge:
-    """Return how to forge a name in the first of these inputs of a step.
+    """Return a function that forges a name in the recorded inputs of one step.
 
-    A forged sender or refused source need not change any output.
+    It changes `part` of the first item in `field`. A replay may give the same outputs with a forged
+    sender or refused source, so the replay must compare the names themselves.
     """
 
     def forge(messages: Messages, dice: random.Random) -> None:
@@ -164,7 +168,7 @@ def input_name(field: str, part: str) -> Forge:
 
 
 def copy(messages: Messages, dice: random.Random) -> None:
-    """Forge the copy of an event from which the list of recordings makes its summary."""
+    """Forge an event in the topic `events`, which is a copy for the list of recordings."""
     places = [n for n, (topic, _, _) in enumerate(messages) if topic == "events"]
     number = dice.choice(places)
     topic, wall_ns, data = messages[number]
@@ -180,7 +184,7 @@ def removed_copy(messages: Messages, dice: random.Random) -> None:
 
 @pytest.fixture(scope="module")
 def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a recording of two sources, calls, refused commands, a lost port and a fault."""
+    """A recording with two sources, calls, refused commands, a lost port and a fault."""
     tape, world = recorded_world()
     world.drive(0.5, 0.3, 1.0, source="nav")
     happenings(world, random.Random(1))

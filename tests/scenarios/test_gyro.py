@@ -1,4 +1,4 @@
-"""A skid-steer robot takes its heading from the gyro, and reports the gyro's state."""
+"""A skid-steer robot computes its heading from the gyro, and reports the state of the gyro."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def world(
     learned_track: bool = False,
     recorder: BlackBox | None = None,
 ) -> World:
-    """Return a robot that has stood for a while."""
+    """Return a world whose robot has been at rest for 1.5 s."""
     odometry = OdometryConfig(gyro=True, learned_track=learned_track)
     made = World(Config(odometry=odometry, sim=sim), recorder=recorder)
     made.gyro_dead = not gyro
@@ -33,7 +33,7 @@ def world(
 
 
 class Drive:
-    """The rotation in truth and by odometry, with whole turns counted."""
+    """Measures the rotation during a drive, simulated and by odometry, including whole turns."""
 
     def __init__(self, made: World) -> None:
         self.world, self.told, self.all = made, 0.0, 0.0
@@ -50,12 +50,12 @@ class Drive:
 
     @property
     def error(self) -> float:
-        """The error of the heading, as a share of the whole rotation."""
+        """The heading error, as a share of the total rotation in both directions."""
         return abs(self.told - (self._true - self._begun)) / self.all
 
 
 def wandering(made: World, seed: int, seconds: float = 60.0) -> Drive:
-    """Drive at random with a stop now and then, and end at rest."""
+    """Drive at random with some stops for `seconds`, and end at rest. Return the measured drive."""
     chance, drive, left = random.Random(seed), Drive(made), seconds
     made.drive(0.0, 0.0, 0.2)
     while left > 0.0:
@@ -191,7 +191,10 @@ def test_without_the_setting_the_gyro_is_off_and_has_no_diagnostics() -> None:
 
 
 def gone_silent(made: World, seed: int) -> Drive:
-    """The gyro teaches for a while and dies; then only the wheels remain."""
+    """Drive 30 s with a gyro, then 30 s without it. Return the second drive.
+
+    In the first part the daemon learns the track from the gyro.
+    """
     wandering(made, seed, seconds=30.0)
     made.gyro_dead = True
     made.hold(0.0, 0.0, 1.0)
@@ -214,7 +217,10 @@ def test_without_its_gyro_the_robot_keeps_a_good_heading_by_the_learned_track() 
 
 @pytest.mark.slow
 def test_the_covariance_knows_how_well_the_track_is_known() -> None:
-    """All turns go to one side, so that an error of the track does not cancel out."""
+    """The learned track has an error, and the covariance of the yaw covers its effect.
+
+    All turns go to one side, so that this effect does not cancel out.
+    """
     made = world(learned_track=True)
     wandering(made, 12, seconds=30.0)
     made.gyro_dead = True

@@ -1,7 +1,7 @@
-"""Two minutes, ten and an hour of a robot, in virtual time, end the same way every time.
+"""Simulated drives of two minutes, ten minutes and an hour give the same result in every run.
 
-The trace covers every line that the MCU received and all values on the bus at the end. It changes
-only when the behaviour does. Then find the reason, and rewrite it with
+The stored trace depends on every line to the MCU and on the final values on the bus. It changes
+only if the robot's behaviour changes. If it does, find the reason, and store the new trace with
 
     python -m tests.scenarios.test_hour
 """
@@ -26,7 +26,10 @@ SHORT, SLOW, LONG = 2, 10, 60
 
 
 def live(minutes: int) -> dict[str, object]:
-    """Drive, turn, stop, unplug, reset, stutter: each minute differs, and nothing is random."""
+    """Drive for `minutes`, each minute with another kind of trouble, and return the trace.
+
+    All random numbers come from a fixed seed.
+    """
     world = World(wanted={"state"})
     dice = random.Random(2026)
     trace = 0

@@ -1,4 +1,4 @@
-"""Nothing that the daemon publishes lets another program pass for the one that drives."""
+"""No published value allows another program to impersonate the sender that drives."""
 
 from __future__ import annotations
 
@@ -32,7 +32,10 @@ def turn_rate(world: World) -> float:
 
 
 def published(world: World, tape: Tape) -> Iterator[bytes]:
-    """Return everything that the daemon shows: messages, answers, the log and the recording."""
+    """Yield all bytes that the daemon makes public.
+
+    These are its messages, its answers, its log and its recording.
+    """
     for messages in world.bus.published.values():
         yield from {encode(message, "json") for message in messages}
     for replies in world.bus.replies.values():
@@ -45,7 +48,7 @@ def published(world: World, tape: Tape) -> Iterator[bytes]:
 
 
 def asked_everything(world: World) -> None:
-    """Ask each key that answers, in the victim's name too."""
+    """Query every key of the daemon, partly with the sender id of the victim."""
     victim = msgspec.msgpack.encode({"sender": VICTIM})
     for topic in TOPICS:
         if topic.direction in ("out", "query") and "<" not in topic.key and topic.key != "alive":
@@ -67,7 +70,7 @@ def names(texts: list[bytes]) -> list[str]:
 
 
 def driven() -> tuple[World, Speaker, list[bytes]]:
-    """A robot that its operator drives straight on, and everything that its daemon has shown."""
+    """Return a robot that a sender (the victim) drives, that sender, and all published bytes."""
     tape, world = recorded_world(wanted=EVERY_KEY)
     victim = Speaker(world, "signed", VICTIM)
     victim.open(0.4)

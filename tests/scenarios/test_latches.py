@@ -1,6 +1,6 @@
-"""A clear that a network delays never releases a stop or a fault that its sender did not know.
+"""A delayed clear never releases a stop or fault that its sender had not seen.
 
-The clients here read `state`, and their clear names the latch that they read there.
+The clients here read `state`, and each clear names the latch that the client read.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def world() -> World:
 def call(
     world: World, service: str, name: str, latch: int | None = None, via: Via = "native"
 ) -> ServiceReply:
-    """Return the answer to a call by the client of this name, delivered now."""
+    """Call a service in the name of this client, without delay, and return the answer."""
     payload = b"" if latch is None else msgspec.json.encode({"latch": latch})
     attachment = msgspec.json.encode({"sender": name})
     if via == "rmw":
@@ -54,7 +54,7 @@ def call(
 
 
 def runaway(world: World) -> None:
-    """Latch a fault: the wheels of a robot that should brake go on turning."""
+    """Latch a fault: a person pushes the robot, so its wheels turn against the commanded zero."""
     with world.mcu.pushed(0.5):
         world.run(2.5)
 
@@ -138,7 +138,7 @@ def test_a_stop_that_arrives_ahead_of_its_query_is_one_latch(world: World) -> No
 @pytest.mark.variations(50)
 @pytest.mark.parametrize("seed", range(100))
 def test_no_delayed_clear_releases_a_stop_that_its_sender_had_not_seen(seed: int) -> None:
-    """Three operators stop and clear over links that hold calls and states back for up to 5 s."""
+    """Three operators stop and clear the robot over networks that delay messages by up to 5 s."""
     dice, world = random.Random(seed), World()
     world.run(0.2)
     moving = Speaker(world, "signed")
@@ -245,7 +245,7 @@ def test_a_fault_does_not_overwrite_a_stop(world: World) -> None:
 def test_a_clear_of_one_fault_does_not_release_another_fault_that_came_after_it(
     world: World,
 ) -> None:
-    """The second fault ends by itself, so it would not latch again."""
+    """The second fault's cause ends by itself, so a wrongly released fault would be lost."""
     with world.mcu.dead_motor(0):
         world.drive(0.5, seconds=1.2)
     assert world.state.mode == "fault"

@@ -1,4 +1,4 @@
-"""The host's delays and lost lines change the pose little, from the simulated wheels to `state`."""
+"""Delays of the host and lost lines change the pose in `state` only a little."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ COUNTS = 3200
 
 
 class Drive:
-    """8 s of driving at random; after each of eight legs something happens to lines or host."""
+    """8 s of random driving in eight legs. In each leg the host stalls, or lines are lost."""
 
     def __init__(self, made: World, reports: bool, batched: bool = False) -> None:
         self.world, self.faults = made, ExitStack()
@@ -35,7 +35,12 @@ class Drive:
         made.drive(0.0, 0.0, 0.2)
 
     def error(self, stall: float = 0.0, lost: float = 0.0) -> float:
-        """Return the final pose error in m, with stalls or bursts of lost lines of these s."""
+        """Drive, and return the final position error in m.
+
+        Args:
+            stall: Length of each stall of the host, s.
+            lost: Length of each burst of lost lines, s.
+        """
         made, chance = self.world, random.Random(4)
         with self.faults:
             for _ in range(8):
@@ -53,7 +58,10 @@ class Drive:
 
     @property
     def floor(self) -> float:
-        """Return the pose error in m with every line at its true time, for reports each 10 ms."""
+        """The position error in m that remains if the sample time of each line is known exactly.
+
+        It is valid for a board that reports every 10 ms.
+        """
         path = Path()
         for line in self.world.bus.published["wheel_states"]:
             assert isinstance(line, JointState)
@@ -121,7 +129,7 @@ class Gap:
         return self.world.state.x - self.world.mcu.vehicle.pose.x
 
     def end(self) -> tuple[float, float]:
-        """End the gap at rest; return the error that it caused, m, and its deviation, m."""
+        """Stop the robot and end the gap. Return the gap's error and its standard deviation, m."""
         self.world.hold(0.0, seconds=1.5)
         grown = self.estimates[-1].covariance.xx - self.variance
         return self.off - self.before, math.sqrt(grown)
@@ -134,10 +142,16 @@ class Gap:
 def test_a_stall_in_a_gap_does_not_end_the_motion_in_the_pose_before_rest_is_commanded(
     kept: float, stall: float, waiting: float, mute: bool
 ) -> None:
-    """The robot moves on while this computer sends nothing, until the zeros or the watchdog.
+    """During the gap the daemon stalls and sends nothing, and the robot drives on.
 
-    A mute board takes no samples, so that its first speeds are the means over the gap. `waiting` is
-    a stall before the gap: the reply to the line before it waits in the buffer.
+    It stops when it receives zeros, or when the board's watchdog stops the motors. The pose must
+    not stop earlier.
+
+    Args:
+        kept: Time in the gap during which commands continue, s.
+        stall: Length of the stall, s.
+        waiting: Length of a stall before the gap, s. A reply then waits in the buffer.
+        mute: Whether the board is mute in the gap. Its first speeds then are means over the gap.
     """
     gap = Gap(0.5)
     if waiting:
@@ -168,7 +182,10 @@ def test_a_stall_behind_the_command_to_rest_changes_nothing_in_the_pose() -> Non
 def test_a_board_that_misses_the_command_to_rest_is_in_the_covariance(
     seconds: float, speed: float
 ) -> None:
-    """It ignores all lines, so only its watchdog stops the robot: up to 0.2 s later."""
+    """The board receives no lines, so only its watchdog stops the robot, up to 0.2 s later.
+
+    The covariance includes this additional distance.
+    """
     gap = Gap(speed)
     with gap.world.mcu.lost_commands(1):
         gap.world.hold(speed, seconds=seconds)
@@ -181,7 +198,10 @@ def test_a_board_that_misses_the_command_to_rest_is_in_the_covariance(
 def test_a_board_that_answered_late_before_loses_no_distance_with_its_replies(
     after: float, every: int
 ) -> None:
-    """The change from late to prompt looks like jitter, in which lost replies could hide."""
+    """The board first answers late, then promptly, and then replies are lost. No distance is lost.
+
+    The change from late to prompt looks like jitter, which could hide the lost replies.
+    """
     world = World(Config())
     with world.mcu.slow_reply(0.03):
         world.run(1.0)
@@ -208,7 +228,10 @@ def test_an_adapter_that_batches_and_stalls_costs_a_reporting_mcu_nothing(
 def test_an_adapter_that_batches_and_stalls_costs_a_prompted_mcu_little(
     every: float, stall: float
 ) -> None:
-    """This holds although each stall loses the link, and answers come before they are due."""
+    """The serial adapter delivers replies in batches and stalls, and the pose error is small.
+
+    Each stall loses the link, and some answers seem to arrive before they are due.
+    """
     drive = Drive(World(Config(sim=FINE)), reports=False, batched=True)
     drive.faults.enter_context(drive.world.mcu.stalls(every, stall))
     assert drive.error() < 0.010

@@ -1,4 +1,4 @@
-"""The serial line fails in every way it can; the robot stops, says why, and comes back."""
+"""The serial line fails in many ways. The robot stops, reports the reason, and recovers."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ T = TypeVar("T", bound=Message)
 
 
 def current(world: World, key: str, kind: type[T]) -> T:
-    """Return the value that a query of this key gets now."""
+    """Return the present value of this key, as a query would receive it."""
     message = world.loop.report.current(key, world.loop._look)
     assert isinstance(message, kind)
     return message
@@ -439,7 +439,10 @@ def test_a_lost_link_is_reported_as_a_host_stall_or_as_a_silent_board(
 @pytest.mark.variations(3)
 @pytest.mark.parametrize("stall", [0.105, 0.15, 0.22])
 def test_a_stall_of_this_computer_does_not_stop_the_robot_without_a_ramp(stall: float) -> None:
-    """A command between two periods is sent at once, so that no answer waits for the next step."""
+    """A short stall of the daemon must not cause an abrupt line of zeros.
+
+    A command arrives before the stall, so its line leaves early, and the reply to it waits.
+    """
     for wait_ms in range(10, 24):
         world = World()
         world.run(0.5)

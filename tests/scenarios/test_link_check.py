@@ -1,4 +1,4 @@
-"""The checked link from end to end: new firmware and old, noise, losses, resets, counts.
+"""The checked link with the whole daemon: new and old firmware, noise, losses, resets, counts.
 
 pytest -m soak -s tests/scenarios/test_link_check.py
 """
@@ -55,7 +55,7 @@ def moving(lines: list[bytes]) -> list[bytes]:
 
 
 def check_of(world: World) -> str:
-    """Return the check in force, by the diagnostics."""
+    """Return the current check of the link, as the diagnostics report it."""
     message = world.loop.report.current("diagnostics", world.loop._look)
     assert isinstance(message, DiagnosticArray)
     (link,) = [status for status in message.status if status.name == "acsard: serial link"]
@@ -71,7 +71,7 @@ def texts(world: World, name: str) -> list[str]:
 
 
 def off_by(world: World) -> float:
-    """Return the distance of the pose from the robot's true place, as a share of the way."""
+    """Return the distance between pose and simulated robot, as a share of the path length."""
     at, true = world.state, world.mcu.vehicle.pose
     return math.hypot(at.x - true.x, at.y - true.y) / math.hypot(true.x, true.y)
 
@@ -304,7 +304,10 @@ def flips(line: bytes) -> Iterator[bytes]:
 
 
 def accepted_by_the_mcu(data: bytes, understand: object = protocol.reference) -> list[object]:
-    """Return the commands that an MCU reads from these bytes if it cuts its input at line feeds."""
+    """Return the commands that an MCU accepts from these bytes, if it splits them at line feeds.
+
+    `understand` decodes one line.
+    """
     assert callable(understand)
     found = [understand(piece + b"\n") for piece in data.split(b"\n")[:-1]]
     return [command.values for command in found if command is not None]
@@ -364,7 +367,7 @@ def test_no_single_bit_error_changes_a_value_on_a_checked_link(count: int) -> No
 
 
 def lossy_drive(check: str, counts: int) -> World:
-    """20 % of the lines are lost in either direction, on a way with curves."""
+    """Drive along curves while 20 % of the lines are lost in each direction. Return the world."""
     world = started(config(check, counts))
     with world.mcu.lost_replies(every=5), world.mcu.lost_commands(every=5):
         for turn in (0.0, 0.6, -0.6, 0.3, 0.0):
@@ -384,7 +387,7 @@ def test_with_counts_lost_lines_lose_no_distance() -> None:
 
 
 class LatePort(VirtualPort):
-    """A port whose bytes are read late, in bunches, by up to 60 ms, as on a busy host."""
+    """A port whose bytes the daemon reads in batches and up to 60 ms late, as on a busy host."""
 
     world: World
     dice = random.Random(5)
@@ -508,7 +511,7 @@ TROUBLE = ("mute", "noise", "partial_line", "slow_reply", "no_check", "no_sample
 
 
 def trouble(world: World, dice: random.Random) -> None:
-    """A fault occurs for a while, while a commander keeps sending."""
+    """Cause one random fault for a random time, while a commander sends speeds."""
     name, seconds = dice.choice(TROUBLE), dice.choice((0.03, 0.12, 0.4, 1.3))
     match name:
         case "reset":
@@ -567,7 +570,7 @@ def test_whatever_happens_no_unchecked_line_moves_a_wheel_and_the_pose_never_jum
 
 
 class Echo(FakeMcu):
-    """A port without a microcontroller: bytes come back 5 ms later, or as the adapter likes."""
+    """A port without a microcontroller, which returns all bytes after 5 ms and `extra_delay_ns`."""
 
     def receive(self, now_ns: int, data: bytes) -> None:
         self._schedule(now_ns + 5 * MS + self.extra_delay_ns, "sent", data)
@@ -626,7 +629,7 @@ def test_an_echo_on_a_plain_link_is_detected_when_the_speed_changes(
 
 
 class HalfDuplex(FakeMcu):
-    """A board behind an adapter that also returns each line of the daemon."""
+    """A board behind an adapter that also returns every line of the daemon to the daemon."""
 
     def receive(self, now_ns: int, data: bytes) -> None:
         super().receive(now_ns, data)

@@ -1,4 +1,4 @@
-"""The log of a day has each caller, and each change with its reason, and never too many lines."""
+"""The log of a day names each caller and the reason of each change, and its length is limited."""
 
 from __future__ import annotations
 
@@ -35,17 +35,20 @@ def told(world: World, name: EventName) -> list[Event]:
 
 
 def signed(name: str) -> bytes:
-    """Return the attachment of a client that states its name."""
+    """Return the attachment by which a client with this name signs its messages."""
     return msgspec.json.encode({"sender": f"{name}/s3cret"})
 
 
 def shown(name: str) -> str:
-    """Return the name that the log has for that client."""
+    """Return the text by which the log names the client of `signed(name)`."""
     return f"{public_name(f'{name}/s3cret')} (native)"
 
 
 def call(world: World, service: str, name: bytes = b"", via: Via = "native") -> None:
-    """Call a service as some client. A stop comes ahead of it, as the bus delivers it."""
+    """Call a service. `name` is the caller's attachment, from `signed`.
+
+    A call of `stop` is preceded by a sample on the key `stop`, as on the real bus.
+    """
     key, at_ns = f"srv/{service}", world.now_ns
     if service == "stop":
         world.bus.arrivals.append(
@@ -242,7 +245,7 @@ def test_noise_on_the_wire_is_one_log_line_a_second_that_counts_all(world: World
 
 
 def most_lines(world: World) -> int:
-    """Return the most lines of one name since the last call."""
+    """Return how many events have the most frequent name, and forget all events."""
     most = max(Counter(event.name for event in world.events).values(), default=0)
     world.events.clear()
     return most

@@ -29,9 +29,9 @@ from tests.unit.core.motion.liars import Plain
 def world(
     gyro: bool = False, sim: SimConfig | None = None, fault_time: float = 0.0, share: float = 1.0
 ) -> World:
-    """Return a world without the latched fault, so that the robot drives on.
+    """Return a world in which a wheel fault latches nothing, so that the robot drives on.
 
-    Its gyro reports this share of the true turn rate.
+    The gyro reports `share` times the true turn rate.
     """
     feedback = FeedbackConfig(fault_time=fault_time)
     made = World(
@@ -47,7 +47,7 @@ def world(
 
 
 def off(made: World) -> tuple[float, float]:
-    """Return m and rad between odometry and truth."""
+    """Return the position error in m and the heading error in rad of the odometry."""
     pose, truth = made.state, made.mcu.vehicle.pose
     turn = math.remainder(pose.yaw - truth.yaw, math.tau)
     return math.dist((pose.x, pose.y), (truth.x, truth.y)), abs(turn)
@@ -141,10 +141,11 @@ def test_with_a_gyro_and_a_wheel_fault_heading_and_distance_stay_right() -> None
 
 
 def reversed_encoder(seed: int) -> tuple[float, float, str]:
-    """Drive a robot of 96 counts at random and reverse an encoder until the fault.
+    """Drive a robot with 96 counts per turn at random, with one reversed encoder, until a fault.
 
-    Return by how far the pose and the plain mean of its wheels are turned at the end, rad, and why
-    it stopped. Its motors respond faster or slower than configured, and it drives fast or creeps.
+    The motors may respond faster or slower than configured, and the robot may creep. Returns the
+    final heading error of the odometry and that of a plain mean of the wheels (both in rad), and
+    the reason of the fault, or "" if it does not name the wheel.
     """
     dice, plain = random.Random(seed), Plain()
     lag, scale = dice.choice((0.05, 0.2, 0.6)), dice.choice((0.25, 1.0))
@@ -188,7 +189,10 @@ def test_forty_robots_of_96_counts_with_a_reversed_encoder_are_all_found() -> No
 def test_a_big_robot_that_responds_late_and_falls_short_is_a_warning(
     lag: float, reaches: float
 ) -> None:
-    """Its wheels reach this share of the commanded speed, and its commands jump."""
+    """The motors respond with the delay `lag` and reach only the share `reaches` of each speed.
+
+    The robot drives on without a wheel fault, and the diagnostics warn if it is too slow.
+    """
     rate = 20.0
     limits = LimitsConfig(
         linear_acceleration=rate, linear_deceleration=rate, linear_stop_deceleration=rate,
@@ -291,7 +295,10 @@ def test_a_false_gyro_is_reported_in_the_first_turn_and_never_used(share: float,
 def test_lines_that_waited_while_the_computer_stalled_cause_no_fault(
     baud: Literal[19200, 38400], period: float
 ) -> None:
-    """The board reports by its own clock, and its watchdog has stopped the motors."""
+    """The board is free-running, and its watchdog stops the motors during the stall of the daemon.
+
+    The daemon then reads old lines in which the robot still moves.
+    """
     world = World(Config(mcu=McuConfig(baud_rate=baud, reply_period=period)))
     with world.mcu.free_running(period):
         world.run(2.0)
@@ -307,7 +314,10 @@ def test_lines_that_waited_while_the_computer_stalled_cause_no_fault(
 def test_a_runaway_is_detected_after_a_late_step_and_again_after_a_clear(
     counts: int, speed: float, clear: bool
 ) -> None:
-    """Single lines of few counts report no motion, although the wheel turns."""
+    """A coarse encoder reports no motion in many single lines, although the wheel turns.
+
+    The daemon latches the fault nevertheless.
+    """
     mcu = McuConfig(encoder_counts=counts, reply_period=0.01)
     world = World(Config(mcu=mcu, sim=SimConfig(encoder_counts=counts)))
     with world.mcu.free_running(0.01):

@@ -1,8 +1,8 @@
-"""Other people's tools follow the neutral-first rule: the table in deploy/ros2/README.md.
+"""Tools of other projects follow the neutral-first rule, as deploy/ros2/README.md describes.
 
-Each class publishes at the rates and with the zeros of the tool after which it is named. Each test
-stops and clears the robot while the tool commands it, then does the table's steps for a person. It
-shows that these steps are enough, and that fewer steps leave the robot standing.
+Each class imitates the rates and the zeros of the tool after which it is named. Each test stops and
+clears the robot while the tool sends commands. Then it does what the README's table asks the person
+to do. It shows that these steps are enough, and that the robot stays at rest after fewer steps.
 """
 
 from __future__ import annotations
@@ -57,7 +57,10 @@ def world() -> World:
 
 
 def stop_and_clear(world: World, meanwhile: Callable[[], None]) -> None:
-    """Stop the robot and clear the stop. The tool publishes as in `meanwhile` between the two."""
+    """Stop the robot, call `meanwhile`, and clear the stop.
+
+    `meanwhile` lets the tool publish between the two calls.
+    """
     assert world.call("stop").success
     since_ns = world.now_ns
     meanwhile()
@@ -66,7 +69,7 @@ def stop_and_clear(world: World, meanwhile: Callable[[], None]) -> None:
 
 
 def stands(world: World, act: Callable[[], None]) -> None:
-    """Check that the robot stands while the tool does this, and reports that it needs a zero."""
+    """Call `act`. Check that the robot stays at rest meanwhile and reports that it needs a zero."""
     since_ns = world.now_ns
     act()
     assert not moved(world, since_ns)
@@ -74,7 +77,7 @@ def stands(world: World, act: Callable[[], None]) -> None:
 
 
 def drives(world: World, act: Callable[[], None]) -> None:
-    """Check that the robot drives at the end of this."""
+    """Call `act`, and check that the robot drives at its end."""
     act()
     assert world.state.mode == "driving", world.state.reason
 
@@ -118,10 +121,10 @@ def test_the_first_of_two_publishers_drives_by_rmw_and_both_drive_by_the_bridge(
 
 
 class Keyboard(Speaker):
-    """It publishes once for each key that the terminal reads: `i` is a speed, `k` is a zero."""
+    """teleop_twist_keyboard: it publishes once per received key. `i` is a speed, `k` is a zero."""
 
     def press(self, linear: float, seconds: float, delay: float = 0.5, hz: float = 30.0) -> None:
-        """Hold a key down: the terminal repeats it after `delay`."""
+        """Hold a key for `seconds`. The terminal repeats the key at `hz` after `delay` seconds."""
         self.send(linear)
         self.world.run(delay)
         self.hold(linear, seconds - delay, hz)
@@ -175,14 +178,14 @@ def test_keyboard_by_the_bridge_waits_for_a_second_after_k(world: World) -> None
 
 
 class Joystick(Speaker):
-    """teleop_twist_joy follows the stick while the button is held, and sends one zero after it."""
+    """teleop_twist_joy: it sends speeds while a button is held, and one zero after the release."""
 
     JOY_HZ = 20.0
     zero_on_release = True
     _released = False
 
     def joy(self, button: bool, stick: float, seconds: float) -> None:
-        """Hold button and stick like this: joy_node repeats them at 20 Hz."""
+        """Hold the button (or not) and the stick for `seconds`. joy_node reports both at 20 Hz."""
         for _ in range(round(seconds * self.JOY_HZ)):
             if button:
                 self.send(stick)
@@ -246,19 +249,19 @@ def test_joy_teleop_is_not_armed_by_releasing_its_button(world: World, road: Roa
 
 
 class Steering(Speaker):
-    """It publishes its sliders at 10 Hz, but a zero only once until they are moved again."""
+    """rqt_robot_steering: it publishes the speed of its slider at 10 Hz, but a zero only once."""
 
     slider = 0.0
     _zero_sent = False
 
     def wait(self, seconds: float) -> None:
-        """Leave the sliders where they are."""
+        """Do not move the slider for `seconds`."""
         for _ in range(round(seconds * 10.0)):
             self._publish()
             self.world.run(0.1)
 
     def stop(self) -> None:
-        """Click Stop."""
+        """Click Stop, which sets the slider to zero and publishes."""
         self.slider, self._zero_sent = 0.0, False
         self._publish()
 
@@ -296,7 +299,7 @@ def test_rqt_robot_steering_drives_after_stop_was_clicked(
 
 
 def topic_pub(world: World, road: Road, name: str, linear: float, seconds: float) -> None:
-    """Run `ros2 topic pub -r 10` and end it by Ctrl-C: it sends the same until its end."""
+    """Run `ros2 topic pub -r 10` with a constant speed for `seconds`, and end it by Ctrl-C."""
     Speaker(world, road, name).hold(linear, seconds, 10.0)
 
 
@@ -328,7 +331,7 @@ def test_topic_pub_once_of_a_zero_by_the_bridge_arms_after_a_second(world: World
 @pytest.mark.slow
 @by_each_road
 def test_drive_py_drives_immediately_after_a_clear(world: World, road: Road) -> None:
-    """It sends its opening zeros for the time that its file sets."""
+    """`deploy/ros2/drive.py` sends zeros first, for the time `ZEROS_S` that its source sets."""
     text = (ROS2 / "drive.py").read_text()
     (zeros,) = re.findall(r"^ZEROS_S = ([\d.]+)$", text, re.M)
     for number in range(2):
@@ -347,9 +350,10 @@ Stamps = Literal["none", "kept", "continued"]
 class Nav2(Speaker):
     """controller_server, velocity_smoother and collision_monitor at 20 Hz, by nav2_params.yaml.
 
-    The controller sends speeds while it has a goal, and one zero at its end. The smoother ramps to
-    the last speed that it received. If it receives none for `TIMEOUT_S` it ramps to zero, publishes
-    that zero and falls silent. The monitor passes on all it receives, but zeros only for 2 s.
+    The controller sends speeds while it has a goal, and one zero at the end. The smoother ramps to
+    the newest speed that it received. If it receives nothing for `TIMEOUT_S` it ramps to zero,
+    publishes this zero and stops publishing. The monitor forwards every speed. It forwards zeros
+    for only 2 s.
     """
 
     TIMEOUT_S, STEP, MONITOR_S = 0.25, 1.0 / 20.0, 2.0
@@ -371,7 +375,7 @@ class Nav2(Speaker):
         self._zeros_ns: int | None = None
 
     def goal(self, linear: float, seconds: float) -> None:
-        """Follow a path for a while, without reaching the goal."""
+        """Follow a path at this speed for `seconds`, without reaching the goal."""
         for _ in range(round(seconds * 20.0)):
             self._tick(linear)
 
@@ -380,12 +384,12 @@ class Nav2(Speaker):
         self._tick(0.0)
 
     def receive_zeros(self, seconds: float) -> None:
-        """Have no goal, while another program publishes zeros to the smoother."""
+        """Let another program publish zeros to the smoother, while Nav2 has no goal."""
         for _ in range(round(seconds * 20.0)):
             self._tick(0.0)
 
     def idle(self, seconds: float) -> None:
-        """Have no goal."""
+        """Let `seconds` pass in which Nav2 has no goal and receives nothing."""
         for _ in range(round(seconds * 20.0)):
             self._tick(None)
 
@@ -471,7 +475,10 @@ def test_nav2_by_rmw_drives_a_goal_that_was_sent_again_right_after_the_zero(
 def test_nav2_between_two_goals_must_be_given_a_goal_that_is_cancelled(
     world: World, road: Road
 ) -> None:
-    """Nav2 is silent while it has no goal, and its zeros from before the clear do not count."""
+    """Without a goal Nav2 publishes nothing, and its zeros from before the clear do not arm it.
+
+    The robot therefore stays at rest during the next goal, until that goal is cancelled.
+    """
     nav2 = Nav2(world, road)
     nav2.goal(FAST, 3.0)
     nav2.cancel()
@@ -489,7 +496,10 @@ def test_nav2_between_two_goals_must_be_given_a_goal_that_is_cancelled(
 def test_nav2_that_retries_a_goal_by_itself_drives_when_its_zero_counts(
     world: World, road: Road
 ) -> None:
-    """The behavior tree retries a goal that made no progress for 10 s, after a wait of some s."""
+    """Nav2 makes no progress for 10 s. Its behavior tree waits some seconds and retries the goal.
+
+    Nav2 sends a zero before the retry. The robot drives if this zero arms Nav2.
+    """
     nav2 = Nav2(world, road)
     nav2.goal(FAST, 10.0)
     nav2.cancel()
@@ -503,7 +513,10 @@ def test_nav2_that_retries_a_goal_by_itself_drives_when_its_zero_counts(
 def test_after_a_start_the_second_goal_of_nav2_is_the_first_to_move_the_robot(
     world: World, road: Road
 ) -> None:
-    """Nothing before the goal, TwistStamped speeds at 20 Hz from its start, one zero at its end."""
+    """Nav2 without a smoother publishes speeds during a goal, and one zero at the goal's end.
+
+    This first zero arms it, so only the second goal moves the robot. Messages are TwistStamped.
+    """
     nav2 = Nav2(world, road, smoother=False, stamps="kept")
     nav2.idle(5.0)
     stands(world, lambda: nav2.goal(FAST, 30.0))
@@ -539,7 +552,10 @@ def test_a_nav2_that_was_started_again_must_send_a_zero_by_rmw_and_not_by_the_br
 def test_zeros_that_pass_through_nav2_after_its_start_replace_the_cancelled_goal(
     world: World, road: Road, smoother: bool, later: float
 ) -> None:
-    """The page has the command. One second of zeros also proves the clock of the monitor."""
+    """One second of zeros, published to Nav2's smoother, arms Nav2, so its first goal drives.
+
+    deploy/ros2/README.md has the command. The second also proves the delays of the monitor.
+    """
     nav2 = Nav2(world, road, smoother=smoother)
     nav2.receive_zeros(1.0)
     nav2.idle(1.0 + later)
@@ -548,7 +564,10 @@ def test_zeros_that_pass_through_nav2_after_its_start_replace_the_cancelled_goal
 
 @pytest.mark.slow
 def test_zeros_that_pass_through_nav2_do_nothing_after_a_clear(world: World) -> None:
-    """The collision monitor falls silent 2 s after its first zero, whatever zeros follow."""
+    """The collision monitor stops forwarding zeros 2 s after the first one.
+
+    So it publishes no zero after the clear, and Nav2 is not armed.
+    """
     nav2 = Nav2(world, "rmw")
     nav2.receive_zeros(1.0)
     drives(world, lambda: nav2.goal(FAST, 1.0))
@@ -574,7 +593,10 @@ def test_a_zero_on_cmd_vel_by_the_bridge_arms_nav2_after_a_clear(world: World) -
 
 
 class Docking(Speaker):
-    """Nav2's docking server: speeds at 50 Hz from the first one, past the monitor, one zero."""
+    """Nav2's docking server: it publishes speeds at 50 Hz from its start, and one zero at its end.
+
+    Its commands do not pass the collision monitor.
+    """
 
     def __init__(self, world: World, road: Road) -> None:
         super().__init__(world, road, "docking server")
@@ -600,7 +622,11 @@ def test_docking_has_its_own_place_above_nav2_and_below_ros2_control() -> None:
 def test_after_one_cancelled_docking_later_ones_drive_through_the_zeros_of_nav2(
     world: World, road: Road
 ) -> None:
-    """The collision monitor still repeats its zeros when the docking server begins."""
+    """A cancelled docking arms the docking server, so later dockings drive.
+
+    They drive although the collision monitor still sends zeros, because their source has a higher
+    priority.
+    """
     monitor, docking = Speaker(world, road, "monitor"), Docking(world, road)
     monitor.key = "cmd/nav"
     stands(world, lambda: docking.dock(0.15, 3.0))
@@ -621,7 +647,10 @@ def test_after_one_cancelled_docking_later_ones_drive_through_the_zeros_of_nav2(
 def test_nav2_with_stamps_moves_again_only_if_its_last_zero_is_stamped_right(
     world: World, road: Road, stamps: Stamps, moves: bool
 ) -> None:
-    """The smoother of 2026 stamps the end of a ramp ahead of time, so stamps are off by default."""
+    """The smoother of 2026 stamps the zero at the end of its ramp with a time in the future.
+
+    The daemon refuses that zero, so nav2_params.yaml has the stamps switched off.
+    """
     nav2 = Nav2(world, road, stamps=stamps)
     nav2.goal(FAST, 3.0)
     nav2.cancel()
@@ -634,16 +663,21 @@ def test_nav2_with_stamps_moves_again_only_if_its_last_zero_is_stamped_right(
 
 
 class DiffDrive(Speaker):
-    """diff_drive_controller at 50 Hz, which never stops sending, and JointStateTopicSystem.
+    """ros2_control: diff_drive_controller at 50 Hz, with JointStateTopicSystem.
 
-    It ramps by its limits, and to zero when its own cmd_vel is silent for 0.25 s.
+    The controller never stops sending. It ramps within its limits, and ramps to zero if it receives
+    no `cmd_vel` for 0.25 s.
     """
 
     RADIUS, STEP, TIMEOUT_S = 0.05, 1.0 / 50.0, 0.25
     _last, _heard_ns, _wanted = 0.0, 0, 0.0
 
     def cycle(self, seconds: float, cmd_vel: float | None = None) -> None:
-        """Run for a while. Some client sends `cmd_vel` at 50 Hz, or none does."""
+        """Run the controller for `seconds`.
+
+        If `cmd_vel` is a speed, a client sends it to the controller at 50 Hz. If it is None, no
+        client sends anything.
+        """
         for _ in range(round(seconds * 50.0)):
             now_ns = self.world.now_ns
             if cmd_vel is not None:
@@ -696,10 +730,10 @@ def test_ros2_control_that_sends_zeros_through_a_clear_is_armed_by_them(
 
 
 class Panel(Speaker):
-    """The panel publishes a speed at 10 Hz while a button is held, and nothing when it is released.
+    """Foxglove's teleop panel: it publishes a speed at 10 Hz, but only while a button is held.
 
-    `acsard foxglove` sends a zero of its own before the first speed after a silence of 1.5 s. If
-    `stamped` is true, the panel's messages have stamps, as in a `TwistStamped`.
+    `acsard foxglove` adds a zero before the first speed after a silence of 1.5 s. If `stamped` is
+    true, the panel's messages have stamps, as in a `TwistStamped`.
     """
 
     def __init__(self, world: World, stamped: bool = False) -> None:
@@ -708,21 +742,21 @@ class Panel(Speaker):
         self._stamped = stamped
 
     def connect(self) -> None:
-        """Connect again, as a new sender."""
+        """Let the panel connect again, as a new sender."""
         self.name += "+"
         self._server = Commander(
             sends_leading_zero=True, detects_bursts=True, connected_ns=self.world.now_ns
         )
 
     def button(self, linear: float, seconds: float, period: float = 0.1) -> None:
-        """Hold a button."""
+        """Hold a button with this speed for `seconds`. The panel publishes once per `period`."""
         for _ in range(round(seconds / period)):
             stamp_ns = self.world.instant.wall_ns if self._stamped else None
             self._server.take(Wish(BodyTwist(linear, 0.0), stamp_ns), self.world.now_ns)
             self.release(period)
 
     def release(self, seconds: float) -> None:
-        """Hold no button."""
+        """Release all buttons for `seconds`."""
         for _ in range(round(seconds * 100.0)):
             self.world.run(0.001)  # the program sends a moment after a message has arrived
             due_ns = self._server.due_ns()

@@ -1,4 +1,4 @@
-"""A recording replays to the byte, and a change of anything shows."""
+"""A replay of a recording gives identical bytes, and detects any changed byte."""
 
 from __future__ import annotations
 
@@ -54,7 +54,10 @@ def lives_again(tape: Tape, config: Config, first: int = 0, least: int = 100) ->
 @pytest.mark.slow
 @pytest.mark.parametrize("after", [0.1, 0.5, 1.2])
 def test_a_recording_that_begins_in_a_ramp_stores_when_the_ramp_was_commanded(after: float) -> None:
-    """The guard of the replay lets the rest of the ramp pass, and nothing that comes too late."""
+    """A recording begins during a ramp to zero, and its state has the time of the command.
+
+    So the guard in the replay allows the rest of the ramp, and refuses a moving line after it.
+    """
     tape, world = recorded_world()
     world.drive(1.0, seconds=2.0)
     world.run(after)

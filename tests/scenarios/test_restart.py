@@ -1,7 +1,7 @@
-"""The daemon ends in any way and starts again: a robot that stood latched stands latched.
+"""A latched robot is still latched after the daemon ends in any way and starts again.
 
-A commander keeps sending all the time: zeros for 0.3 s every 2 s, and a speed in between. So it
-arms itself after every start, and only the latch holds the robot.
+A commander sends all the time: zeros for 0.3 s every 2 s, and a speed in between. The zeros arm it
+after every start, so only the latch can keep the robot at rest.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ ZEROS_S, CYCLE_S = 0.3, 2.0
 
 
 class MemoryFile:
-    """The latch file without a disk: it has the newest latches immediately."""
+    """A latch file in memory. It contains the newest latches without waiting for a disk."""
 
     def __init__(self) -> None:
         self.data = b""
@@ -64,7 +64,7 @@ class MemoryFile:
         return [self.told.pop() for _ in range(len(self.told))]
 
     def read(self, now: Instant) -> Latches:
-        """Return the latches that the next start finds here."""
+        """Return the latches that the next start of the daemon reads."""
         try:
             return decode("acsar", self.data)
         except LatchFileError as error:
@@ -72,7 +72,7 @@ class MemoryFile:
 
 
 class Host:
-    """A computer with a daemon, a board that stays on, and one stop-and-go commander."""
+    """A computer with a daemon, a simulated board, and the commander of this module."""
 
     def __init__(self, dice: random.Random) -> None:
         self.file, self.dice = MemoryFile(), dice
@@ -88,7 +88,7 @@ class Host:
         self._phase = self.dice.uniform(0.0, CYCLE_S)
 
     def restart(self) -> None:
-        """End the process by a kill and start it with the latches in the file."""
+        """Kill the daemon, and start it again after a pause with the latches in the file."""
         end = self.world
         pause_ns = self.dice.randrange(int(0.2 * NS_PER_S), 3 * NS_PER_S)
         latches = self.file.read(Instant(end.now_ns + pause_ns, end.instant.wall_ns + pause_ns))
@@ -104,7 +104,7 @@ class Host:
             self.world.run(0.05)
 
     def latch(self, kind: Kind) -> None:
-        """Stop the robot, let it fault, or switch it off."""
+        """Latch a stop, a fault or "inactive"."""
         match kind:
             case "stop":
                 assert self.world.call("stop").success
@@ -116,13 +116,16 @@ class Host:
         assert self.world.state.mode == MODES[kind]
 
     def release(self, kind: Kind) -> None:
-        """Release the latch by its own call."""
+        """Release the latch: call `activate` for "inactive", and `clear` for the others."""
         answer = self.world.call("activate" if kind == "inactive" else "clear")
         assert answer.success, answer.message
 
 
 def stands_until_released(host: Host, kind: Kind, spoil: Callable[[bytes], bytes]) -> None:
-    """Latch, end, start and release; the robot moves before and after, and never in between."""
+    """Latch the robot, end and start the daemon, and release the latch.
+
+    Check that the robot moves before and afterwards, but never in between.
+    """
     host.patrols(2 * CYCLE_S)
     assert host.world.state.mode == "driving"
     host.latch(kind)
@@ -154,7 +157,7 @@ def whole(data: bytes) -> bytes:
 
 
 def cut(data: bytes) -> bytes:
-    """Cut the content as a power cut may."""
+    """Return the beginning of the file's content, as after a power failure."""
     return data[: random.Random(len(data)).randrange(len(data) - 1)]
 
 
@@ -355,7 +358,10 @@ def test_a_stop_while_the_bus_closes_is_in_force_at_the_next_start() -> None:
 def test_a_stop_in_a_step_that_raises_is_in_force_at_the_next_start(
     monkeypatch: pytest.MonkeyPatch, owner: type, name: str, works: bool, by: str
 ) -> None:
-    """The bug is in the bus's input, in the robot, after the robot's step, or in publishing."""
+    """A bug raises an exception in the same step that receives a stop, and the daemon ends.
+
+    The bug is in reading the bus, in the robot, after the robot's step, or in publishing.
+    """
     host = Host(random.Random(16))
     host.patrols(2 * CYCLE_S)
     usual = getattr(owner, name)

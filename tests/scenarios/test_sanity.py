@@ -1,4 +1,4 @@
-"""Encoders and motors fail one wheel at a time; the robot stops and names the wheel."""
+"""An encoder or motor of one wheel fails; the robot stops and names the wheel."""
 
 from __future__ import annotations
 
@@ -104,7 +104,10 @@ def test_repeated_impossible_lines_are_a_fault_within_thirty_milliseconds(world:
 def test_one_count_is_no_impossible_speed_although_it_looks_faster_than_the_bound(
     counts: int, known: bool, rate: float, bound: float
 ) -> None:
-    """At 100 Hz, one count of 96 in a line looks like 6.5 rad/s."""
+    """At 100 Hz and 96 counts per turn, one count in a line looks like 6.5 rad/s.
+
+    The daemon must not treat that as an impossible speed.
+    """
     world = World(
         Config(
             mcu=McuConfig(encoder_counts=counts if known else 0),
@@ -137,10 +140,12 @@ def test_minutes_of_varied_driving_raise_no_false_alarm(world: World) -> None:
 
 
 def damage(world: World, silence: float, number: int, place: int, bits: int) -> None:
-    """Lose all replies for `silence` s, and flip bits in one reply after that.
+    """Lose all replies for `silence` seconds, and damage one later reply.
 
-    It is the reply with this `number`, the first being 1, and `bits` is a mask of the bits to flip
-    in its byte at `place`.
+    Args:
+        number: The number of the damaged reply after the silence, from 1.
+        place: The index of the damaged byte.
+        bits: A mask of the bits to invert.
     """
     feed, begun_ns, replies = world.port.feed, world.now_ns, itertools.count(1)
 
@@ -234,7 +239,10 @@ def told(world: World, name: str) -> list[str]:
 
 
 def enter(world: World, mode: str, dice: random.Random) -> None:
-    """Drive a bit and end in this mode at rest. "driving" means a commander that holds zero."""
+    """Drive, stop, and put the robot into this mode.
+
+    "driving" means that a commander sends zeros, so the robot is at rest in every mode.
+    """
     world.drive(dice.choice((-1, 1)) * dice.uniform(0.2, 1.0), dice.uniform(-2, 2), seconds=0.6)
     world.send(0.0)
     if mode in ("stopped", "fault"):
@@ -263,7 +271,7 @@ def leave(world: World, mode: str) -> None:
 
 
 def shove(world: World, mode: str, dice: random.Random) -> None:
-    """Push it by hand once or a few times, as fast as hands do, and release it."""
+    """Push the robot by hand one to three times, at up to 1 m/s, and release it each time."""
     for _ in range(dice.randint(1, 3)):
         for hands, seconds in ((True, dice.uniform(0.1, 3.0)), (False, dice.uniform(0.05, 0.4))):
             speed = dice.choice((-1, 1)) * dice.uniform(0.05, 1.0)
@@ -396,7 +404,10 @@ def test_motors_that_lag_are_no_runaway_when_the_daemon_has_forgotten_their_spee
 def test_a_robot_that_does_not_obey_a_stop_is_a_fault_as_soon_as_it_is_evident(
     world: World, linear: float, way: str, within: float
 ) -> None:
-    """For the daemon, hands that keep the robot at its speed look like motors that do not obey."""
+    """Hands push the robot on at its speed during a stop. The daemon latches a fault.
+
+    To the daemon this looks like motors that do not obey.
+    """
     world.drive(linear, seconds=2.0)
     began_ns = world.now_ns
     with world.mcu.pushed(linear):
@@ -412,7 +423,10 @@ def test_a_robot_that_does_not_obey_a_stop_is_a_fault_as_soon_as_it_is_evident(
 
 
 def test_a_robot_that_still_rolls_after_a_lost_link_is_a_runaway(world: World) -> None:
-    """It was driven and has not been at rest since, and an MCU without a watchdog drives on."""
+    """The robot was driving when the link was lost, and still moves when the link returns.
+
+    An MCU without a watchdog behaves like this, so the daemon latches a fault.
+    """
     world.drive(0.5, seconds=1.0)
     mcu = world.mcu
     with mcu.no_watchdog(), mcu.pushed(0.5):

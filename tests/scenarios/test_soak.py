@@ -1,7 +1,8 @@
-"""Nothing moves that must not, in ten thousand attempts, and for a day with a fault every minute.
+"""The robot never moves when it must not, in ten thousand attempts and in a day of faults.
 
-Each test prints its figure. The short versions run by default, those marked slow run in `.ci/run`,
-and those with more random cases in the nightly job. The long ones run with
+A fault occurs in each minute of the day. Each test prints its result. The short versions run by
+default, those marked slow in `.ci/run`, and those with more random cases in the nightly job. The
+long ones run with
 
     pytest -m soak -s tests/scenarios/test_soak.py
 """
@@ -30,17 +31,17 @@ DAY_NS = 86_400 * NS_PER_S
 
 
 def slow(value: float) -> object:
-    """Return a run that is too slow for every day."""
+    """Return a parameter for a run that only `.ci/run` does, because it is slow."""
     return pytest.param(value, marks=pytest.mark.slow)
 
 
 def long(count: int, seconds: int) -> object:
-    """Return a long run that may take this many seconds of real time."""
+    """Return a parameter for a soak run, which may take this many seconds of real time."""
     return pytest.param(count, marks=[pytest.mark.soak, pytest.mark.timeout(seconds)])
 
 
 def wheels(line: bytes) -> tuple[float, ...]:
-    """Return the wheel speeds of a line that we sent, rad/s."""
+    """Return the wheel speeds in a line of the daemon, rad/s."""
     return tuple(
         float(line[at + 2 : at + 7]) * (1 if line[at + 1 : at + 2] == b"p" else -1)
         for at in (0, 8, 16, 24)
@@ -56,7 +57,7 @@ def speed(line: bytes) -> float:
 
 
 def refused(world: World, dice: random.Random) -> None:
-    """Send something that must not count as a command."""
+    """Send a message that the daemon must refuse as a command."""
     match dice.randrange(4):
         case 0:
             world.put("cmd/it", b'{"linear": {"x": ')
@@ -70,10 +71,7 @@ def refused(world: World, dice: random.Random) -> None:
 
 
 def silence(world: World, dice: random.Random, timeout: float) -> float:
-    """Drive, then fall silent.
-
-    Returns the time from the last command until the wheels first slow down, s.
-    """
+    """Drive, then send no commands. Return the time from the last one to the first braking, s."""
     linear = dice.choice((-1, 1)) * dice.uniform(0.1, 1.0)
     angular = dice.uniform(-1.5, 1.5)
     pause = min(0.05, timeout * 0.6)
@@ -137,7 +135,10 @@ STARTS_OVER = (
 
 
 def start_over(world: World, kind: str, dice: random.Random) -> World:
-    """Cause the event while the commander goes on sending; return the world that follows it."""
+    """Cause an event of this kind, such as a reset, while the commander sends speeds.
+
+    Returns the world after the event, which is a new one after a restart of the daemon.
+    """
     fast = dice.uniform(-0.9, 0.9)
     match kind:
         case "restart":
@@ -215,10 +216,11 @@ NORMAL_NS = 3_000_000
 
 
 def blackhole(dice: random.Random, slow: bool, seconds: float) -> tuple[int, int, int]:
-    """Run a network that holds everything back and then delivers it.
+    """Run a network that stores all commands for `seconds` and then delivers them.
 
-    Returns the numbers of stale, of backward (stale but obeyed), and of accepted commands. A
-    command that would be stale on arrival requests backward motion, every other one forward motion.
+    A command that is stale on arrival asks for backward motion, and every other one for forward
+    motion. Returns the number of stale commands, of lines with backward motion, and of accepted
+    stale commands.
     """
     timeout_ns, pause_ns = NS_PER_S // 4, int(NS_PER_S / dice.choice((20, 30, 50)))
     world = World()
@@ -282,7 +284,11 @@ TROUBLES = (
 
 
 def trouble(world: World, kind: str, dice: random.Random) -> str:
-    """One fault, from begin to end, and a word that the reason must contain meanwhile, or ""."""
+    """Cause one fault and end it.
+
+    Returns an error text if the reason in `state` lacks the expected word during the fault, else
+    "".
+    """
     seconds, wheel, linear = dice.uniform(0.5, 4.0), dice.randrange(4), 0.5
     if kind == "mute":
         with world.mcu.mute():
@@ -339,7 +345,7 @@ def _word(world: World, word: str) -> str:
 
 
 def recover(world: World) -> None:
-    """Recover from any fault: after a clear and a zero the robot drives, and then it is ready."""
+    """Recover from any fault: clear it, send a zero, and check that the robot drives and stops."""
     world.run(3.0)  # a board that was reset boots for 2 s
     if world.state.mode in ("stopped", "fault"):
         assert world.call("clear").success
@@ -351,7 +357,7 @@ def recover(world: World) -> None:
 
 
 def empty(world: World) -> int:
-    """Drop the objects that only the test keeps; return the memory blocks still in use."""
+    """Delete the messages that only the test stores. Return the number of memory blocks in use."""
     for kept in (world.events, world.bus.replies, world.bus.finished, world.port.sent):
         kept.clear()
     world.mcu.heard.clear()
@@ -408,7 +414,11 @@ def test_a_day_with_a_fault_every_minute_is_explained_and_leaks_no_memory(
 
 
 def walk(count: int, jumps: bool) -> tuple[int, int, list[int], object]:
-    """Drive about while the wall clock jumps `count` times, or does not."""
+    """Drive at random while the wall clock jumps `count` times, or does not jump at all.
+
+    Returns the number of control periods and of missed ones, digests of poses and lines, and the
+    counters.
+    """
     dice, clock = random.Random(5), random.Random(6)
     world, ticks, trace = World(), 0, [0, 0]
 
@@ -453,7 +463,7 @@ def test_a_wall_clock_that_jumps_a_day_loses_no_tick_and_moves_no_odometry(count
 
 
 def poured_out(dice: random.Random, way: Way, running: bool) -> bool:
-    """Return whether the late backlog of a sender that has ended moves the robot."""
+    """Return whether the delayed backlog of a sender that has ended moves the robot."""
     world = World()
     world.run(0.3)
     ahead = dice.choice((0.0, 0.3, -0.3, -2.0, 2.0, -3600.0, 86400.0))
@@ -497,9 +507,10 @@ def test_no_backlog_moves_the_robot_for_a_new_or_a_known_sender(
 def test_a_replay_in_real_time_by_a_new_sender_looks_like_a_clock_that_is_behind(
     way: Way,
 ) -> None:
-    """Nothing distinguishes the two.
+    """A delayed stream of a new sender, delivered in real time, moves the robot.
 
-    If the sender is known, the zeros with which it opens do not count.
+    The daemon cannot distinguish it from a sender whose clock is behind. It knows the delays of an
+    earlier sender, so the stream of such a sender does not move the robot.
     """
     for known in (False, True):
         world = World()
@@ -523,7 +534,7 @@ def test_a_replay_in_real_time_by_a_new_sender_looks_like_a_clock_that_is_behind
 
 
 def driving_again(world: World, speaker: Speaker, within: float = 3.0) -> bool:
-    """Return whether the robot drives after speeds for this time, zeros, and speeds again."""
+    """Send speeds for `within` s, zeros, and speeds again. Return whether the robot drives."""
     speaker.hold(0.4, within)
     # A zero of an identity that programs may share counts after a second. So does one whose stamp
     # Zenoh replaced because its clock is ahead.
@@ -536,7 +547,10 @@ def driving_again(world: World, speaker: Speaker, within: float = 3.0) -> bool:
 
 
 def drives_on_or_again(world: World, speaker: Speaker) -> bool:
-    """The sender drives on for 4 s. If not, it drives again within 3 s, including its zeros."""
+    """Return whether the robot drives on for 4 s, or drives again within 3 s after it stopped.
+
+    The 3 s include the zeros that the sender must send.
+    """
     for _ in range(40):
         speaker.hold(0.4, 0.1)
         if world.state.mode != "driving":
@@ -545,9 +559,10 @@ def drives_on_or_again(world: World, speaker: Speaker) -> bool:
 
 
 def stale_moves(world: World, speaker: Speaker, cut: float) -> bool:
-    """Return whether backward commands that a network held for `cut` seconds moved the robot.
+    """Return whether backward commands that a network delays by up to `cut` s move the robot.
 
-    By a slewed clock they look fresher by the seconds that the clock has gained.
+    If the sender's clock has gained time, its commands look fresher by that time, so the newest
+    commands are left out.
     """
     held, end_ns = [], world.now_ns + int(cut * NS_PER_S)
     while world.now_ns < end_ns:
@@ -562,9 +577,9 @@ def stale_moves(world: World, speaker: Speaker, cut: float) -> bool:
 
 
 def stepped(dice: random.Random, way: Way, ahead: float, step: float) -> str:
-    """Set the sender's clock by `step` seconds while it drives, then cut the network.
+    """Step the sender's clock by `step` seconds while it drives, and later interrupt the network.
 
-    Returns the failure, or "".
+    Returns a description of the failure, or "".
     """
     world = World()
     world.run(0.3)
@@ -647,7 +662,7 @@ KINDS = ("steady", "stalls", "cuts", "another")
 
 
 def stuck(dice: random.Random, way: Way, hz: float, kind: str) -> bool:
-    """Return whether a sender that is never neutral, through stop and clear, moves the robot."""
+    """Return whether a sender that sends only speeds moves the robot after a stop and a clear."""
     world = World()
     world.run(0.3)
     speaker = Speaker(world, way)

@@ -1,4 +1,4 @@
-"""Nav2's speed filter slows the robot in a zone, and an operator sets limits meanwhile."""
+"""Nav2's speed filter limits the robot in a zone, while an operator changes the limits too."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def limit(world: World, value: float, **fields: Any) -> None:
 
 
 def sets(world: World, **settings: Plain) -> ServiceReply:
-    """Dots in keys are written as two underscores."""
+    """Call `set` with these settings. Two underscores in a name stand for a dot."""
     wishes = {key.replace("__", "."): value for key, value in settings.items()}
     return world.call("set", msgspec.json.encode({"settings": wishes}))
 
@@ -44,7 +44,7 @@ def config(world: World) -> Config:
 
 
 def fastest(world: World) -> list[float]:
-    """Return a list that has the highest speed of each line from now on, m/s."""
+    """Return a list to which each later step adds its linear speed in m/s, without its sign."""
     found: list[float] = []
 
     def note(outputs: Outputs) -> None:
@@ -149,7 +149,7 @@ def test_a_speed_limit_neither_moves_the_robot_nor_clears_a_stop(world: World) -
 
 
 class Memory:
-    """A robot whose latch file survives its daemons."""
+    """A robot whose latch file and configuration file outlive each daemon."""
 
     def __init__(self, file: Path, text: str) -> None:
         file.write_text(text)
@@ -167,7 +167,7 @@ class Memory:
 def test_a_restart_forgets_the_limit_and_keeps_the_lower_setting_of_the_operator(
     tmp_path: Path,
 ) -> None:
-    """The program that would lift the limit may be gone after the restart."""
+    """A restart removes the speed filter's limit, because no program may be left to lift it."""
     robot = Memory(tmp_path / "acsard.toml", "[limits]\nlinear_speed = 0.9\n")
     world = robot.start()
     assert sets(world, limits__linear_speed=0.6).success
@@ -187,7 +187,7 @@ def test_a_restart_forgets_the_limit_and_keeps_the_lower_setting_of_the_operator
 def test_a_speed_limit_is_not_stored_if_its_step_raises(
     lifts: bool, obeyed: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """No message would lift a limit that the latch file has."""
+    """If the latch file contained the limit, no message would ever lift it."""
     robot = Memory(tmp_path / "acsard.toml", "[limits]\nlinear_speed = 0.9\n")
     world = robot.start()
     if lifts:
@@ -246,7 +246,7 @@ def test_a_flood_of_limits_changes_the_robot_ten_times_a_second(world: World) ->
 
 @pytest.mark.slow
 def test_a_drive_through_a_zone_is_replayed_to_the_last_bit() -> None:
-    """A recording has the requests that the limits became, so its replay needs no speed limit."""
+    """The replay needs no speed filter, because the recording contains the resulting requests."""
     tape = Tape()
     world = World(recorder=tape)
     world.run(0.2)

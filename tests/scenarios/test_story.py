@@ -1,8 +1,8 @@
-"""A reader of one output of a recording learns what happened, when, why and by which client.
+"""Each output of a recording tells its reader what happened, when, why and by which client.
 
-The story has thirteen incidents in three runs of the daemon. `acsard recording show`, the report
-and the exported `log` must tell all of them alike. Two incidents are about the battery: it runs
-empty, and an undervoltage restarts the board.
+The test plays thirteen incidents in three runs of the daemon. `acsard recording show`, the report
+and the exported `log` must report all of them in the same words. In two incidents the battery runs
+low, and an undervoltage restarts the board.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ TOM_BY = rf"\(by {TOM}/[0-9a-f]{{16}}\)"
 
 
 class Line(NamedTuple):
-    """A line of an output."""
+    """A line of one output, with its time."""
 
     seconds: float
     """Wall-clock time, s since 1970."""
@@ -72,7 +72,7 @@ def signed(name: str) -> bytes:
 
 
 class Host:
-    """The computer of the robot: it runs the daemon, whose recorder writes when it is asked."""
+    """The robot's computer with its daemon. The recorder writes only when `write` is called."""
 
     def __init__(self, where: Path) -> None:
         self.config = replace(
@@ -89,12 +89,12 @@ class Host:
         self.world.wall_offset_ns = wall_ns - self.world.now_ns
 
     def note(self, name: str, *patterns: str, after: float = 0.0) -> None:
-        """Note that an incident happens `after` s from now."""
+        """Add an incident to the list. It happens `after` seconds from now."""
         wall_ns = self.world.instant.wall_ns + int(after * NS_PER_S)
         self.incidents.append(Incident(name, wall_ns, patterns))
 
     def write(self) -> None:
-        """Write what the recorder's thread would write each second."""
+        """Write the recorded steps to the file, as the recorder's thread does each second."""
         self.recorder._writer.write(self.recorder._taken(), False)
 
     def run(self, seconds: float) -> None:
@@ -106,7 +106,7 @@ class Host:
         self.world.put(f"cmd/{source}", payload, attachment=signed(name))
 
     def hold(self, name: str, source: str, speed: float, seconds: float) -> None:
-        """Send a speed at 20 Hz."""
+        """Let the client `name` send a speed in m/s at 20 Hz for `seconds`."""
         for number in range(round(seconds * 20)):
             self.send(name, source, speed)
             self.world.run(0.05)
@@ -115,7 +115,7 @@ class Host:
         self.write()
 
     def drive(self, seconds: float = 2.0) -> None:
-        """Let the navigation send zeros for a second, and then drive."""
+        """Let the navigation program send zeros for 1 s, and then a speed for `seconds`."""
         self.hold(NAV, "nav", 0.0, 1.0)
         self.hold(NAV, "nav", 0.5, seconds)
         assert self.world.state.mode == "driving", self.world.state.reason
@@ -141,7 +141,7 @@ class Host:
         self.run(0.05)
 
     def crash(self) -> None:
-        """End the process without notice: the kernel closes its files."""
+        """End the daemon as a crash does, so that only the kernel closes the files."""
         writer = self.recorder._writer
         assert writer._writing is not None
         assert writer._directory is not None
@@ -150,13 +150,13 @@ class Host:
 
 
 def identity(counts: int, watchdog_ms: int, sample: bool) -> bytes:
-    """Return the line with which a board names itself that an undervoltage has restarted."""
+    """Return the identity line of a board that an undervoltage has just reset."""
     return IDENTITY(counts, watchdog_ms, sample).removesuffix(b"\r\n") + b" reset=brown-out\r\n"
 
 
 @contextmanager
 def full_disk() -> Iterator[None]:
-    """Let each sync fail as on a disk without free space."""
+    """Make each fsync fail, as on a disk without free space."""
 
     def refuse(handle: int) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
@@ -167,7 +167,7 @@ def full_disk() -> Iterator[None]:
 
 
 def by(name: str, source: str = "") -> str:
-    """Return a pattern for the client in a line, with its source if it has one."""
+    """Return a pattern that matches the part of a line which names this client and its source."""
     found = f"{re.escape(name)}/[0-9a-f]{{16}}"
     return rf"\(by {source} \({found}\)\)" if source else rf"\(by {found} \(native\)\)"
 
@@ -375,7 +375,7 @@ def second_run(host: Host) -> None:
 
 
 def third_run(host: Host) -> None:
-    """Restart a robot that anna has stopped before."""
+    """Start a robot that is still stopped, because the client anna stopped it earlier."""
     wall_ns = host.world.instant.wall_ns
     client = f"{ANNA}/0123456789abcdef (native)"
     stop = Latch(1, wall_ns, client, f"stopped by {client}", kept=True)
@@ -390,9 +390,9 @@ def third_run(host: Host) -> None:
 
 
 def seconds_of(text: str, date: str = "") -> float:
-    """Return a local time like 2027-01-15 08:00:59.950 in s since 1970.
+    """Convert a local time like 2027-01-15 08:00:59.950 to s since 1970.
 
-    `date` is the date of a time that has none.
+    If the text has no date, `date` is used.
     """
     whole, _, fraction = (text if "-" in text else f"{date} {text}").partition(".")
     return time.mktime(time.strptime(whole, "%Y-%m-%d %H:%M:%S")) + float(f"0.{fraction}")
@@ -407,7 +407,7 @@ def shown(*words: str) -> list[Line]:
 
 
 def reported(where: Path, directory: Path) -> list[Line]:
-    """Return the lines of the lists of events in the reports, in the order of the recordings."""
+    """Return the lines of the event lists in the reports, in the order of the recordings."""
     assert main(["recording", "report", "all", "--directory", str(where)]) == 0
     cells = (
         r'<td class="time">(.*?)</td><td class="name .*?">(.*?)</td><td>(.*?)</td><td>(.*?)</td>'
@@ -471,7 +471,7 @@ def story(tmp_path_factory: pytest.TempPathFactory) -> Story:
 
 
 def is_near(line: Line, incident: Incident) -> bool:
-    """Return whether a line has the time of an incident."""
+    """Return whether the time of a line agrees with the time of an incident."""
     return abs(line.seconds - incident.wall_ns / NS_PER_S) <= TOLERANCE_S
 
 
@@ -503,7 +503,7 @@ def test_the_three_outputs_have_the_same_lines_at_the_same_times(story: Story) -
 def test_show_and_export_of_a_part_have_the_same_lines(
     begin: float, end: float, story: Story, tmp_path: Path
 ) -> None:
-    """A drive that goes on at the end of the part has a line in both."""
+    """A drive that is not finished at the end of the part also has a line, in both outputs."""
     first, new = str(listed(story.where)[0]), tmp_path / "new.mcap"
     times = ["--from", str(begin), "--to", str(end)]
     assert main(["recording", "export", first, str(new), *times]) == 0

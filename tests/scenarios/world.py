@@ -1,7 +1,8 @@
-"""The whole daemon in virtual time: control loop, fake MCU and an in-memory bus, no real clock.
+"""The whole daemon in virtual time: control loop, simulated MCU and an in-memory bus.
 
-`World.run` jumps from one event to the next, so an hour costs seconds. The port here applies the
-same gate as the real one. The fake MCU sets the pace of the wire.
+`World.run` jumps from one event to the next and reads no real clock, so an hour takes seconds. The
+port here delays lines by the same rule as the real one (`SerialOutput`). The simulated MCU sends
+and receives bytes at the speed of the wire.
 """
 
 from __future__ import annotations
@@ -45,9 +46,9 @@ SIGNED = Signature("somebody").pack()
 
 
 class VirtualPort:
-    """A serial port to the fake MCU.
+    """A serial port to the simulated MCU.
 
-    Tests can unplug it, block it, delay it and make it take only part of a line.
+    Tests can unplug it, block it, delay it, and let it accept only part of a line.
     """
 
     def __init__(self, baud_rate: int, stop: bytes, period_ns: int) -> None:
@@ -103,7 +104,10 @@ class VirtualPort:
 
 
 class MemoryBus:
-    """Collects the messages on the wanted keys, and delivers the test's samples and queries."""
+    """A bus in memory: it stores the daemon's messages, and delivers a test's samples and queries.
+
+    It stores only messages on the keys in `wanted`.
+    """
 
     def __init__(self, wanted: Collection[str]) -> None:
         self.wanted = set(wanted)
@@ -140,7 +144,7 @@ class MemoryBus:
 
 
 class World:
-    """A simulated robot on a bench, with its daemon, in virtual time."""
+    """A simulated robot and its daemon in virtual time."""
 
     def __init__(
         self,
@@ -154,7 +158,10 @@ class World:
         wanted: Collection[str] = (),
         late_watch: LateWatch | None = None,
     ) -> None:
-        """Messages are made only for the `wanted` keys. `state` and `odom` need no key."""
+        """Start the daemon. It encodes messages only for the keys in `wanted`.
+
+        `state` and `odom` are always available as properties.
+        """
         self.config = config or Config()
         self.now_ns = START.mono_ns
         self.wall_offset_ns = START.wall_ns - START.mono_ns
@@ -215,7 +222,7 @@ class World:
 
     @property
     def _listens(self) -> bool:
-        """Whether a command that arrives now gets a step of its own."""
+        """Whether the daemon handles a command that arrives now immediately, in an extra step."""
         return self.steps > 0 and self.loop.accepts_early_command
 
     @property
@@ -223,7 +230,10 @@ class World:
         return Instant(self.now_ns, self.now_ns + self.wall_offset_ns)
 
     def run(self, seconds: float) -> None:
-        """Let time pass. Bytes arrive when they are due, and each period has a step."""
+        """Advance the time by `seconds`, with a step in each control period.
+
+        Bytes from the MCU arrive at their due times.
+        """
         end_ns = self.now_ns + int(seconds * NS_PER_S)
         while True:
             alarm_ns, at_ns = self._alarm_ns, self.next_period_ns
@@ -248,9 +258,9 @@ class World:
             self._step(Period(1 + missed, due_ns))
 
     def _bytes_came(self, until_ns: int) -> bool:
-        """Advance the MCU until its next bytes reach the port.
+        """Advance the MCU until it sends bytes, and deliver them to the port.
 
-        Return False if no bytes arrive by `until_ns`.
+        Returns False if it sends none by `until_ns`.
         """
         mcu = self.port.mcu
         if mcu is None:
@@ -274,7 +284,7 @@ class World:
         self.next_period_ns += self._missed * self.period_ns
 
     def stall_in_step(self, seconds: float) -> None:
-        """Stall the loop between the making of the next line and its handing over."""
+        """Stall the next step after it has built its line and before the port gets the line."""
 
         def pause() -> int:
             self.stall(seconds)
@@ -297,7 +307,7 @@ class World:
     def send(
         self, linear: float, angular: float = 0.0, source: str = "app", stamp_ns: int | None = None
     ) -> None:
-        """Send one Twist as JSON with a sender attachment. `speakers.py` has the other senders."""
+        """Send one Twist as JSON, with a sender id. `speakers.py` has other kinds of senders."""
         if linear or angular:
             self._moved_ns[source] = self.now_ns
         payload = msgspec.json.encode({"linear": {"x": linear}, "angular": {"z": angular}})
@@ -377,7 +387,10 @@ class World:
         return self.bus.replies.get(query.ticket, [])
 
     def call(self, service: str, payload: bytes = b"") -> ServiceReply:
-        """Return a service's answer. Like our tools, a release names the latch of `state`."""
+        """Call a service and return its answer.
+
+        A `clear` or `activate` without a payload names the latch in `state`, as acsard's tools do.
+        """
         if service in ("clear", "activate") and not payload:
             payload = msgspec.json.encode({"latch": self.state.latch})
         (reply,) = self.ask(f"srv/{service}", payload=payload)
@@ -398,5 +411,5 @@ class World:
         return message
 
     def lines(self) -> list[bytes]:
-        """Return the lines that the MCU received, oldest first, without bare line ends."""
+        """Return the lines that the MCU has received, oldest first, without empty lines."""
         return [line for _, line in self.mcu.heard if line != b"\r\n"]

@@ -47,7 +47,7 @@ NO_TROUBLE = DIALECTS | INPUTS
 
 
 class Result(NamedTuple):
-    """The result of playing one plan."""
+    """The result of a run."""
 
     seed: int
     finding: str
@@ -69,8 +69,7 @@ def collect_seldom() -> None:
 
 
 def played(plan: Plan, log: Callable[[dict[str, Any]], None] | None = None) -> Result:
-    """Play a plan in this process, and return the result. `log` receives the outputs of each step.
-    """
+    """Play a plan in this process and return the result. `log` receives each step's outputs."""
     began = time.process_time()
     run = Run(plan, log)
     try:
@@ -184,7 +183,7 @@ class Run:
     # the play
 
     def play(self) -> Counter[str]:
-        """Play the plan to its end. Raise `BrokenError` at the first broken promise."""
+        """Play the plan to its end; raise `BrokenError` for a promise that does not hold."""
         try:
             self._begin()
             self.run_to(int(self.plan["seconds"] * NS))
@@ -258,7 +257,7 @@ class Run:
         self.product.deliver(at_ns, one.key, one.payload, **one.options)
 
     def _dropped(self, key: str) -> None:
-        """Note that the inbox was full and dropped its oldest message on this key."""
+        """Note that the inbox dropped its oldest message of this key unread."""
         self.witness.dropped(key)
         self.reasons.dropped(key, self.true_ns)
 
@@ -670,7 +669,7 @@ class Run:
             self.failure = error
 
     def _take_answers(self) -> None:
-        """Pass each answer of the daemon to the call that it answers."""
+        """Hand each answer of the daemon to the call that it belongs to."""
         for ticket, reply in self.product.replies():
             if ticket in self._calls:
                 _, _, answered = self._calls.pop(ticket)

@@ -26,7 +26,7 @@ CALL: Event = {
 
 
 def add(plan: Plan) -> None:
-    """Change this plan to have one of the coincidences in `MOMENTS`, with their probabilities."""
+    """Give this plan at most one coincidence of `MOMENTS`, each with its own probability."""
     for name, (share, fits, give) in MOMENTS.items():
         dice = random.Random(f"a moment {name} {plan['seed']}")
         if dice.random() < share and fits(plan):
@@ -59,8 +59,7 @@ def _best(plan: Plan) -> dict[str, Any]:
 
 
 def _driver(plan: Plan, source: dict[str, Any], **more: Any) -> dict[str, Any]:
-    """Return the plan's first sender with a good network, an exact clock, and the fields in `more`.
-    """
+    """Return the plan's first sender with a good network, an exact clock, and fields `more`."""
     usual = {
         "source": source["name"], "wheels": False, "from": 0.0, "to": plan["seconds"],
         "delay": 0.001, "jitter": 0.0, "congestion": [], "clock": [], "bursts": [],
@@ -248,7 +247,7 @@ def _ideal(plan: Plan, dice: random.Random) -> None:
 
 
 def _inputs(plan: Plan, dice: random.Random, names: tuple[str, ...]) -> str:
-    """Give the board one of these inputs, remove all others, and return its name."""
+    """Give the board one of these inputs, and no other, and return its name."""
     config, name = plan["config"], dice.choice(names)
     config.pop("battery", None)
     config["safety"] = {}
@@ -260,7 +259,7 @@ def _inputs(plan: Plan, dice: random.Random, names: tuple[str, ...]) -> str:
 
 
 def _press(dice: random.Random, plan: Plan, name: str, lasts: float) -> list[Any]:
-    """Return the fault of the board that activates this input for `lasts` seconds."""
+    """Return a fault of the board that presses an input, or reports a fault of a motor driver."""
     match name:
         case "bumpers":
             number = dice.randint(1, len(plan["config"]["safety"]["bumpers"]))
@@ -271,7 +270,7 @@ def _press(dice: random.Random, plan: Plan, name: str, lasts: float) -> list[Any
 
 
 def _named_stop(plan: Plan, dice: random.Random) -> None:
-    """Press an input of the board shortly after a client has stopped the robot."""
+    """Press an input of a robot that a client has stopped."""
     _alone(plan, dice, _drives(plan, dice, 0.3, 1.0, 4.0))
     name, at = _inputs(plan, dice, ("bumpers", "estop")), 4.0
     while at < plan["seconds"] - 6.0:
@@ -291,7 +290,7 @@ def _named_stop(plan: Plan, dice: random.Random) -> None:
 
 
 def _other_board(plan: Plan, dice: random.Random) -> None:
-    """Replace a board that reports a fault or a press by a board without this input."""
+    """Replace a board that reports a fault or a press by one that never reports this input."""
     _alone(plan, dice, _drives(plan, dice, 0.3, 1.0, 4.0))
     name = _inputs(plan, dice, ("driver", "estop"))
     at, lasts = round(dice.uniform(3.0, 15.0), 3), round(dice.uniform(0.3, 3.0), 3)
@@ -407,10 +406,7 @@ def _set_back(plan: Plan, dice: random.Random) -> None:
 
 
 def _routed(plan: Plan, dice: random.Random) -> None:
-    """Let two programs without a sender id send through the same distant Zenoh router.
-
-    The robot has no link to this router.
-    """
+    """Let two programs without an id send through a router that is not linked to the robot."""
     plan["config"]["commands"]["neutral_first"] = True
     _best(plan)["timeout"] = dice.choice((0.25, 0.5, 1.0))
     first = _alone(plan, dice, [])
@@ -554,7 +550,7 @@ def _doubtful_holder(plan: Plan, dice: random.Random) -> None:
 
 
 def _coarse(plan: Plan, dice: random.Random) -> None:
-    """Give the robot encoders with few counts, and motors with the slowest allowed response."""
+    """Give the robot encoders with few counts, and wheels that respond as late as allowed."""
     config, counts = plan["config"], dice.choice((16, 20, 32, 48))
     config.pop("feedback", None)
     config["drive"] = {"wheel_radius": 0.05, "wheel_separation": 0.3}

@@ -79,7 +79,7 @@ CLEAR = {
 
 
 def add(plan: Plan) -> None:
-    """Give some plans inputs, presses of these inputs, and operators who clear the stops."""
+    """Give some plans inputs, and operators who clear the stops."""
     dice = random.Random(f"board inputs {plan['seed']}")
     # A line without a checksum does not count once the link has the check.
     if dice.random() <= SHARE and "link_check" not in plan["config"]["mcu"]:
@@ -118,7 +118,7 @@ def _clears(dice: random.Random, events: list[Any], at: float, lasts: float) -> 
 
 
 def _moment(plan: Plan, dice: random.Random) -> float:
-    """Return a time in s, mostly one at which a sender drives."""
+    """Return a time, mostly one at which a sender drives."""
     drives = [p[0] for s in plan["senders"] for p in s["phases"] if p[1]]
     if drives and dice.random() < 0.7:
         return float(min(dice.choice(drives) + dice.uniform(0.2, 3.0), plan["seconds"]))
@@ -199,7 +199,7 @@ def _away(plan: Plan, dice: random.Random) -> None:
 
 
 def _driver(plan: Plan, dice: random.Random) -> None:
-    """Add faults of a motor driver at random times."""
+    """Add faults of a motor driver."""
     plan["board"].append(["driver_fault", NEVER_S, 1.0])
     for _ in range(1 + int(plan["seconds"] / 15)):
         _pressed(plan, dice, "driver_fault", "driver_fault")
@@ -233,7 +233,7 @@ def kinds(plan: Plan) -> set[str]:
 
 
 def removed(plan: Plan) -> Plan:
-    """Return the plan without inputs, for an older product that does not know them."""
+    """Return the plan without inputs, for a product that does not know them."""
     tables = plan["config"].items()
     return plan | {
         "config": {name: table for name, table in tables if name not in ("safety", "battery")},
@@ -246,8 +246,7 @@ def removed(plan: Plan) -> Plan:
 
 
 class _Input:
-    """The state of the emergency stop or of all bumpers, from the lines that the daemon has read.
-    """
+    """The state of the emergency stop or all bumpers, from the lines that the daemon has read."""
 
     def __init__(self) -> None:
         self.marks = b""
@@ -279,9 +278,8 @@ class _Mean:
     """
 
     def __init__(self, config: dict[str, Any], emptied: bool) -> None:
-        """Start without reports.
+        """`emptied` says whether the daemon may have started with the stop of an empty battery.
 
-        If `emptied` is true, the daemon may have started with a latched stop of an empty battery.
         The battery then counts as empty until its mean rises.
         """
         names = [name for name in ("warning", "return", "stop") if config.get(f"{name}_below")]
@@ -326,10 +324,10 @@ class _Mean:
 
 
 class Inputs:
-    """Judges the robot's behaviour while an input is pressed, is silent, or has a fault."""
+    """Judges what the robot does while an input counts as pressed or the battery is empty."""
 
     def __init__(self, witness: Witness, reports: bool) -> None:
-        """Start for a plan. `reports` is true if its board reports any input."""
+        """`reports` says whether the board ever reports an input."""
         self._witness = witness
         self._reports = reports
         config = witness.config

@@ -27,7 +27,7 @@ MAX_LINE = 4096
 
 
 class Damage:
-    """Counts the whole lines that the board sent after the last damaged line."""
+    """The lines that the board sent, and how many whole ones followed the last damaged one."""
 
     def __init__(self) -> None:
         self.forget()

@@ -274,7 +274,7 @@ class Followed:
         return None if self._holder is None else self._holder.sender
 
     def forget(self) -> None:
-        """Note that the daemon may have forgotten all earlier commands."""
+        """Note that the daemon may have forgotten all commands."""
         self._sure.clear()
         self._holder = self._keeper = None
 

@@ -65,8 +65,7 @@ def _add_wrong_samples(plan: Plan, dice: random.Random) -> None:
 
 
 def _add_hangs(plan: Plan, dice: random.Random) -> None:
-    """Add times in which the gyro repeats its rate, often the rate of a turn that has just ended.
-    """
+    """Add times in which the gyro repeats its rate, often that of a turn that has just ended."""
     ends = [
         after[0]
         for sender in plan["senders"]
@@ -84,7 +83,7 @@ def _add_hangs(plan: Plan, dice: random.Random) -> None:
 
 
 class GyroFaults:
-    """Replaces the measured rates of a gyro by the wrong ones that it reports."""
+    """The rates that a gyro reports instead of the measured ones."""
 
     def __init__(self) -> None:
         self.hanging = False

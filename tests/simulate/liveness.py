@@ -160,8 +160,7 @@ class Liveness:
         return self._armed.get(name, -1) > self._disarmed_ns + self._tick_ns
 
     def _take_zero(self, name: str, wish: Wish) -> None:
-        """Record the zero that arms this sender, unless a stall may have hidden it from the daemon.
-        """
+        """Record the zero that arms this sender, unless a stall may have hidden it."""
         zero_ns, (begun_ns, ended_ns) = wish.armed_ns, self._stall
         if self._is_armed(name):
             return

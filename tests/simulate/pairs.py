@@ -72,7 +72,7 @@ def serve(where: Path) -> None:
 
 
 class Trace:
-    """The hashes of all seconds of a run, and the steps of one second."""
+    """A hash of each second of a run, and the steps of one second as text."""
 
     def __init__(self, second: int | None = None) -> None:
         self.hashes: list[str] = []
@@ -94,7 +94,7 @@ class Trace:
 
 
 def rewritten(step: Step, differences: tuple[tuple[str, str, str, str], ...] = DIFFERENCES) -> Step:
-    """Return a step without the intended differences between the checkouts."""
+    """Return a step with the deliberate differences taken out."""
     changed = dict(step)
     for field, pattern, replacement, _ in differences:
         value = changed[field]
@@ -109,8 +109,7 @@ def _replaced(pattern: str, replacement: str, text: str) -> str:
 
 
 def comparable(plan: Plan, left_out: tuple[tuple[str, object, str], ...] = LEFT_OUT) -> Plan:
-    """Return a plan without the events that intentionally have different effects on the two sides.
-    """
+    """Return a plan without the events whose effects intentionally differ on the two sides."""
     events = plan["events"]
     for field, value, _ in left_out:
         events = [event for event in events if event.get(field) != value]
@@ -118,11 +117,10 @@ def comparable(plan: Plan, left_out: tuple[tuple[str, object, str], ...] = LEFT_
 
 
 class Side:
-    """A process that plays plans on one checkout."""
+    """The process that plays plans on one checkout."""
 
     def __init__(self, tree: Path, adapter: Path | None = None) -> None:
-        """Start the process on the checkout `tree`. `adapter` replaces the checkout's `product.py`.
-        """
+        """Start the process on the checkout `tree`. `adapter` replaces its `product.py`."""
         environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
         self._process = subprocess.Popen(
             [sys.executable, "-c", BOOT, str(tree.resolve()), str(OURS),

@@ -235,8 +235,7 @@ def _rare_events(dice: random.Random, plan: Plan) -> list[dict[str, Any]]:
 
 
 def _drives(dice: random.Random, seconds: float) -> list[list[Any]]:
-    """Return the phases of a sender that drives for up to a few minutes, rests, and often reverses.
-    """
+    """Return the phases of a sender that drives for some minutes, rests, and often reverses."""
     phases: list[list[Any]] = []
     t = 0.0
     while t < seconds:
@@ -253,8 +252,7 @@ def _drives(dice: random.Random, seconds: float) -> list[list[Any]]:
 def _config(
     dice: random.Random, odd: bool, timing: bool, vehicle: bool
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return a random configuration as tables of `acsard.toml`, and the board's lasting properties.
-    """
+    """Return a random configuration (tables of `acsard.toml`) and lasting board properties."""
     linear, angular = round(dice.uniform(0.2, 2.0), 2), round(dice.uniform(0.5, 6.0), 2)
     slow = round(max(linear / 5, dice.choice((0.5, 1.0, 3.0))) + 0.001, 3)
     slow_turn = round(max(angular / 5, dice.choice((2.0, 4.0, 9.0))) + 0.001, 3)
@@ -342,9 +340,9 @@ def _make_odd(dice: random.Random, config: dict[str, Any], extras: dict[str, Any
 
 
 def _make_extreme(dice: random.Random, config: dict[str, Any]) -> None:
-    """Draw rates, timeouts and pauses from their whole ranges, and one to six sources.
+    """Draw rates, timeouts and pauses from their whole range, and one to six sources.
 
-    No rate is above 349 Hz, because a plain line takes 2.9 ms at the highest baud rate.
+    No rate above 349 Hz is legal, because a plain line takes 2.9 ms at the highest baud rate.
     """
     rate, period = dice.choice(
         ((10.0, 0.1), (200.0, 0.005), (300.0, 0.0034), ("auto", 0.01), (100.0, 0.01))
@@ -366,8 +364,7 @@ def _make_extreme(dice: random.Random, config: dict[str, Any]) -> None:
 
 
 def _make_other(dice: random.Random, config: dict[str, Any]) -> None:
-    """Draw multipliers of the wheels, bounds that a healthy wheel never exceeds, and error rates.
-    """
+    """Draw wheel multipliers, bounds that a healthy wheel never exceeds, and error rates."""
     config["drive"] = config.get("drive", {}) | {
         "wheel_separation_multiplier": round(dice.uniform(0.8, 1.6), 3),
         "left_wheel_radius_multiplier": round(dice.uniform(0.95, 1.05), 3),
@@ -573,7 +570,7 @@ def _events(
         return float(round(max(1.0, min(at, seconds)), 3))
 
     def add(kind: str, every: float) -> list[float]:
-        """Return random times for events of this kind, on average one in `every` seconds."""
+        """Return times for events of this kind, about one in `every` s."""
         if kind not in kinds:
             return []
         count = dice.randrange(1, max(2, int(2 * seconds / every)))

@@ -145,8 +145,7 @@ def _row(fault: Fault, promise: str, seed: str, cpu_s: float, simulated_s: float
 
 
 def broken_again(fault: Fault, row: Row) -> str:
-    """Play the recorded seed of a row. Return why it no longer finds the fault, or "" if it does.
-    """
+    """Return why the recorded seed of a row no longer finds its fault, "" if it still does."""
     seed = int(row.seed)
     with tempfile.TemporaryDirectory() as name:
         plant(fault, Path(name))

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 
 class Edit(NamedTuple):
-    """A replacement of one text in one module."""
+    """A change in one module."""
 
     module: str
     old: str

@@ -21,8 +21,7 @@ PERIODS = 2
 
 
 class Plugging:
-    """Judges the link state and the lines of the daemon when the board is unplugged or plugged in.
-    """
+    """Judges the daemon's link state and lines when the board is unplugged or plugged in."""
 
     def __init__(self, period_ns: int) -> None:
         self._period_ns = period_ns

@@ -1,4 +1,4 @@
-"""The promises about odometry: the error of the pose agrees with its covariance, without jumps."""
+"""The promise of odometry: the pose stays within its covariance and never jumps."""
 
 from __future__ import annotations
 
@@ -262,7 +262,7 @@ class PoseWitness:
             self._before = true and (last_ns, self.latest, true, self._speed, covariance)
 
     def end_step(self) -> bool:
-        """Forget the pose if a call has set it in this step. Return whether one has."""
+        """Forget the pose if it was set in this step, and return whether it was."""
         placed = self._placed
         if placed:
             last, asked = self._last, self._asked
@@ -429,8 +429,7 @@ class PoseWitness:
     def _put(
         self, now_ns: int, expected: tuple[Pose, Pose], true: Pose, pose: Pose, room: float
     ) -> None:
-        """Check that the first estimate after a call has the requested pose, plus the motion since.
-        """
+        """Check that the first estimate after a call has the requested pose plus later motion."""
         x, y, yaw = _through(expected, true)
         off, turned = math.hypot(pose[0] - x, pose[1] - y), math.remainder(pose[2] - yaw, math.tau)
         if off > ROOM_M + room or abs(turned) > ROOM_RAD + room / self.track:

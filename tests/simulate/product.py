@@ -74,7 +74,7 @@ class Seen(msgspec.Struct, frozen=True, gc=False):
 
 
 def problems(config: dict[str, Any]) -> list[str]:
-    """Return the error messages for this configuration, or an empty list if it is legal."""
+    """Return the problems of this configuration, in words; none if it is legal."""
     try:
         parse(b"", config)
     except ConfigError as error:
@@ -99,7 +99,7 @@ class CrashError(Exception):
 
 
 class Disk:
-    """The latch file on a simulated disk. The next daemon reads it at its start."""
+    """The latch file, from which the next daemon starts."""
 
     def __init__(self) -> None:
         self.full = False
@@ -271,8 +271,7 @@ class Product:
         via: Any = "native",
         attachment: bytes = b"",
     ) -> None:
-        """Deliver a sample to the daemon's inbox. `at_ns` is its arrival, at most the present time.
-        """
+        """Deliver a sample to the daemon's inbox. It arrived at `at_ns`, now or earlier."""
         world = self._world
         arrivals = world.bus.arrivals
         received = None if session else self.wall_ns
@@ -374,8 +373,7 @@ class Product:
         vars(mcu).update(receive=receive, advance=advance)
 
     def _half_duplex(self, mcu: FakeMcu, load: float) -> None:
-        """Send each line of the daemon back to it, in addition to the replies, and load the motors.
-        """
+        """Send each line of the daemon back to it, beside the replies, and load the motors."""
         receive = mcu.receive
 
         def both(at_ns: int, data: bytes) -> None:
@@ -416,7 +414,7 @@ class Product:
         self._world.port.trouble = "the device is gone"
 
     def plug(self, new: bool = False) -> None:
-        """Plug the same board in again, or a new one."""
+        """Plug the board in again, or another one."""
         world = self._world
         if new:
             self._lasting.close()

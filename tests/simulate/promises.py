@@ -375,7 +375,7 @@ class Witness:
         latched[:] = later
 
     def set_limits(self, at_ns: int, settings: dict[str, float], asked_ns: int) -> None:
-        """Note that a `set` has changed these settings. With a full disk its answer comes late."""
+        """Note settings that a `set` has changed. With a full disk its answer is late."""
         self.before, self.changed_ns = dict(self.limits), at_ns
         for key, value in settings.items():
             parts = key.split(".")
@@ -439,8 +439,7 @@ class Witness:
     # the steps and lines of the daemon
 
     def step(self, at_ns: int, mode: str, reason: str, fed_ns: int = -1) -> None:
-        """Judge the mode and the reason. The daemon last received bytes of the board at `fed_ns`.
-        """
+        """Judge the mode and the reason. The daemon last received bytes of a board at `fed_ns`."""
         if mode == "driving" and fed_ns >= 0:
             if self._silent(at_ns, fed_ns):
                 text = f"last heard {fed_ns / NS:.3f} s"
@@ -603,7 +602,7 @@ class Witness:
             raise BrokenError("a wheel that does not obey is a fault", at_ns, text)
 
     def reported(self, at_ns: int, lines: bytes) -> None:
-        """Record the motor speeds in lines of the board."""
+        """Note lines of the board, which report the speeds of its motors a to d."""
         if len(self.lies) != 1 or self.lies[0][0] != "dead_motor":
             return
         letter = "abcd"[self.lies[0][1][0]].encode()
@@ -633,7 +632,7 @@ class Witness:
         return at_ns - fed_ns > self.quiet_ns + tolerance_ns and not stalled
 
     def _read(self, at_ns: int, line: bytes) -> tuple[float, ...] | None:
-        """Return the wheel speeds of a line, or None for a question to the board or a torn line."""
+        """Return the wheel speeds of a line, None for a question to the board or a torn line."""
         match = LINE.match(line)
         if match is not None and not line.endswith(b"\n"):
             return None  # only its end is missing: the board may obey it, and the daemon says no
@@ -657,8 +656,7 @@ class Witness:
         return (right + left) / 2, (right - left) / (2 * self.half)
 
     def _most(self, name: str, at_ns: int) -> float:
-        """Return a limit. Shortly after a change, return the larger of the old and the new value.
-        """
+        """Return a limit. Shortly after a change, return the larger of the old and new value."""
         value = self.limits[name]
         if at_ns - self.changed_ns < MARGIN_NS + self.period_ns:
             return float(max(value, self.before[name]))
@@ -706,7 +704,7 @@ class Witness:
                 )  # fmt: skip
 
     def _jerk(self, at_ns: int, wheels: tuple[float, ...], dt: int) -> None:
-        """Check that the acceleration changes within the jerk limit while a speed grows."""
+        """Judge the change of the acceleration while a speed grows."""
         rim, longest_s = self._most("wheel_speed", at_ns), max(0.05, 1.5 * self.period_ns / NS)
         saturated = max(map(abs, wheels)) > rim - STEP or _fastest(self.last) > rim - STEP
         # A line that goes at once, or late, belongs to a step of another length than its interval.
@@ -900,7 +898,7 @@ class Witness:
 
 
 def disobeys(name: str, values: tuple[Any, ...]) -> bool:
-    """Return whether this fault of the board makes a wheel clearly disobey its command."""
+    """Return whether a wheel with this fault of the board clearly does not obey its command."""
     if name == "bias":
         return values[1] in (-1.0, 9.0)
     return name in ("dead_motor", "stuck_encoder", "reversed_motor", "reversed_encoder")

@@ -221,7 +221,7 @@ class Reasons:
         )
 
     def _judge(self, now_ns: int, wishing: list[str], state: dict[str, Any]) -> None:
-        """Compare the reasons in `state` with the possible causes."""
+        """Compare the words of `state` with the possible causes."""
         self.run.counts["reason looks"] += 1
         name = "every refusal has its reason in state"
         words = {one["name"]: one["waits_for"] for one in state["sources"]}

@@ -178,7 +178,7 @@ class _Changes:
 
 
 class Echo(_Changes):
-    """The daemon's lines while its TX is connected to its RX and no board answers."""
+    """The lines while TX is joined to RX and no board answers."""
 
     def line(self, at_ns: int, wheels: tuple[float, ...]) -> None:
         """Check that the daemon stops driving when enough changes of speed have shown the echo."""

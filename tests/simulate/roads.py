@@ -112,7 +112,7 @@ def messages(sender: dict[str, Any], seed: int, seconds: float, wall_ns: int) ->
 
 
 def _let_last_wait(found: list[Message], number: int, until_ns: int) -> None:
-    """Delay the last message, which has this number, until this time."""
+    """Let the message with this number, which is the last one so far, arrive at this time."""
     for place in range(max(0, len(found) - 2), len(found)):
         if found[place].number == number:
             found[place] = found[place]._replace(arrives_ns=until_ns)
@@ -170,15 +170,14 @@ def _ahead(sender: dict[str, Any], t: float) -> float:
 
 
 def stable(sender: dict[str, Any]) -> bool:
-    """Return whether the sender's clock is never adjusted and all its stamps are right."""
+    """Return whether nothing adjusts this sender's clock, and all its stamps are true."""
     return not sender["clock"] and not sender.get("bad_stamps")
 
 
 def sample(
     sender: dict[str, Any], message: Message, config: dict[str, Any], robot_wall_ns: int
 ) -> Sample:
-    """Return the sample of a message. The robot's wall clock shows `robot_wall_ns` at its arrival.
-    """
+    """Return a message as it arrives at the robot, whose wall clock shows `robot_wall_ns`."""
     way, source = sender["way"], sender["source"]
     options: dict[str, Any] = {}
     own = f"{sender['id']}{message.number}" if sender["churn"] else sender["id"]
@@ -328,7 +327,7 @@ def _wheels(config: dict[str, Any], v: float, w: float, cancels: bool) -> bytes:
 
 
 def parameters(settings: dict[str, float]) -> bytes:
-    """Return a ROS request in CDR that sets these parameters."""
+    """Return a request of ROS in CDR that sets these parameters."""
     out = struct.pack("<I", len(settings))
     for name, value in settings.items():
         text = name.encode() + b"\0"
@@ -341,9 +340,9 @@ def parameters(settings: dict[str, float]) -> bytes:
 
 
 def read_reply(reply: bytes, via: str, listed: bool = False) -> tuple[bool, str]:
-    """Return whether a call succeeded, and the text of its answer.
+    """Return whether a call worked, and the answer in words.
 
-    `listed` is true for a ROS reply with a list of results. Only the first result is read.
+    `listed` is true for a reply of ROS with a list of results, of which the first is read.
     """
     if via == "native":
         found = msgspec.json.decode(reply)

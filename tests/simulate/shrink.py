@@ -37,8 +37,7 @@ class _Search:
         return result if result.promise == self.promise else None
 
     def drop(self, kind: Callable[[Plan], list[Part]]) -> None:
-        """Remove all unneeded parts of one kind: try halves first, then quarters, then single ones.
-        """
+        """Remove all unneeded parts of one kind: first halves, then quarters, then single ones."""
         parts = kind(self.plan)
         size = max(1, len(parts) // 2)
         while parts:

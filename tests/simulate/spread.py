@@ -69,11 +69,11 @@ class Spread:
         self._last = None
 
     def trouble(self, now_ns: int) -> None:
-        """Note that the board may have sent a line with a wrong speed."""
+        """Note that a line with a wrong speed may have come now."""
         self._calm_ns = now_ns + CALM_NS
 
     def see(self, now_ns: int, estimate: Estimate, faults: set[str]) -> None:
-        """Judge an estimate. `faults` are the present faults of the board."""
+        """Judge an estimate while the board has these faults."""
         if not self._judged:
             return
         if not faults <= DIALECTS:

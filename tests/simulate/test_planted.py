@@ -1,5 +1,4 @@
-"""Checks that each planted fault can be planted into the product, and that the simulator finds it.
-"""
+"""Checks that each fault can be planted into the product, and that the simulator finds it."""
 
 from __future__ import annotations
 
@@ -78,7 +77,7 @@ def test_the_table_has_no_fault_that_is_not_planted_any_more() -> None:
 
 
 def test_a_change_of_a_judge_changes_the_version() -> None:
-    """The version includes each module of the simulator that can change the finding of a seed."""
+    """Each module of the simulator is hashed, unless it cannot change the finding of a seed."""
     beside = {"__init__", "__main__", "differences", "pairs", "shrink", "unjudged"}
     planting = {"planted", "planted_cases", "planted_faults"}
     modules = {path.stem for path in TABLE.parent.glob("*.py")}

@@ -1421,7 +1421,7 @@ def test_a_limit_that_was_lowered_on_the_way_down_is_no_finding() -> None:
 
 
 def quiet_with(*events: dict[str, Any]) -> Plan:
-    """Return a plan of 6 s with only these events."""
+    """A quiet plan of 6 s with these events."""
     return quiet() | {"seconds": 6.0, "events": list(events)}
 
 

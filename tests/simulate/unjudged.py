@@ -14,12 +14,10 @@ from tests.simulate.roads import NS, Message, sample
 
 
 class Unjudged(Run):
-    """A run that passes each step to `log` and judges nothing."""
+    """A run that hands each step to `log` and judges nothing."""
 
     def played(self) -> str:
-        """Play the plan without the lawful drive at its end. Return the text of an exception, or
-        "".
-        """
+        """Play the plan without the lawful drive at its end. Return an exception as text, or ""."""
         try:
             self._begin()
             self.run_to(int(self.plan["seconds"] * NS))

@@ -1,4 +1,4 @@
-"""The robot's page as browsers and programs use it: `acsard web`, and clients that drive."""
+"""Run the robot's page (`acsard web`), and clients that use it as browsers and programs do."""
 
 from __future__ import annotations
 
@@ -35,13 +35,12 @@ TRUSTING = ("--ignore-certificate-errors", f"--host-resolver-rules=MAP {NAME} 12
 
 
 class Page(Program):
-    """`acsard web` for a daemon: over HTTP on the robot, and over HTTPS as other hosts reach it."""
+    """`acsard web` for one daemon, over HTTP on the robot and over HTTPS for other hosts."""
 
     def __init__(self, daemon: Daemon, where: Path, *words: str, at: str = "", **more: str) -> None:
-        """Start the server.
+        """Prepare the server, which starts when the object is entered.
 
-        `at` is the address under which another host reaches this one; `more` is for its
-        environment.
+        `at` is the address of this host for other hosts. `more` are variables of its environment.
         """
         plain, secure = (free_endpoint().rpartition(":")[2] for _ in range(2))
         self.here, self.away = f"http://127.0.0.1:{plain}", f"https://{at or NAME}:{secure}"
@@ -60,7 +59,7 @@ class Page(Program):
         return self
 
     def tokens(self, *words: str) -> str:
-        """Return the output of an `acsard web` command about tokens."""
+        """Run `acsard web` with a command about tokens, and return its output."""
         done = finish(acsard("web", *self.told, *words), self.state.parent, env=self.env)
         assert done.code == 0, done
         return done.out
@@ -75,7 +74,7 @@ class Page(Program):
         return self.vault.invite(role, name, 1)[0]
 
     def client(self, token: str = "", address: str = "") -> aiohttp.ClientSession:
-        """Open a session of a program from another host, with or without a token."""
+        """Return an HTTP session like that of another host's program, with or without a token."""
         trusted = ssl.create_default_context(cafile=str(self.tls / "ca.pem"))
         told = {"Authorization": f"Bearer {token}"} if token else {}
         local = (address, 0) if address else None
@@ -107,7 +106,7 @@ class _Here(aiohttp.abc.AbstractResolver):
 
 
 async def answer(url: str) -> tuple[int, str]:
-    """Return status and body."""
+    """Return the status and the body of the answer to a GET request."""
     async with aiohttp.ClientSession() as session, session.get(url) as got:
         return got.status, await got.text()
 
@@ -120,7 +119,7 @@ async def text(url: str) -> str:
 
 
 class Hands:
-    """A page's WebSocket, as a browser uses it."""
+    """A WebSocket to the page's server, used as a browser uses it."""
 
     def __init__(self, socket: aiohttp.ClientWebSocketResponse) -> None:
         self.socket = socket
@@ -137,7 +136,7 @@ class Hands:
         await self.say(cmd=wish, stamp=time.time() * 1e3 - late_ms, **source)
 
     async def hold(self, linear: float, seconds: float, angular: float = 0.0) -> None:
-        """Hold a finger on the stick, at 20 Hz."""
+        """Send this speed at 20 Hz for `seconds`, like a finger that holds the stick."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
             await self.drive(linear, angular)
@@ -164,7 +163,7 @@ class Hands:
         return found["value"]
 
     async def until_driving(self, linear: float) -> None:
-        """Send zeros until they count, then this speed until the robot has it."""
+        """Send zeros for 0.6 s, then this speed until the robot reaches it."""
         holding = asyncio.create_task(self.hold(0.0, 0.6))
         await holding
         holding = asyncio.create_task(self.hold(linear, PATIENCE_S))
@@ -176,7 +175,7 @@ class Hands:
 
 @asynccontextmanager
 async def hands(page: Page, token: str = "", **how: Any) -> AsyncIterator[Hands]:
-    """Connect: on the robot's machine, or from another host with a token."""
+    """Connect to the page, on the robot itself or, with a token, like another host."""
     session = page.client(token) if token else aiohttp.ClientSession()
     place = page.away if token else page.here
     async with session, session.ws_connect(f"{place}/ws", **how) as opened:
@@ -184,7 +183,7 @@ async def hands(page: Page, token: str = "", **how: Any) -> AsyncIterator[Hands]
 
 
 def run(story: Callable[[], Awaitable[None]], within: float = 3 * PATIENCE_S) -> None:
-    """Run the scenario with a deadline."""
+    """Run the coroutine `story` with a time limit."""
     asyncio.run(_within(story, within))
 
 

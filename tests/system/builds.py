@@ -26,14 +26,14 @@ def program(name: str, needed: str) -> str:
 
 
 def finished(words: Sequence[str], where: Path, **more: str) -> subprocess.CompletedProcess[str]:
-    """Run it to the end. `more` are variables of its environment."""
+    """Run a program to its end. `more` are variables of its environment."""
     return subprocess.run(
         words, cwd=where, env=environment(**more), capture_output=True, text=True, check=False
     )
 
 
 def run(words: Sequence[str], where: Path, **more: str) -> str:
-    """Run it to the end, which must be successful, and return its output."""
+    """Run a program to its end and return its output. Fails if its exit code is not 0."""
     done = finished(words, where, **more)
     assert done.returncode == 0, f"{words}\n{done.stdout}\n{done.stderr}"
     return done.stdout

@@ -1,8 +1,8 @@
-"""Measure how much time the machine itself takes during a test: how late a bare process is.
+"""Measure how much time other programs take from the tests: how late a minimal process wakes up.
 
-A bound limits the time that the program takes; a busy machine adds to that. A process that only
-wakes up every 5 ms and checks how late it is measures this extra time for any interval. On a quiet
-machine the extra time is close to zero, and the plain bound applies.
+A test asserts that the product is fast enough, but a busy machine makes everything slower. The
+bystander is a process that only wakes up every 5 ms and measures its lateness. A test adds this
+lateness to its time limit. On a quiet machine it is close to zero.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ while True:
 
 
 class Bystander:
-    """The bare process, which runs until it is ended. `lost` returns how late it was."""
+    """The minimal process, which runs until `end`. `lost` returns how late it was."""
 
     def __init__(self) -> None:
         with tempfile.NamedTemporaryFile() as file:
@@ -55,7 +55,10 @@ class Bystander:
         self._process.wait()
 
     def lost(self, since: float, to: float | None = None) -> float:
-        """Return how long it waited for a core between two times (default: until now), s."""
+        """Return how long the bystander waited for a core between two times, in s.
+
+        Without `to` the interval ends now.
+        """
         end = time.monotonic() if to is None else to
         deadline = end + 10.0
         while (seen := ROW.unpack_from(self._book))[1] < end:
@@ -77,7 +80,7 @@ _running: list[Bystander] = []
 
 @contextlib.contextmanager
 def standing_by() -> Iterator[None]:
-    """Run a bystander for `lost` while entered."""
+    """Run a bystander while the body runs. The function `lost` uses it."""
     bystander = Bystander()
     _running.append(bystander)
     try:
@@ -88,5 +91,8 @@ def standing_by() -> Iterator[None]:
 
 
 def lost(since: float, to: float | None = None) -> float:
-    """Return the time that the machine took between two moments (default: until now), s."""
+    """Return how long a process waited for a core between two times, in s.
+
+    Without `to` the interval ends now.
+    """
     return _running[-1].lost(since, to)

@@ -15,7 +15,10 @@ HZ = 10.0
 
 
 def picture(grey: int) -> bytes:
-    """Return a small PNG. The browser decodes it like a JPEG, and no library draws one here."""
+    """Return a small PNG picture, which the browser accepts in place of a JPEG.
+
+    It is built by hand, because the tests have no library for pictures.
+    """
 
     def chunk(name: bytes, body: bytes) -> bytes:
         return (

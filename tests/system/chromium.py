@@ -59,12 +59,12 @@ _PRESSED = """[...document.querySelectorAll('button, a, input, select, #stick')]
 
 
 class Browser:
-    """One browser in a process of its own. Calls come from the test's thread."""
+    """A browser in a separate process. The test's thread calls its methods."""
 
     def __init__(self, where: Path, host: str = "", options: Sequence[str] = ()) -> None:
-        """Start it.
+        """Prepare the browser. `start` starts it.
 
-        `host` runs it on another host than this one; `options` extend its command line.
+        `host` is the simulated host on which it runs. `options` extend its command line.
         """
         self._where, self._options = where, options
         self._host = host
@@ -82,7 +82,7 @@ class Browser:
         """Bytes, of HTTP with its headers and over WebSockets, since `Network.enable`."""
 
     def start(self) -> None:
-        """Wait until the browser accepts commands."""
+        """Start the browser, and wait until it accepts commands."""
         assert CHROMIUM is not None
         words = [CHROMIUM, *OPTIONS, *self._options, f"--user-data-dir={self._where}"]
         with self._there():
@@ -101,7 +101,7 @@ class Browser:
         return inside(self._host) if self._host else nullcontext()
 
     def end(self) -> None:
-        """Kill it, with all its processes."""
+        """Kill the browser with all its processes."""
         if self.process is None:
             return
         if hasattr(self, "_session"):
@@ -131,16 +131,19 @@ class Browser:
             await self._ask(f"{domain}.enable", {})
 
     def another(self, **how: bool) -> str:
-        """Open one more tab, in front (or `background`, or a `newWindow`); return its target id."""
+        """Open a new tab and return its target id.
+
+        The tab opens in front, or with `background` or `newWindow` as these say.
+        """
         return str(self.ask("Target.createTarget", url="about:blank", **how)["targetId"])
 
     def attend(self, tab: str) -> None:
-        """Send the following commands to that tab."""
+        """Send all later commands to this tab."""
         self._wait(self._attend(tab))
         self._down = ()
 
     def close(self, tab: str) -> None:
-        """Close that tab."""
+        """Close this tab."""
         self.ask("Target.closeTarget", targetId=tab)
 
     async def _read(self) -> None:
@@ -162,7 +165,7 @@ class Browser:
                 self.received += len(told["params"]["response"]["payloadData"].encode())
 
     def ask(self, method: str, **params: object) -> Any:
-        """Run one command of the protocol and return its result."""
+        """Run one command of the DevTools protocol, and return its result."""
         return self._wait(self._ask(method, params))
 
     async def _ask(self, method: str, params: dict[str, object]) -> Any:
@@ -177,7 +180,7 @@ class Browser:
         return asyncio.run_coroutine_threadsafe(work, self._loop).result(20.0 + PATIENCE_S)
 
     def size(self, width: int, height: int, *, touch: bool = True, dark: bool = False) -> None:
-        """Set the size and the touch support of this screen."""
+        """Set the screen's size, its touch support and the colour scheme."""
         self.ask(
             "Emulation.setDeviceMetricsOverride",
             width=width, height=height, deviceScaleFactor=1, mobile=touch,
@@ -192,17 +195,17 @@ class Browser:
         until(lambda: self.js("document.readyState") == "complete", 10.0, url)
 
     def js(self, text: str) -> Any:
-        """Return the value of a JavaScript expression in the page, after a promise is settled."""
+        """Evaluate a JavaScript expression in the page, wait for a promise, return the value."""
         told = self.ask("Runtime.evaluate", expression=text, returnByValue=True, awaitPromise=True)
         assert "exceptionDetails" not in told, told["exceptionDetails"]
         return told["result"].get("value")
 
     def text(self, name: str) -> str:
-        """Return the text of the element with this id, or "" while one page replaces another."""
+        """Return the text of the element with this id, or "" if there is no such element."""
         return str(self.js(f"document.getElementById({name!r})?.textContent ?? ''"))
 
     def middle(self, name: str) -> tuple[float, float]:
-        """Return the position of the element, px."""
+        """Return the position of the element's centre, in px."""
         box = f"document.getElementById({name!r}).getBoundingClientRect()"
         found = self.js(f"(b => [b.x + b.width / 2, b.y + b.height / 2])({box})")
         return found[0], found[1]
@@ -212,9 +215,9 @@ class Browser:
         return list(self.js(_PRESSED.replace("LEAST", str(FINGER_PX - 0.5))))
 
     def obstacles(self, only: str = "") -> list[Any]:
-        """Return the obstacles for a screen reader that axe finds: grade, rule, element.
+        """Return the accessibility problems that axe finds: severity, rule, element.
 
-        `only` names one of its rules.
+        `only` selects a single rule.
         """
         rules = json.dumps({"runOnly": [only]} if only else {})
         if not self.js("'axe' in window"):
@@ -232,10 +235,10 @@ class Browser:
         self.ask("Input.dispatchTouchEvent", type=f"touch{kind}", touchPoints=where)
 
     def tap(self, name: str) -> None:
-        """Tap the element.
+        """Tap the element with this id.
 
-        A further finger is a synthetic event of the page, because Chromium no longer forwards any
-        touch after two were emulated.
+        If other fingers are down, the tap is a synthetic event in the page, because Chromium
+        forwards no touch after two emulated ones.
         """
         if self._down:
             self.js(
@@ -247,26 +250,29 @@ class Browser:
             self.touch("End")
 
     def release(self) -> None:
-        """Tap the button that ends the page's mode, when a press of that button counts."""
+        """Wait until the page accepts a press of its button `clear`, and tap it."""
         time.sleep(SETTLED_S)
         self.tap("clear")
 
     def lift(self) -> None:
-        """Lift all fingers, if there are any. A page that has gone has taken them along."""
+        """Lift all fingers that are down. Do nothing if the page has gone."""
         if self._down:
             with suppress(AssertionError):
                 self.touch("End")
             self._down = ()
 
     def push(self, x: float, y: float, kind: str = "Move") -> None:
-        """Put the finger on the page's stick, in px from its middle; y points up."""
+        """Move the finger on the page's stick to this position.
+
+        The position is in px from the stick's centre, with y upwards. `kind` is the touch event.
+        """
         mx, my = self.middle("stick")
         self.touch(kind, (mx + x, my - y))
 
     def hold(self, drives: Callable[[], bool]) -> None:
-        """Push the stick forwards until the robot drives.
+        """Push the stick forwards until `drives` returns True.
 
-        Presses again if a busy machine made the page release it.
+        If a busy machine makes the page release the stick, the finger presses it again.
         """
         told: list[str] = []
 

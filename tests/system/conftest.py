@@ -1,4 +1,4 @@
-"""A bystander, and the simulator's daemon and a client of it, once for the tests of a module."""
+"""Fixtures of the system tests, and the repetition of tests that fail on a busy machine."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ _before = cores.idle()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """If a test fails while no core was ever free, run it again, at most twice.
+    """Repeat a failed test, at most twice, if other programs used all cores during it.
 
-    The machine was then busy with other work. The summary lists the test. Any other failure counts.
+    The summary lists such tests. Any other failure counts.
     """
     again = pytest.mark.flaky(reruns=2, condition=lambda: cores.taken(_before, cores.idle()))
     for item in items:
@@ -43,7 +43,7 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 
 @pytest.fixture(scope="session", autouse=True)
 def bystander() -> Iterator[None]:
-    """Measure all the time how much time the machine takes: `bystander.lost`."""
+    """Run a bystander during the whole session, so that `bystander.lost` works."""
     with standing_by():
         yield
 
@@ -58,7 +58,7 @@ def kept(request: pytest.FixtureRequest) -> Path:
 
 @pytest.fixture(scope="session")
 def dds(kept: Path) -> NewDomain:
-    """Return the maker of DDS domains with their bridges. It takes a directory for files."""
+    """Return a function that creates a DDS domain with bridges. Its argument is a directory."""
     needed = "no Cyclone DDS for Python: .venv/bin/pip install -e '.[test,dds]'"
     pytest.importorskip("cyclonedds", reason=needed)
     from tests.system.dds import DdsDomain
@@ -70,7 +70,7 @@ def dds(kept: Path) -> NewDomain:
 def shared(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[Daemon]:
-    """A daemon on the simulator for all tests of a module, with its `CONFIG` if it has one."""
+    """A daemon on the simulator for all tests of a module, with the module's `CONFIG`, if any."""
     config = getattr(request.module, "CONFIG", None)
     with Daemon(tmp_path_factory.mktemp("shared"), config=config) as daemon:
         yield daemon
@@ -96,7 +96,7 @@ def bus(shared: Daemon) -> Iterator[Bus]:
 
 @pytest.fixture
 def peer(tmp_path: Path) -> Iterator[Peer]:
-    """An independent serial peer, plugged in at `tmp_path/mcu`."""
+    """A simulated board on a pty, independent of acsard's simulator, at `tmp_path/mcu`."""
     with Peer(tmp_path / "mcu") as peer:
         yield peer
 
@@ -117,7 +117,7 @@ def daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
 
 @pytest.fixture(scope="module")
 def page(daemon: Daemon, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
-    """The page of that daemon, over HTTP here and over HTTPS for other hosts."""
+    """The page of `daemon`, over HTTP here and over HTTPS for other hosts."""
     where = tmp_path_factory.mktemp("page")
     Authority.make(where / "tls", "test", 1, [NAME]).issue(where / "tls", "robot", [NAME], 1)
     with Page(daemon, where) as page:
@@ -126,7 +126,7 @@ def page(daemon: Daemon, tmp_path_factory: pytest.TempPathFactory) -> Iterator[P
 
 @pytest.fixture
 def standing(daemon: Daemon) -> Iterator[Bus]:
-    """A plain client of `daemon`, whose robot stands and may be driven."""
+    """A Zenoh client of `daemon`, whose robot is ready and at rest."""
     with Bus(daemon.endpoint) as bus:
         bus.ask("srv/clear")
         bus.at_rest()

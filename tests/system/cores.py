@@ -1,6 +1,6 @@
-"""Find out whether all cores of the machine were busy throughout a time.
+"""Find out whether other programs kept all cores busy during a test.
 
-If so, other programs had the processor time whose lack a test reports as a failure.
+If so, the test may have failed only because it got too little processor time.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ each core is free.
 
 
 class Idle(NamedTuple):
-    """The idle time of the cores at some moment."""
+    """The idle time of all cores up to a moment."""
 
     at: float
     """Monotonic clock, s."""
@@ -29,7 +29,7 @@ class Idle(NamedTuple):
 
 
 def idle() -> Idle:
-    """Return the idle time up to now."""
+    """Return the present time, and the idle time of all cores so far."""
     first, *_ = Path("/proc/stat").read_text().splitlines()
     _, _user, _nice, _system, idles, waits, *_ = first.split()
     spare = (int(idles) + int(waits)) / os.sysconf("SC_CLK_TCK")
@@ -37,9 +37,10 @@ def idle() -> Idle:
 
 
 def idle_class() -> float:
-    """Return the processor time of the processes in the kernel's idle class, s.
+    """Return the processor time of all processes in the kernel's idle class, s.
 
-    These get only the time that no test wants. `.ci/run` computes in this class while tests wait.
+    The kernel runs them only while a core is otherwise idle. `.ci/run` uses this class while tests
+    wait.
     """
     ticks = 0
     for name in filter(str.isdigit, os.listdir("/proc")):
@@ -52,6 +53,6 @@ def idle_class() -> float:
 
 
 def taken(before: Idle, after: Idle) -> bool:
-    """Return whether hardly any core was free between the two moments."""
+    """Return whether nearly all cores were busy all the time between the two moments."""
     whole = (after.at - before.at) * (os.cpu_count() or 1)
     return after.idle_s - before.idle_s < FREE * whole

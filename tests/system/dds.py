@@ -1,10 +1,10 @@
-"""ROS 2 nodes on DDS, made of Cyclone DDS for Python, and the bridge that joins them to Zenoh.
+"""ROS 2 nodes on DDS, built with Cyclone DDS for Python, and the bridge between DDS and Zenoh.
 
-A `DdsNode` is a ROS node as far as the bridge can tell: it announces its endpoints on
-`ros_discovery_info`, as rmw_cyclonedds_cpp does. Cyclone DDS encodes and decodes each message, from
-types that are made of rosbags' definitions.
+For the bridge a `DdsNode` looks like a ROS node, because it announces its endpoints on
+`ros_discovery_info`, as rmw_cyclonedds_cpp does. Cyclone DDS encodes and decodes each message, with
+types that are created from rosbags' definitions.
 
-All traffic is on loopback, without multicast, in a domain that no other process of the tests uses.
+All traffic is on loopback, without multicast, in a domain that no other test process uses.
 """
 
 from __future__ import annotations
@@ -69,9 +69,9 @@ _LATCHED = (_RELIABLE, Policy.Durability.TransientLocal, Policy.History.KeepLast
 
 
 class DdsDomain:
-    """A DDS domain of the nodes in this process and of the bridges that the process starts.
+    """A DDS domain for the nodes of this process and for the bridges that it starts.
 
-    `program` is the bridge. `where` is the directory of its files.
+    `program` is the path of the bridge. `where` is the directory for its files.
     """
 
     def __init__(self, program: str, where: Path) -> None:
@@ -90,16 +90,16 @@ class DdsDomain:
 
     @property
     def environment(self) -> dict[str, str]:
-        """The environment of a shell in this domain that knows nothing else of ROS."""
+        """The environment of a shell for this domain, without any other ROS settings."""
         own = {"CYCLONEDDS_URI": f"file://{self.cyclone}", "ROS_DISTRO": "jazzy"}
         return bare_environment() | own
 
     def node(self, namespace: str = "", name: str = "tester") -> DdsNode:
-        """Return a node, which is in the domain while it is entered."""
+        """Return a node, which joins the domain when it is entered."""
         return DdsNode(self.number, namespace, name)
 
     def bridge(self, endpoint: str, *more: str, file: Path = BRIDGE_FILE) -> Bridge:
-        """Return a bridge to the robot or the router at `endpoint`; `more` are more options."""
+        """Return a bridge that connects to the Zenoh address `endpoint`, with options `more`."""
         domain = str(self.number)
         words = [self._program, "-c", str(file), "-e", endpoint, "-d", domain, *more]
         env = self.environment | {"RUST_LOG": "zenoh_plugin_ros2dds=debug"}
@@ -107,11 +107,11 @@ class DdsDomain:
 
 
 def _unused_domain() -> tuple[int, socket.socket]:
-    """Return a domain and a socket that claims it.
+    """Return the number of an unused DDS domain, and a socket that reserves it.
 
-    A domain has 250 UDP ports, from 7400 + 250 times its number on. Its 20 participants use the
-    first 52, so the last one is free for the claim. The ports of the domains below 100 are below
-    those that the kernel assigns.
+    Domain n has 250 UDP ports from 7400 + 250 n on, and its 20 participants use the first 52. The
+    socket is bound to the last one, which is free. The ports of domains below 100 are below those
+    that the kernel assigns by itself.
     """
     for number in range(20, 100):
         claim = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -139,9 +139,10 @@ def idl(type_name: str) -> type[IdlStruct]:
 
 @functools.cache
 def idl_of_service(type_name: str, dds_type: str) -> type[IdlStruct]:
-    """Return the IDL type of a request or a reply, of which `dds_type` is the name on DDS.
+    """Return the IDL type of a service's request or reply, with the name `dds_type` on DDS.
 
-    It begins with the id of the request: the client's GUID and a sequence number, 8 bytes each.
+    The type begins with the id of the request: the client's GUID and a sequence number, 8 bytes
+    each.
     """
     return _struct(dds_type, {"guid": types.uint64, "number": types.int64}, type_name)
 
@@ -173,10 +174,10 @@ def _idl_field(node: Nodetype, of: Any) -> Any:
 
 
 class DdsNode(Client):
-    """A ROS node on DDS; leaving it removes it from the domain.
+    """A ROS node on DDS. Leaving the context removes it from the domain.
 
-    `put` waits until the bridge takes the messages of a new publisher, and `call` until it takes
-    the requests of a new client.
+    The first `put` of a topic waits until the bridge subscribes to it. The first `call` of a
+    service waits until the bridge offers it.
     """
 
     PAUSE_S = 0.05
@@ -211,7 +212,7 @@ class DdsNode(Client):
         assert not self._failed, self._failed
 
     def publisher(self, name: str, type_name: str) -> DataWriter[Any]:
-        """Return the node's publisher of this topic, which is new at the first call."""
+        """Return the node's publisher of this topic. The first call creates it."""
         if name not in self._publishers:
             self._publishers[name] = self._writer(
                 f"rt/{self.full(name)}", idl(type_name), type_name
@@ -258,7 +259,7 @@ class DdsNode(Client):
         return self._clients[name].call(payload, next(self._numbers))
 
     def _take_all(self) -> None:
-        """Pass on what the readers of `follow` receive."""
+        """Pass received messages to the subscribers of `follow`, in a separate thread."""
         try:
             while not self._ended.wait(0.003):
                 self._take()
@@ -287,7 +288,7 @@ class DdsNode(Client):
         return self._writers[-1]
 
     def _announce(self) -> None:
-        """Publish the node's endpoints. The bridge makes routes for endpoints of nodes only."""
+        """Publish the list of the node's endpoints. The bridge ignores all others."""
         readers, writers = (
             [make("rmw_dds_common/msg/Gid", data=_gid(end)) for end in ends]
             for ends in (self._readers, self._writers)
@@ -319,9 +320,9 @@ class _ServiceClient:
         node._announce()
 
     def call(self, payload: bytes, number: int) -> Called:
-        """Return the replies to this request that came until the first one.
+        """Send a request, and return the replies that have arrived when the first one arrives.
 
-        It waits for the service first, as ROS programs do.
+        It first waits for the service, as ROS programs do.
         """
         until(self._requests.get_matched_subscriptions, ROUTE_S, f"a route to {self.service}")
         until(self._replies.get_matched_publications, ROUTE_S, f"a route from {self.service}")
@@ -345,7 +346,7 @@ class _ServiceClient:
 
 
 def taken(reader: DataReader[Any]) -> list[bytes]:
-    """Return the messages that have arrived, in CDR."""
+    """Return the messages that have arrived at a reader, encoded in CDR."""
     samples = reader.take(100)
     return [sample.serialize() for sample in samples if isinstance(sample, IdlStruct)]
 
@@ -355,7 +356,7 @@ def received(name: str, payload: bytes) -> Sample:
 
 
 def _delete(entity: Any) -> None:
-    """Delete an entity and all that it contains now, and not with the last reference to it."""
+    """Delete an entity and its contents now, instead of when the last reference goes."""
     entity.__del__()
 
 
@@ -375,7 +376,7 @@ class Bridge(Program):
         return [re.sub(r"\x1b\[[0-9;]*m", "", line) for line in [*self.out, *self.err]]
 
     def logs(self, *texts: str, within: float = 10.0) -> str:
-        """Return the first log line that contains all of these."""
+        """Wait for a log line that contains all these texts, and return it."""
         look: Callable[[], str | None] = lambda: next(  # noqa: E731
             (line for line in self.log if all(text in line for text in texts)), None
         )

@@ -1,4 +1,7 @@
-"""deploy/zenoh's router.json5 as a process: Python's Zenoh, `acsard router`, or zenohd itself."""
+"""Run the router of deploy/zenoh/router.json5, in three ways.
+
+They are the Zenoh library of Python, `acsard router`, and the real zenohd.
+"""
 
 from __future__ import annotations
 
@@ -62,7 +65,7 @@ def certified(where: Path, *names: str) -> None:
 
 
 def tls_settings(own: Path) -> dict[str, object]:
-    """Return Zenoh's `transport/link/tls` of a client with the certificate in this directory."""
+    """Return the Zenoh setting `transport/link/tls` of a client. `own` has its certificate."""
     return {
         "root_ca_certificate": str(own / "ca.pem"),
         "connect_certificate": str(own / "certificate.pem"),
@@ -72,14 +75,14 @@ def tls_settings(own: Path) -> dict[str, object]:
 
 
 def for_two(where: Path) -> Path:
-    """Write the file that `acsard tls router` makes of router.json5 for both robots."""
+    """Write the router file for both test robots, as `acsard tls router` creates it."""
     file = where / "router.json5"
     file.write_text(router_file(ROUTER_FILE.read_text(), ROBOTS, {}))
     return file
 
 
 def _changes(file: Path, where: Path, endpoint: str) -> dict[str, object]:
-    """Return a router's settings that differ from its file here: address, files, no plugins."""
+    """Return the settings that a test changes in a router's file: address, files, no plugins."""
     config = zenoh.Config.from_file(str(file))
     tls = json.loads(config.get_json("transport/link/tls"))
     for key, value in tls.items():
@@ -93,7 +96,7 @@ def _changes(file: Path, where: Path, endpoint: str) -> dict[str, object]:
 
 
 def here(file: Path, where: Path, endpoint: str) -> Path:
-    """Change a router's file to this address, the certificates below `where`, and no plugins."""
+    """Write a copy of a router's file with this address, these certificates and no plugins."""
     config = zenoh.Config.from_file(str(file))
     for key, value in _changes(file, where, endpoint).items():
         config.insert_json5(key, json.dumps(value))
@@ -103,13 +106,13 @@ def here(file: Path, where: Path, endpoint: str) -> Path:
 
 
 def router(where: Path, endpoint: str) -> Program:
-    """Run Python's Zenoh as the router. It prints "routing" when it is ready."""
+    """Run a router with the Zenoh library of Python. It prints "routing" when it is ready."""
     file = for_two(where)
     return Program(words(_ROUTER, file, json.dumps(_changes(file, where, endpoint))), where)
 
 
 def watched_router(where: Path, endpoint: str) -> Program:
-    """Run `acsard router` with the file. Its log says when it listens."""
+    """Run `acsard router` with that file. Its log says when it listens."""
     return Program(acsard("router", str(here(for_two(where), where, endpoint))), where)
 
 

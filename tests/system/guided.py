@@ -1,4 +1,4 @@
-"""Let a client go through a check or a calibration over the page's WebSocket."""
+"""A client that answers the questions of a check or a calibration over the page's WebSocket."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ WHEELS = ("fr", "fl", "rl", "rr")
 
 
 class NoDaemon(Daemon):
-    """The configuration of a daemon that does not run."""
+    """A configuration file without a running daemon."""
 
     def __init__(self, where: Path, port: str = "sim") -> None:
         self.endpoint = free_endpoint()
@@ -26,7 +26,7 @@ class NoDaemon(Daemon):
 
 
 class Guided:
-    """The messages of the child process, in order, while pings go on as a browser's do."""
+    """The client of a check or calibration. It pings the page's server as a browser does."""
 
     def __init__(self, ours: Hands, pinging: asyncio.Task[None] | None = None) -> None:
         self.ours, self._pinging = ours, pinging
@@ -66,11 +66,11 @@ class Guided:
         await self.answer(await self.asks(words), "start")
 
     async def lifted(self) -> None:
-        """Confirm that the check may go on."""
+        """Confirm that the robot's wheels are off the ground."""
         await self.answer(await self.asks("lifted"), "lifted")
 
     async def sees(self, wheels: tuple[str, ...] = WHEELS) -> None:
-        """Answer which wheel each motor turns, all of them forward."""
+        """Answer for each motor which wheel it turns, and that the wheel turns forward."""
         for wheel in wheels:
             await self.answer(await self.asks("which wheel"), wheel)
             await self.answer(await self.asks("which way did the wheel turn"), "forward")
@@ -78,7 +78,7 @@ class Guided:
 
 @asynccontextmanager
 async def guiding(page: Page, *, pings: bool = True, token: str = "") -> AsyncIterator[Guided]:
-    """Connect as a page that somebody looks at."""
+    """Connect as a visible page does, with pings unless `pings` is False."""
     async with hands(page, token) as ours:
         guided = Guided(ours, asyncio.create_task(_ping(ours)) if pings else None)
         try:
@@ -94,10 +94,10 @@ async def _ping(ours: Hands) -> None:
 
 
 def commands(page: Page) -> list[int]:
-    """Return the running checks and calibrations that the page's server has started."""
+    """Return the pids of the checks and calibrations that the page's server runs."""
     return children(page.pid, "--json-lines")
 
 
 def none_left(page: Page) -> None:
-    """Wait until they have ended."""
+    """Wait until the page's server runs no check or calibration."""
     until(lambda: not commands(page), 8.0, "no command runs any more")

@@ -1,8 +1,8 @@
-"""Run the system tests' programs, an independent MCU and a plain bus client.
+"""Programs for the system tests: the daemon, an independent board, and a Zenoh client.
 
-Nothing of acsard is imported here: the tests see only what a stranger sees on the wire, on the bus
-or at the shell. Every wait has a deadline and waits for the thing itself. Every process is ended by
-its own pid.
+This module imports nothing of acsard. The tests see only the interfaces that any program sees: the
+wire, the bus and the shell. Every wait ends as soon as its condition holds, or fails at a deadline.
+Every process is ended by its own pid.
 """
 
 from __future__ import annotations
@@ -58,7 +58,10 @@ ZERO = {"linear": {"x": 0.0}, "angular": {"z": 0.0}}
 
 
 def until(look: Callable[[], T | None], within: float = 10.0, what: str = "") -> T:
-    """Return the first true value of `look`. The failure message contains `what`."""
+    """Call `look` repeatedly until it returns a true value, and return that value.
+
+    Fails after `within` seconds with a message that contains `what`.
+    """
     deadline = time.monotonic() + within + PATIENCE_S
     while True:
         got = look()
@@ -70,7 +73,7 @@ def until(look: Callable[[], T | None], within: float = 10.0, what: str = "") ->
 
 
 def twist(linear: float, angular: float = 0.0) -> dict[str, dict[str, float]]:
-    """Return a command as a stranger writes it."""
+    """Return a twist as plain values. `linear` is in m/s, `angular` in rad/s."""
     return {"linear": {"x": linear}, "angular": {"z": angular}}
 
 
@@ -82,7 +85,7 @@ def free_endpoint() -> str:
 
 
 def environment(**more: str) -> dict[str, str]:
-    """Return the environment of a shell that knows nothing of this test run."""
+    """Return the environment for a program, without the settings of this test run."""
     hidden = ("INVOCATION_ID", "ACSARD_CONFIG", "ACSARD_RECORD", "RUST_LOG", "STATE_DIRECTORY")
     env = {key: value for key, value in os.environ.items() if key not in hidden}
     paths = [str(ROOT), *filter(None, [env.get("PYTHONPATH")])]
@@ -92,7 +95,7 @@ def environment(**more: str) -> dict[str, str]:
 
 @functools.cache
 def _states() -> str:
-    """Make a home for the latch files of this test run; no test may stop a real robot."""
+    """Create a directory for the latch files, so that no test stops a real robot."""
     where = tempfile.mkdtemp(prefix="acsard-tests-")
     atexit.register(shutil.rmtree, where, ignore_errors=True)
     return where
@@ -102,7 +105,7 @@ def _states() -> str:
 
 
 def children(pid: int, words: str) -> list[int]:
-    """Return the children of all threads of a process whose command line contains these words."""
+    """Return the pids of a process's children whose command line contains these words."""
     born = [file.read_text().split() for file in Path(f"/proc/{pid}/task").glob("*/children")]
     found = []
     for child in itertools.chain.from_iterable(born):
@@ -116,7 +119,7 @@ def children(pid: int, words: str) -> list[int]:
 
 
 class Program:
-    """A process whose output is collected while it runs. Leaving it ends it in any case."""
+    """A process that runs while the object is entered. Its output is collected meanwhile."""
 
     def __init__(
         self,
@@ -210,7 +213,7 @@ def _collect(stream: Any, lines: list[str]) -> None:
 
 
 def acsard(*words: str) -> list[str]:
-    """Return the words that run the program under test."""
+    """Return the command line of `acsard` with these arguments."""
     return [sys.executable, "-m", "acsard", *words]
 
 
@@ -240,7 +243,7 @@ Tables = Mapping[str, Mapping[str, object]]
 
 
 def write_config(path: Path, tables: Tables) -> Path:
-    """Write a TOML file of plain tables. TOML and JSON write their values alike."""
+    """Write a TOML file. Its values are written as JSON, which is the same for these types."""
     lines = []
     for name, table in tables.items():
         lines += [f"[{name}]", *(f"{key} = {json.dumps(value)}" for key, value in table.items())]
@@ -249,7 +252,10 @@ def write_config(path: Path, tables: Tables) -> Path:
 
 
 class Daemon(Program):
-    """`acsard run` with a configuration and a bus address of its own, ready when entered."""
+    """`acsard run` with its own configuration and bus address.
+
+    Entering the object waits until the daemon is ready, unless `ready` is False.
+    """
 
     def __init__(
         self,
@@ -313,7 +319,7 @@ class Daemon(Program):
 
 
 def resident_kb(pid: int) -> int:
-    """Memory in use, kB."""
+    """Return the resident memory of a process in kB."""
     status = Path(f"/proc/{pid}/status").read_text()
     return int(status.partition("VmRSS:")[2].split()[0])
 
@@ -335,7 +341,10 @@ Reply = Callable[[Speeds], bytes]
 def form(
     separator: str = ",", end: str = "\r\n", pad: int = 2, decimals: int = 2, comma: str = ""
 ) -> Reply:
-    """Build replies that report the requested speeds, in one of the forms of MCU.md section 1."""
+    """Return a function that builds replies in one of the formats of MCU.md section 1.
+
+    The replies report the requested speeds.
+    """
 
     def reply(speeds: Speeds) -> bytes:
         width = pad + 1 + decimals
@@ -352,7 +361,7 @@ PLAIN = form()
 
 
 def silence(speeds: Speeds) -> bytes:
-    """A microcontroller that receives everything and answers nothing."""
+    """Return no reply, like a board that receives everything and answers nothing."""
     return b""
 
 
@@ -381,9 +390,10 @@ class Session:
 
 
 class Peer:
-    """A serial peer at the other end of a pty: records every byte and answers each command line.
+    """A simulated board at the other end of a pty, independent of acsard's simulator.
 
-    It keeps a symbolic link at `path` while it is plugged in, as udev does.
+    It records every byte and answers each command line. While it is plugged in, `path` is a
+    symbolic link to the pty, as udev creates it.
     """
 
     def __init__(self, path: Path, reply: Reply = PLAIN) -> None:
@@ -414,7 +424,7 @@ class Peer:
             self.unplug()
 
     def plug(self) -> None:
-        """Open a new pty under the same name."""
+        """Plug the board in: open a new pty and link it at `path`."""
         master, slave = pty.openpty()
         tty.setraw(slave)
         os.set_blocking(master, False)
@@ -441,7 +451,7 @@ class Peer:
 
     @contextmanager
     def deaf(self) -> Iterator[None]:
-        """Read nothing while entered, so that the kernel keeps the incoming bytes."""
+        """Read nothing while the body runs, so that the bytes stay in the kernel."""
         self._listens.clear()
         idle = self._idle
         until(lambda: self._idle > idle, 5.0, "it has stopped to listen")
@@ -451,7 +461,7 @@ class Peer:
             self._listens.set()
 
     def stuff(self) -> int:
-        """Fill the kernel's buffer towards us with line ends; return the number of bytes."""
+        """Fill the kernel's buffer of bytes to this board with line ends. Return their number."""
         assert self._ends is not None
         os.set_blocking(self._ends[1], False)
         taken = 0
@@ -473,7 +483,7 @@ class Peer:
         return self.lines[start : start + count]
 
     def last_line(self) -> bytes:
-        """Return the last line, once the daemon has ended and all its output has been read."""
+        """Wait until no more output of the ended daemon arrives, and return its last line."""
         idle = self._idle
         until(lambda: self._idle > idle, 5.0, "the line falls silent")
         return self.session.said()[-1]
@@ -532,11 +542,11 @@ while True:
 
 
 class FarPeer(Program):
-    """A serial peer in a process of its own, at a higher priority than all others.
+    """A simulated board in a separate process with a real-time priority.
 
-    Its times are reliable: nothing in this test run (its interpreter lock, its load) makes a line
-    look late. It answers each command with the speeds requested two lines before; the speed of
-    wheel a is 0.01 to 0.09 off.
+    Its times are reliable, because neither the load of this test run nor Python's interpreter lock
+    delays it. It answers each command with the speeds of the command before the previous one. To
+    differ from an echo, the speed of wheel a is wrong by 0.01 to 0.09.
     """
 
     def __init__(self, where: Path, name: str = "far_mcu") -> None:
@@ -567,7 +577,7 @@ class FarPeer(Program):
         return self._heard
 
     def awaits(self, line: bytes, within: float = 5.0, after: float = 0.0) -> Heard:
-        """Return the first line after that time that starts with this prefix."""
+        """Wait for a line that begins with `line` and arrives after `after`, and return it."""
         return until(
             lambda: next((h for h in self.since(after) if h.line.startswith(line)), None),
             within,
@@ -587,7 +597,7 @@ def _speeds(line: bytes) -> Speeds | None:
 
 
 def wheels(line: bytes) -> Speeds:
-    """Return the four speeds of a line that must be a command."""
+    """Return the four speeds of a line. Fails if it is not a command."""
     speeds = _speeds(line)
     assert speeds is not None, line
     return speeds
@@ -597,7 +607,10 @@ def wheels(line: bytes) -> Speeds:
 
 
 def client_config(endpoint: str, mode: str = "client") -> zenoh.Config:
-    """Return the settings that any Zenoh user writes to reach one address."""
+    """Return the Zenoh settings of a session that connects only to this address.
+
+    A router listens at the address instead.
+    """
     config = zenoh.Config()
     config.insert_json5("mode", json.dumps(mode))
     config.insert_json5("scouting/multicast/enabled", "false")
@@ -607,7 +620,7 @@ def client_config(endpoint: str, mode: str = "client") -> zenoh.Config:
 
 
 def read(sample: zenoh.Sample) -> Any:
-    """Return a published payload as plain values, decoded by its encoding."""
+    """Decode a payload by its encoding, and return plain values."""
     data = sample.payload.to_bytes()
     if str(sample.encoding).startswith("application/json"):
         return msgspec.json.decode(data)
@@ -623,14 +636,14 @@ class Seen(NamedTuple):
 
 
 class Following:
-    """The messages that arrive on a key, from now on."""
+    """Collects the messages that arrive on a key."""
 
     def __init__(self) -> None:
         self.seen: list[Seen] = []
         self._news = threading.Condition()
 
     def add(self, sample: zenoh.Sample) -> None:
-        """Take a sample; Zenoh calls this."""
+        """Store a sample. Zenoh calls this function."""
         seen = Seen(time.monotonic(), read(sample), str(sample.encoding))
         with self._news:
             self.seen.append(seen)
@@ -654,10 +667,10 @@ class Following:
 
 
 def broken(states: Following, since: float, to: float = float("inf")) -> bool:
-    """Return whether the link was lost in that time although no test broke it.
+    """Return whether the link was lost in this time, although no test interrupted it.
 
-    The machine then kept the microcontroller, or the kernel's thread that carries its lines,
-    waiting. The robot rightly stands in that case, and its behaviour proves nothing.
+    On a busy machine the board, or the kernel's thread for its pty, may have to wait. The robot
+    then stops correctly, and the test learns nothing from its behaviour.
     """
     return any(since <= seen.at <= to and seen.value["link"] != "up" for seen in states.seen)
 
@@ -685,14 +698,14 @@ class Bus:
         self.session.close()
 
     def put(self, key: str, value: object, sender: str = "") -> None:
-        """Put JSON without an encoding, as the smallest client does, with a sender id if given."""
+        """Put JSON without an encoding, as a minimal client does. `sender` is an optional id."""
         attachment = json.dumps({"sender": sender}) if sender else None
         self.session.put(f"{self.root}/{key}", json.dumps(value), attachment=attachment)
 
     def payload(self, key: str, payload: object) -> str | None:
         """Return the payload of a query as JSON.
 
-        A release without a latch is given the current one.
+        A `clear` or `activate` without a payload gets the number of the current latch.
         """
         if key in ("srv/clear", "srv/activate") and payload is None:
             states = self.ask("state")
@@ -700,7 +713,10 @@ class Bus:
         return None if payload is None else json.dumps(payload)
 
     def ask(self, key: str, payload: object = None) -> list[Answered]:
-        """Return all replies to a query. A release names the latch of `state`, as our tools do."""
+        """Return all replies to a query.
+
+        A `clear` or `activate` names the latch of `state`, as acsard's tools do.
+        """
         data = self.payload(key, payload)
         found = []
         for reply in self.session.get(f"{self.root}/{key}", payload=data, timeout=5.0):
@@ -736,7 +752,7 @@ class Bus:
 
     @contextmanager
     def follow(self, key: str) -> Iterator[Following]:
-        """Subscribe while entered. The daemon knows the subscription by then."""
+        """Subscribe to a key while the body runs. The daemon knows the subscription by then."""
         following = Following()
         subscriber = self.session.declare_subscriber(f"{self.root}/{key}", following.add)
         # Messages on one link arrive in order. An answer received now follows the subscription.
@@ -747,15 +763,15 @@ class Bus:
             subscriber.undeclare()
 
     def linked(self, within: float = 5.0) -> None:
-        """Wait until the robot could drive."""
+        """Wait until the link to the board is up."""
         with self.follow("state") as states:
             states.find(lambda state: state["link"] == "up", within, "link up")
 
     def comes_to(self, *modes: str) -> Any:
-        """Return the state in one of these modes.
+        """Return the state, and check that it has one of these modes.
 
-        This is immediate unless a busy machine kept the link waiting for a tenth of a second; then
-        it waits until the link is back.
+        If a busy machine has interrupted the link, this function first waits until the link is up
+        again.
         """
 
         def look() -> Any:
@@ -767,7 +783,7 @@ class Bus:
         return state
 
     def at_rest(self, within: float = 5.0) -> Any:
-        """Return the state when the robot is ready, obeys no client and its wheels stand."""
+        """Wait until the robot is ready and its wheels do not turn. Return the state."""
 
         def look() -> Any:
             state = self.state()
@@ -789,7 +805,7 @@ class Bus:
         neutral: bool = True,
         certificate: str = "",
     ) -> Iterator[Commander]:
-        """Send commands at 20 Hz while entered. Opens with a zero unless told to be rude."""
+        """Send commands at 20 Hz while the body runs. A zero comes first if `neutral` is set."""
         commander = Commander(self, command_key("cmd", source, certificate), linear, angular)
         if neutral:
             before, said = self.count("commands"), 0.0
@@ -836,7 +852,7 @@ class Commander:
 
 
 class Periods(NamedTuple):
-    """The account of the control periods between two states."""
+    """The numbers of control periods between two states, by their result."""
 
     elapsed: float
     """Elapsed periods by the stamps of the states, at 100 Hz."""
@@ -864,21 +880,23 @@ class Periods(NamedTuple):
         return self.sent + self.superseded + self.missed
 
     def are_all_accounted_for(self) -> bool:
-        """Return whether every period sent a line or was counted as not doing so.
+        """Return whether every period sent a line or was counted as superseded or missed.
 
-        A state may fall anywhere within a period, at either end, or before one that is about to
-        begin. A period that is due by the stamp is counted then.
+        A few periods of tolerance are allowed, because a state may fall anywhere within a period.
         """
         return abs(self.accounted - self.elapsed) <= 2 + self.latest + self.commands
 
 
 def waited_for_a_core(pid: int) -> float:
-    """Return how long a process's first thread, the control loop, was ready without a core, s."""
+    """Return how long the first thread of a process was ready to run but had no core, s.
+
+    In the daemon this thread is the control loop.
+    """
     return int(Path(f"/proc/{pid}/schedstat").read_text().split()[1]) / 1e9
 
 
 def waits_for_a_core(pid: int) -> dict[int, float]:
-    """Return how long each thread of a process was ready without a core, s."""
+    """Return how long each thread of a process was ready to run but had no core, s."""
     waits = {}
     for task in Path(f"/proc/{pid}/task").iterdir():
         try:
@@ -889,28 +907,28 @@ def waits_for_a_core(pid: int) -> dict[int, float]:
 
 
 def kept_waiting(pid: int) -> float:
-    """Return how long all threads of a process were ready without a core, s.
+    """Return how long all threads of a process together were ready to run but had no core, s.
 
-    One thread may delay the others. A process that passes its interpreter from thread to thread
-    waits longer on a busy machine than a bystander that only checks the clock.
+    The threads wait for each other, because they share the Python interpreter. So on a busy machine
+    such a process loses more time than the bystander, which has one thread.
     """
     return sum(waits_for_a_core(pid).values())
 
 
 def held_up(before: dict[int, float], after: dict[int, float], pid: int) -> float:
-    """Return how long the machine may have delayed the first thread, the control loop, s.
+    """Return how long a busy machine may have delayed the control loop, s.
 
-    The loop waited for a core itself, or for the interpreter, which the thread with the longest
-    wait held.
+    The sum has two parts: the loop's own wait for a core, and the longest wait of another thread,
+    which may have held the Python interpreter.
     """
     waits = {thread: waited - before.get(thread, 0.0) for thread, waited in after.items()}
     return waits.pop(pid) + max(waits.values(), default=0.0)
 
 
 def silences(times: Sequence[float], longest: float = 0.2) -> float:
-    """Return the time that a robot may lose by pauses of its commander, s.
+    """Return the time that a robot may lose because its commander paused, in s.
 
-    It ramps down and up once more for each.
+    For each pause it includes the time of a ramp down and up again.
     """
     gaps = [after - before for before, after in itertools.pairwise(times)]
     return sum(gap + 0.3 for gap in gaps if gap > longest)
@@ -923,7 +941,7 @@ def seconds(stamp: Mapping[str, int]) -> float:
 
 @contextmanager
 def alive_at(endpoint: str, daemon: Program) -> Iterator[Any]:
-    """Return the alive tokens seen by a client of `endpoint`, where `daemon` is starting."""
+    """Provide a subscriber to the alive tokens at `endpoint`, while `daemon` is starting."""
 
     def connect() -> zenoh.Session | None:
         assert daemon.process.poll() is None, f"ended with {daemon.process.returncode}\n{daemon}"
@@ -942,7 +960,7 @@ def alive_at(endpoint: str, daemon: Program) -> Iterator[Any]:
 def running(
     where: Path, port: Path | str = "sim", config: Tables | None = None, **how: Any
 ) -> Iterator[tuple[Daemon, Bus]]:
-    """A daemon whose link is up, and a plain client of it."""
+    """Provide a daemon whose link is up, and a Zenoh client of it."""
     with Daemon(where, port, config, **how) as daemon, Bus(daemon.endpoint) as bus:
         bus.linked()
         yield daemon, bus

@@ -1,4 +1,7 @@
-"""Two hosts with a cable between them: network namespaces of a test. They need root and `ip`."""
+"""Two simulated hosts with a cable between them. Each is a network namespace.
+
+They need root and the program `ip`.
+"""
 
 from __future__ import annotations
 
@@ -56,9 +59,9 @@ class Hosts:
             ip("netns", "delete", name, check=False)
 
     def cut(self) -> None:
-        """Cut the network silently: from now on each host sends to a card that does not exist.
+        """Cut the network silently: each host then sends to a network card that does not exist.
 
-        Nothing arrives, and no program gets an error. The way to the robot is cut first.
+        Nothing arrives, and no program gets an error. The direction to the robot is cut first.
         """
         self._way(self.stranger, ROBOT_AT, NOBODY)
         self._way(self.robot, STRANGER_AT, NOBODY)
@@ -76,7 +79,10 @@ class Hosts:
 
 @contextmanager
 def inside(host: str) -> Iterator[None]:
-    """Put this thread, and the processes and sockets that it makes, on that host while entered."""
+    """Move this thread to that host while the body runs.
+
+    Sockets and processes that the thread creates meanwhile are on that host, too.
+    """
     with open("/proc/thread-self/ns/net") as back, open(f"/run/netns/{host}") as there:
         _enter(there.fileno())
         try:
@@ -100,7 +106,7 @@ def _enter(namespace: int) -> None:
 
 
 def ip(*arguments: str, check: bool = True) -> None:
-    """Call `ip`."""
+    """Run the program `ip` with these arguments. Fails on an error if `check` is set."""
     subprocess.run(["ip", *arguments], check=check, capture_output=True, timeout=10.0)
 
 

@@ -1,4 +1,7 @@
-"""The identities of clients on the bus: plain clients, certificates of each role, and bad ones."""
+"""Provides the identities of clients on the bus.
+
+They are plain clients, clients with a certificate of each role, and clients with a bad one.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +26,7 @@ STRANGERS: tuple[Identity, ...] = ("unlisted", "nobody", "foreign", "expired")
 
 
 class Certificates:
-    """The certificates of one robot, and those that strangers would hold, below a directory."""
+    """The certificates of one robot and of unauthorised clients, below a directory."""
 
     def __init__(self, where: Path, *addresses: str) -> None:
         self.robot = where / "tls"
@@ -51,7 +54,10 @@ class Certificates:
         Authority.load(self.robot, str).issue(directory, name, [], days)
 
     def config(self, who: Identity, plain: str, tls: str) -> zenoh.Config:
-        """Return the settings of a client with this identity; all of them know the robot's CA."""
+        """Return the Zenoh settings of a client with this identity.
+
+        Each client trusts the robot's CA.
+        """
         if who == "local":
             return client_config(plain)
         return self.shown(tls, self.own(who))
@@ -61,13 +67,13 @@ class Certificates:
         return self._client.get(who)
 
     def shown(self, endpoint: str, own: Path | None) -> zenoh.Config:
-        """Return the settings of a client that shows the certificate in `own`, or none."""
+        """Return the Zenoh settings of a client that presents the certificate in `own`, if any."""
         config = client_config(endpoint)
         config.insert_json5("transport/link/tls", json.dumps(self.settings(own)))
         return config
 
     def settings(self, own: Path | None) -> dict[str, object]:
-        """Return Zenoh's `transport/link/tls` for that client."""
+        """Return `transport/link/tls` of a client with the certificate in `own`, if any."""
         tls: dict[str, object] = {"root_ca_certificate": str(self.robot / "ca.pem")}
         if own is not None:
             tls["enable_mtls"] = True

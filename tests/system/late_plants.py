@@ -1,10 +1,10 @@
-"""Makes a thread late for real, by each cause that a machine can produce without special hardware.
+"""Delays a thread by each cause of lateness that needs no special hardware.
 
     python -m tests.system.late_plants CAUSE TIMES
 
-The thread has a watch as the control loop has. Each lateness is printed as a line of JSON, with the
-texts of the events that the watch reported. Most causes need root: a real-time priority, as the
-service has it, keeps the load of the machine away from the thread.
+The thread uses the same diagnosis of lateness as the control loop. For each delay the program
+prints a JSON line with the texts of the reported events. Most causes need root: the thread gets the
+real-time priority of the service, so that other programs do not delay it.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ for line in sys.stdin:
 
 
 def hog() -> subprocess.Popen[bytes]:
-    """Start the real-time program."""
+    """Start the real-time program that `spin` controls."""
     process = subprocess.Popen(
         [sys.executable, "-c", HOG], stdin=subprocess.PIPE, stdout=subprocess.PIPE
     )
@@ -63,7 +63,7 @@ def spin(process: subprocess.Popen[bytes], times: int) -> None:
 
 
 def real_time() -> None:
-    """Get the priority of the service's control loop."""
+    """Give this process the real-time priority of the service's control loop."""
     os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(10))
 
 

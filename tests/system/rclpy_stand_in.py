@@ -1,8 +1,8 @@
-"""Stand-ins for rclpy and geometry_msgs, as far as `drive.py` needs them; both need ROS.
+"""Replacements for rclpy and geometry_msgs, which need ROS, with the parts that `drive.py` uses.
 
-As in the real rclpy, a signal by default ends the context while a node may still be publishing. The
-messages go into a real daemon by the protocol of rmw_zenoh, as a bridge puts them, or over DDS to a
-real bridge.
+As in the real rclpy, a signal shuts the context down by default, even while a node publishes. The
+messages go to a real daemon in the protocol of rmw_zenoh or of a bridge, or over DDS to a real
+bridge.
 """
 
 from __future__ import annotations
@@ -110,7 +110,7 @@ class Twist:
 
 
 def write(where: Path) -> None:
-    """Write the stand-in packages there."""
+    """Write the replacement packages into the directory `where`."""
     for name, text in {
         "rclpy/__init__.py": RCLPY,
         "rclpy/signals.py": SIGNALS,

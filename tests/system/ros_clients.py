@@ -1,7 +1,7 @@
-"""ROS 2 as strangers speak it over Zenoh: rmw_zenoh's side and the bridge's side.
+"""ROS 2 clients over Zenoh, as rmw_zenoh and as zenoh-bridge-ros2dds.
 
-Nothing of acsard is imported: keys, tokens and attachments are written here a second time, CDR is
-made and read by rosbags. The programs run in processes of their own.
+This module imports nothing of acsard. It has separate code for keys, tokens and attachments, and
+rosbags encodes and decodes CDR. The programs run in separate processes.
 """
 
 from __future__ import annotations
@@ -203,17 +203,17 @@ def _twist(linear: float, angular: float) -> Any:
 
 
 def twist(linear: float, angular: float = 0.0) -> bytes:
-    """A Twist in CDR."""
+    """Return a Twist in CDR."""
     return encode(_twist(linear, angular))
 
 
 def stamped(linear: float, angular: float = 0.0, age: float | None = 0.0) -> bytes:
-    """A TwistStamped in CDR."""
+    """Return a TwistStamped in CDR."""
     return encode(make(STAMPED, header=header(age, "base_link"), twist=_twist(linear, angular)))
 
 
 def joints(speed: float, names: Sequence[str] = WHEELS) -> bytes:
-    """A JointState in CDR as ros2_control's topic-based hardware sends it: velocities only."""
+    """Return a JointState in CDR with velocities only, like ros2_control's topic-based hardware."""
     return encode(
         make(
             JOINTS,
@@ -246,18 +246,21 @@ def dds_name(type_name: str) -> str:
 
 
 def rmw_key(name: str, type_name: str, domain: int = 0) -> str:
-    """Return the key of a fully qualified name without its leading slash."""
+    """Return the Zenoh key that rmw_zenoh uses for this ROS name, given without its first slash."""
     return f"{domain}/{name}/{dds_name(type_name)}/RIHS01_{HASHES[type_name]}"
 
 
 def gid_of(token: str) -> bytes:
-    """Return rmw_zenoh's hash of a liveliness token: low half first, each little endian."""
+    """Return rmw_zenoh's GID: the 128-bit hash of a liveliness token.
+
+    The low half comes first, and both halves are little endian.
+    """
     value = xxhash.xxh3_128_intdigest(token.encode())
     return struct.pack("<QQ", value & (2**64 - 1), value >> 64)
 
 
 class Attached(NamedTuple):
-    """The attachment of rmw_zenoh."""
+    """The attachment that rmw_zenoh adds to each sample."""
 
     sequence: int
     stamp_ns: int
@@ -287,14 +290,14 @@ class Sample(NamedTuple):
 
 
 class Samples:
-    """The samples that arrive at a subscriber, from now on."""
+    """Collects the samples that arrive at a subscriber."""
 
     def __init__(self) -> None:
         self.seen: list[Sample] = []
         self._news = threading.Condition()
 
     def add(self, sample: zenoh.Sample) -> None:
-        """Take a sample; Zenoh calls this."""
+        """Store a sample. Zenoh calls this function."""
         attachment, stamp = sample.attachment, sample.timestamp
         self.take(
             Sample(
@@ -339,7 +342,7 @@ class Called(NamedTuple):
     seconds: float
 
     def trigger(self) -> tuple[bool, str]:
-        """Return the contents of the only reply, which must be a Trigger's."""
+        """Return success and message of the single reply, which must be that of a Trigger."""
         assert len(self.replies) == 1, self
         assert self.errors == 0, self
         reply = decode("std_srvs/msg/TriggerReply", self.replies[0].payload)
@@ -347,9 +350,9 @@ class Called(NamedTuple):
 
 
 def released(ros: Client) -> None:
-    """Call `clear` until it is obeyed.
+    """Call `clear` until the daemon executes it.
 
-    A Trigger has no latch number, so it only works 2 s after a stop.
+    A Trigger cannot name a latch, so the daemon refuses it in the first 2 s after a stop.
     """
     until(lambda: ros.call("acsard/clear").trigger()[0], 5.0, "a plain clear is obeyed")
 
@@ -358,9 +361,9 @@ def released(ros: Client) -> None:
 
 
 class Client(ABC):
-    """A ROS node that publishes, subscribes and calls. `namespace` is put in front of every name.
+    """A ROS node that publishes, subscribes and calls services.
 
-    Payloads are messages in CDR.
+    `namespace` is the prefix of every name. Payloads are messages in CDR.
     """
 
     PAUSE_S = 0.0
@@ -382,7 +385,7 @@ class Client(ABC):
 
     @abstractmethod
     def follow(self, name: str, type_name: str) -> AbstractContextManager[Samples]:
-        """Subscribe while entered."""
+        """Subscribe to a topic while the body runs."""
 
     @abstractmethod
     def follow_late(
@@ -393,9 +396,10 @@ class Client(ABC):
     def heard(
         self, bus: Bus, name: str, type_name: str, payload: bytes | Callable[[], bytes]
     ) -> None:
-        """Put a command until it is accepted, built again each time.
+        """Publish a command repeatedly until the daemon accepts one.
 
-        A new sender must show its delays first.
+        If `payload` is a function, it builds each command anew. The daemon accepts a new sender
+        only after some messages, when its delays are proved.
         """
         before, sent = bus.count("commands"), 0.0
 
@@ -409,14 +413,14 @@ class Client(ABC):
         until(taken, 5.0, f"a command on {name}")
 
     def zeros(self, bus: Bus) -> None:
-        """Put an accepted zero on every source. From here on each could move the robot."""
+        """Publish zeros on every source until the daemon accepts them. This arms each source."""
         for name in TWISTS:
             self.heard(bus, name, TWIST, twist(0.0))
         self.heard(bus, "joint_commands", JOINTS, lambda: joints(0.0))
 
     @contextmanager
     def driving(self, bus: Bus, name: str, type_name: str, speed: float) -> Iterator[None]:
-        """Send a zero, and then this speed at 20 Hz while entered."""
+        """Send a zero first, and then this speed at 20 Hz while the body runs."""
         self.heard(bus, name, type_name, lambda: PAYLOADS[type_name](0.0))
         silenced = threading.Event()
         if not isinstance(self, RmwClient):
@@ -438,7 +442,7 @@ class Client(ABC):
 
 
 class ZenohClient(Client):
-    """The common part of the clients of both trees, over a plain session."""
+    """The common part of both kinds of clients, which use an ordinary Zenoh session."""
 
     def __init__(self, session: zenoh.Session, namespace: str = "") -> None:
         super().__init__(namespace)
@@ -495,7 +499,7 @@ class ZenohClient(Client):
 
 
 class RmwClient(ZenohClient):
-    """A node of rmw_zenoh, written from its protocol."""
+    """A node of rmw_zenoh, implemented according to its protocol."""
 
     def __init__(self, session: zenoh.Session, namespace: str = "", domain: int = 0) -> None:
         super().__init__(session, namespace)
@@ -507,7 +511,7 @@ class RmwClient(ZenohClient):
         return rmw_key(self.full(name), type_name, self.domain)
 
     def attachment(self, age: float = 0.0) -> bytes:
-        """Return the next attachment, stamped `age` seconds ago."""
+        """Return the attachment of the next sample, with a stamp `age` seconds ago."""
         self._sequence += 1
         return Attached(self._sequence, time.time_ns() - int(age * 1e9), self.gid).pack()
 
@@ -528,13 +532,13 @@ class RmwClient(ZenohClient):
 
     @contextmanager
     def tokens(self) -> Iterator[list[str]]:
-        """The graph as every node watches it."""
+        """Provide the liveliness tokens of the ROS graph, as each rmw_zenoh node gets them."""
         with listed(self.session, f"@ros2_lv/{self.domain}/**") as found:
             yield found
 
 
 class BridgeHalf(ZenohClient):
-    """The Zenoh half of zenoh-bridge-ros2dds, emulated. `dds.py` has the real one."""
+    """The Zenoh side of zenoh-bridge-ros2dds, emulated. `dds.py` runs the real bridge."""
 
     def key(self, name: str, type_name: str) -> str:
         return self.full(name)
@@ -549,7 +553,7 @@ class BridgeHalf(ZenohClient):
 
 @contextmanager
 def listed(session: zenoh.Session, pattern: str) -> Iterator[list[str]]:
-    """Keep the liveliness tokens up to date while entered."""
+    """Provide a list of the matching liveliness tokens, updated while the body runs."""
     found: list[str] = []
 
     def on_token(sample: zenoh.Sample) -> None:
@@ -568,7 +572,7 @@ def listed(session: zenoh.Session, pattern: str) -> Iterator[list[str]]:
 
 @contextmanager
 def session_at(endpoint: str) -> Iterator[zenoh.Session]:
-    """A plain client."""
+    """Provide an ordinary Zenoh session at this address."""
     with zenoh.open(client_config(endpoint)) as session:
         yield session
 
@@ -578,9 +582,9 @@ def session_at(endpoint: str) -> Iterator[zenoh.Session]:
 
 @contextmanager
 def two_robots(where: Path, *names: str) -> Iterator[tuple[str, dict[str, Daemon]]]:
-    """Start a router, and there a robot that is a peer and one that is a client.
+    """Start a router and two robots on it, one as a Zenoh peer and one as a Zenoh client.
 
-    Yields the router's address and the daemons by name. The robots' ids are their namespaces too.
+    Yields the router's address and the daemons by name. A robot's id is also its ROS namespace.
     """
     meeting, daemons = free_endpoint(), {}
     with Program(words(ROUTER, meeting), where) as router, ExitStack() as stack:
@@ -601,7 +605,7 @@ def two_robots(where: Path, *names: str) -> Iterator[tuple[str, dict[str, Daemon
 
 @contextmanager
 def over_router(meeting: str, name: str) -> Iterator[Bus]:
-    """A client of one of the robots, with the link up."""
+    """Provide a client of one robot over the router, when the robot's link is up."""
     with Bus(meeting, name) as bus:
         until(lambda: bus.ask("info"), 5.0, f"{name} over the router")
         bus.linked()
@@ -610,7 +614,7 @@ def over_router(meeting: str, name: str) -> Iterator[Bus]:
 
 @contextmanager
 def undisturbed(robot: Bus) -> Iterator[None]:
-    """Check that this robot, which stands, receives no command and does not move meanwhile."""
+    """Check that this resting robot receives no command and does not move while the body runs."""
     before = robot.at_rest()
     yield
     after = robot.state()
@@ -651,9 +655,11 @@ def refused_without_motion(bus: Bus, send: Callable[[], None], reason: str, said
 
 
 def behind(bus: Bus, send: Callable[[], None], reason: str) -> None:
-    """Wait until all earlier messages are through: a link keeps order, and `send` is counted.
+    """Wait until the daemon has received all earlier messages of this client.
 
-    Sends again if necessary, because a sample within 1 ms of another one on its key is dropped.
+    `send` sends a command that the daemon refuses for `reason`. The messages of a link stay in
+    order, so all earlier ones have arrived when the refusal is counted. It is sent again if
+    necessary, because a sample is dropped within 1 ms of another one on its key.
     """
     before, sent = bus.count(f"command_{reason}"), 0.0
 
@@ -668,9 +674,9 @@ def behind(bus: Bus, send: Callable[[], None], reason: str) -> None:
 
 
 def settled(bus: Bus) -> None:
-    """Wait until the robot is at rest, then put it at the origin.
+    """Wait until the robot is at rest, then set its pose to the origin.
 
-    One reading of slow wheels cannot tell rest.
+    The pose must stay the same for ten lines, because one reading may miss a slow motion.
     """
 
     def look() -> bool:
@@ -834,7 +840,7 @@ manager.close()
 
 
 def bare_environment() -> dict[str, str]:
-    """The environment of a shell that knows nothing of ROS."""
+    """Return the environment of a shell without ROS settings."""
     ours = ("ROS_", "ZENOH_", "CYCLONEDDS_")
     return {key: value for key, value in environment().items() if not key.startswith(ours)}
 
@@ -865,7 +871,7 @@ class Sdk(Program):
         super().__exit__(*error)
 
     def do(self, verb: str, *args: object, **kwargs: object) -> Any:
-        """Return the SDK's answer as plain values."""
+        """Call a function of the SDK in the process, and return its result as plain values."""
         self._number += 1
         stdin = self.process.stdin
         assert stdin is not None

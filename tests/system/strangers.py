@@ -1,6 +1,6 @@
-"""Programs of strangers: plain Zenoh and JSON, nothing of acsard.
+"""Programs that use plain Zenoh and JSON, and nothing of acsard, like those of other people.
 
-Each constant is the text of a program.
+Each constant is the source text of a program.
 """
 
 from __future__ import annotations
@@ -233,7 +233,7 @@ BUSY = "while True: pass"
 
 
 def words(program: str, *arguments: object) -> list[str]:
-    """Return the words that run such a program."""
+    """Return the command line that runs a program of this module."""
     return [sys.executable, "-c", program, *map(str, arguments)]
 
 

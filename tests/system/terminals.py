@@ -1,4 +1,4 @@
-"""A person at a terminal, and `acsard` at a terminal of its own."""
+"""Simulates a person at a terminal, and runs `acsard` at a separate terminal."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class Terminal:
             self.close()
 
     def close(self) -> None:
-        """Close the window."""
+        """Close the terminal, as a person closes its window."""
         self._open = False
         self._leave.set()
         self._reader.join()
@@ -80,7 +80,7 @@ class Terminal:
 
 @contextmanager
 def held(terminal: Terminal, key: str) -> Iterator[None]:
-    """Hold a key down: it repeats 20 times a second until it is released."""
+    """Hold a key down while the body runs. The key repeats 20 times a second."""
     released = threading.Event()
 
     def repeat() -> None:
@@ -97,7 +97,7 @@ def held(terminal: Terminal, key: str) -> Iterator[None]:
 
 
 def screens(terminal: Terminal) -> list[str]:
-    """Return all whole screens so far, without their colours."""
+    """Return all complete screens that the program has drawn so far, without colours."""
     frames = terminal.screen.split("\x1b[H")[1:-1]
     return [re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", frame) for frame in frames]
 
@@ -111,9 +111,10 @@ def at_terminal(
     columns: int = 80,
     piped: str = "",
 ) -> Iterator[tuple[Terminal, Program]]:
-    """Run `acsard` in a directory at a terminal of its own, of that kind and width, with 24 lines.
+    """Run `acsard` at a separate terminal with 24 lines.
 
-    `piped` is the name of an output stream that goes into a pipe instead.
+    `term` is the kind of terminal and `columns` its width. `piped` names an output stream that goes
+    into a pipe instead.
     """
     with Terminal() as terminal:
         size = struct.pack("HHHH", 24, columns, 0, 0)

@@ -1,8 +1,9 @@
 """Every identity, verb and key has exactly the permissions in the table of SAFETY section 3.
 
-The tests judge effects. A put or delete counts if the robot obeys it, or if others take it for the
-robot's own message. A query counts if an answer comes, and a subscription if a sample comes. No
-test waits to see a forbidden effect stay away: a request that is answered follows each attempt.
+The tests check effects. A put or delete has an effect if the robot obeys it, or if it reaches other
+clients as if the robot had sent it. A query has an effect if an answer arrives, and a subscription
+if a sample arrives. To see that nothing happens, a test does not wait for a fixed time. It sends a
+request after each attempt, and waits for its answer.
 """
 
 from __future__ import annotations
@@ -59,12 +60,12 @@ CDR_TWIST, CDR_STAMPED = ros.twist(0.0), ros.stamped(0.0, age=None)
 
 
 def _cdr_wheels() -> bytes:
-    """Return joint speeds in CDR. They are stamped, so each use needs new ones."""
+    """Return wheel speeds in CDR with the present time. Build them anew for each use."""
     return ros.joints(0.0)
 
 
 class Try(NamedTuple):
-    """One row of the matrix: a key (expression) and the identities that may use it."""
+    """One row of the permission table: a key expression, and the identities that may use it."""
 
     key: str
     who: Who
@@ -217,7 +218,7 @@ Outcome = dict[str, bool]
 
 
 class Robot:
-    """A daemon with a plain and a TLS endpoint, a local client, and a witness on the bus."""
+    """A daemon with a plain and a TLS endpoint, a local client, and a second one as witness."""
 
     def __init__(self, where: Path) -> None:
         self.certificates = Certificates(where)
@@ -248,7 +249,7 @@ class Robot:
             self._fooled.set()
 
     def fooled(self) -> bool:
-        """Return whether the witness has since received a message that the robot did not send."""
+        """Return whether the witness has received a forged message since the last call."""
         self.witness.ask("info")
         was = self._fooled.is_set()
         self._fooled.clear()
@@ -258,9 +259,9 @@ class Robot:
         return self.certificates.config(who, self.plain, self.tls)
 
     def comes(self, look: Callable[[], bool], steps: int = 5) -> bool:
-        """Return whether `look` becomes true within this number of control periods.
+        """Return whether `look` returns True within `steps` control periods.
 
-        Periods are long compared with a delivery on one machine.
+        A period is long compared with the delivery of a message on one machine.
         """
         begun = self.here.count("lines_sent")
         while not (found := look()):
@@ -269,7 +270,7 @@ class Robot:
         return found
 
     def settled(self) -> None:
-        """Wait some control periods, until every message sent before has long arrived."""
+        """Wait some control periods, so that every earlier message has certainly arrived."""
         self.comes(lambda: False)
 
     def switched(self) -> None:
@@ -284,7 +285,7 @@ class Robot:
         assert self.here.get("srv/activate")["success"]
 
     def outcome(self, who: Identity, verb: Verb) -> Outcome:
-        """Return the result of every attempt."""
+        """Try each row of this verb with this identity, once per test run. Return the results."""
         if (who, verb) not in self._outcomes:
             self._outcomes[who, verb] = self._tried(who, verb)
         return self._outcomes[who, verb]
@@ -312,7 +313,7 @@ class Robot:
 
 
 class Visitor:
-    """One session of some identity at the robot."""
+    """One Zenoh session with a certain identity, which makes the attempts."""
 
     def __init__(self, robot: Robot, who: Identity) -> None:
         self._robot, self._who, self._sequence = robot, who, 0
@@ -331,16 +332,19 @@ class Visitor:
         return ros.Attached(self._sequence, time.time_ns(), bytes(range(16))).pack()
 
     def _behind(self) -> None:
-        """Wait until all messages of this session have arrived: one link keeps them in order."""
+        """Wait until all messages of this session have arrived.
+
+        The messages of one link stay in order, so the answer to a query shows that.
+        """
         if self._who in ADMITTED:
             assert list(self._session.get(f"{ME}/info", timeout=5.0))
         else:
             self._robot.settled()
 
     def _patience(self, rows: Sequence[Try]) -> int:
-        """Return the control periods to wait.
+        """Return the number of control periods to wait for an effect.
 
-        An expected effect gets the time that a busy machine takes.
+        An effect that is expected gets more time, because the machine may be busy.
         """
         if not all(self._who in row.who for row in rows):
             return 5
@@ -369,7 +373,7 @@ class Visitor:
         return done
 
     def asked(self, rows: Sequence[Try]) -> Outcome:
-        """Return the queries that got an answer."""
+        """Send these queries. Return for each whether an answer arrived."""
         waiting = {}
         for row in rows:
             answers: zenoh.handlers.FifoChannel[zenoh.Reply] = zenoh.handlers.FifoChannel(64)
@@ -428,9 +432,9 @@ class Visitor:
 
 
 def _heard(state: Any) -> int:
-    """Return the number of commands that reached the arbiter.
+    """Return the number of commands that the daemon has admitted, from its counters.
 
-    A new sender's commands do not count at once.
+    This includes the first commands of a new sender, which do not drive the robot yet.
     """
     counters = state["counters"]
     return sum(

@@ -1,4 +1,4 @@
-"""Every bad command on the real bus is refused whole, counted and logged, and moves nothing."""
+"""The daemon refuses, counts and logs every bad command on the real bus, and nothing moves."""
 
 from __future__ import annotations
 
@@ -38,9 +38,10 @@ ALL_JOINTS = [*JOINTS, "rear_right_wheel_joint"]
 
 
 class Bad(NamedTuple):
-    """A payload, the counter of its refusal, a word of the logged reason, its key and encoding.
+    """A bad command, and how the daemon must refuse it.
 
-    A payload of None is a DELETE.
+    `reason` is the name of the counter, and `said` a part of the reported reason. A payload of None
+    is a DELETE.
     """
 
     payload: bytes | None
@@ -55,7 +56,7 @@ def pack(value: object) -> bytes:
 
 
 def stamped(seconds: float) -> bytes:
-    """Return a speed that claims to be this old."""
+    """Return a speed in JSON whose stamp is `seconds` old."""
     sec, nanosec = divmod(int((time.time() - seconds) * 1e9), 10**9)
     stamp = {"sec": sec, "nanosec": nanosec}
     return json.dumps({"header": {"stamp": stamp}, "twist": twist(0.5)}).encode()
@@ -87,7 +88,7 @@ BAD = [
 
 
 def refused_without_motion(bus: Bus, *bad: Bad) -> None:
-    """Check that each counts under its reason and is reported, and that nothing moves."""
+    """Send these bad commands. Check that each is counted and reported, and that nothing moves."""
     # The source may drive: if a bad command were accepted, the robot would move.
     heard = bus.count("commands")
     bus.put("cmd/app", ZERO)
@@ -275,7 +276,7 @@ EMPTY_NAMES = HALF + struct.pack("<I", 1022) + bytes(4088)
 
 @pytest.fixture(scope="module")
 def flooded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
-    """A separate daemon for the ROS floods."""
+    """A separate daemon for the tests that flood it with ROS messages."""
     with Daemon(tmp_path_factory.mktemp("flooded")) as daemon:
         yield daemon
 

@@ -1,4 +1,4 @@
-"""`acsard bench` on the simulator, and on the port of an independent peer."""
+"""`acsard bench` on the simulator, and on the serial port of an independent simulated board."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ auto_activate = false
 def test_bench_measures_the_simulator_and_moves_nothing_on_a_real_port(
     tmp_path: Path, peer: Peer
 ) -> None:
-    """Run both at once, since they share nothing."""
+    """Run the two benchmarks at the same time, because they share nothing."""
     (tmp_path / "acsard.toml").write_text(CHECKED)
     (tmp_path / "real").mkdir()
     words = acsard("bench", "--seconds", "3", "--json")

@@ -72,7 +72,7 @@ FIELDS = {
 
 
 class Late(Following):
-    """A plain client that subscribed to `tf_static` late, and when it did."""
+    """A client that subscribed to `tf_static` after its first message, and the time when it did."""
 
     since = 0.0
 
@@ -90,7 +90,7 @@ def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
 
 @pytest.fixture(scope="module", autouse=True)
 def late(shared: Daemon) -> Iterator[Late]:
-    """Subscribe while all the other tests run, because its message is sent only every 5 s."""
+    """Subscribe to `tf_static` during all other tests, because it is published only every 5 s."""
     with Bus(shared.endpoint) as bus:
         bus.linked()  # the first tf_static, sent at the start, is gone by then
         late = Late()

@@ -69,7 +69,7 @@ def free() -> str:
 
 @contextmanager
 def router(endpoint: str) -> Iterator[zenoh.Session]:
-    """Run a separate router on the bus, which has positions."""
+    """Run a Zenoh router in this process, through which a positioning system can publish."""
     config = zenoh.Config()
     config.insert_json5("mode", '"router"')
     config.insert_json5("listen/endpoints", json.dumps([endpoint]))
@@ -84,14 +84,14 @@ RIDES_S = 120.0
 
 @contextmanager
 def calibrating(daemon: Daemon, *words: str) -> Iterator[tuple[Terminal, Program]]:
-    """Run `acsard calibrate` at a terminal of its own, with its results in a pipe."""
+    """Run `acsard calibrate` at a separate terminal. Its results go into a pipe."""
     given = ("calibrate", "--config", str(daemon.config), *words)
     with at_terminal(daemon.config.parent, *given, piped="stdout") as found:
         yield found
 
 
 def asks(terminal: Terminal, program: Program, words: str, times: int, within: float) -> None:
-    """Wait until the screen shows those words this often; fails if the program has ended."""
+    """Wait until the screen has shown these words `times` times. Fails if the program ends."""
 
     def look() -> bool:
         assert program.process.poll() is None, terminal.screen
@@ -101,9 +101,9 @@ def asks(terminal: Terminal, program: Program, words: str, times: int, within: f
 
 
 def begun(terminal: Terminal, program: Program, bus: Bus) -> int:
-    """Wait until the first leg moves; return how often it was started.
+    """Start the first leg and wait until the robot moves. Return the number of starts.
 
-    Starts it again if a busy machine has disturbed it.
+    If a busy machine disturbs the leg, it is started again.
     """
     asks(terminal, program, STARTS, 1, 10.0)
     terminal.press("\n")
@@ -123,10 +123,10 @@ def begun(terminal: Terminal, program: Program, bus: Bus) -> int:
 
 
 def ends(terminal: Terminal, program: Program, starts: int) -> None:
-    """Wait until the program ends with 1. Its first leg was started this number of times.
+    """Wait until the program ends with exit code 1.
 
-    If a busy machine disturbs the leg before its cause does, the program asks for a repetition. The
-    cause then ends the leg that is started again.
+    If a busy machine has disturbed the leg, the program asks for a repetition, and the leg is
+    started again. `starts` is the number of starts so far.
     """
 
     def ended() -> bool:
@@ -148,7 +148,7 @@ T = TypeVar("T")
 
 
 def tried(bus: Bus, drive: Callable[[], T]) -> T:
-    """Return the result of the drive. Repeats it if the machine did not run during it."""
+    """Call `drive` and return its result. Repeat it if the machine stalled during the drive."""
     for left in reversed(range(TRIES)):
         try:
             return drive()
@@ -201,7 +201,10 @@ LINE_M, LENGTH_M, WIDTH_M = 0.45, 0.25, 0.30
 
 
 def measured(bus: Bus, words: str) -> str:
-    """Return a person's reading of the robot's true position, mm, or m for the long distance."""
+    """Return the number that a person would measure for this question.
+
+    It follows from the robot's true position. It is in mm, or in m for the long distance.
+    """
     pose = bus.get("sim/pose")["pose"]
     where, turn = pose["position"], pose["orientation"]
     yaw = 2 * math.atan2(turn["z"], turn["w"])
@@ -223,7 +226,10 @@ def shown(terminal: Terminal) -> str:
 
 
 def question(terminal: Terminal, program: Program, seen: int) -> str | None:
-    """Return the question after the text seen so far. `ENDED` means that no more will come."""
+    """Return the question after the first `seen` characters, or None if there is none yet.
+
+    Returns `ENDED` if the program has ended.
+    """
     words = shown(terminal)[seen:]
     if words.endswith((" mm:", " m:", " deg:", "q quits.")):
         return words
@@ -231,7 +237,7 @@ def question(terminal: Terminal, program: Program, seen: int) -> str | None:
 
 
 def once_round(bus: Bus) -> None:
-    """Wait until the robot has turned to the left and looks as before."""
+    """Wait until the robot has turned to the left by a whole turn."""
 
     def yaw() -> float:
         turn = bus.get("sim/pose")["pose"]["orientation"]
@@ -246,7 +252,7 @@ Reads = Callable[[str], str]
 
 
 def goes_through(daemon: Daemon, bus: Bus, way: str, reads: Reads) -> str:
-    """Go through every leg and question of a way to the written file; return the output."""
+    """Do a whole calibration with the method `way`, answer each question, and return the output."""
     with calibrating(daemon, "--method", way, "--write") as (terminal, program):
         seen = 0
         while program.process.poll() is None:
@@ -279,9 +285,9 @@ def test_a_person_with_a_tape_alone_is_guided_to_the_written_file(tmp_path: Path
 
 
 class Beside:
-    """A person who sets the robot where a leg asks for it, and reads off how it stands from there.
+    """A simulated person who places the robot where a leg asks for it, and measures its position.
 
-    Nothing moves the simulated robot, so that place is its current position.
+    The simulated robot cannot be carried, so its current position counts as that place.
     """
 
     def __init__(self, bus: Bus) -> None:

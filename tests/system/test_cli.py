@@ -1,4 +1,4 @@
-"""The tools at the shell: their output, its stream, and their exit code."""
+"""The command-line tools: their output, its stream (stdout or stderr), and their exit codes."""
 
 from __future__ import annotations
 
@@ -625,7 +625,7 @@ def test_get_of_a_service_does_not_call_it(shared: Daemon, bus: Bus) -> None:
 def without_a_screen(
     shared: Daemon, *words: str, how: str = ON_TERMINAL, columns: int = 80
 ) -> Iterator[tuple[Terminal, Program]]:
-    """Run `acsard drive` at a terminal that cannot show a screen."""
+    """Run `acsard drive` at a terminal that cannot draw a full screen."""
     drive = ("drive", "--config", str(shared.config), *words)
     with at_terminal(shared.config.parent, *drive, how=how, columns=columns, piped="stderr") as (
         terminal,
@@ -637,7 +637,7 @@ def without_a_screen(
 
 @contextmanager
 def screened(shared: Daemon, columns: int) -> Iterator[tuple[Terminal, Program]]:
-    """Run `acsard drive` at a terminal of that width that can show a screen."""
+    """Run `acsard drive` at a terminal of this width that can draw a full screen."""
     drive = ("drive", "--config", str(shared.config))
     with at_terminal(
         shared.config.parent, *drive, term=SCREEN, columns=columns, piped="stderr"

@@ -52,7 +52,7 @@ DEFAULT = "tcp/127.0.0.1:7448"
 
 
 class Outcome(NamedTuple):
-    """An example's exit, the robot's state at rest after it, and the time the machine took, s."""
+    """An example's exit, the robot's final state, and the time lost to other programs, s."""
 
     ended: Finished
     state: Any
@@ -60,19 +60,19 @@ class Outcome(NamedTuple):
 
 
 def code_blocks() -> list[str]:
-    """Return the README's Python, as printed."""
+    """Return the Python code blocks of the README."""
     return re.findall(r"^```python\n(.*?)^```", (ROOT / "README.md").read_text(), re.S | re.M)
 
 
 def kind(code: str) -> str:
-    """Return the name of this one of the three examples."""
+    """Return the name of the example that has this code."""
     if "connect_async" in code:
         return "async"
     return "five lines" if "acsard.client" in code else "plain zenoh"
 
 
 def default_is_free() -> bool:
-    """Return whether the default endpoint of a daemon is free."""
+    """Return whether no program uses the daemon's default endpoint."""
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
@@ -92,7 +92,7 @@ def at_endpoint(code: str, endpoint: str) -> str:
 
 @pytest.fixture(scope="module")
 def examples(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Outcome]:
-    """Run all examples at the same time, each with a robot of its own: each takes two seconds."""
+    """Run all examples at the same time, each with its own robot, as each takes two seconds."""
     where = tmp_path_factory.mktemp("examples")
     codes = {kind(code): code for code in code_blocks()}
     endpoints = {name: free_endpoint() for name in codes}
@@ -179,7 +179,7 @@ def test_the_plain_zenoh_example_of_the_readme_drives_one_metre_and_follows_the_
 
 @pytest.fixture
 def fresh(shared: Daemon, bus: Bus) -> Iterator[Bus]:
-    """Provide the shared robot at the origin and at rest, and leave it so."""
+    """Provide the shared robot at the origin and at rest. Wait for rest at the end, too."""
     bus.at_rest()
     bus.get("srv/reset_odometry")
     yield bus

@@ -75,7 +75,7 @@ print("that was", "all")
 
 
 def shown(words: Sequence[str], where: Path, text: str, **more: str) -> str:
-    """Return a program's output at a terminal that knows colours, up to that text."""
+    """Return the output of a program at a colour terminal, until it contains this text."""
     with Terminal() as terminal:
         fcntl.ioctl(terminal.slave, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 100, 0, 0))
         env = environment(TERM="xterm-256color", COLORTERM="truecolor")
@@ -95,7 +95,7 @@ def shown(words: Sequence[str], where: Path, text: str, **more: str) -> str:
 
 
 def typed_at(daemon: Daemon, words: Sequence[str]) -> list[str]:
-    """Run this command line at a terminal, with that daemon's file."""
+    """Return a command line of acsard for a terminal, with this daemon's configuration file."""
     file = [] if words[0] in ("run", "recording") else ["--config", str(daemon.config)]
     return [sys.executable, "-c", ON_TERMINAL, *words, *file]
 

@@ -1,4 +1,4 @@
-"""The log, `diagnostics` and `doctor` report a router that is missing, goes or comes back."""
+"""The log, `diagnostics` and `doctor` report a router that is missing, ends or returns."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def row(bus: Bus) -> Any:
 
 
 def told(daemon: Daemon, name: str, times: int) -> str:
-    """Return the text of that event's log line, once there are this many."""
+    """Wait until the daemon has logged this event `times` times. Return the last one's text."""
     until(lambda: len(daemon.events(name)) >= times, 5.0, f"{name}, {times} times")
     return str(daemon.events(name)[times - 1]["text"])
 
@@ -92,9 +92,9 @@ def test_a_client_says_that_its_router_went_and_came_back(tmp_path: Path) -> Non
 def test_two_directly_connected_daemons_report_it_and_a_wildcard_stop_reaches_one(
     tmp_path: Path,
 ) -> None:
-    """Neither daemon forwards the other's messages.
+    """A daemon that is not a router forwards no messages between the others.
 
-    An operator who stops all robots at one of them must know that.
+    So a stop for all robots reaches only the daemon to which the operator is connected.
     """
     one = Daemon(tmp_path, config={"robot": {"id": "one"}}, name="one")
     config: Tables = {
@@ -128,7 +128,11 @@ def test_a_daemon_without_a_connect_endpoint_reports_nothing_about_routers(tmp_p
 def test_the_zeros_of_a_program_behind_routers_release_no_other_program(
     tmp_path: Path, routers: int
 ) -> None:
-    """The first router stamps all messages. If there are two, the daemon has no link to it."""
+    """Two programs send through the same routers: one zeros, the other one speeds.
+
+    The first router stamps all messages, so both look like one sender. The robot does not drive
+    until the zeros pause. With two routers, the daemon has no link to the first one.
+    """
     ends = [free_endpoint() for _ in range(routers)]
     with ExitStack() as stack:
         for place, endpoint in enumerate(ends):
@@ -145,7 +149,7 @@ def test_the_zeros_of_a_program_behind_routers_release_no_other_program(
             return bus.state()
 
         def arrive(session: zenoh.Session) -> None:
-            """Send speeds until some arrive. At first a session does not know the subscriber."""
+            """Send speeds until some arrive. A new session first has to learn of the subscriber."""
             before = bus.count("commands")
             until(lambda: put(session, 0.1)["counters"].get("commands", 0) > before + 5, 10.0)
 
@@ -154,7 +158,7 @@ def test_the_zeros_of_a_program_behind_routers_release_no_other_program(
         begun = time.monotonic()
 
         def sends() -> Any:
-            """Send zeros all the time, and speeds in the first and the last part of it."""
+            """Send a zero, and also a speed, except between 4 and 6 s. Return the state."""
             state = put(zeros, 0.0)
             return state if 4.0 < time.monotonic() - begun < 6.0 else put(speeds, 0.1)
 

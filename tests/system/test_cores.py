@@ -1,4 +1,4 @@
-"""A failure is not yet a verdict if no core was free."""
+"""A failed test counts only if a core was idle during it."""
 
 from __future__ import annotations
 

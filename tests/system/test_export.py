@@ -1,4 +1,4 @@
-"""The export of a recording has the messages that strangers received while it was made."""
+"""The export of a recording contains the messages that other clients received meanwhile."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ RECORDED = ROOT / "tests" / "recordings" / "quiet.mcap"
 
 
 class Told(NamedTuple):
-    """A bag in memory: the bytes of each topic, and the function that decodes them."""
+    """The contents of an exported file: the bytes of each topic, and a function to decode them."""
 
     data: dict[str, list[bytes]]
     times: dict[str, list[int]]
@@ -75,7 +75,7 @@ def _take_numbered(got: list[tuple[int, bytes]], sample: Any) -> None:
 
 @contextmanager
 def heard(bus: Bus) -> Iterator[Live]:
-    """Collect all messages for ROS nodes of both kinds, and our own `state` and `events`."""
+    """Collect all messages for ROS nodes (rmw_zenoh and bridge), and `state` and `events`."""
     live = Live()
     with ExitStack() as stack:
         for key in (*ROS, f"{bus.root}/state", f"{bus.root}/events"):
@@ -93,7 +93,10 @@ def heard(bus: Bus) -> Iterator[Live]:
 
 
 def places(live: Sequence[Any], told: Sequence[Any], topic: str) -> list[int]:
-    """Return the place of each live message in the file. Fails unless all are there, in order."""
+    """Return the index of each live message in the file.
+
+    Fails if one is missing or in the wrong order.
+    """
     at = iter(enumerate(told))
     found = [next((n for n, other in at if other == one), None) for one in live]
     if None in found:
@@ -106,9 +109,10 @@ def places(live: Sequence[Any], told: Sequence[Any], topic: str) -> list[int]:
 def assert_published(
     numbered: Sequence[tuple[int, Any]], told: Sequence[Any], displaced: int, topic: str
 ) -> None:
-    """Check that the file has as many messages between two live ones as the daemon published.
+    """Check the number of messages in the file against the publisher's sequence numbers.
 
-    A busy machine loses messages on their way, but the numbers of the others count them.
+    A busy machine may lose live messages, but the numbers of the others show how many were
+    published.
     """
     assert len(numbered) > 50, topic
     found = places([message for _, message in numbered], told, topic)
@@ -117,7 +121,7 @@ def assert_published(
 
 
 def since_driving(live: Sequence[Any], reason: Callable[[Any], str]) -> Sequence[Any]:
-    """Return the messages from the first change of mode on."""
+    """Return the messages from the first one whose reason is "driving"."""
     first = next(n for n, one in enumerate(live) if reason(one).startswith("driving"))
     assert len(live) - first > 50
     return live[first:]

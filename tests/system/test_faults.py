@@ -1,7 +1,7 @@
-"""Faults of the processes, the kernel and the serial line (SAFETY section 2), on the real daemon.
+"""Faults of processes, the kernel and the serial line (SAFETY section 2), with the real daemon.
 
-The faults of the bus are in `test_faults_bus.py`. Every promise has a short version here; the full
-count is `pytest -m soak -s tests/system/test_faults.py`, which prints its figures.
+The faults of the bus are in `test_faults_bus.py`. Every promise has a short test here. The long
+tests run with `pytest -m soak -s tests/system/test_faults.py`, which prints their results.
 """
 
 from __future__ import annotations
@@ -66,10 +66,9 @@ def commander(daemon: Daemon, speed: float, source: str = "app", zeros: int = 1)
 
 
 def drives(peer: FarPeer, driver: Program, speed: float = 0.3) -> Heard:
-    """Return the first line at this speed.
+    """Wait for the first line with this speed in m/s, and return it.
 
-    The machine may have delayed a commander at the beginning so that its zero did not count; the
-    commander then returns to neutral once more.
+    If a busy machine has delayed the commander's first zero, the commander must send zeros again.
     """
     begun = said = time.monotonic()
 
@@ -99,9 +98,9 @@ def one_robot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[FarPee
 
 @pytest.fixture
 def far(one_robot: tuple[FarPeer, Daemon]) -> Iterator[tuple[FarPeer, Daemon]]:
-    """Provide `one_robot` at rest, so that lines of two commanders are not confused.
+    """Provide `one_robot` at rest, so that the lines of two commanders do not mix.
 
-    After the test, print what the daemon has logged meanwhile. pytest shows it if the test failed.
+    After the test, print the daemon's log of this test. pytest shows it if the test failed.
     """
     peer, daemon = one_robot
     began = len(daemon.err)
@@ -118,7 +117,10 @@ def last_put(program: Program) -> float:
 
 
 def puts_of(program: Program) -> list[float]:
-    """Return when a commander sent, without the last time, which it may not have printed whole."""
+    """Return the times of a commander's commands.
+
+    The last time is left out, because the killed commander may have printed only a part of it.
+    """
     return [float(line.split()[1]) for line in program.out[:-1]]
 
 
@@ -135,7 +137,10 @@ def gaps(lines: list[Heard]) -> list[float]:
 
 
 class Ramp(NamedTuple):
-    """The time from the last accepted command to a ramp, s, less the time that the machine took."""
+    """The time from the last accepted command to the ramp, s.
+
+    The time lost to other programs is subtracted.
+    """
 
     step: float
     """Until the first slower step, by the daemon's own stamps."""
@@ -149,10 +154,11 @@ LATE_S = 0.005
 
 
 def killed_commanders(peer: FarPeer, daemon: Daemon, count: int) -> list[Ramp]:
-    """Return the times from the last accepted command of a commander that is killed to the ramp.
+    """Kill a commander `count` times. Return the times from its last command to the ramp.
 
-    `state` says when a command was accepted: its stamp less the source's age. A put that died on
-    its way with its commander does not count, and neither does the travel time of one that arrived.
+    The last command counts from its acceptance, which follows from `state`: the stamp minus the
+    source's age. So a command that was lost with the commander does not matter, and the travel time
+    of commands does not count.
     """
     rng, found = random.Random(1), []
     with (
@@ -231,7 +237,7 @@ TWO = [
 
 @contextmanager
 def three_sources(where: Path, peer: FarPeer) -> Iterator[Daemon]:
-    """A daemon with two sources of one priority and one below them."""
+    """A daemon with three sources: two of the same priority, and one with a lower priority."""
     rows = "".join(
         f'[[commands.sources]]\nname = "{row["name"]}"\npriority = {row["priority"]}\n'
         f"timeout = {row['timeout']}\n"
@@ -248,9 +254,10 @@ def three_sources(where: Path, peer: FarPeer) -> Iterator[Daemon]:
 def taken_over(
     peer: FarPeer, daemon: Daemon, bus: Bus, successor: str
 ) -> tuple[float, list[Heard]] | None:
-    """Return a killed commander's last send time, and the lines up to the next one's speed.
+    """Kill a commander while another one waits.
 
-    Returns nothing if the machine broke the link meanwhile.
+    Returns the time of its last command, and the lines from then until the other one's speed.
+    Returns None if the machine interrupted the link meanwhile.
     """
     with bus.follow("state") as states, commander(daemon, 0.3, "first") as first:
         steady = drives(peer, first).at
@@ -301,13 +308,13 @@ def test_when_a_commander_is_killed_the_next_one_takes_over_from_its_own_command
 
 
 def kinds_of(pid: int) -> tuple[int, int]:
-    """Return the file descriptors and threads of a process."""
+    """Return the number of file descriptors and of threads of a process."""
     return len(os.listdir(f"/proc/{pid}/fd")), len(os.listdir(f"/proc/{pid}/task"))
 
 
 @contextmanager
 def taken(name: str) -> Iterator[None]:
-    """Hold the pty of this name, so that the next program that opens a pty gets another."""
+    """Occupy the pty of this name, so that the next program that opens a pty gets another name."""
     kept: list[tuple[int, int]] = []
 
     def hold() -> bool:
@@ -330,9 +337,10 @@ def taken(name: str) -> Iterator[None]:
 
 
 def replugged(tmp_path: Path, peer: Peer, cycles: int) -> tuple[list[float], list[float]]:
-    """Return the seconds until `state` shows an unplug, and from a replug to the first zero line.
+    """Unplug and replug the board `cycles` times.
 
-    The time that the machine took is subtracted from each.
+    Returns the times until `state` shows the unplugging, and the times from the replugging to the
+    first line of zeros, in s. Both are without the time lost to other programs.
     """
     noticed, zeros = [], []
     with (
@@ -499,10 +507,10 @@ def busy(where: Path) -> ExitStack:
 
 
 def unheard(states: Following, since: float, to: float) -> float:
-    """Return the greatest age of the last command of `app` in the states of that time, s.
+    """Return the largest age of the last command of `app` in the states of this time, s.
 
-    A command may wait for a core on its way through the bus, and `state` is published when the
-    mode changes for want of a command.
+    It is larger than the timeout if a command waited for a core. `state` is also published at the
+    moment when the mode changes because commands are missing.
     """
     ages = [
         source["age"] or 0.0
@@ -574,7 +582,7 @@ def test_starved_of_both_cores_every_missed_period_is_counted_and_none_made_up_i
 
 @contextmanager
 def stalled(daemon: Daemon) -> Iterator[None]:
-    """Stop the whole daemon while entered."""
+    """Stop the whole daemon process while the body runs."""
     daemon.signal(signal.SIGSTOP)
     try:
         yield
@@ -583,11 +591,11 @@ def stalled(daemon: Daemon) -> Iterator[None]:
 
 
 def no_burst(lines: list[Heard]) -> float:
-    """Return the smallest gap.
+    """Check that lines do not come in a burst, and return the smallest gap between two lines.
 
-    Fails if lines came faster than their periods. Lines are counted over a tenth of a second: the
-    kernel's thread that carries bytes through a pty may be late itself and deliver two or three
-    lines at once, or as many as the machine made it wait.
+    The lines in each tenth of a second are counted. Two or three more than the control rate are
+    allowed, and further ones if the machine was busy, because the kernel's thread for the pty may
+    deliver several lines at once.
     """
     for first in lines:
         most = 10 + 4
@@ -695,7 +703,7 @@ def test_after_50_stalls_of_any_length_the_first_line_is_zero_and_none_comes_in_
 
 @contextmanager
 def full_pipe() -> Iterator[int]:
-    """A full pipe that no process reads: every write to it waits for ever."""
+    """Provide a full pipe that no process reads, so that every write to it blocks for ever."""
     reader, writer = os.pipe()
     fcntl.fcntl(writer, fcntl.F_SETPIPE_SZ, 4096)
     os.set_blocking(writer, False)

@@ -1,7 +1,7 @@
-"""Faults of the bus (SAFETY section 2) on the real daemon: partition, flood, stalls, a dead router.
+"""Faults of the bus (SAFETY section 2): partition, flood, stalls, and a router that dies.
 
-Every promise has a short version here; the full count is
-`pytest -m soak -s tests/system/test_faults_bus.py`, which prints its figures.
+The daemon is the real one. Every promise has a short test here. The long tests run with `pytest -m
+soak -s tests/system/test_faults_bus.py`, which prints their results.
 """
 
 from __future__ import annotations
@@ -72,7 +72,10 @@ PROMPT_FEEDBACK: dict[str, object] = {"wheel_acceleration": 1e6}
 
 
 def gaps(lines: list[Heard]) -> list[float]:
-    """Return the gaps between the lines, less the time that the machine took if that is much."""
+    """Return the gaps between the lines in s.
+
+    The time lost to other programs is subtracted from gaps of more than two periods.
+    """
     return [
         b.at - a.at - (lost(a.at, b.at) if b.at - a.at > 2 * TICK_S else 0.0)
         for a, b in itertools.pairwise(lines)
@@ -89,9 +92,10 @@ Way = Literal["hole", "fast", "slow"]
 
 
 class Proxy:
-    """A relay between a client and the daemon.
+    """A TCP relay between a client and the daemon.
 
-    A hole holds back both sides' bytes and delivers them later.
+    In a simulated partition (a hole) it stores the bytes of both directions, and delivers them
+    later.
     """
 
     def __init__(self, endpoint: str) -> None:
@@ -122,7 +126,7 @@ class Proxy:
             one.close()
 
     def turn(self, way: Way) -> None:
-        """From now on let nothing through, or everything at once, or everything at `pace`."""
+        """Switch the relay: let no bytes through, or all at once, or `pace` bytes per 10 ms."""
         with self._changed:
             self._way = way
             self._changed.notify_all()
@@ -199,7 +203,7 @@ class Proxy:
 
 
 class Numbered:
-    """A stamped commander at 50 Hz whose every command has a speed of its own."""
+    """A commander at 50 Hz with stamps. Each command has a different speed, which identifies it."""
 
     COUNT = 400
     """Number of speeds before they repeat: 8 s, longer than any hole and its drain."""
@@ -227,7 +231,10 @@ class Numbered:
                 return
 
     def age(self, heard: Heard) -> float | None:
-        """Return the age of this line's command when the line appeared, or None without one."""
+        """Return the age in s that the command of this line had when the line appeared.
+
+        Returns None if the line has no command's speed.
+        """
         number = round(wheels(heard.line)[0] * 100) - 200
         if not 0 <= number < self.COUNT:
             return None
@@ -254,7 +261,10 @@ def appeared(lines: list[Heard]) -> list[Heard]:
 
 
 def holes(where: Path, ways: list[tuple[Way, float]]) -> list[Hole]:
-    """Run partitions of these lengths (s) one after the other, each drained in one way."""
+    """Simulate partitions one after the other, and return their results.
+
+    `ways` has for each how the stored bytes are delivered, and the length in s.
+    """
     where.mkdir(exist_ok=True)
     found: list[Hole] = []
     with (
@@ -358,10 +368,11 @@ BASE = 0.25
 
 
 class Flooded(NamedTuple):
-    """The ages of the commands that the steps obeyed in a flood, s.
+    """The ages in s of the commands that the daemon's steps obeyed during a flood.
 
-    The time that the machine took is subtracted if it is over 20 ms. The first two also contain the
-    way to the daemon, on which the flooder's own threads and Zenoh's wait for a core.
+    The time lost to other programs is subtracted from ages of more than 20 ms. `age` and
+    `overtaken` also include the way to the daemon, where the threads of the flooder and of Zenoh
+    wait for a core.
     """
 
     age: list[float]
@@ -388,11 +399,12 @@ class Flooded(NamedTuple):
 
 
 def flooded(where: Path, length: float) -> Flooded:
-    """Return the ages of the obeyed commands in a flood, by applied speeds and step stamps.
+    """Flood the daemon with commands for `length` seconds, and return the ages of the obeyed ones.
 
-    The lines at the other end of the pty would not show it: the kernel's thread that carries them
-    starves on a machine that a flood keeps busy, until the link becomes stale. The robot then
-    stands, and steps that stand or rise from there obey no command's speed yet.
+    The speed of a command encodes its time, so the applied speeds and their stamps give the age.
+    The lines on the pty are not used: on a machine that a flood keeps busy, the kernel's thread for
+    the pty delays them until the link is stale. The robot then stops, and the steps at rest or on a
+    ramp show no command's speed.
     """
     limits = PROMPT | {"linear_speed": 10.0, "wheel_speed": 99.0}
     feedback = PROMPT_FEEDBACK | {"wheel_speed": 99.99}
@@ -503,16 +515,16 @@ def test_in_a_minute_of_floods_the_command_obeyed_is_a_fresh_one(tmp_path: Path)
 
 
 def unsent(port: int) -> list[int]:
-    """Return the bytes that the kernel holds for each client of a local port."""
+    """Return the number of unsent bytes in the kernel for each client of a local port."""
     rows = [row.split() for row in Path("/proc/net/tcp").read_text().splitlines()[1:]]
     mine = [row for row in rows if int(row[1].partition(":")[2], 16) == port and row[3] == "01"]
     return [int(row[4].partition(":")[0], 16) for row in mine]
 
 
 def filled(daemon: Daemon, filler: Bus) -> int:
-    """Return the bytes held for stopped clients once there is no more room, else 0.
+    """Return the unsent bytes for the stopped clients if the kernel's buffers are full, else 0.
 
-    The daemon's own messages would take a minute to fill it, so another client helps.
+    `filler` sends additional messages, because the daemon's own would take a minute to fill them.
     """
     before = sorted(unsent(port_of(daemon.endpoint)))[-4:]
     for _ in range(40):
@@ -523,7 +535,7 @@ def filled(daemon: Daemon, filler: Bus) -> int:
 
 
 def hoarded(where: Path, rounds: int, length: float) -> tuple[list[float], list[float]]:
-    """Return the longest gaps between lines: without and with four stopped subscribers."""
+    """Return the longest gaps between lines in s, without and with four stopped subscribers."""
     without, stopped = [], []
     with FarPeer(where) as peer, Daemon(where, peer.path) as daemon, ExitStack() as stack:
         peer.awaits(b"ap00.00")
@@ -577,7 +589,10 @@ def test_four_stopped_subscribers_hold_up_no_line_in_20_rounds(tmp_path: Path) -
 
 
 def rerouted(where: Path, cycles: int) -> list[float]:
-    """Return the seconds from a router's return to odometry at a client behind it."""
+    """Kill and restart a router `cycles` times.
+
+    Returns the times from its return until a client behind it receives odometry, in s.
+    """
     routed, found, worst = free_endpoint(), [], 0.0
     with ExitStack() as stack:
         peer = stack.enter_context(FarPeer(where))

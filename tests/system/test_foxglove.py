@@ -1,4 +1,4 @@
-"""`acsard foxglove` serves a viewer: a client of its protocol that knows nothing of acsard."""
+"""`acsard foxglove` works with a client of the Foxglove protocol that knows nothing of acsard."""
 
 from __future__ import annotations
 
@@ -110,7 +110,10 @@ CONNECTED_S = RELEASE_TIMEOUT_NS / NS_PER_S + 0.1
 
 
 class Panel:
-    """Hold a button down: 20 messages a second. Press it as soon as the panel may drive."""
+    """A Teleop panel whose button is held while the object is entered: 20 messages a second.
+
+    The panel waits `CONNECTED_S` first, because it may not drive earlier.
+    """
 
     def __init__(self, viewer: Viewer, data: bytes, encoding: str = "json") -> None:
         self._send, self.channel = viewer.publish_on("/cmd_vel", encoding, "geometry_msgs/Twist")
@@ -139,7 +142,7 @@ class Panel:
 
 
 def driving(bus: Bus, faster_than: float = 0.2) -> Any:
-    """Return the state once the robot drives at this speed."""
+    """Wait until the robot drives faster than this speed in m/s, and return the state."""
 
     def look() -> Any:
         state = bus.state()
@@ -151,7 +154,7 @@ def driving(bus: Bus, faster_than: float = 0.2) -> Any:
 
 
 def same(told: Any, value: Any) -> bool:
-    """Check that a ROS message, as rosbags decodes it, holds the same as one of the bus."""
+    """Return whether a ROS message, decoded by rosbags, equals a message of the bus."""
     if isinstance(value, Mapping):
         return all(same(getattr(told, key), inner) for key, inner in value.items())
     if isinstance(value, list):
@@ -241,7 +244,7 @@ Sent = tuple[str, float, Callable[[], None]]
 
 
 def moving(name: str, speed: float) -> Any:
-    """Return a message of this ROS type."""
+    """Return a message of this ROS type that commands this speed in m/s."""
     if name == JOINTS:
         wheels = [speed / 0.05] * 4
         return JointState(name=list(JointsConfig().as_tuple()), velocity=wheels)
@@ -250,7 +253,7 @@ def moving(name: str, speed: float) -> Any:
 
 
 def every_way(session: zenoh.Session) -> Iterator[Sent]:
-    """The ways to command, each with a speed of its own."""
+    """Yield every way to send a command: the source, a different speed for each, and a function."""
     speeds = (number / 100 for number in itertools.count(1))
 
     def put(key: str, payload: bytes, **named: str) -> Callable[[], None]:
@@ -280,7 +283,7 @@ def every_way(session: zenoh.Session) -> Iterator[Sent]:
 
 
 def asked(messages: list[Any]) -> list[tuple[str, float, float]]:
-    """Return frame and speeds of each."""
+    """Return the frame and the two speeds of each message."""
     return [(m.header.frame_id, m.twist.linear.x, m.twist.angular.z) for m in messages]
 
 
@@ -540,7 +543,7 @@ def test_a_viewer_that_reads_nothing_or_floods_does_not_delay_other_viewers(
 
 @contextmanager
 def followed(bus: Bus) -> Iterator[tuple[list[Any], list[Any]]]:
-    """Collect the commanded and the applied speeds, each with its time by our clock."""
+    """Collect the commanded and the applied speeds, each with this process's time of arrival."""
     asked: list[Any] = []
     applied: list[Any] = []
 

@@ -42,7 +42,7 @@ pytestmark = pytest.mark.network
 
 
 class Open:
-    """A daemon with a TLS gateway, and clients that come through it."""
+    """A daemon with a TLS gateway, and clients that connect to the gateway."""
 
     def __init__(self, where: Path, certificates: Certificates) -> None:
         self._certificates = certificates
@@ -51,7 +51,7 @@ class Open:
         self.daemon = Daemon(where, config={"bus": bus}, endpoint=self._plain)
 
     def gateway(self) -> int:
-        """The gateway's process."""
+        """Return the pid of the gateway's process."""
         (pid,) = until(lambda: children(self.daemon.pid, "acsard gateway"), 5.0, "a gateway")
         return pid
 
@@ -77,7 +77,7 @@ def robot(tmp_path: Path, certificates: Certificates) -> Iterator[Open]:
 
 
 def gone(pid: int) -> bool:
-    """Return whether the process has ended, even if no process has reaped it."""
+    """Return whether the process has ended. A zombie counts as ended."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
     except FileNotFoundError:
@@ -229,7 +229,10 @@ def listening(endpoint: str) -> zenoh.Config:
 def test_a_gateway_ends_if_its_connected_daemon_answers_no_queries(
     tmp_path: Path, certificates: Certificates, answers: bool
 ) -> None:
-    """Zenoh has been seen to stop reading from a gateway on a machine with much other work."""
+    """On a busy machine Zenoh sometimes stops reading from a gateway, although the link stays open.
+
+    The gateway must then end, so that the daemon starts a new one.
+    """
     plain, tls = free_endpoint(), free_tls_endpoint()
     bus = {"listen": [plain, tls], "tls": str(certificates.robot)}
     config = write_config(tmp_path / "a.toml", {"bus": bus})
@@ -254,7 +257,7 @@ def test_a_gateway_ends_if_its_connected_daemon_answers_no_queries(
 def test_a_gateway_ends_in_order_if_its_daemon_ended_without_reading_signs_of_life(
     tmp_path: Path, certificates: Certificates
 ) -> None:
-    """The kernel then reports a reset connection in place of its end."""
+    """The gateway then reads a connection reset instead of an end of file. It still ends with 0."""
     bus = {"listen": [free_endpoint(), free_tls_endpoint()], "tls": str(certificates.robot)}
     config = write_config(tmp_path / "gateway.toml", {"bus": bus})
     ours, theirs = socket.socketpair()

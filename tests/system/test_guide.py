@@ -27,12 +27,15 @@ pytestmark = pytest.mark.slow
 
 
 async def beside(call: Callable[[], Any]) -> Any:
-    """Run the call in a thread, while the pings go on."""
+    """Run a blocking call in a thread, so that the pings continue."""
     return await asyncio.to_thread(call)
 
 
 async def drives(guided: Guided, standing: Bus) -> None:
-    """Wait until the first leg moves. Starts it again if a busy machine has ended it."""
+    """Start the first leg and wait until the robot moves.
+
+    If a busy machine ends the leg, it is started again.
+    """
     for _ in range(4):
         await guided.begin("calibrate", method="umbmark")
         await guided.answer(await guided.asks("How wide"), 300)
@@ -186,7 +189,7 @@ LINES = 10
 async def test_a_network_that_fails_during_a_leg_stops_it_within_a_second(
     hosts: Hosts, tmp_path: Path
 ) -> None:
-    """No connection closes, and no program gets an error."""
+    """The network delivers nothing more, but no connection closes and no program gets an error."""
     Authority.make(tmp_path / "tls", "test", 1, [hosts.address]).issue(
         tmp_path / "tls", "robot", [hosts.address], 1
     )
@@ -199,7 +202,7 @@ async def test_a_network_that_fails_during_a_leg_stops_it_within_a_second(
         return speeds[0] if steady else 0.0
 
     def slower(gone: float, than: float) -> float | None:
-        """Return when the first slower line came."""
+        """Return the time of the first line after `gone` that is slower than `than`, or None."""
         for one in peer.since(gone):
             if one.line != b"-" and abs(wheels(one.line)[0]) < than:
                 return one.at
@@ -280,7 +283,7 @@ async def _then_fail(story: Callable[[], Any]) -> None:
 
 
 def ended(pid: int) -> bool:
-    """Return whether the process has ended, or is a zombie of a parent that hangs."""
+    """Return whether the process has ended. A zombie, whose parent hangs, counts as ended."""
     try:
         return " Z " in Path(f"/proc/{pid}/stat").read_text()
     except FileNotFoundError:

@@ -1,4 +1,4 @@
-"""Over TLS an operator cannot drive as another sender by any attachment that it knows."""
+"""Over TLS an operator cannot drive as another sender, whatever attachment it sends."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def robot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Robot]:
 
 @contextmanager
 def driving(client: Client, seconds: float) -> Iterator[None]:
-    """Drive straight on at 0.2 m/s by the client, in a thread of its own."""
+    """Let the client drive straight at 0.2 m/s in a separate thread while the body runs."""
     failed: list[BaseException] = []
 
     def drive() -> None:
@@ -80,7 +80,7 @@ def driving(client: Client, seconds: float) -> Iterator[None]:
 
 
 def attack(session: zenoh.Session, keys: tuple[str, ...], sender: str) -> None:
-    """Turn the robot by commands that claim to be `sender`'s and the newest of all."""
+    """Send commands that turn the robot and claim to be the newest ones of `sender`."""
     end_s, sequence = time.monotonic() + ATTACK_S, 1_000_000
     while time.monotonic() < end_s:
         sequence += 1
@@ -92,9 +92,9 @@ def attack(session: zenoh.Session, keys: tuple[str, ...], sender: str) -> None:
 
 
 def attacked(robot: Robot, victim: Client, sender: str = "") -> list[Any]:
-    """Return the states while an operator attacks the victim.
+    """Let an operator attack the victim while it drives. Return the states during the attack.
 
-    The attack uses this sender, or else the published one.
+    The attack uses this sender id, or the id that `state` publishes if it is empty.
     """
     keys = tuple(f"acsard/acsar/cmd/teleop{end}" for end in ("", "/operator", "/maintainer"))
     with (

@@ -1,4 +1,4 @@
-"""The bus input accepts and drops messages of real Zenoh sessions, without a daemon."""
+"""The daemon's inbox accepts or drops messages of real Zenoh sessions. No daemon runs."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from tests.system.harness import Bus, client_config, free_endpoint, until
 
 
 class Deaf:
-    """A stand-in for the loop that is woken when something came in. Here no loop waits."""
+    """A stand-in for the control loop, which the inbox notifies of messages. It does nothing."""
 
     def command(self) -> None:
-        """Called for a message that may be a command."""
+        """Ignore the notification of a possible command."""
 
     def stop(self) -> None:
-        """Called for a stop."""
+        """Ignore the notification of a stop."""
 
 
 def test_a_stop_query_counts_even_if_too_many_queries_are_open_to_answer_it() -> None:

@@ -1,8 +1,7 @@
 """A client that is admitted over TLS cannot disturb the loop, the stop or the other users.
 
-Each attack comes with a viewer's certificate and with an unlisted certificate, while a local
-client drives. The attack goes to the robot's own TLS gateway, and to the router of a fleet to which
-the robot belongs.
+Each attack is tried with a viewer's certificate and with an unlisted one, while a local client
+drives. It goes to the robot's own TLS gateway, and to the router of a fleet with this robot.
 """
 
 from __future__ import annotations
@@ -99,7 +98,7 @@ class Stop(NamedTuple):
 
 
 class Figures(NamedTuple):
-    """The effects of an attack."""
+    """The measured effects of an attack."""
 
     periods: Periods
     calm: Periods
@@ -113,7 +112,7 @@ class Figures(NamedTuple):
 
 
 class Network(NamedTuple):
-    """The way by which other hosts reach a robot."""
+    """How other hosts reach a robot: over its gateway or over a router."""
 
     tls: str
     """The endpoint."""
@@ -142,7 +141,10 @@ class Robot:
         return Bus(self._plain, self._network.robot)
 
     def attacked(self, form: str, who: Identity, seconds: float, reported: str = "") -> Figures:
-        """Run the attack and return its effects. It ends once the event `reported` is logged."""
+        """Run an attack and return its effects.
+
+        If `reported` is given, the attack ends when the daemon logs this event.
+        """
         with self._peer, self.daemon, self._joined() as bus:
             bus.linked()
             with ExitStack() as driven:
@@ -168,7 +170,7 @@ class Robot:
     @staticmethod
     @contextmanager
     def _driven(bus: Bus) -> Iterator[None]:
-        """Drive by a local client while entered."""
+        """Let a local client drive the robot while the body runs."""
         with bus.commanding(0.3):
             until(lambda: (bus.state()["linear"] or 0.0) > 0.25, 5.0, "it drives")
             yield
@@ -176,8 +178,7 @@ class Robot:
     def locked(self, seconds: float) -> tuple[Periods, Mapping[str, int], float]:
         """Return the effects while Zenoh cleans up after a local attacker.
 
-        These are the periods, the counters, and the time that the machine took meanwhile from a
-        bare process, s.
+        These are the control periods, the counters, and the time lost to other programs, in s.
         """
         with self._peer, self.daemon, self._joined() as bus, bus.follow("odom"):
             bus.linked()
@@ -202,9 +203,9 @@ class Robot:
         bus: Bus,
         driven: ExitStack,
     ) -> tuple[int, tuple[Stop, ...]]:
-        """Return the daemon's growth and the stops.
+        """Run an attack with stops in it. Return the daemon's memory growth in kB, and the stops.
 
-        In a long run the robot is driven again after each.
+        In a long run the robot drives again after each stop.
         """
         memory_kb, most_kb = resident_kb(self.daemon.pid), 0
         network, text = self._network, HOSTILE.replace("acsard/acsar", self._root)
@@ -234,7 +235,7 @@ class Robot:
         driven.enter_context(self._driven(bus))
 
     def _stopped(self) -> Stop:
-        """Return the time from a stop, by a client that has just connected here, to the wire."""
+        """Let a new local client stop the robot. Return the time until a slower line, s."""
         with self._joined() as other:
             said = time.monotonic()
             before = wheels(self._peer.lines[-1].line)[0]
@@ -289,7 +290,7 @@ Router = Callable[[Path, str], Program]
 
 @contextmanager
 def fleet(where: Path, router: Router) -> Iterator[Network]:
-    """A router with the rules of deploy/zenoh, and the way to a robot behind it."""
+    """Run a router with the rules of deploy/zenoh. Yield how a client reaches a robot behind it."""
     tls = free_tls_endpoint()
     certified(where, "robot1", ITS_NAME, "viewer", "operator", "unlisted")
     bus: dict[str, object] = {"listen": [], "connect": [tls], "tls": str(where / "robot1")}
@@ -325,9 +326,10 @@ Forms = Mapping[Identity, Sequence[str]]
 
 
 def attacks(half_a_minute: Forms, a_moment: Forms) -> list[Any]:
-    """Each attack takes half a minute in the long runs.
+    """Return the parameter sets of the attacks.
 
-    The most different ones run briefly: every fourth one each time, the others at night.
+    Long runs try each attack of the first argument for half a minute. The attacks of the second
+    argument run briefly: one in four in each run, and the others in the nightly job.
     """
     brief = [(form, who) for who in a_moment for form in a_moment[who]]
     nightly, soak = pytest.mark.nightly, pytest.mark.soak
@@ -409,9 +411,9 @@ def test_an_attack_on_zenohd_does_not_disturb_the_robot_behind_it(
 def test_a_bus_that_is_locked_costs_messages_and_no_period(
     tmp_path: Path, gateway: Gateway
 ) -> None:
-    """On the robot's machine any client may use wildcards.
+    """A local client may use wildcards, and so it can hold the lock on Zenoh's tables for a while.
 
-    A client that holds the lock on Zenoh's tables blocks every program that puts.
+    The lock blocks every program that puts. The daemon loses messages then, but no period.
     """
     periods, counters, taken = Robot(tmp_path, gateway.network()).locked(0.5)
     print(f"\n{periods}, {counters}, {taken:.3f} s taken")

@@ -1,4 +1,4 @@
-"""A robot writes its settings into its own configuration file, and drives on meanwhile."""
+"""A robot writes settings into its own configuration file while it drives."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def test_keep_leaves_the_file_if_the_robot_refuses_the_setting(tmp_path: Path) -
 
 @pytest.mark.slow
 def test_keeping_settings_costs_no_control_period(tmp_path: Path) -> None:
-    """A file like the reference takes a tenth of a second, in a process of its own."""
+    """Writing a file like the reference takes 0.1 s, so a separate process does it."""
     endpoint, file = free_endpoint(), tmp_path / "robot.toml"
     text = (ROOT / "acsard.toml").read_text()
     file.write_text(text.replace(DEFAULT_ENDPOINT, endpoint))

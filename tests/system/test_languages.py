@@ -1,8 +1,8 @@
-"""The examples in deploy/clients follow a robot, and types generated from the schemas read it.
+"""The examples in deploy/clients work, and types generated from the schemas fit the messages.
 
 `pytest -m 'languages and not soak'` runs Rust and the types in TypeScript and Python: two minutes.
-`pytest -m languages` also runs TypeScript, whose bridge takes ten minutes to build. The builds are
-kept in pytest's cache.
+`pytest -m languages` also runs TypeScript, whose bridge takes ten minutes to build. pytest's cache
+stores the builds.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ LINE = re.compile(r"x (-?\d+\.\d{3}) m, y (-?\d+\.\d{3}) m, (-?\d+\.\d{3}) m/s")
 
 
 def followed(words: Sequence[str], where: Path, bus: Bus) -> None:
-    """Check that the example prints the robot's position, and does so while it drives."""
+    """Run an example that follows the robot. Check the positions that it prints during a drive."""
     with Program(words, where) as follower:
         follower.says(" m/s", 30.0)
         begun = bus.state()["x"]
@@ -83,7 +83,7 @@ def driven(words: Sequence[str], where: Path, bus: Bus, **more: str) -> None:
 
 
 def printed(page: Page) -> str:
-    """Return the address on the machine itself as the page prints it, with a slash at the end."""
+    """Return the page's local address as the page prints it, with a slash at the end."""
     return f"{page.here}/"
 
 
@@ -206,7 +206,7 @@ def npm() -> str:
 
 @pytest.fixture(scope="module")
 def bridge(kept: Path) -> str:
-    """Return the installed bridge, or build the one of the page's first line."""
+    """Return the path of the installed bridge, or build it with the command on the page."""
     words = next(line for line in commands() if line.startswith(f"cargo install {BRIDGE}"))
     if (found := shutil.which(BRIDGE)) is None:
         program("cargo", "it builds the bridge")
@@ -226,7 +226,7 @@ def commands() -> list[str]:
 
 
 def copied(language: str, kept: Path) -> Path:
-    """Copy the example to a directory for building, on top of an earlier build."""
+    """Copy the example of a language into the build directory, which keeps earlier builds."""
     built = shutil.ignore_patterns("target", "node_modules", "dist", "*lock*")
     return shutil.copytree(CLIENTS / language, kept / language, ignore=built, dirs_exist_ok=True)
 
@@ -305,7 +305,10 @@ def wrong(heard: list[Said]) -> list[Said]:
 
 
 def judged(words: Sequence[str], where: Path, said: list[Said]) -> list[str]:
-    """Return the reader's output for each message: its type, and `read` or `refused`."""
+    """Give these messages to a program that reads them with the generated types.
+
+    Returns its output lines: the type of each message, and `read` or `refused`.
+    """
     text = "".join(json.dumps(one) + "\n" for one in said)
     done = subprocess.run(
         words, cwd=where, env=environment(), input=text, capture_output=True, text=True, check=False

@@ -1,4 +1,4 @@
-"""Causes of lateness that this machine can produce are named, in all places alike."""
+"""The daemon names the causes of lateness that this machine can produce, the same everywhere."""
 
 from __future__ import annotations
 

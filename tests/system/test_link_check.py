@@ -1,4 +1,4 @@
-"""The checked link in the real process: the simulator on a pty, real bytes, real time."""
+"""The checked link with the real daemon on a pty of the simulator, in real time."""
 
 from __future__ import annotations
 
@@ -14,7 +14,10 @@ from tests.system.harness import Bus, Daemon, until
 
 
 def drives(robot: Client) -> float:
-    """Drive at 0.5 m/s for 0.5 s from this x. Repeats it if a busy machine broke the link."""
+    """Drive at 0.5 m/s for 0.5 s, and return the x at the start in m.
+
+    Repeats the drive if a busy machine interrupted the link.
+    """
     while True:
         begun, x = time.monotonic(), robot.pose().x
         try:

@@ -1,6 +1,6 @@
-"""The log of the real process names each caller and each change with its reason.
+"""The log of the real process names each caller, and each change with its reason.
 
-It also says how the process began and ended.
+It also reports how the process started and ended.
 """
 
 from __future__ import annotations

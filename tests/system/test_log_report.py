@@ -1,4 +1,7 @@
-"""A report in a browser draws under its page's own policy, and a stranger's text stays text."""
+"""A report works in a browser with the content policy of its page.
+
+Text from other clients is shown as text and never runs as code.
+"""
 
 from __future__ import annotations
 

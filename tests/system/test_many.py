@@ -103,7 +103,10 @@ HOSTILE = "[2J\x1b]0;x\x07"
 
 @contextmanager
 def fake(robots: Robots, answer: bytes | None) -> Iterator[None]:
-    """Run a client of the same router that claims to be a robot and gives that answer or none."""
+    """Run a client of the router that pretends to be a robot.
+
+    It sends `answer` to every query, or no answer if it is None.
+    """
     who = "acsard/fake"
 
     def reply(query: zenoh.Query) -> None:
@@ -228,7 +231,7 @@ def test_fleet_at_a_terminal_is_live_and_says_which_robot_has_gone(robots: Robot
 @pytest.mark.nightly
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root may mount")
 def test_a_full_disk_and_a_certificate_that_ends_do_not_look_ready(tmp_path: Path) -> None:
-    """An operator sees them in the table, on the page, in its metrics and by echo."""
+    """The table, the page, its metrics and `acsard echo` show both problems to the operator."""
     endpoint, names = free_endpoint(), ("full", "ends", "sound")
     Authority.make(tmp_path / "own", "test", 10).issue(tmp_path / "own", "ends", ["localhost"], 10)
     with ExitStack() as stack:

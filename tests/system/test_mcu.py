@@ -195,7 +195,7 @@ BUSY = "while True: pass"
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize("loops", [0, 4])
 def test_a_busy_computer_finds_no_fault_of_a_good_board(tmp_path: Path, loops: int) -> None:
-    """Run five checks in parallel, or one together with loops of the same priority."""
+    """Run five checks at once, or one beside busy loops. They blame only this computer."""
     spinning = [subprocess.Popen([sys.executable, "-c", BUSY]) for _ in range(loops)]
     places = [tmp_path / str(n) for n in range(1 if loops else 5)]
     for place in places:

@@ -1,4 +1,4 @@
-"""The robot's page in a real browser: seen, stopped and driven."""
+"""The robot's page in a real browser shows, stops and drives the robot."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def running(where: Path) -> Iterator[Robot]:
 
 @pytest.fixture(scope="module")
 def common_robot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Robot]:
-    """The robot of all tests that leave it as it was, apart from a latch. Its start takes 1 s."""
+    """The robot for all tests that change only its latch. Starting it takes 1 s."""
     with running(tmp_path_factory.mktemp("common")) as robot:
         yield robot
 
@@ -113,7 +113,7 @@ The test ends or suspends a process, changes a setting, counts, or looks at a hi
 
 @pytest.fixture
 def page(request: pytest.FixtureRequest, browser: Browser) -> Iterator[Phone]:
-    """The page of a robot that stands and may be driven, just opened."""
+    """The newly opened page of a robot that is at rest and may be driven."""
     own = "own_robot" in request.fixturenames
     robot: Robot = request.getfixturevalue("own_robot" if own else "common_robot")
     page = Phone(*robot, browser)
@@ -275,7 +275,7 @@ def test_a_second_finger_anywhere_releases_the_stick(page: Phone, where: str) ->
 def test_releasing_the_left_mouse_button_while_another_is_held_releases_the_stick(
     page: Phone,
 ) -> None:
-    """The browser sends no pointerup until the last finger is lifted."""
+    """While another mouse button is down, the browser sends no `pointerup` for the left one."""
     browser, bus = page.browser, page.bus
     browser.size(*DESKTOP, touch=False)
     x, y = browser.middle("stick")
@@ -285,7 +285,7 @@ def test_releasing_the_left_mouse_button_while_another_is_held_releases_the_stic
         browser.ask("Input.dispatchMouseEvent", x=x, y=y - dy, **told)
 
     def drives() -> bool:
-        """If the page released the stick on a busy machine, the mouse presses it again."""
+        """Return whether the robot drives. Press the stick again if the page has released it."""
         if not browser.js("document.getElementById('stick').matches('.held')"):
             mouse("Released", button="left", buttons=0)
             mouse("Pressed", button="left")
@@ -332,7 +332,10 @@ JAM = """(() => {
 def test_the_zero_of_a_released_stick_is_sent_twice_also_over_a_congested_socket(
     page: Phone,
 ) -> None:
-    """A daemon that reads late may drop a zero that closely follows another command."""
+    """The page repeats the zero after 50 ms.
+
+    A daemon that reads late may drop a zero that closely follows another command.
+    """
     page.hold()
     page.browser.js(JAM)
     page.browser.touch("End")
@@ -344,9 +347,9 @@ def test_the_zero_of_a_released_stick_is_sent_twice_also_over_a_congested_socket
 
 
 def test_a_page_that_is_frozen_releases_the_stick(page: Phone) -> None:
-    """A phone freezes a page that was put away.
+    """A phone first hides and then freezes a page in the background.
 
-    It hides the page before, so this test sends the event alone.
+    Hiding alone releases the stick, so this test sends only the event `freeze`.
     """
     page.hold()
     page.browser.js("document.dispatchEvent(new Event('freeze'))")
@@ -355,9 +358,9 @@ def test_a_page_that_is_frozen_releases_the_stick(page: Phone) -> None:
 
 
 def test_a_page_releases_the_stick_before_the_browser_leaves_it(page: Phone) -> None:
-    """The test waits for this event alone.
+    """The page releases the stick at the event `beforeunload`.
 
-    The browser reports the later ones late on a busy machine.
+    On a busy machine the browser sends the later events late, so the test sends only this one.
     """
     page.hold()
     page.browser.js("window.dispatchEvent(new Event('beforeunload'))")
@@ -366,7 +369,7 @@ def test_a_page_releases_the_stick_before_the_browser_leaves_it(page: Phone) -> 
 
 
 def viewers(page: Phone) -> int:
-    """Return the number of viewers that the page's server knows."""
+    """Return the number of open pages that the page's server counts."""
     _, told = asyncio.run(answer(f"{page.server.here}/metrics"))
     return int(re.findall(r"^acsard_page_viewers\{.*\} (\d+)$", told, re.MULTILINE)[0])
 
@@ -376,7 +379,7 @@ def viewers(page: Phone) -> int:
 def test_a_page_disconnects_when_it_is_left_and_reconnects_after_going_back(
     page: Phone,
 ) -> None:
-    """The browser keeps the page, asleep, with everything that it has open."""
+    """The browser keeps a page that a person has left, so the page itself must disconnect."""
     browser = page.browser
     assert viewers(page) == 1
     left = time.monotonic()
@@ -433,7 +436,7 @@ def test_a_key_is_released_if_the_system_may_swallow_its_key_up_event(
 def test_a_key_that_was_pressed_while_driving_was_impossible_does_not_drive_later(
     page: Phone,
 ) -> None:
-    """Its release may never be reported, for example while Meta is down."""
+    """The browser may never report the release of that key, for example while Meta is down."""
     browser, bus = page.browser, page.bus
     bus.ask("srv/stop")
     page.shows("mode", "STOPPED")
@@ -542,7 +545,7 @@ def test_a_gamepad_that_disconnects_releases_the_stick(page: Phone) -> None:
 
 
 def test_a_page_that_connects_again_says_why_it_has_released_the_stick(page: Phone) -> None:
-    """The page gets a new sender id if its clock was set, although the connection is sound."""
+    """If the device's clock was set, the page connects again with a new sender id."""
     page.hold()
     page.browser.js("{ const now = Date.now; Date.now = () => now() + 60000; } 1")
     page.shows("told", "released: this device slept, or its clock was set")
@@ -614,7 +617,7 @@ def test_stale_values_are_grey_and_marked_until_messages_return(page: Phone) -> 
 def test_a_page_opened_while_the_daemon_is_silent_waits_and_shows_no_measurements(
     page: Phone,
 ) -> None:
-    """The page's server still has a state from before."""
+    """The page's server still has the last `state`, but the page must not show its old values."""
     browser = page.browser
     page.daemon.signal(signal.SIGSTOP)
     try:
@@ -643,12 +646,12 @@ HEX = r"[0-9a-f]{16}"
 
 
 def colour(browser: Browser, name: str) -> str:
-    """Return the colour of an element's words."""
+    """Return the colour of an element's text."""
     return str(browser.js(f"getComputedStyle(document.getElementById({name!r})).color"))
 
 
 def greyed(browser: Browser) -> bool:
-    """Return whether the stick looks as if it does not drive."""
+    """Return whether the stick is drawn as inactive."""
     return bool(browser.js("document.getElementById('stick').ariaDisabled === 'true'"))
 
 
@@ -738,9 +741,9 @@ STEADY = 5
 
 
 def drawing(browser: Browser) -> str:
-    """Return the map once nothing changes it any more.
+    """Wait until the map no longer changes, and return it.
 
-    Messages at the beginning (the robot's place, a banner that goes) change it, too.
+    After the page opens, the robot's position and a disappearing banner still change it.
     """
     looks = [str(n) for n in range(STEADY)]
 
@@ -1007,7 +1010,7 @@ async def test_a_page_beyond_the_connection_limit_says_why_and_can_still_stop(pa
     reading: list[asyncio.Task[None]] = []
 
     async def read(other: Hands) -> None:
-        """Stay connected as a viewer, however long it takes."""
+        """Stay connected as a viewer until the task is cancelled."""
         async for _ in other.socket:
             pass
 
@@ -1166,7 +1169,7 @@ COMMANDER = """import('/page/commander.js').then(({Commander, ZERO, twist, objec
 
 
 def commanded(page: Phone, script: str) -> list[Any]:
-    """Run the page's pure part in the browser and return its results."""
+    """Run a script on the page's command logic in the browser, and return the results."""
     return list(page.browser.js(COMMANDER.replace("SCRIPT", script)))
 
 
@@ -1251,7 +1254,10 @@ def test_a_stop_is_repeated_until_it_arrives_and_never_sent_long_after_the_press
 
 
 def test_a_page_that_is_hidden_sends_its_zero_once(page: Phone) -> None:
-    """The page's timers run late while another client may drive."""
+    """A hidden page does not repeat the zero, because its timers run late.
+
+    Another client may drive by then.
+    """
     page.hold()
     page.browser.js(JAM)
     page.browser.js(
@@ -1320,7 +1326,7 @@ def test_a_typed_comma_is_a_decimal_separator_except_between_several_values(page
 
 
 def test_a_list_setting_is_shown_without_spaces_and_says_why(page: Phone) -> None:
-    """Space is STOP, in a text field too."""
+    """The key Space stops the robot even in a text field, so a person cannot type a space."""
     browser = page.browser
     browser.tap("tab-set")
     fields = "[...document.querySelectorAll('#settings input')]"
@@ -1459,7 +1465,11 @@ ABOVE = """(() => {
 def test_the_plots_begin_with_the_minute_before_and_say_which_data_is_missing(
     page: Phone,
 ) -> None:
-    """A client drove the robot before any page was open, then while one was. It stands now."""
+    """A client drives the robot before a page is open, and again while one is open.
+
+    Then the page is opened again and shows the measured speeds. It has commanded speeds only from
+    the time in which a page was open.
+    """
     browser, bus = page.browser, page.bus
     browser.open("about:blank")
     until(lambda: viewers(page) == 0, 5.0, "no page is open")
@@ -1468,7 +1478,7 @@ def test_the_plots_begin_with_the_minute_before_and_say_which_data_is_missing(
     bus.at_rest()
 
     def looked() -> tuple[int, int]:
-        """Open the page again, and count the points."""
+        """Open the page again. Return the numbers of measured and of commanded plot points."""
         browser.open(page.server.here)
         page.shows("mode", "READY")
         browser.tap("tab-status")

@@ -1,4 +1,4 @@
-"""A camera's stream on the page: its picture, its age, and the mark of a frozen one."""
+"""A camera's stream on the page: the picture, its age, and the sign for a frozen picture."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ async def test_the_camera_needs_a_token_and_ends_with_it(filmed: Filmed) -> None
 
 
 async def test_pictures_that_no_client_reads_cost_little_memory(filmed: Filmed) -> None:
-    """Before, each of these clients cost a picture of its own."""
+    """In a former version the server stored a separate picture for each of these clients."""
     server, pid = filmed.server, filmed.server.pid
     filmed.stream.more = 900_000
     url, clients = f"{server.away}/api/camera", []

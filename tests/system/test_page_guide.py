@@ -27,7 +27,7 @@ pytestmark = [
 
 
 class Person:
-    """A person with a phone, at the view Set."""
+    """A person with a phone who has opened the page's view *Set*."""
 
     def __init__(self, browser: Browser, server: Page) -> None:
         self.browser, self.server = browser, server
@@ -164,7 +164,10 @@ def skidding(tmp_path: Path) -> Iterator[tuple[Daemon, Bus, Page]]:
 
 
 def drives(person: Person, bus: Bus) -> None:
-    """Wait until the first leg moves. Starts it again if a busy machine has cut it short."""
+    """Start the first leg and wait until the robot moves.
+
+    If a busy machine ends the leg, it is started again.
+    """
     told: list[str] = []
     disturbed = 0
 
@@ -236,7 +239,7 @@ def test_any_action_of_the_operator_during_a_leg_stops_the_robot(
 def test_a_browser_that_hangs_during_a_leg_stops_the_robot_within_a_second(
     browser: Browser, skidding: tuple[Daemon, Bus, Page]
 ) -> None:
-    """Its connection stays open: the server can notice only the silence."""
+    """The browser's connection stays open, so the server notices only that pings are missing."""
     _, bus, server = skidding
     person = Person(browser, server)
     drives(person, bus)

@@ -1,4 +1,7 @@
-"""STOP works as soon as it is red, whichever file of the page is missing and however slow it is."""
+"""STOP works as soon as the page shows it in red.
+
+This holds if any file of the page is missing, and if any file loads slowly.
+"""
 
 from __future__ import annotations
 
@@ -55,7 +58,7 @@ class Robot:
 
     @contextmanager
     def without(self, *names: str) -> Iterator[None]:
-        """Open the page without these files."""
+        """Open the page in a browser that is not allowed to load the named files."""
         self.bus.ask("srv/clear")
         until(lambda: self.mode == "ready", 5.0, "it is ready")
         self.browser.ask("Network.setBlockedURLs", urls=[f"*/page/{name}" for name in names])
@@ -86,7 +89,10 @@ def impatient(robot: Robot) -> Iterator[Robot]:
 
 
 def some(names: Sequence[str], which: int) -> list[Any]:
-    """Keep each fourth file, from number `which` on, and leave the others to the nightly job."""
+    """Return parameters for all files, and mark three of four as `nightly`.
+
+    The files without the mark are each fourth one of `FILES`, from index `which` on.
+    """
     return [
         pytest.param(name, marks=() if FILES.index(name) % 4 == which else pytest.mark.nightly)
         for name in names
@@ -173,7 +179,10 @@ def test_stop_latches_within_a_second_while_the_socket_is_dead_but_open(robot: R
 
 @pytest.fixture
 def stopless(robot: Robot) -> Iterator[Robot]:
-    """A browser that does not run the script of STOP, because a name of it is taken."""
+    """Provide a browser in which the script of STOP fails.
+
+    Another script has already declared the class `Stopping`.
+    """
     added = robot.browser.ask("Page.addScriptToEvaluateOnNewDocument", source="class Stopping {}")
     yield robot
     robot.browser.ask("Page.removeScriptToEvaluateOnNewDocument", identifier=added["identifier"])
@@ -217,7 +226,7 @@ def test_on_a_slow_network_stop_latches_before_the_page_shows_the_robot(impatien
 
 
 def test_every_module_of_the_page_is_preloaded() -> None:
-    """The browser need not read one module to learn of the next one."""
+    """The browser can load all modules at once, because index.html lists them."""
     page = (PAGE_DIRECTORY / "index.html").read_text(encoding="utf-8")
     loaded = {name for name in MODULES if f'<link rel="modulepreload" href="page/{name}"' in page}
     assert loaded == set(MODULES) - {"main.js"}

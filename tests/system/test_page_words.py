@@ -1,4 +1,4 @@
-"""The words and buttons of the page in each state, and its missing buttons without a state."""
+"""The page shows the right words and buttons in each state, and hides buttons without a state."""
 
 from __future__ import annotations
 
@@ -37,14 +37,17 @@ def shows(browser: Browser, name: str, words: str) -> None:
 
 
 def forgets(browser: Browser, within_s: float) -> None:
-    """Wait until the page shows no message about a button."""
+    """Wait until the page no longer shows a message about a button press."""
     until(lambda: browser.text("complaint") == "", within_s, "the complaint is outdated")
 
 
 def test_a_page_that_has_not_shown_a_stop_does_not_release_it(
     tmp_path: Path, browser: Browser
 ) -> None:
-    """Another person may have stopped the robot while this page had no connection."""
+    """Stop the robot while the page has no connection. The page then offers no release at first.
+
+    Another person may have had a reason for that stop.
+    """
     with running(tmp_path) as (daemon, bus):
         with Page(daemon, tmp_path) as page:
             browser.open(page.here)
@@ -122,7 +125,7 @@ def robot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Daemon, Bu
 
 @pytest.fixture
 def page(robot: tuple[Daemon, Bus, Peer, Page], browser: Browser) -> Page:
-    """Open the page of a robot that is ready, also after a test that failed."""
+    """Clear all latches and open the page of the ready robot."""
     for service in ("srv/clear", "srv/activate"):
         robot[1].ask(service)
     browser.size(*PHONE)
@@ -135,7 +138,11 @@ def page(robot: tuple[Daemon, Bus, Peer, Page], browser: Browser) -> Page:
 def test_a_stop_without_an_answer_is_sent_again_although_another_client_stopped_the_robot(
     page: Page, browser: Browser, robot: tuple[Daemon, Bus, Peer, Page], first: str
 ) -> None:
-    """The person who released the other stop would release the robot although STOP was pressed."""
+    """The page repeats its own STOP until the robot answers.
+
+    Otherwise a person who releases the other client's stop would also release the robot for this
+    user, who has pressed STOP.
+    """
     bus = robot[1]
     if first == "the other stop":
         bus.get("srv/stop")
@@ -157,7 +164,7 @@ def test_a_stop_without_an_answer_is_sent_again_although_another_client_stopped_
 
 
 def clicked(browser: Browser, name: str, times: int = 1) -> None:
-    """Click the element by a script, which needs no visible view."""
+    """Click the element with a script, so that it need not be visible on the screen."""
     browser.js("; ".join([f"document.getElementById({name!r}).click()"] * times))
 
 
@@ -243,7 +250,7 @@ def test_a_gap_between_two_states_greys_the_release_button_and_does_not_restart_
     bus = robot[1]
 
     def gap(*services: str) -> None:
-        """Keep the states from the page until it greys the button, while the services act."""
+        """Call these services while the page receives no state; check its grey release button."""
         place = browser.middle("stop")
         browser.js("window.mute = true")
         for service in services:
@@ -301,7 +308,7 @@ def test_switch_on_is_beside_stop_and_only_offered_while_the_robot_is_off(
 
 
 def stopped_while_off(bus: Bus, browser: Browser) -> None:
-    """Stop a robot that is switched off, and wait until its release may be pressed."""
+    """Deactivate and stop the robot, and wait until the page accepts a press of "Release STOP"."""
     bus.get("srv/deactivate")
     bus.get("srv/stop")
     shows(browser, "clear", "Release STOP")
@@ -474,7 +481,7 @@ SHOWN = "!!document.getElementById({!r}).checkVisibility()"
 def test_a_pressed_emergency_stop_or_bumper_and_a_low_battery_are_shown_with_the_remedy(
     tmp_path: Path, browser: Browser
 ) -> None:
-    """Release STOP is refused while the button is pressed, and the page says what to do first."""
+    """The page refuses a press of "Release STOP" and says what the operator must do first."""
 
     def says(status: bytes) -> None:
         board.reply = lambda speeds: PLAIN(speeds) + b"!status %b\r\n" % status

@@ -65,13 +65,13 @@ def find(page: str, *words: str) -> str:
 
 
 def shell(place: Path, command: str, within: float = 60.0) -> Finished:
-    """Run a command in a directory whose `.venv` has acsard, first on the PATH."""
+    """Run a shell command in this directory. The commands of its `.venv` come first on the PATH."""
     path = os.pathsep.join([str(place / ".venv/bin"), os.environ["PATH"]])
     return finish(["bash", "-c", command], place, within, environment(PATH=path))
 
 
 def with_acsard(place: Path) -> Path:
-    """Make a `.venv` as after `pip install`, of the acsard that is tested."""
+    """Make a `.venv` in this directory whose `acsard` command runs the code under test."""
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", place / ".venv"], check=True)
     script = place / ".venv/bin/acsard"
     script.write_text(f'#!/bin/sh\nexec {sys.executable} -m acsard "$@"\n')
@@ -81,7 +81,7 @@ def with_acsard(place: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def desk(shared: Daemon, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Provide a directory, like a clone, whose acsard.toml is that of the running robot."""
+    """Provide a directory whose `acsard` command and acsard.toml reach the running robot."""
     place = with_acsard(tmp_path_factory.mktemp("desk"))
     write_config(place / "acsard.toml", {"bus": {"listen": [shared.endpoint]}})
     return place
@@ -245,7 +245,7 @@ def clone(tmp_path: Path) -> Path:
 
 
 def of_a_stranger(**more: str) -> dict[str, str]:
-    """Return an environment that can import only installed packages."""
+    """Return an environment without PYTHONPATH, in which Python imports only installed packages."""
     env = environment(**more)
     del env["PYTHONPATH"]
     return env

@@ -1,4 +1,4 @@
-"""A hundred lines a second, and every period that did not send one is accounted for."""
+"""The daemon sends a hundred lines a second; its counters explain each period without a line."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ TICK_S = 0.01
 
 
 def undisturbed(tmp_path: Path, length: float) -> tuple[Periods, float, bool]:
-    """Run on the simulator without commands.
+    """Run the daemon with the simulator and without commands for `length` seconds.
 
-    Returns the periods, the seconds the daemon waited for a core, and whether the link was up all
-    the time.
+    Returns the counted periods, the time in which the daemon waited for a core (s), and whether the
+    link was always up.
     """
     with Daemon(tmp_path) as daemon, Bus(daemon.endpoint) as bus, bus.follow("state") as states:
         begun = states.find(lambda state: state["link"] == "up", 5.0, "link up")
@@ -51,10 +51,10 @@ def undisturbed(tmp_path: Path, length: float) -> tuple[Periods, float, bool]:
 
 
 def is_even(periods: Periods, waited: float, up: bool) -> None:
-    """The number of lines is within 1 % of the rate.
+    """Check that the number of sent lines is within 1 % of the rate.
 
-    One line at either end and the periods that the machine took are allowed, and every gap is
-    counted.
+    One line more at either end is allowed, and fewer lines for the time without a core. The
+    counters must explain each period without a line, unless the link was lost.
     """
     least, most = periods.elapsed * 0.99 - 1, periods.elapsed * 1.01 + 1
     assert least - waited / TICK_S <= periods.sent <= most

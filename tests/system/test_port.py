@@ -1,4 +1,4 @@
-"""The serial port on a real pty sends what it should, and nothing else."""
+"""The serial port on a real pty sends fresh lines only, and copes with a lost or stuck device."""
 
 from __future__ import annotations
 
@@ -66,7 +66,10 @@ def line() -> Iterator[Line]:
 async def test_a_line_made_before_the_process_was_suspended_is_not_sent_after_it(
     line: Line,
 ) -> None:
-    """The step was suspended before it wrote, and goes on later. A stop is never too old."""
+    """The port replaces a line that is older than one period, because the process was suspended.
+
+    It sends a stop of any age.
+    """
     async with line.port() as port:
         assert port.offer(STOP, clock.now()) == "sent"
         await asyncio.sleep(0.01)  # the wire is free again
@@ -121,7 +124,7 @@ async def test_a_port_is_opened_by_the_next_try_if_no_thread_could_start(line: L
 async def test_a_late_step_reads_waiting_bytes_before_it_judges_a_silence(
     line: Line,
 ) -> None:
-    """After a stall both the clock and the reader are due, in any order."""
+    """After a stall the step may run before the reader. It then reads the waiting bytes itself."""
     async with line.port() as port:
         os.write(line.board, GO)
         assert port.take() == ()
@@ -138,9 +141,9 @@ async def test_a_late_step_reads_waiting_bytes_before_it_judges_a_silence(
 async def test_a_reader_called_after_a_late_step_reports_no_hang_up(
     line: Line,
 ) -> None:
-    """The step takes the bytes that were there when the event loop looked.
+    """A late step reads the waiting bytes, then the event loop calls the reader, which finds none.
 
-    The reader is called nevertheless.
+    The reader must not take this for a hang-up.
     """
     async with line.port() as port:
         loop, taken = asyncio.get_running_loop(), list[bytes]()
@@ -159,7 +162,7 @@ async def test_a_reader_called_after_a_late_step_reports_no_hang_up(
 
 
 async def test_a_line_sent_right_after_the_device_hung_up_is_lost_without_an_error() -> None:
-    """The reader and the step notice the hang-up in the same round of the event loop."""
+    """The reader and the step can notice the hang-up in the same round of the event loop."""
     loop, errors, told = asyncio.get_running_loop(), list[str](), list[str]()
     loop.set_exception_handler(lambda _, context: errors.append(str(context)))
     board, device = os.openpty()
@@ -183,7 +186,10 @@ async def test_a_line_sent_right_after_the_device_hung_up_is_lost_without_an_err
 async def test_a_device_that_vanishes_while_it_is_opened_is_opened_later(
     line: Line, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
-    """Suspend each call of the opening in turn until one succeeds. No attempt ends the daemon."""
+    """Let each terminal call of the opening fail once, one further call in each attempt.
+
+    The port tries again after each failure until an attempt succeeds.
+    """
     real, attempts, said = getattr(termios, name), itertools.count(1), list[str]()
     left = 1
 
@@ -211,7 +217,7 @@ async def test_a_device_that_vanishes_while_it_is_opened_is_opened_later(
 async def test_a_port_whose_driver_accepts_no_bytes_is_reported_while_it_still_receives(
     line: Line,
 ) -> None:
-    """The far end reports by its own clock and does not read."""
+    """The simulated board sends reports and reads nothing, so the port's output buffer fills."""
     os.set_blocking(line.board, False)
     os.set_blocking(line.device, False)
     wake, session, unsent = asyncio.Event(), McuSession(McuConfig(), 100.0), False

@@ -1,4 +1,4 @@
-"""A driver that hangs in open: it takes one thread, and the next device is opened all the same."""
+"""A device whose driver hangs in `open` blocks one thread, and the daemon opens the next device."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""The real process keeps its recording when killed or ended, and drives on without a disk.
+"""The daemon process loses no recording when it is killed or ended, and drives on without a disk.
 
-The same holds for a full disk. Real disks that fail are in `test_record_disks.py`.
+It also drives on when the disk is full. `test_record_disks.py` tests real disks that fail.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ LOST_S = 1.5
 
 @contextmanager
 def recording(where: Path, name: str = "daemon", **how: Any) -> Iterator[tuple[Daemon, Bus]]:
-    """A daemon that records to `where/record`, linked, and a client of it."""
+    """Run a daemon that records to `where/record`. Yield it and a client once its link is up."""
     words = ["--record", str(where / "record")]
     with Daemon(where, name=name, words=words, **how) as daemon, Bus(daemon.endpoint) as bus:
         until(lambda: bus.state()["link"] == "up", 5.0, "link up")
@@ -40,7 +40,7 @@ def files(where: Path) -> list[Path]:
 
 
 def replayed(where: Path, path: Path) -> int:
-    """Return the number of lines, and check that all of them replay the same."""
+    """Return the number of lines in a recording, and check that a replay reproduces all of them."""
     ended = finish(acsard("recording", "replay", str(path)), where)
     assert ended.code == 0, ended
     found = re.match(r"([\d ]+) of ([\d ]+) lines are the same", ended.out)
@@ -50,7 +50,7 @@ def replayed(where: Path, path: Path) -> int:
 
 
 def last_s(where: Path, path: Path) -> float:
-    """Return the wall clock of the last step that can be read."""
+    """Return the wall-clock time of the last readable step of a recording, s."""
     code = (
         "import sys, pathlib; from acsard.recording import file, file_replay;"
         "recording = file.Recording(pathlib.Path(sys.argv[1]));"

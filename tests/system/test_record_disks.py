@@ -1,7 +1,8 @@
-"""The recorder on failing real disks (full, read-only, 2 s per sync) does not disturb the loop.
+"""The recorder on real disks that fail does not disturb the control loop.
 
-A second daemon that records nothing runs next to the one on the bad disk. Delays that both have
-come from the machine and not from the disk. The tests need root, to mount disks.
+The disks are full, read-only, or take 2 s for a sync. A second daemon runs next to the first one
+and records nothing. Delays that both daemons have come from the machine and not from the disk. The
+tests need root, because they mount disks.
 """
 
 from __future__ import annotations
@@ -77,7 +78,10 @@ def disk(where: Path, *options: str) -> Iterator[Path]:
 
 @contextmanager
 def both(where: Path, record: Path, **how: object) -> Iterator[tuple[Daemon, Bus, Bus]]:
-    """A daemon that records to the bad disk, its bus, and the bus of a daemon without recording."""
+    """Run a daemon that records to the bad disk, and another one that records nothing.
+
+    Yields the first daemon, its bus, and the bus of the other daemon.
+    """
     other = where / "other"
     other.mkdir()
     with (
@@ -92,9 +96,10 @@ def both(where: Path, record: Path, **how: object) -> Iterator[tuple[Daemon, Bus
 
 
 def misses_what_the_other_misses(name: str, bus: Bus, beside: Bus) -> None:
-    """Drive both for a while.
+    """Drive both robots for SPAN_S seconds.
 
-    Both miss equally many periods, apart from those that the machine took.
+    Check that the daemon with the bad disk misses hardly more periods than the other one. Periods
+    in which the machine was busy are allowed in addition.
     """
     began, buses = time.monotonic(), (bus, beside)
     with bus.commanding(0.3), beside.commanding(0.3):
@@ -108,7 +113,7 @@ def misses_what_the_other_misses(name: str, bus: Bus, beside: Bus) -> None:
 
 
 def says(bus: Bus, text: str) -> None:
-    """Wait until `state` reports this problem of the recording, or none for ""."""
+    """Wait until `recording_error` in the `state` contains the text, or is empty for ""."""
     until(
         lambda: (told := bus.state()["recording_error"]) == text or (text and text in told),
         30.0,
@@ -117,7 +122,7 @@ def says(bus: Bus, text: str) -> None:
 
 
 def lived_again(where: Path, record: Path) -> None:
-    """Return every file of the recording."""
+    """Check that all files next to the recording replay, and together have more than 50 lines."""
     found = files(record.parent)
     assert found
     assert sum(replayed(where, path) for path in found) > 50
@@ -142,7 +147,7 @@ def test_a_disk_that_is_full_is_reported_and_costs_only_records(tmp_path: Path) 
 
 
 def fill(where: Path, content: bytes, names: Iterator[str]) -> None:
-    """Write as many of them as there is room for, the last one cut."""
+    """Write files with this content until the disk is full. The last file may be cut."""
     with suppress(OSError):
         for name in names:
             (where / name).write_bytes(content)
@@ -151,7 +156,7 @@ def fill(where: Path, content: bytes, names: Iterator[str]) -> None:
 
 @contextmanager
 def records(where: Path, record: Path) -> Iterator[Daemon]:
-    """Run a daemon that drives for a while, until a second of it is on the disk."""
+    """Run a daemon that drives until the disk has a second of its recording, then yield it."""
     before = set(record.glob("*.part"))
 
     def sizes() -> list[int]:

@@ -1,4 +1,4 @@
-"""When the cable is pulled and put back, the daemon reports it and sends nothing unsafe."""
+"""When the board's cable is pulled and put back, the daemon reports it and sends no old speed."""
 
 from __future__ import annotations
 
@@ -60,7 +60,10 @@ def test_unplug_and_replug_while_driving_says_so_reconnects_and_sends_nothing_ol
         zeros = 1
 
         def drives() -> bool:
-            """The daemon waits for another zero if the machine stood still for a second."""
+            """Return whether the board receives the speed. Send a zero if the daemon asks for one.
+
+            The daemon asks for a zero if the robot stood still for a second.
+            """
             nonlocal zeros
             before = commander.wish
             commander.wish = ZERO if "send a zero first" in bus.state()["reason"] else twist(0.5)

@@ -1,7 +1,8 @@
-"""A real daemon ends in every way and starts again under a commander that never stops sending.
+"""A real daemon ends in every way and starts again while a commander sends without a pause.
 
-The commander sends zeros for 0.3 s every second and a speed in between, so it arms itself after
-every start: only the latch holds the robot. The ways that need systemd are in `tests/systemd`.
+The commander sends zeros for 0.3 s every second and a speed in between. It therefore arms itself
+after every start, and only a latch prevents the robot from driving. `tests/systemd` tests the ways
+to end that need systemd.
 """
 
 from __future__ import annotations
@@ -65,7 +66,7 @@ SIGNALS = {
 
 
 class Robot(NamedTuple):
-    """A board, a commander and where the daemon is to be started."""
+    """A board, an endpoint and a directory that all daemons of a test use one after the other."""
 
     where: Path
     peer: Peer
@@ -80,7 +81,7 @@ class Robot(NamedTuple):
         return self.where / "daemon.states" / "acsar.latches.json"
 
     def moved(self, since: float) -> bool:
-        """Return whether a line since then turns a wheel."""
+        """Return whether a line after the time `since` turns a wheel."""
         lines = (heard for session in self.peer.sessions for heard in list(session.lines))
         return any(heard.at > since and heard.line.strip(b"\r\n") not in STILL for heard in lines)
 
@@ -90,7 +91,7 @@ STILL = (ZERO_LINE.strip(b"\r\n"), b"")
 
 @pytest.fixture
 def robot(tmp_path: Path, peer: Peer) -> Iterator[Robot]:
-    """A board and a stop-and-go commander that outlive every daemon."""
+    """Provide a board and a stop-and-go commander that run on while daemons end and start."""
     (bug := tmp_path / "bug").mkdir()
     (bug / "sitecustomize.py").write_text(CRASH)
     endpoint = free_endpoint()
@@ -99,7 +100,7 @@ def robot(tmp_path: Path, peer: Peer) -> Iterator[Robot]:
 
 
 def drives(robot: Robot, bus: Bus) -> None:
-    """Wait until the commander drives the robot: nothing but a latch could hold it."""
+    """Wait until the commander drives the robot. A latch would prevent this."""
     since = time.monotonic()
     until(lambda: robot.moved(since), 2 * CYCLE_S, "the commander drives")
 
@@ -119,12 +120,15 @@ def latch(robot: Robot, bus: Bus, kind: Kind) -> None:
 
 
 def kept(robot: Robot, kind: Kind) -> bool:
-    """Return whether the file has this latch."""
+    """Return whether the latch file contains a latch of this kind."""
     return json.loads(robot.file.read_bytes())["latches"].get(kind) is not None
 
 
 def stands(robot: Robot, bus: Bus, mode: str, since: float) -> Any:
-    """Return the state after the commander had every chance to drive."""
+    """Wait for one and a half cycles of the commander, and check that the robot stood in this mode.
+
+    Returns the last state.
+    """
     bus.linked()
     linked = time.monotonic()
     until(lambda: time.monotonic() > linked + 1.5 * CYCLE_S, 1.5 * CYCLE_S, "the time is over")
@@ -135,7 +139,10 @@ def stands(robot: Robot, bus: Bus, mode: str, since: float) -> Any:
 
 
 def release(bus: Bus, kind: Kind) -> None:
-    """Release the latch. The same call once more has nothing to release."""
+    """Release a latch of this kind.
+
+    After a stop or a fault a second release is answered with "nothing to clear".
+    """
     if kind == "inactive":
         assert bus.get("srv/activate")["success"]
         return
@@ -145,7 +152,7 @@ def release(bus: Bus, kind: Kind) -> None:
 
 
 def found(robot: Robot, bus: Bus, before: End, since: float) -> None:
-    """Check that the robot stands since then by the latch of the daemon before, and release it."""
+    """Check that the latch of the previous daemon still stops the robot, and release it."""
     spoiled = before.spoil is not whole
     state = stands(robot, bus, "stopped" if spoiled else MODES[before.kind], since)
     assert ("may have been lost" if spoiled else "before the restart") in state["reason"]
@@ -153,9 +160,9 @@ def found(robot: Robot, bus: Bus, before: End, since: float) -> None:
 
 
 def restarted(robot: Robot, *ends: End) -> None:
-    """Latch the robot, end the daemon, spoil its file and start the next daemon, for each end.
+    """Run one daemon for each `End`: latch the robot, end the daemon, and damage the latch file.
 
-    The next daemon finds the latch, and nothing else once that is released.
+    Each next daemon must find that latch. The robot drives again after its release.
     """
     before: End | None = None
     for end in (*ends, None):
@@ -183,13 +190,13 @@ def whole(file: Path) -> None: ...
 
 
 def cut(file: Path) -> None:
-    """Cut the file anywhere, as a power cut may."""
+    """Truncate the file at a random byte, as a power cut may."""
     data = file.read_bytes()
     file.write_bytes(data[: random.randrange(len(data) - 1)])
 
 
 class End(NamedTuple):
-    """How one daemon ends: its latch, the signal and the damage to its file."""
+    """How one daemon ends: the kind of its latch, the signal, and the damage to the latch file."""
 
     kind: Kind
     way: Way
@@ -226,7 +233,10 @@ def test_no_end_of_the_process_moves_a_latched_robot(robot: Robot) -> None:
 
 
 def kills_after_a_stop(robot: Robot, times: int, longest_s: float) -> list[float]:
-    """Kill the daemon soon after a stop was answered; return the delays, s, that lost the stop."""
+    """Kill a daemon many times, each time a random delay after it has answered a stop.
+
+    Returns the delays (s) after which the latch file did not contain the stop.
+    """
     lost = []
     for _ in range(times):
         delay = random.uniform(0.0, longest_s)

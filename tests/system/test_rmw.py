@@ -1,4 +1,4 @@
-"""ROS 2 by rmw_zenoh: an independent implementation, and its protocol to the letter."""
+"""ROS 2 over rmw_zenoh works with an independent implementation, and the protocol is exact."""
 
 from __future__ import annotations
 
@@ -80,7 +80,10 @@ The keys are the same in all of them.
 
 
 class Fleet(NamedTuple):
-    """Two robots and a process of the SDK on one router: `one` is a peer, `two` a client."""
+    """Two robots and a process of the ROS 2 SDK on one router.
+
+    `one` is connected as a Zenoh peer, and `two` as a Zenoh client.
+    """
 
     daemons: dict[str, Daemon]
     one: Bus
@@ -101,7 +104,7 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fleet]:
 
 
 class Ground(NamedTuple):
-    """A robot and a process of the SDK, which reach each other in one of the ways."""
+    """A robot and a process of the ROS 2 SDK, connected in one of the ways that are tested."""
 
     daemon: Daemon
     bus: Bus

@@ -1,7 +1,8 @@
 """ROS 2 drives the robot in the same way over both transports, rmw_zenoh and the bridge.
 
-The bridge is here twice: its Zenoh half, emulated, and the real one with ROS nodes on DDS. The real
-one takes long to build, so its tests have the mark `bridge` instead of `network`.
+These tests run with an emulated bridge, which has only the Zenoh half, and with the real bridge and
+ROS nodes on DDS. The build of the real bridge takes long, so its tests have the mark `bridge`
+instead of `network`.
 
 `test_rmw.py` and `test_ros_bridge.py` test the protocol of each transport.
 """
@@ -68,7 +69,7 @@ REAL = pytest.param("real bridge", marks=[pytest.mark.bridge, pytest.mark.timeou
 
 @pytest.fixture(params=[*NETWORK, REAL])
 def ros(request: pytest.FixtureRequest, bus: Bus) -> Iterator[Client]:
-    """A ROS node of each kind."""
+    """Provide a ROS node for each transport: emulated nodes, and a real one on the real bridge."""
     if request.param in EMULATED:
         yield EMULATED[request.param](bus.session)
         return
@@ -79,13 +80,13 @@ def ros(request: pytest.FixtureRequest, bus: Bus) -> Iterator[Client]:
 
 @pytest.fixture(params=NETWORK)
 def zenoh_ros(request: pytest.FixtureRequest, bus: Bus) -> ZenohClient:
-    """A client that puts any bytes on any key, as no ROS node does."""
+    """Provide an emulated ROS node that can also publish malformed bytes on any key."""
     return EMULATED[request.param](bus.session)
 
 
 @pytest.fixture
 def restored(bus: Bus) -> Iterator[None]:
-    """Leave the shared robot at rest and at the origin."""
+    """After the test, release the latches of the shared robot, stop it and reset its odometry."""
     yield
     for verb in ("clear", "activate"):
         bus.get(f"srv/{verb}")
@@ -149,7 +150,7 @@ def described(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
 
 @pytest.mark.parametrize("transport", NETWORK)
 def test_the_urdf_is_latched_and_sent_once(described: Daemon, transport: str) -> None:
-    """RViz would load the robot again with each message."""
+    """A late subscriber gets the URDF once, because RViz reloads the robot with each message."""
     with Bus(described.endpoint) as bus:
         assert bus.get("robot_description") == {"data": URDF_TEXT}
         ros = EMULATED[transport](bus.session)
@@ -270,7 +271,7 @@ def test_a_wrong_command_is_counted_and_reported_and_moves_nothing(
 
 
 class Bad(NamedTuple):
-    """Bytes on `cmd_vel`, the counter of their refusal, and a word of the logged reason."""
+    """A malformed message on `cmd_vel`, and how the daemon counts and logs its refusal."""
 
     payload: bytes
     reason: str
@@ -358,7 +359,7 @@ def test_a_trigger_is_answered_once_for_every_form_of_an_empty_request(
 
 
 def asked(ros: Client, service: str, **request: Any) -> Any:
-    """Return the reply of a service of the parameters."""
+    """Call one of the parameter services of ROS and return its only reply."""
     kind = PARAMETER_SERVICES[service]
     question, answer = REQUESTS[kind]
     called = ros.call(f"acsard/{service}", kind, encode(make(question, **request)))
@@ -384,7 +385,7 @@ def test_the_parameters_are_listed_described_and_read(bus: Bus, ros: Client) -> 
 
 
 def _limit(value: float) -> Any:
-    """Return the parameter that limits the robot's speed."""
+    """Return the ROS parameter `limits.linear_speed` with this value."""
     none: dict[str, Any] = {"bool_value": False, "integer_value": 0, "string_value": ""}
     lists = ("byte_array", "bool_array", "integer_array", "double_array", "string_array")
     none |= {f"{kind}_value": np.array([]) for kind in lists}

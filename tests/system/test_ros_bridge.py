@@ -1,6 +1,6 @@
-"""What a zenoh-bridge-ros2dds may put, call and read in Zenoh, to the byte, by an emulated one.
+"""The daemon works with the exact bytes that a zenoh-bridge-ros2dds puts, calls and reads.
 
-`test_ros_dds.py` has the real one.
+These tests emulate the bridge. `test_ros_dds.py` tests the real bridge.
 """
 
 from __future__ import annotations
@@ -123,7 +123,7 @@ ALIVE = "acsard/acsar/alive"
 
 
 def announced(zid: str, namespace: str, twists: bool) -> set[str]:
-    """Declare the tokens of a bridge for everything that it can announce."""
+    """Return the liveliness keys with which a bridge announces everything that it can announce."""
     head = f"@/{zid}/@ros2_lv"
     prefix = f"{namespace}§" if namespace else ""
     found = {head}

@@ -1,7 +1,7 @@
-"""The real zenoh-bridge-ros2dds joins ROS nodes on DDS to robots, with the file of deploy/ros2.
+"""The real zenoh-bridge-ros2dds, with the file in deploy/ros2, joins ROS nodes on DDS to robots.
 
-`pytest -m bridge` runs these tests, and those of `test_ros.py` that need the same bridge. The first
-run builds it.
+`pytest -m bridge` runs these tests, and the tests of `test_ros.py` that need the same bridge. The
+first run builds the bridge.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ pytestmark = [pytest.mark.bridge, pytest.mark.timeout(BUILD_S)]
 
 @pytest.fixture
 def driven(bus: Bus) -> Iterator[Bus]:
-    """`bus`, whose robot stands afterwards."""
+    """Provide `bus`, and stop its robot after the test."""
     yield bus
     bus.at_rest()
 
@@ -147,7 +147,10 @@ def test_a_command_has_the_time_at_which_the_bridge_sent_it(driven: Bus, domain:
 
 @contextmanager
 def sending(first: DdsNode, speed: float, second: DdsNode, its_speed: float) -> Iterator[None]:
-    """Send both speeds 20 times a second while entered, the second one 10 ms after the first."""
+    """Publish a speed from each of two nodes 20 times a second until the context ends.
+
+    The second node publishes 10 ms after the first one.
+    """
     ended = threading.Event()
 
     def send() -> None:
@@ -167,7 +170,7 @@ def sending(first: DdsNode, speed: float, second: DdsNode, its_speed: float) -> 
 
 
 def speeds(bus: Bus) -> list[float]:
-    """Return the robot's speeds in a second that begins in a second."""
+    """Wait for 200 control periods, and return the robot's speeds of the last second, m/s."""
     with bus.follow("state") as states:
         sent = bus.count("lines_sent")
         until(lambda: bus.count("lines_sent") >= sent + 200, 10.0, "200 periods")
@@ -244,7 +247,7 @@ def test_a_publisher_of_a_type_that_is_no_command_moves_nothing(
 
 
 class Robot(NamedTuple):
-    """A robot of the fleet, and a node on the side of ROS that reaches it."""
+    """A robot of the fleet, and a ROS node on DDS that reaches it over a bridge."""
 
     daemon: Daemon
     bus: Bus
@@ -253,7 +256,7 @@ class Robot(NamedTuple):
 
 @pytest.fixture(scope="module")
 def robots(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, dict[str, Daemon]]]:
-    """The address of a router, and two robots that meet there, by name."""
+    """Provide a router's address and two robots behind that router, keyed by name."""
     with two_robots(tmp_path_factory.mktemp("robots"), "robot1", "robot2") as robots:
         yield robots
 
@@ -261,7 +264,10 @@ def robots(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, dict
 def one_domain_each(
     stack: ExitStack, dds: NewDomain, where: Path, meeting: str
 ) -> dict[str, DdsNode]:
-    """Start a bridge for each robot: in its own domain its names are the plain ones."""
+    """Start a bridge and a DDS domain for each robot, and return a node in each domain.
+
+    A robot's ROS names have no namespace in its own domain.
+    """
     nodes = {}
     for name in ("robot1", "robot2"):
         domain = stack.enter_context(dds(where))
@@ -273,7 +279,10 @@ def one_domain_each(
 def one_domain_for_both(
     stack: ExitStack, dds: NewDomain, where: Path, meeting: str
 ) -> dict[str, DdsNode]:
-    """Start one bridge, which shows the names of both robots with their namespaces."""
+    """Start one bridge and one DDS domain for both robots, and return a node for each robot.
+
+    The namespace of a ROS name says which robot it belongs to.
+    """
     file = where / "both.json5"
     # `allow` with an expression for both robots, as the page says.
     file.write_text(re.sub(r'"/(\w+)', r'"/robot[12]/\1', BRIDGE_FILE.read_text()))

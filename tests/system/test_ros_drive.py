@@ -1,4 +1,4 @@
-"""The command on the pages with which a ROS user moves the robot works as written."""
+"""A ROS user can move the robot with the command exactly as the pages give it."""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ pytestmark = [pytest.mark.network, pytest.mark.timeout(60)]
 
 
 def listens(program: Program, times: int = 1) -> None:
-    """Wait until the router has opened this number of times."""
+    """Wait until the log shows that the router has started to listen for the nth time."""
     until(
         lambda: sum("router_open" in line for line in list(program.err)) >= times,
         10.0,
@@ -40,7 +40,7 @@ def listens(program: Program, times: int = 1) -> None:
 
 
 def the_router(program: Program) -> int:
-    """Return the child process that may be lost."""
+    """Return the process id of the supervised router."""
     return until(lambda: children(program.pid, "--supervised"), 5.0, "its process")[0]
 
 

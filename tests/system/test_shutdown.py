@@ -1,4 +1,4 @@
-"""SIGTERM and SIGINT on the wire: ramp, STOP last, exit 0 within a second."""
+"""After SIGTERM or SIGINT the daemon sends a ramp, then STOP, and exits with 0 within a second."""
 
 from __future__ import annotations
 
@@ -40,12 +40,12 @@ SLOW_STOP = {
 
 
 def ramp_after(peer: Peer, at: float) -> list[Heard]:
-    """Return the lines since then, without those that were on their way."""
+    """Return the lines that the board received after this time."""
     return [heard for heard in peer.lines if heard.at > at]
 
 
 def last_speed(ramp: list[Heard]) -> float:
-    """Return the last speed among them that is not zero, rad/s."""
+    """Return the last wheel speed of the ramp that is not zero, rad/s."""
     return next(wheels(heard.line)[0] for heard in reversed(ramp) if heard.line != ZERO_LINE)
 
 

@@ -1,4 +1,4 @@
-"""The daemon's beliefs agree with the truth of the simulated robot, on a real bus."""
+"""The daemon's estimates agree with the true state of the simulated robot, on a real bus."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SKIDDING: dict[str, dict[str, object]] = {"sim": {"track_multiplier": 1.6}}
 
 @pytest.fixture(scope="module")
 def skidding(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bus]:
-    """A client of a daemon whose simulated robot turns less than its wheels say."""
+    """Provide a client of a daemon whose simulated robot turns less than its wheels suggest."""
     where = tmp_path_factory.mktemp("skidding")
     with running(where, config=SKIDDING) as (_, bus):
         yield bus
@@ -59,7 +59,7 @@ def test_the_true_pose_is_published_at_100_hz_with_the_stamp_of_each_sample(
 
 @pytest.fixture(scope="module")
 def real(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bus]:
-    """A client of a daemon that has a real port and listens to a gyro on the bus."""
+    """Provide a client of a daemon on a pty that uses a gyro from the bus."""
     where, tables = tmp_path_factory.mktemp("real"), {"odometry": {"gyro": True}}
     with (
         Peer(where / "mcu") as peer,

@@ -188,7 +188,7 @@ def test_a_second_daemon_with_the_same_id_behind_one_router_ends_with_75(
 def test_a_second_robot_with_the_ros_names_of_another_behind_one_router_ends_with_75(
     tmp_path: Path, peer: Peer, ros: dict[str, object]
 ) -> None:
-    """One `cmd_vel` would drive both robots."""
+    """The second daemon refuses to start, because one `cmd_vel` would drive both robots."""
     endpoint = free_endpoint()
 
     def robot(name: str, port: str = "sim") -> Tables:
@@ -219,7 +219,7 @@ def test_a_second_robot_with_the_ros_names_of_another_behind_one_router_ends_wit
 
 
 def unprivileged() -> list[str]:
-    """Return the command prefix that drops root's rights; other users need none."""
+    """Return a command prefix that drops root's capabilities, or an empty list for other users."""
     if os.geteuid() != 0:
         return []
     drop = ["setpriv", "--bounding-set=-all", "--inh-caps=-all"]

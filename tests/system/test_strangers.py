@@ -1,7 +1,7 @@
-"""Strangers can do nothing from another host, and little by force.
+"""A stranger on another host has no access to the robot, and can disturb it little by force.
 
-The other host is a network namespace, made for the test with a cable to the robot's own. Those
-tests are skipped without root, or without `ip`.
+The other host is a network namespace, which a virtual cable connects to the robot's namespace. The
+tests with another host are skipped without root or without `ip`.
 """
 
 from __future__ import annotations
@@ -40,14 +40,14 @@ PORT, TLS_PORT = 7448, 7449
 
 
 def daemon_on(host: str, where: Path, bus: dict[str, object]) -> AbstractContextManager[Daemon]:
-    """Run a daemon on a host, with this bus table."""
+    """Run a daemon on a host, with these settings in its `[bus]` table."""
     return on(host, Daemon(where, config={"bus": {"listen": NEAR} | bus}))
 
 
 def visit(
     host: str, where: Path, endpoints: list[str], tls: dict[str, object] | None = None
 ) -> dict[str, Any]:
-    """Return the findings and effects of a stranger on a host within a second."""
+    """Run a stranger on this host for a second, and return its report of all it found and did."""
     said = [json.dumps(endpoints), json.dumps(tls)]
     with inside(host):
         done = finish(words(VISIT, 1.0, *said), where)
@@ -234,7 +234,7 @@ It yields the processor to all others: the test does not measure its own work.
 
 
 class Figures(NamedTuple):
-    """The effects of some time on the robot, on connected clients, and on newcomers."""
+    """How a period of time affected the robot, clients that were connected, and new clients."""
 
     periods: Periods
     calm: Periods
@@ -275,7 +275,10 @@ class Robot:
     def attacked(
         self, kind: str, doors: list[str], seconds: float, count: int = 0
     ) -> Iterator[Program]:
-        """Run an attack by a client that has a viewer's certificate if one is needed."""
+        """Run an attack of this kind on these endpoints, and yield its process.
+
+        The attacker has a viewer's certificate for attacks that need one.
+        """
         viewer = self._certificates.robot / "clients" / "viewer"
         settings = json.dumps(self._certificates.settings(viewer))
         arguments = (kind, json.dumps(doors), settings, seconds, count)
@@ -288,7 +291,10 @@ class Robot:
         during: Callable[[], AbstractContextManager[Callable[[], bool]]],
         comers: tuple[Identity, ...] = ("local", "operator"),
     ) -> Figures:
-        """Measure while the attack goes on; `comers` connect again and again."""
+        """Measure the robot and its clients while `during` goes on.
+
+        Each identity in `comers` connects again and again as a new client.
+        """
         own = self._certificates.config("operator", self.plain, self.tls)
         with Bus(self.plain) as bus, zenoh.open(own) as operator:
             bus.linked()
@@ -307,7 +313,7 @@ class Robot:
         return Figures(periods, calm, grown, max(answered), max(entered, default=0.0), len(entered))
 
     def _entered(self, who: Identity) -> float:
-        """Return the time until a client is connected and answered, s."""
+        """Connect as a new client, and return the time until the daemon answered it, s."""
         config = self._certificates.config(who, self.plain, self.tls)
         begun = time.monotonic()
 
@@ -324,7 +330,7 @@ class Robot:
 
 
 def _answered(session: zenoh.Session) -> float:
-    """Return the time until an answer, s."""
+    """Query the `state`, and return the time until the answer came, s."""
     begun = time.monotonic()
     assert any(reply.ok for reply in session.get("acsard/acsar/state", timeout=5.0))
     return time.monotonic() - begun
@@ -344,7 +350,7 @@ def calm(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bus]:
 
 @pytest.fixture
 def robot(tmp_path: Path, certificates: Certificates, calm: Bus) -> Iterator[Robot]:
-    """Each test gets a new daemon, because the effects of an attack last."""
+    """Provide a new daemon for each test, because the effects of an attack last."""
     with Robot(tmp_path, certificates, calm) as robot:
         yield robot
 
@@ -357,7 +363,7 @@ def hold(
     comers: tuple[Identity, ...] = ("local", "operator"),
     count: int | None = None,
 ) -> None:
-    """Attack these endpoints and check that the robot's users lose nothing."""
+    """Attack these endpoints, and check that connected and new clients still get their answers."""
     at = [door for door in (robot.plain, robot.tls) if door.startswith(doors)]
     times = TIMES[kind] if count is None else count
 

@@ -16,7 +16,7 @@ from tests.system.harness import ZERO_LINE, Bus, Daemon, Peer, alive_at, until
 
 @contextmanager
 def readerless_pipe() -> Iterator[int]:
-    """A pipe whose reader has gone."""
+    """Provide a pipe whose reading end is closed."""
     reader, writer = os.pipe()
     os.close(reader)
     yield writer
@@ -32,7 +32,7 @@ def full_disk() -> Iterator[int]:
 
 
 def slow(value: str) -> object:
-    """Mark a stream's own test as slow, because another test covers all of them at once."""
+    """Mark this value as slow, because another test tries all three standard streams at once."""
     return pytest.param(value, marks=pytest.mark.slow)
 
 
@@ -64,7 +64,7 @@ def test_control_goes_on_when_a_stream_was_closed_before_the_start(
 
 
 def drives_and_leaves(daemon: Daemon, peer: Peer) -> None:
-    """Check that the robot drives, and that the tool ends as usual."""
+    """Check that the robot drives, and that SIGTERM ends the daemon with a zero line and exit 0."""
     with alive_at(daemon.endpoint, daemon) as alive:
         until(alive.try_recv, 5.0, "the alive token")
     with Bus(daemon.endpoint) as bus:

@@ -1,4 +1,4 @@
-"""Each mistake on the way to a TLS endpoint has its own sentence, over real connections."""
+"""Each mistake in the settings of a TLS connection gets its own message, over real connections."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ ALL_NAMES = ["localhost", "127.0.0.1"]
 
 @pytest.fixture(scope="module", name="tls")
 def _tls(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An authority with a client's certificate, one that has expired, and another authority's."""
+    """Provide a directory of certificates: valid, expired, for other names, or by a stranger."""
     place = tmp_path_factory.mktemp("tls")
     ours = Authority.make(place / "ca", "ours", 10, ["robot.example"])
     ours.issue(place / "client", "client", [], 1)

@@ -1,4 +1,4 @@
-"""`acsard top` at a terminal and in a pipe."""
+"""`acsard top` shows the robot on a terminal, and prints to a pipe."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ FRAME = "\x1b[H"
 
 @contextmanager
 def top(daemon: Daemon) -> Iterator[tuple[Terminal, Program]]:
-    """`acsard top` at a terminal of 80x24 of its own."""
+    """Run `acsard top` on a separate terminal of 80x24 characters."""
     words = ("top", "--config", str(daemon.config))
     with at_terminal(daemon.config.parent, *words, term=SCREEN, piped="stderr") as found:
         yield found
 
 
 def shown(terminal: Terminal) -> list[str]:
-    """The lines of the last whole screen, without their colours; none before the first."""
+    """Return the lines of the last complete screen without colours, or [] if there is none yet."""
     for frame in reversed(terminal.screen.split(FRAME)):
         lines = re.sub(r"\x1b\[[0-9;]*m", "", frame).split("\r\n")
         if len(lines) >= SIZE[1] and len(lines[-1]) >= SIZE[0]:
@@ -37,7 +37,7 @@ def shown(terminal: Terminal) -> list[str]:
 
 
 def shows(terminal: Terminal, text: str, within: float) -> list[str]:
-    """Return the first screen that contains that text."""
+    """Wait for the text, and return the first screen that contains it."""
 
     def look() -> list[str] | None:
         lines = shown(terminal)
@@ -47,7 +47,7 @@ def shows(terminal: Terminal, text: str, within: float) -> list[str]:
 
 
 def piped(daemon: Daemon) -> Program:
-    """Run `acsard top` without a terminal, though its environment requests colours."""
+    """Run `acsard top` with a pipe as output, although FORCE_COLOR asks for colours."""
     env = environment(COLUMNS="80", FORCE_COLOR="1")
     return Program(acsard("top", "--config", str(daemon.config)), daemon.config.parent, env)
 

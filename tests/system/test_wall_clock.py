@@ -1,4 +1,4 @@
-"""Setting the wall clock during a tool's run, here or at the robot, changes nothing it shows."""
+"""A tool shows the same when the wall clock of its own machine or of the robot is set meanwhile."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ SET = (sys.executable, "-c", SET_AGAIN)
 
 
 class Place:
-    """A robot and a tool; the clock of one of them is set again and again."""
+    """A robot and a tool. The test sets the clock of one of them by hours, five times a second."""
 
     def __init__(self, daemon: Daemon, before: Sequence[str]) -> None:
         self._daemon, self._before = daemon, before

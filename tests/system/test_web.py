@@ -1,4 +1,7 @@
-"""A client that opens the robot's page sees, drives and stops; one that leaves drives no more."""
+"""A client that opens the robot's page sees it, drives it and stops it.
+
+When the client leaves, its drive ends.
+"""
 
 from __future__ import annotations
 
@@ -240,7 +243,10 @@ async def test_recordings_are_listed_and_downloaded_as_mcap(page: Page, daemon: 
 
 
 async def drawn(session: aiohttp.ClientSession) -> tuple[str, dict[str, Any]]:
-    """Request the report of the first recording; return the name and the result."""
+    """Request a report of the first recording and wait until it is drawn.
+
+    Returns the name of the recording, and the status and content of the answer.
+    """
     name = await first_recording(session)
     async with asyncio.timeout(2 * PATIENCE_S):
         while True:
@@ -322,7 +328,7 @@ class Terminal(Program):
         return until(look, START_S, f"{pattern} on the screen: {self.seen}")
 
     def page(self) -> list[int]:
-        """Return the processes of the page."""
+        """Return the process ids of `acsard web` below this daemon."""
         return children(self.pid, "acsard web")
 
 
@@ -343,7 +349,7 @@ def test_a_daemon_in_a_terminal_serves_its_page_at_a_free_port_and_restarts_it(
             assert json.loads(asyncio.run(text(f"{url}api/whoami")))["role"] == "maintainer"
 
             def listed() -> bool:
-                """Wait until the recorder has made its directory."""
+                """Return whether the page lists a recording."""
                 status, told = asyncio.run(answer(f"{url}api/recordings"))
                 return status == 200 and ".mcap" in told
 

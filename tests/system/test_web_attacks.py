@@ -1,6 +1,6 @@
-"""Each forbidden request to the robot's page is refused and counted, and nothing moves.
+"""The page refuses and counts each forbidden request, and the robot does not move.
 
-With `-s` the results are printed as a table.
+With `-s` pytest prints the results as a table.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ MOVED_M = 0.005
 
 
 class Table:
-    """The attempts, their results, and the check that the robot stood meanwhile."""
+    """The table of attacks and their results. Each attack checks that the robot stood still."""
 
     def __init__(self, page: Page, daemon: Daemon) -> None:
         self.page, self.daemon = page, daemon
@@ -70,10 +70,10 @@ class Table:
         *,
         stands: bool = True,
     ) -> Iterator[None]:
-        """Check one attempt.
+        """Run the attack in the body of the `with`, and add a row to the table.
 
-        It is refused this number of times for that reason, by the page or the robot, and nothing
-        moves unless another client may drive.
+        The page or the robot (`by`) must refuse it at least `times` times and count `reason`. The
+        robot must not move, unless `stands` is false because another client may drive it.
         """
         with Bus(self.daemon.endpoint) as bus:
             before, counted = bus.comes_to("ready"), self._refused(bus, reason, by)
@@ -109,7 +109,7 @@ def table(page: Page, daemon: Daemon) -> Iterator[Table]:
 
 @pytest.fixture(scope="module")
 def tokens(page: Page) -> dict[str, str]:
-    """Return one token of each kind: none, wrong, expired, revoked, and a viewer's."""
+    """Return tokens of five kinds: empty, wrong, expired, revoked, and a viewer's."""
     revoked = page.invite("maintainer", "revoked")
     page.tokens("--revoke", "revoked")
     vault = page.vault
@@ -285,7 +285,7 @@ async def test_a_viewer_moves_nothing_with_any_message(
 
 
 async def _known(ours: Hands, bus: Bus) -> None:
-    """Make the robot know the client by its own clock; the client then drives no more."""
+    """Drive briefly, so that the robot knows this sender and its clock. Then stop."""
     await ours.say(subscribe="state", rate=50)
     await ours.until_driving(0.3)
     await ours.drive(0.0)
@@ -373,7 +373,7 @@ async def test_a_thousand_connections_do_not_disconnect_the_page_that_drives(
 
 
 async def _idle(host: str, port: int, number: int) -> list[socket.socket]:
-    """Open connections that send nothing, and check that each of them is open."""
+    """Open `number` connections that send nothing, and return their sockets."""
     idle: list[socket.socket] = []
     for _ in range(number):
         one = socket.socket()
@@ -384,7 +384,7 @@ async def _idle(host: str, port: int, number: int) -> list[socket.socket]:
 
 
 def _waits(one: socket.socket) -> bool:
-    """Check that it was not closed."""
+    """Return whether the server still keeps this connection open."""
     try:
         return one.recv(1) != b""
     except BlockingIOError:
@@ -401,7 +401,10 @@ def test_a_browser_with_many_cookies_of_other_ports_gets_the_page(table: Table) 
 
 @pytest.mark.parametrize("before", [b"", b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"])
 def test_a_head_without_an_end_is_cut_off(table: Table, bus: Bus, before: bytes) -> None:
-    """Clients without a token could fill the memory with headers, of the first request or later."""
+    """Send endless headers, in the first request of a connection or in the second.
+
+    Otherwise clients without a token could fill the memory.
+    """
     sent = 0
     with (
         table.attack("headers without an end", "cut off", "crowded"),
@@ -423,7 +426,7 @@ def test_a_head_without_an_end_is_cut_off(table: Table, bus: Bus, before: bytes)
 def test_answers_that_no_client_reads_cost_little_memory(
     table: Table, bus: Bus, headers: int
 ) -> None:
-    """Sixty clients without a token send requests without end, and read no answer."""
+    """Sixty clients without a token send requests all the time, and read no answer."""
     page, place = table.page, URL(table.page.away)
     trusting = ssl._create_unverified_context()
     request = f"GET /x HTTP/1.1\r\nHost: {place.host}:{place.port}\r\n" + "".join(
@@ -463,7 +466,7 @@ async def test_a_viewer_that_floods_with_pings_is_cut_off(
 
 @pytest.mark.nightly
 def test_a_slow_or_silent_client_is_disconnected(table: Table, bus: Bus) -> None:
-    """A header of one byte a second, no bytes at all, and a body that is announced but not sent."""
+    """One client sends a byte a second, one sends nothing, one announces a body and sends none."""
     begun = time.monotonic()
     with (
         table.attack("a slow loris, and who says nothing", "cut off", "slow", 2),
@@ -660,7 +663,7 @@ VIEWERS, A_SECOND, LASTS_S = 6, 190, 3.0
 
 
 class Cost(NamedTuple):
-    """The cost of a wave of messages."""
+    """The cost of the messages that all clients send in one part of the test."""
 
     cpu_s: float
     """Processor time of the page and the daemon."""
@@ -674,7 +677,7 @@ class Cost(NamedTuple):
 async def test_stops_of_robots_that_do_not_exist_cost_no_more_than_pings_and_no_periods(
     table: Table, bus: Bus, tokens: dict[str, str]
 ) -> None:
-    """The viewers are quiet, send pings and send stops in turns, as much as their limit allows."""
+    """Viewers send nothing, then pings, then stops, each as often as their rate limit allows."""
     page, daemon = table.page.pid, table.daemon.pid
 
     async def told(number: int, what: str) -> None:

@@ -1,8 +1,8 @@
-"""Crowds of connections from another host cost the page little, and lock no phone out.
+"""Crowds of connections from another host cost the page little, and exclude no phone.
 
-Each crowd comes twice: once while a phone drives, and once while the phone and a browser on the
-robot itself stop the robot. Another crowd comes to a page that may open no more files. With `-s`
-the figures of each crowd are printed.
+Each crowd connects twice: once while a phone drives, and once while the phone and a browser on the
+robot itself stop the robot. Another crowd connects to a page that has reached its limit of open
+files. With `-s` pytest prints the figures of each crowd.
 """
 
 from __future__ import annotations
@@ -95,7 +95,10 @@ def robot(hosts: Hosts, where: Path) -> Iterator[Daemon]:
 
 @contextmanager
 def files(most: int) -> Iterator[None]:
-    """Let programs that start meanwhile open this many files, as far as this machine permits."""
+    """Raise or lower the limit of open files for programs that start in the body of the `with`.
+
+    The machine's hard limit still applies.
+    """
     before = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (min(most, before[1]), before[1]))
     try:
@@ -120,13 +123,13 @@ class Scene:
         return Program(self._words, self.page.tls)
 
     async def comes(self, crowd: Program) -> None:
-        """Start the crowd on the other host, and wait until all its connections were opened."""
+        """Start the crowd on the other host, and wait until it has opened all its connections."""
         with inside(self._hosts.stranger):
             crowd.__enter__()
         await asyncio.to_thread(crowd.says, "opened", PATIENCE_S)
 
     def stop_here(self) -> float:
-        """Stop the robot from itself; return how long that took, s."""
+        """Stop the robot by a client on the robot itself, and return how long that took, s."""
         with inside(self._hosts.robot):
             place = self.page.here.removeprefix("http://")
             return _stopped(lambda: http.client.HTTPConnection(place, timeout=PATIENCE_S), {})
@@ -137,7 +140,7 @@ class Scene:
         return False
 
     def stop_away(self) -> float:
-        """Stop the robot from the phone by a new connection; return how long that took, s."""
+        """Stop the robot by a new connection of the phone, and return how long that took, s."""
         with inside(self._hosts.stranger):
             place = self.page.away.removeprefix("https://")
             told = {"Authorization": f"Bearer {self._token}"}
@@ -164,7 +167,7 @@ class Scene:
             connection.close()
 
     async def drive_on(self, crowd: Program) -> list[str]:
-        """Drive from the phone while the crowd comes; return the modes meanwhile."""
+        """Drive from the phone while the crowd connects, and return the robot's modes meanwhile."""
         with inside(self._hosts.stranger):
             session = self.page.client(self._token)
             opened = await session.ws_connect(f"{self.page.away}/ws", heartbeat=None)
@@ -200,7 +203,10 @@ FREE_FILES, SILENT = 12, 80
 def test_a_page_that_runs_out_of_files_stops_the_robot_and_recovers(
     hosts: Hosts, robot: Daemon, where: Path, near: bool, tmp_path: Path
 ) -> None:
-    """The limit of open files is lowered behind the page's back, so its own bounds are too high."""
+    """The test lowers the limit of open files after the page has read it.
+
+    The page therefore accepts more connections than it can open.
+    """
     (tmp_path / "tls").symlink_to(where / "tls")
     server = Page(robot, tmp_path, at=ROBOT_AT)
     with inside(hosts.robot):
@@ -243,12 +249,15 @@ def test_a_page_that_runs_out_of_files_stops_the_robot_and_recovers(
 
 
 def nine_of_ten(took: list[float]) -> float:
-    """Return the time within which nine of ten stops were done."""
+    """Return the time in which 90 % of the stops were done, s."""
     return sorted(took)[round(0.9 * len(took)) - 1]
 
 
 async def _stops(stop: Callable[[], float]) -> list[float]:
-    """Return how long some stops took. They are too far apart to be merged."""
+    """Stop the robot several times, and return how long each stop took, s.
+
+    The pauses are so long that the page does not merge two stops.
+    """
     took = []
     for _ in range(STOPS):
         took.append(await asyncio.to_thread(stop))

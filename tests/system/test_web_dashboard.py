@@ -1,4 +1,4 @@
-"""A web page of another origin uses the robot's page as an interface."""
+"""A web page of another origin uses the web API of the robot's page."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def server(robot: Daemon, tmp_path_factory: pytest.TempPathFactory) -> Iterator[
 
 @pytest.fixture
 def bus(robot: Daemon) -> Iterator[Bus]:
-    """A plain client of the robot, which stands and may be driven."""
+    """Provide a client of the robot, which has no latch and stands still."""
     with Bus(robot.endpoint) as bus:
         bus.linked()
         bus.ask("srv/clear")
@@ -160,7 +160,7 @@ class _Silent(SimpleHTTPRequestHandler):
 
 @contextmanager
 def served(where: Path, origin: str) -> Iterator[None]:
-    """Serve the files of a directory at that origin."""
+    """Serve the files of a directory at an origin."""
     port = int(origin.rpartition(":")[2])
     server = ThreadingHTTPServer(("127.0.0.1", port), partial(_Silent, directory=str(where)))
     thread = threading.Thread(target=server.serve_forever, daemon=True)

@@ -1,4 +1,4 @@
-"""The page's server, run in this process, for cases that no client can cause at will."""
+"""Tests of the page's server in this process, for cases that a real client cannot cause."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ ABOUT = About("1", True, 1.0, 4.0, 10.0, "", {"teleop": 0.25, "app": 0.25})
 
 
 class Inside:
-    """The whole server without a connection to a robot, which a test opens if it needs one."""
+    """The whole server of the page in this process, without a connection to a robot."""
 
     def __init__(self, where: Path, rules: WebConfig = DEFAULT_CONFIG) -> None:
         self.counts = Counts()
@@ -56,7 +56,7 @@ class Inside:
 
     @asynccontextmanager
     async def hands(self) -> AsyncIterator[Hands]:
-        """Open the page."""
+        """Serve the page and open its WebSocket as a client."""
         async with (
             TestServer(self.page.app) as server,
             aiohttp.ClientSession() as session,
@@ -269,7 +269,7 @@ def shared(tmp_path: Path) -> Inside:
 async def test_only_a_page_of_a_listed_origin_may_send_requests_and_read_answers(
     shared: Inside,
 ) -> None:
-    """Another page of this machine, and the robot's own, are tried as well."""
+    """The test also tries another page of this machine, and the robot's own page."""
     async with TestServer(shared.page.app) as server, aiohttp.ClientSession() as session:
         place, own = server.make_url("/api/srv/stop"), f"http://127.0.0.1:{server.port}"
         for origin, status, readable in [

@@ -1,4 +1,4 @@
-"""Each way to leave the robot's page ends the drive, and nothing of it is obeyed later."""
+"""Each way to leave the robot's page ends the drive, and the robot obeys no later command of it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Way = Callable[[Hands, Page], Awaitable[None]]
 
 
 async def closes(ours: Hands, page: Page) -> None:
-    """The tab is closed."""
+    """The user closes the tab."""
     await ours.socket.close()
 
 
@@ -26,11 +26,11 @@ async def vanishes(ours: Hands, page: Page) -> None:
 
 
 async def freezes(ours: Hands, page: Page) -> None:
-    """The browser is stopped, or its network is gone: nothing more comes, and nothing says so."""
+    """The browser is suspended or its network is gone: it sends nothing and does not disconnect."""
 
 
 async def releases(ours: Hands, page: Page) -> None:
-    """The finger is lifted: one zero, then silence."""
+    """The user lifts the finger: the page sends one zero and then nothing."""
     await ours.drive(0.0)
 
 
@@ -45,7 +45,7 @@ async def is_killed(ours: Hands, page: Page) -> None:
 
 
 async def freezes_for_a_while(ours: Hands, page: Page) -> None:
-    """The page's server stands still while commands come in, and goes on later."""
+    """The page's server is suspended while commands come in, and continues later."""
     page.signal(signal.SIGSTOP)
     try:
         await ours.hold(0.3, 0.5)
@@ -59,7 +59,7 @@ OF_THE_SERVER: tuple[Way, ...] = (is_asked_to_end, is_killed)
 
 
 def let_go(daemon: Daemon, page: Page, way: Way) -> None:
-    """Drive, leave, and check the obeyed commands until well after the robot stands."""
+    """Drive and leave in this way. Check that no later command moves the robot again."""
     with Bus(daemon.endpoint) as bus:
         bus.at_rest()
 

@@ -1,4 +1,4 @@
-"""Clients from other hosts are invited to the robot's page, admitted, named, and removed again."""
+"""Clients from other hosts are invited to the robot's page, admitted, listed, and removed."""
 
 from __future__ import annotations
 
@@ -161,7 +161,7 @@ async def test_a_link_with_fewer_permissions_replaces_a_cookie_only_if_asked_to(
 async def test_a_phone_can_use_two_pages_on_one_host_with_its_two_tokens(
     page: Page, daemon: Daemon, tmp_path: Path
 ) -> None:
-    """A browser's cookies do not depend on ports."""
+    """The browser sends each page the cookies of both, because cookies do not depend on ports."""
     shutil.copytree(page.tls, tmp_path / "tls")
     with Page(daemon, tmp_path) as other:
         rooms = [(page, "first"), (other, "second")]
@@ -210,7 +210,7 @@ async def test_a_connection_whose_token_was_revoked_is_cut_and_others_are_not(pa
     trusted = ssl.create_default_context(cafile=str(page.tls / "ca.pem"))
 
     async def opened(token: str) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
-        """Open a connection that has shown its token, and has not sent its next request wholly."""
+        """Open a connection that has shown its token and has sent a part of its next request."""
         reader, writer = await asyncio.open_connection(
             "127.0.0.1", port, ssl=trusted, server_hostname=NAME
         )
@@ -233,7 +233,7 @@ async def test_a_connection_whose_token_was_revoked_is_cut_and_others_are_not(pa
 async def test_a_client_with_too_many_connections_shuts_out_no_other_at_its_address(
     page: Page, bus: Bus
 ) -> None:
-    """All of them come from 127.0.0.1, including the robot's own browser."""
+    """All clients, including the robot's own browser, connect from 127.0.0.1."""
     few = MAX_WEBSOCKETS_OF_NETWORK // MAX_WEBSOCKETS_OF_TOKEN_IN_NETWORK + 1
     broken, *others = (page.invite("viewer", f"one{n}") for n in range(few))
     counted = page.refused().get("too_many", 0)
@@ -360,13 +360,16 @@ def test_the_log_of_a_refusal_names_the_address_and_the_token_s_name(
 async def test_a_driving_program_that_is_disconnected_gets_a_close_code_and_a_reason(
     page: Page, bus: Bus
 ) -> None:
-    """A connection that ends before the close was answered is equivalent to a lost radio link."""
+    """The page waits for the client's answer to the close before it ends the connection.
+
+    Otherwise the program could not tell a close from a lost radio link.
+    """
     vault = page.vault
     trusted = ssl.create_default_context(cafile=str(page.tls / "ca.pem"))
     wishes = (json.dumps({"cmd": {"linear_x": 0}, "stamp": 1.8e12 + n}) for n in itertools.count())
 
     async def plain(name: str) -> tuple[int | None, str | None]:
-        """Read in one task and drive in another; return the close code and the reason."""
+        """Drive by aiohttp in one task and read in another. Return close code and reason."""
         async with (
             page.client(page.invite("operator", name)) as session,
             session.ws_connect(f"{page.away}/ws") as ours,
@@ -379,7 +382,7 @@ async def test_a_driving_program_that_is_disconnected_gets_a_close_code_and_a_re
             return ours.close_code, message.extra
 
     async def other(name: str) -> tuple[int | None, str | None]:
-        """Use another library, which answers pings by itself."""
+        """Drive by the library websockets, which answers pings. Return close code and reason."""
         told = {"Authorization": f"Bearer {page.invite('operator', name)}"}
         url = page.away.replace("https", "wss") + "/ws"
         async with websockets.connect(

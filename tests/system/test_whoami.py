@@ -1,4 +1,4 @@
-"""Every tool tells a role that may not do something so, and finds its role by the access rules."""
+"""Every tool finds its role by the access rules, and names it when the role lacks a permission."""
 
 from __future__ import annotations
 
@@ -158,9 +158,9 @@ def test_the_error_suggests_a_wrong_id_before_an_unlisted_certificate(
 
 
 def followed_to_its_end(robot: Robot, own: Path, lasts: float) -> str | None:
-    """Return the message of `echo` about its certificate's end after this time, s.
+    """Run `acsard echo` with a viewer's certificate that expires after `lasts` seconds.
 
-    Returns None if it started too late.
+    Returns the tool's message about the expiry, or None if the tool started too late.
     """
     robot.certificates.issue(own, "viewer", lasts / 86400)
     words = acsard("echo", "state", "--connect", robot.tls, "--tls", str(own))

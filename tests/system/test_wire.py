@@ -1,4 +1,4 @@
-"""The bytes on the line are right, against an independent serial peer."""
+"""An independent serial peer checks the bytes that the daemon sends."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def running(
 
 
 class Started(NamedTuple):
-    """What a board received at a start, a straight drive at 0.5 m/s and a turn at 1 rad/s."""
+    """Lines that a board received at a start, a straight drive at 0.5 m/s and a turn at 1 rad/s."""
 
     stream: bytes
     """Every byte up to the end of the straight drive."""
@@ -63,7 +63,7 @@ def started(tmp_path_factory: pytest.TempPathFactory) -> Started:
     where = tmp_path_factory.mktemp("started")
 
     def steady(*others: bytes) -> bytes | None:
-        """Return the first line that came thirty times in a row, unless it is one of those."""
+        """Return the first line outside `others` that the board received thirty times in a row."""
         for line, same in itertools.groupby(peer.session.said()):
             if line not in others and sum(1 for _ in same) >= 30:
                 return line
@@ -137,7 +137,7 @@ def test_a_trailing_comma_and_wired_signs_and_letters_apply_on_the_wire(
 
 
 def mixture() -> Reply:
-    """Reply in every accepted form in turn, with some lines of mixed forms."""
+    """Return a board that replies in each accepted form in turn, and then in a mix of forms."""
 
     def mixed(speeds: Speeds) -> bytes:
         a, b, c, d = (f"{'n' if speed < 0 else 'p'}{abs(speed):.3f}" for speed in speeds)
@@ -164,7 +164,7 @@ ACCEPTED: dict[str, Reply] = {
 
 
 def steady(bus: Bus) -> Any:
-    """Return the state when the robot drives at 0.4 m/s."""
+    """Return the state if the robot drives at 0.4 m/s, otherwise None."""
     state = bus.state()
     right = state["link"] == "up" and state["linear"] == pytest.approx(0.4, abs=0.005)
     return state if right else None
@@ -189,7 +189,7 @@ def test_every_accepted_reply_form_drives_odometry(tmp_path: Path, peer: Peer) -
 
 
 def always(data: bytes) -> Reply:
-    """Give the same answer to everything."""
+    """Return a board that answers every line with `data`."""
     return lambda speeds: data
 
 
@@ -308,7 +308,11 @@ def test_after_a_silence_of_a_second_the_commander_must_be_neutral_first(
 
 
 def _fall_silent(peer: Peer, states: Following) -> tuple[float, Seen, float]:
-    """Return when the peer was muted, the state that reports it, and when only zeros came."""
+    """Mute the board and wait until the daemon sends zeros.
+
+    Returns the time of the muting, the state that reports the stale link, and the time of the last
+    line that was not zero.
+    """
     peer.reply = silence
     muted = time.monotonic()
     stale = states.find(lambda state: state["link"] == "stale", 5.0, "stale", after=muted)
@@ -318,7 +322,7 @@ def _fall_silent(peer: Peer, states: Following) -> tuple[float, Seen, float]:
 
 
 def _moving_since(peer: Peer, after: float) -> bytes | None:
-    """Return the first line since then that is not zero."""
+    """Return the first line after this time that is not zero."""
     moving = (heard.line for heard in peer.lines if heard.at > after and heard.line != ZERO_LINE)
     return next(moving, None)
 

@@ -1,7 +1,7 @@
-"""Run a shell command in this process, because starting Python would take most of its time.
+"""Run an acsard command in this process, because starting Python would take most of its time.
 
-It serves for the output and the exit code. Signals, terminals, pipes and the end of a program need
-a process.
+Use this to test the output and the exit code. Tests of signals, terminals, pipes and the end of a
+program need a separate process.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from tests.system.harness import Finished
 
 
 def typed(*words: str) -> Finished:
-    """Return the result of `acsard` with these words, without a terminal.
+    """Run `acsard` with these words and without a terminal, and return the result.
 
-    Relative paths are those of this process.
+    Relative paths start at this process's working directory.
     """
     out, err, begun = io.StringIO(), io.StringIO(), time.monotonic()
     before = sys.stdin

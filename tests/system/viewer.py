@@ -1,6 +1,7 @@
-"""An independent viewer: speaks Foxglove's websocket protocol by hand, knows nothing of acsard.
+"""A viewer that speaks Foxglove's websocket protocol with its own code, without acsard's.
 
-Rare messages are JSON; the rest is a byte of opcode and little-endian fields.
+Control messages are JSON. Messages with data are binary: a byte of opcode, then little-endian
+fields.
 """
 
 from __future__ import annotations
@@ -49,7 +50,7 @@ def opened(port: int, protocol: str = PROTOCOL) -> ClientConnection:
 
 
 class Viewer:
-    """One connection; all messages are kept by their kind."""
+    """One connection to the bridge, which sorts all received messages by kind."""
 
     def __init__(self, port: int, protocol: str = PROTOCOL, *, services: bool = True) -> None:
         self._opened = ExitStack()
@@ -81,7 +82,7 @@ class Viewer:
         self._thread.join(5.0)
 
     def cut(self) -> None:
-        """Cut the connection without a close, as the kernel does when a cable is pulled."""
+        """Cut the connection without a closing handshake, as if the cable were pulled."""
         self._socket.socket.shutdown(2)
 
     def _listen(self) -> None:
@@ -138,7 +139,7 @@ class Viewer:
         self._say("unsubscribe", subscriptionIds=[number])
 
     def status(self, words: str, within: float = 5.0) -> dict[str, Any]:
-        """Return the first status with these words."""
+        """Wait for a status message that contains these words, and return it."""
 
         def look() -> dict[str, Any] | None:
             return next((one for one in list(self.statuses) if words in one["message"]), None)
@@ -150,7 +151,7 @@ class Viewer:
     def publish_on(
         self, topic: str, encoding: str, schema_name: str
     ) -> tuple[Callable[[bytes], None], int]:
-        """Advertise a channel of ours; return the function that sends on it, and its number."""
+        """Advertise a channel of this viewer. Return the function that sends on it, and its id."""
         number = next(self._numbers)
         channel = {"id": number, "topic": topic, "encoding": encoding, "schemaName": schema_name}
         if encoding == "cdr":
@@ -159,7 +160,7 @@ class Viewer:
         return lambda data: self._socket.send(struct.pack("<BI", MESSAGE, number) + data), number
 
     def withdraw(self, number: int) -> None:
-        """Unadvertise a channel of ours."""
+        """Unadvertise a channel of this viewer."""
         self._say("unadvertise", channelIds=[number])
 
     def call(self, service: str, request: object) -> Any:
@@ -192,7 +193,7 @@ class Viewer:
 
 
 class Looked:
-    """A topic that is subscribed."""
+    """A topic to which the viewer has subscribed, and its received messages."""
 
     def __init__(
         self, channel: Mapping[str, Any], came: list[Came], hide: Callable[[], None]
@@ -200,12 +201,12 @@ class Looked:
         self.channel, self.came, self.hide = channel, came, hide
 
     def first(self, count: int = 1, within: float = 5.0) -> list[Came]:
-        """Wait for the first messages."""
+        """Wait for `count` messages, and return the first ones."""
         until(lambda: len(self.came) >= count, within, f"{count} of {self.channel['topic']}")
         return self.came[:count]
 
     def read(self, payload: bytes) -> Any:
-        """Decode the message by the definition that comes with its channel, and by nothing else."""
+        """Decode the message with nothing but the definition that its channel announced."""
         name = self.channel["schemaName"]
         assert (self.channel["encoding"], self.channel["schemaEncoding"]) == ("cdr", "ros2msg")
         store = get_typestore(Stores.EMPTY)

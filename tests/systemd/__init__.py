@@ -1,1 +1,1 @@
-"""The unit in a real systemd, booted in a container of its own."""
+"""Tests of the systemd units in a real systemd, which boots in a container."""

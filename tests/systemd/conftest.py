@@ -1,4 +1,4 @@
-"""One booted systemd for all tests here, and in it a board, a commander and the unit."""
+"""One booted systemd for all tests of this directory, with a board, a commander and the unit."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from tests.systemd.container import (
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Give each test here the time in which a busy machine makes the container.
+    """Give each test of this directory a timeout that includes the making of the container.
 
-    The first test makes it. If that took too long, all tests would fail with the first.
+    The first test makes it. If its time ran out there, all later tests would fail too.
     """
     for item in items:
         ours = item.path.is_relative_to(Path(__file__).parent)
@@ -34,7 +34,10 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.fixture(scope="session")
 def rootfs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """A small Debian: kept where $ACSARD_TEST_ROOTFS says, else made and removed again."""
+    """Provide the root file system of a small Debian.
+
+    It is kept in $ACSARD_TEST_ROOTFS if this variable is set. Otherwise it is temporary.
+    """
     missing = needs()
     if missing:
         unavailable(missing)
@@ -63,7 +66,7 @@ def booted(rootfs: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[C
 
 @pytest.fixture
 def container(booted: Container) -> Iterator[Container]:
-    """That systemd with the unit stopped, its usual configuration and no record of failures."""
+    """Provide the systemd with a stopped unit, its usual configuration and no failed units."""
     booted.reset()
     yield booted
     booted.reset()
@@ -71,7 +74,7 @@ def container(booted: Container) -> Iterator[Container]:
 
 @pytest.fixture
 def board(container: Container) -> Iterator[Board]:
-    """A serial board at the configured port, whose times are reliable."""
+    """Provide a simulated board at the configured serial port, with reliable timestamps."""
     with Board(container) as board:
         yield board
     container.path(PORT).unlink(missing_ok=True)

@@ -1,7 +1,7 @@
 """Make, boot, inspect and end a real systemd in a container.
 
-The container has its own processes, network, mounts and cgroup, so nothing of the host's services
-is touched. Clocks are shared: a monotonic time read on either side means the same.
+The container has its own processes, network, mounts and cgroup, so the tests do not touch the
+host's services. Container and host have the same monotonic clock.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ ACSARD = f"{HOME}/venv/bin/acsard"
 
 
 class UnavailableError(Exception):
-    """This machine cannot do it; the message says why."""
+    """This machine cannot run the container. The message says why."""
 
 
 def unavailable(why: object) -> NoReturn:
@@ -72,7 +72,7 @@ def unavailable(why: object) -> NoReturn:
 
 
 def suite() -> str:
-    """Return the Debian to boot; "" if none has our Python or libraries for it."""
+    """Return the name of the Debian release to boot, or "" if none suits our Python version."""
     if OURS in SUITES:
         return SUITES[OURS]
     try:
@@ -83,7 +83,7 @@ def suite() -> str:
 
 
 def needs() -> str:
-    """Return the tools that are missing to boot a systemd here; "" if none is."""
+    """Return the reason why this machine cannot boot a container, or "" if it can."""
     if os.geteuid() != 0:
         return "not root"
     missing = [tool for tool in ("mmdebstrap", "systemd-nspawn") if shutil.which(tool) is None]
@@ -102,7 +102,7 @@ def _cgroups() -> Path | None:
 
 
 def build(where: Path) -> Path:
-    """Make a root file system at `where`, unless there is one already."""
+    """Make a root file system at `where`, unless this directory has one already."""
     if (where / "usr/lib/systemd/systemd").exists():
         return where
     where.parent.mkdir(parents=True, exist_ok=True)
@@ -127,12 +127,12 @@ class Ran(NamedTuple):
 
 
 class Container:
-    """A booted systemd; leaving ends it and everything in it."""
+    """A booted systemd. The end of the `with` ends it and all its processes."""
 
     def __init__(
         self, rootfs: Path, scratch: Path, name: str = "acsard-test", keeps: Path | None = None
     ) -> None:
-        """`keeps` is a directory that holds the state of the services over a reboot."""
+        """Prepare a container. The directory `keeps` preserves the services' state over reboots."""
         self._rootfs, self._log, self._name = rootfs, scratch / "console", name
         self._keeps = keeps
         root = _cgroups()
@@ -205,16 +205,22 @@ class Container:
         return self.run("systemctl", "is-system-running").out.strip() in ("running", "degraded")
 
     def inside(self, *words: str, only: str = "muinpC") -> list[str]:
-        """Return the words that run a program in there, in all or `only` some of its namespaces."""
+        """Return the words of a host command that runs `words` inside the container.
+
+        `only` has a letter for each namespace of the container that the program enters.
+        """
         return ["nsenter", "-t", str(self.leader), *(f"-{kind}" for kind in only), "--", *words]
 
     def run(self, *words: str) -> Ran:
-        """Run a program in there to its end."""
+        """Run a program in the container to its end, and return its result."""
         done = subprocess.run(self.inside(*words), capture_output=True, text=True, timeout=60)
         return Ran(done.returncode, done.stdout, done.stderr)
 
     def types(self, command: str, where: str = f"{HOME}/src") -> Ran:
-        """Run a line of a page as it stands, in the clone or elsewhere."""
+        """Run a shell command exactly as a page gives it. Fail if it fails.
+
+        Its directory is by default the clone in the container.
+        """
         ran = self.run("sh", "-c", f"cd {where} && {command}")
         assert ran.code == 0, f"{command}\n{ran.out}\n{ran.err}"
         return ran
@@ -224,7 +230,7 @@ class Container:
         return Path(f"/proc/{self.leader}/root{name}")
 
     def write(self, name: str, text: str, mode: int = 0o644) -> None:
-        """Write a file in there."""
+        """Write a file in the container."""
         path = self.path(name)
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text)
@@ -233,7 +239,10 @@ class Container:
     # the program and its unit
 
     def install(self) -> None:
-        """Install the files of an administrator. Our packages come in by a path file."""
+        """Install the files that an administrator installs.
+
+        A `.pth` file makes acsard and its packages importable.
+        """
         version = "python{}.{}".format(*OURS)
         packages = f"{HOME}/venv/lib/{version}/site-packages"
         python = f"{HOME}/venv/bin/python"
@@ -260,7 +269,7 @@ class Container:
         self.run("systemctl", "daemon-reload")
 
     def reset(self) -> None:
-        """Restore the state after the installation."""
+        """Restore the state in which the installation left the container."""
         self.run("systemctl", "stop", PAGE, GATEWAY, UNIT)
         for unit in (UNIT, GATEWAY, PAGE):
             shutil.rmtree(self.path(f"{UNITS}/{unit}.d"), ignore_errors=True)
@@ -270,7 +279,7 @@ class Container:
         self.write(CONFIG, USUAL)
 
     def forget(self) -> None:
-        """Remove the latch files: the next start is a first one."""
+        """Remove the latch files, so that the next start of the daemon is like its first one."""
         for file in self.path(f"{STATES}/acsard").glob("*.latches.*"):
             file.unlink()
 
@@ -293,9 +302,9 @@ class Container:
         return int(procs.read_text().split()[0])
 
     def waited(self) -> float:
-        """Return the total time in which processes in there had work but no processor, s.
+        """Return how long processes in the container have waited for a processor, s.
 
-        systemd is an ordinary process, so other work of this machine delays it.
+        The container's systemd is an ordinary process, so other work of this machine delays it.
         """
         try:
             some = (self._cgroup / "cpu.pressure").read_text().splitlines()[0]
@@ -315,7 +324,7 @@ class Container:
         return self.run("journalctl", "-o", "cat", "-u", unit).out
 
     def is_active_again(self, restarts: int) -> None:
-        """Wait for the daemon's return after its `restarts`-th end."""
+        """Wait until the unit is active and has been restarted more than `restarts` times."""
         until(
             lambda: self.show("ActiveState") == "active" and int(self.show("NRestarts")) > restarts,
             10.0,
@@ -364,10 +373,11 @@ while True:
 
 
 class Board(Program):
-    """A serial board in the container, in a process ahead of all others.
+    """A simulated serial board in the container, in a process with precedence over all others.
 
-    Its times are therefore reliable. Unless it lies, it answers each command with the speeds
-    requested two lines before. The speed of wheel a is 0.01 to 0.09 off.
+    Its timestamps are therefore reliable. It answers each command with the speeds requested two
+    lines before; only wheel a is 0.01 to 0.09 off. It reports wrong speeds while the file `LIES`
+    exists.
     """
 
     def __init__(self, container: Container) -> None:
@@ -381,14 +391,14 @@ class Board(Program):
         return self
 
     def since(self, at: float) -> list[Heard]:
-        """Return the lines after then, without their ends; "-" for an empty one."""
+        """Return the lines after this time without their line ends, and "-" for an empty line."""
         for text in self.out[1 + len(self._heard) :]:
             came, _, line = text.partition(" ")
             self._heard.append(Heard(float(came), line.encode()))
         return [heard for heard in self._heard if heard.at > at]
 
     def awaits(self, line: bytes, after: float = 0.0, within: float = 5.0) -> Heard:
-        """Return the first line after then that starts with this prefix."""
+        """Wait for the first line after this time that starts with this prefix, and return it."""
         return until(
             lambda: next((h for h in self.since(after) if h.line.startswith(line)), None),
             within,
@@ -436,7 +446,7 @@ while True:
 
 
 class Driver(Program):
-    """A plain client of the bus in the container's network, sending a speed at 20 Hz."""
+    """A client of the bus in the container's network, which sends a speed at 20 Hz."""
 
     def __init__(self, container: Container) -> None:
         words = container.inside(sys.executable, "-c", _DRIVER, only="n")
@@ -449,18 +459,18 @@ class Driver(Program):
         self.process.stdin.flush()
 
     def patrols(self, speed: float = 0.3) -> None:
-        """Send zeros for 0.3 s every 2 s and this speed in between, as a sender of its own."""
+        """Send zeros for 0.3 s every 2 s, and this speed in between, under a separate sender id."""
         assert self.process.stdin is not None
         self.process.stdin.write(f"{speed} patrols\n".encode())
         self.process.stdin.flush()
 
     def states(self, after: float) -> list[tuple[float, str]]:
-        """Return the time and the mode of each state after then."""
+        """Return the time and the mode of each state after this time."""
         told = [line.split(" ", 1) for line in list(self.out)]
         return [(float(at), mode) for at, mode in told if float(at) > after]
 
     def drives(self, board: Board, speed: float = 0.5) -> None:
-        """Send zeros until they are obeyed, then the speed until the wheels have it."""
+        """Send zeros until the daemon obeys them, then the speed until the wheels reach it."""
         self.sends(0.0)
         began = time.monotonic()
         obeyed = until(

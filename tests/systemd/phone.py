@@ -1,4 +1,4 @@
-"""A phone on a cable to the container: another host, with an address of its own."""
+"""A phone, simulated by a network namespace with its own address and a cable to the container."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ CONNECT_S = 1.0
 
 
 class Phone:
-    """A network namespace. Leaving it removes it and the cable."""
+    """A network namespace. The end of the `with` removes it and its cable."""
 
     def __init__(self, container: Container) -> None:
         self._container = container
@@ -53,16 +53,16 @@ class Phone:
         ip("netns", "delete", self.name, check=False)
 
     def reaches(self, port: int, at: str = ROBOT_AT) -> bool:
-        """Return whether a program on the phone can connect there."""
+        """Return whether a program on the phone can connect to this port and address."""
         with inside(self.name), suppress(OSError):
             socket.create_connection((at, port), CONNECT_S).close()
             return True
         return False
 
     def shown(self, port: int) -> str:
-        """Return the presented certificate, or "" without an answer.
+        """Return the certificate that the robot presents at this port, or "" if nothing answers.
 
-        Verifies it by its authority or not at all.
+        The connection fails unless our authority has signed the certificate.
         """
         with inside(self.name), suppress(OSError):
             return ssl.get_server_certificate(
@@ -71,9 +71,10 @@ class Phone:
         return ""
 
     def browser(self, token: str = "") -> aiohttp.ClientSession:
-        """Open a session that knows the authority and keeps cookies, or a program's with a token.
+        """Open an HTTP session that trusts the authority.
 
-        It is made and used `inside`.
+        It keeps cookies like a browser, or sends a token like a program. Open and use it `inside`
+        the phone's namespace.
         """
         trusted = ssl.create_default_context(cafile=str(self.authority))
         told = {"Authorization": f"Bearer {token}"} if token else {}

@@ -1,4 +1,4 @@
-"""The commands that the fleet page has root type for a router work in a real systemd."""
+"""The fleet page's root commands for a router work in a real systemd."""
 
 from __future__ import annotations
 

@@ -1,6 +1,7 @@
-"""The unit ends in every way that systemd knows, and a latched robot stands until it is released.
+"""A latched robot stands until its release, in whichever way systemd ends and restarts the unit.
 
-A commander sends zeros for 0.3 s every 2 s and a speed in between: only the latch holds the robot.
+A commander sends zeros for 0.3 s every 2 s and a speed in between. It therefore arms itself, and
+only the latch prevents the robot from driving.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ FILE = f"{STATES}/acsard/acsar.latches.json"
 
 
 def moves(board: Board, since: float) -> list[Heard]:
-    """Return the lines since then that turn a wheel."""
+    """Return the lines after this time that turn a wheel."""
     return [heard for heard in board.since(since) if heard.line not in (ZERO, b"-")]
 
 
@@ -63,7 +64,7 @@ def call(container: Container, verb: str) -> None:
 
 
 def latch(container: Container, board: Board, driver: Driver, kind: Kind) -> float:
-    """Latch the robot while it drives; return the time of the first zero line, where it stands."""
+    """Latch the robot while it drives. Return the time of the first zero line, when it stands."""
     if kind == "fault":
         container.write(LIES, "")
         has_mode(driver, "fault")
@@ -76,7 +77,7 @@ def latch(container: Container, board: Board, driver: Driver, kind: Kind) -> flo
 
 
 def stands(container: Container, board: Board, driver: Driver, kind: Kind, since: float) -> None:
-    """Check that the robot stands although the commander had every chance to drive it."""
+    """Check that the robot stands although the commander has tried to drive it."""
     has_mode(driver, MODES[kind])
     up = time.monotonic()
     until(lambda: time.monotonic() > up + 1.5 * CYCLE_S, 1.5 * CYCLE_S, "the time is over")

@@ -1,4 +1,4 @@
-"""systemd's own assessment of the unit, and the drop-ins as far as they can be tried."""
+"""systemd's own assessment of the unit, and tests of the drop-ins that a container can test."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def test_the_unit_of_a_fleet_s_router_runs_the_router(container: Container) -> N
 
 
 def opened(container: Container) -> None:
-    """The service with a TLS gateway."""
+    """Run the service and its TLS gateway, with the drop-in for the local network."""
     made = container.run(ACSARD, "tls", "init", "--force", "--address", "127.0.0.1")
     assert made.code == 0, made.err
     listen = ["tcp/127.0.0.1:7448", "tls/0.0.0.0:7449"]
@@ -223,7 +223,7 @@ def test_without_its_key_the_gateway_or_page_stays_down_and_doctor_names_the_key
 
 
 def reaches(container: Container, address: str) -> bool:
-    """Return whether a client with that address can connect to the daemon at it."""
+    """Return whether a client at this address can connect to the daemon at the same address."""
     code = (
         "import socket, sys; "
         "socket.create_connection((sys.argv[1], 7448), 1.0, (sys.argv[1], 0)).close()"

@@ -1,4 +1,4 @@
-"""`acsard service` in a real systemd installs a service that runs, and removes all of it."""
+"""`acsard service` installs a running service in a real systemd, and removes it without a trace."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ RECORDINGS = ROOT / "tests" / "recordings"
 
 @pytest.fixture(scope="module")
 def alone(rootfs: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Container]:
-    """A separate systemd: the other tests must not depend on files that are installed here."""
+    """Provide a separate systemd, so that no other test depends on files installed here."""
     try:
         with Container(rootfs, tmp_path_factory.mktemp("alone"), "acsard-service") as container:
             container.install()
@@ -36,7 +36,7 @@ def alone(rootfs: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Co
 
 @pytest.fixture
 def bare(alone: Container) -> Iterator[Container]:
-    """The program alone, as after pip."""
+    """Provide a systemd with the program but without the service, as `pip install` leaves it."""
     clean = "rm -rf /etc/systemd/system/acsard* /opt/acsard/bin /etc/acsard"
     alone.run("systemctl", "stop", PAGE, GATEWAY, UNIT)
     alone.run("sh", "-c", clean)
@@ -46,7 +46,7 @@ def bare(alone: Container) -> Iterator[Container]:
 
 
 def listing(container: Container) -> set[str]:
-    """Return every file of ours and of the administrator, with its size."""
+    """Return every file of acsard and of the administrator in the container, with its size."""
     found = set()
     for place in PLACES:
         for path in container.path(place).rglob("*"):
@@ -97,9 +97,10 @@ def test_the_service_runs_after_install_and_leaves_no_file_after_uninstall(bare:
 
 
 def asks(container: Container, path: str, *more: str) -> str:
-    """Return the page's answer to a client in there.
+    """Return the page's answer to a client in the container.
 
-    It uses Python for lack of curl; `more` makes a POST.
+    The client is a Python program, because the container has no curl. It sends a POST if `more` is
+    given.
     """
     return container.run("python3", "-c", ASK, f"http://127.0.0.1:8080{path}", *more).out
 
@@ -149,7 +150,10 @@ FORMER = "000001-20260101T000000Z.kept.mcap"
 
 
 def recorded_before(container: Container) -> bytes:
-    """A recording of an earlier version, which kept all files for its own user of that time."""
+    """Store a recording as an earlier version of the service left it, and return its bytes.
+
+    That version's files belong to a user id that systemd assigned for one run.
+    """
     (recording, *_) = sorted(RECORDINGS.glob("*.mcap"), key=lambda path: path.stat().st_size)
     container.run("sh", "-c", f"rm -rf {STATE} && install -d -m 700 {STATE.rpartition('/')[0]}")
     place = container.path(f"{STATE}/record")
@@ -201,7 +205,7 @@ print(json.dumps({
 
 
 def drawn(container: Container) -> dict[str, object]:
-    """Request a report of that recording and return the result."""
+    """Request a report of the recording of the earlier version, and return the result."""
 
     def ended() -> dict[str, object]:
         told = json.loads(asks(container, f"/api/recordings/{FORMER}/report", "POST") or "{}")

@@ -1,4 +1,4 @@
-"""The stop script alone sends zeros on the configured port at once, and never hangs."""
+"""The stop script sends zeros on the configured port without the daemon, and never hangs."""
 
 from __future__ import annotations
 
@@ -55,7 +55,10 @@ class Wire:
         return int(struct.unpack("i", waiting)[0])
 
     def fill(self) -> None:
-        """Write until it accepts nothing more. It is full only when the reading end is, too."""
+        """Write until the pty accepts nothing more.
+
+        It is full only when its master end is full as well.
+        """
         os.set_blocking(self.slave, False)
         while self.unread() < UNREAD_AT_MOST or select.select([], [self.slave], [], 0)[1]:
             with contextlib.suppress(BlockingIOError):
@@ -82,7 +85,7 @@ def wire() -> Iterator[Wire]:
 
 
 def stop(config: Path | str, **env: str) -> Ended:
-    """Run it as systemd would."""
+    """Run the stop script as systemd runs it."""
     words = [str(SCRIPT), *([str(config)] if config else [])]
     began = time.monotonic()
     done = subprocess.run(words, capture_output=True, text=True, timeout=5, env=os.environ | env)
@@ -214,7 +217,7 @@ def test_a_device_that_is_not_a_port_is_reported(tmp_path: Path) -> None:
 
 
 def processor_s() -> float:
-    """Return the processor time of ended children so far, s."""
+    """Return the processor time that all ended child processes have used, s."""
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     return used.ru_utime + used.ru_stime
 

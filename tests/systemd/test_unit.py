@@ -1,4 +1,4 @@
-"""The unit in a real systemd becomes ready, drives, and puts zeros on the wire after every end."""
+"""The unit in a real systemd becomes ready, drives, and sends the board zeros after every end."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def report(what: str, seconds: list[float]) -> None:
 
 
 class Fault(NamedTuple):
-    """The times after one fault, in seconds."""
+    """The delays after one fault of the daemon, s."""
 
     zero: float
     """Until the first zero line on the wire."""
@@ -83,15 +83,15 @@ def faults(
 
 
 def undisturbed(took: list[Fault]) -> list[float]:
-    """Return the times to a zero without the time in which the processor had other work.
+    """Return the delays until the first zero line, less the time that other work took, s.
 
-    Times that other work of this machine determined are left out.
+    Faults that other work of this machine disturbed for too long are left out.
     """
     return [one.zero - one.waited for one in took if one.waited <= DISTURBED_S]
 
 
 def within(took: list[Fault], bound: float) -> bool:
-    """Check the bound: always when the machine is calm, and mostly when it is not."""
+    """Return whether the median delay to a zero and each undisturbed delay are within the bound."""
     mostly = statistics.median_low(one.zero for one in took) <= bound
     return mostly and max(undisturbed(took), default=0.0) <= bound
 

@@ -1,4 +1,4 @@
-"""The page as an installed service, opened to phones by the commands on its own page."""
+"""The page as an installed service, opened to phones by the commands on the manual's web page."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ SERVED_S = 20.0
 
 
 def of_the_page(language: str, words: str) -> Block:
-    """Return the only block of the page with these words."""
+    """Return the only code block of the manual's page that contains these words."""
     (found,) = (
         block
         for block in blocks(language)
@@ -62,7 +62,7 @@ print(urlopen(sys.argv[1]).read().decode())
 
 
 def clean(container: Container) -> None:
-    """Remove certificates and tokens, as after the installation."""
+    """Remove certificates and tokens, so that the container is as it was after the installation."""
     container.reset()
     container.run("systemctl", "clean", "--what=state", PAGE)
     container.run("rm", "-rf", "/etc/acsard/tls")
@@ -70,7 +70,7 @@ def clean(container: Container) -> None:
 
 @pytest.fixture(scope="module")
 def robot(booted: Container) -> Iterator[Container]:
-    """Run the service on the simulator, with its page for this computer alone."""
+    """Run the service on the simulator. Only programs in the container can reach its page."""
     clean(booted)
     booted.write(CONFIG, 'mcu.port = "sim"\n')
     for unit in (UNIT, PAGE):
@@ -82,7 +82,7 @@ def robot(booted: Container) -> Iterator[Container]:
 
 @pytest.fixture(scope="module")
 def phone(robot: Container) -> Iterator[Phone]:
-    """Provide a phone next to the robot, whose page has been opened for it."""
+    """Provide a phone, after the robot's page was opened to the network."""
     try:
         with Phone(robot) as phone:
             robot.write(CONFIG, SETTINGS)
@@ -95,18 +95,18 @@ def phone(robot: Container) -> Iterator[Phone]:
 
 
 def is_served(robot: Container, phone: Phone) -> None:
-    """Check that the page answers the phone, and that the daemon behind it does."""
+    """Check that both the page and the daemon behind it answer the phone."""
     until(lambda: phone.shown(8443), SERVED_S, "the page is served")
     until(lambda: '"mode"' in here(robot, "/api/state"), SERVED_S, "it hears the robot")
 
 
 def here(robot: Container, path: str) -> str:
-    """Return the page's answer on the robot's own machine; "" if there is none."""
+    """Return the page's answer to a client on the robot itself, or "" if there is none."""
     return robot.run("python3", "-c", ASK, f"http://127.0.0.1:8080{path}").out
 
 
 def invited(robot: Container, *more: str) -> str:
-    """Return the token of an invitation, made as the page says."""
+    """Invite a client with the page's command, and return its token."""
     told = robot.types(" ".join([OPENING[-1], *more])).out
     found = LINK.search(told)
     assert found, told
@@ -114,13 +114,13 @@ def invited(robot: Container, *more: str) -> str:
 
 
 def on(phone: Phone, story: Callable[[], Awaitable[None]]) -> None:
-    """Run the scenario on the phone."""
+    """Run this coroutine function in the phone's network namespace."""
     with inside(phone.name):
         run(story)
 
 
 async def let_in(browser: aiohttp.ClientSession, token: str) -> str:
-    """Post a token as the page does; return the cookie that it becomes."""
+    """Post a token as the page does, and return the cookie that the server sets."""
     posted = browser.post(f"{AWAY}/token", data={"token": token}, headers={"Origin": AWAY})
     async with posted as answer:
         assert answer.status == 200, await answer.text()

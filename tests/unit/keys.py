@@ -1,4 +1,4 @@
-"""Every key of the configuration, found by walking the structs, so that no test can miss one."""
+"""Every key of the configuration, found by walking the structs, so that tests miss no key."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Bounded = inspect.FloatType | inspect.IntType
 
 
 class Key(msgspec.Struct, frozen=True):
-    """One key: its written path, its struct and its field there."""
+    """One key of the configuration: its path in TOML, its struct, and its field in that struct."""
 
     path: str
     table: type[msgspec.Struct]
@@ -34,7 +34,7 @@ class Key(msgspec.Struct, frozen=True):
 
 
 def all_keys(table: type[msgspec.Struct] = Config, path: str = "") -> Iterator[Key]:
-    """Yield every key that holds a value, with those of sources as `commands.sources[0].…`."""
+    """Yield every key that has a value. The keys of sources are `commands.sources[0].…`."""
     for field in fields(table):
         where = f"{path}.{field.name}" if path else field.name
         if isinstance(field.type, type) and issubclass(field.type, msgspec.Struct):

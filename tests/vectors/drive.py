@@ -1,6 +1,6 @@
-"""Kinematics and odometry worked by hand; the arithmetic is beside each number.
+"""Kinematics and odometry worked by hand. A comment beside each number shows the arithmetic.
 
-Default robot: wheel radius r = 0.05 m, track L = 0.30 m. All units SI.
+Default robot: wheel radius r = 0.05 m, track L = 0.30 m. All units are SI.
 """
 
 from __future__ import annotations

@@ -1,4 +1,8 @@
-"""Lines of the MCU protocol: how each is read or why it is refused, and which are written."""
+"""Lines of the MCU protocol.
+
+The tables have lines that acsard reads, lines that it refuses with the reason, and lines that it
+writes.
+"""
 
 from __future__ import annotations
 

@@ -1,9 +1,9 @@
-"""The ROS 2 message and service definitions (Jazzy) behind the types we speak, as facts: those that
-`acsard/core/ros/channels.py` does not have.
+"""ROS 2 (Jazzy) message and service definitions that acsard uses and does not define itself.
 
-One line a type: its name, a colon, its fields as `type name` with commas between. A type without
-a package is a base type; `[]` is a sequence, `[<=n]` a bounded one, `[n]` an array. A service has
-`|` between request and response.
+`acsard/core/ros/channels.py` has the other ones. Each type has one line: its name, a colon, and its
+fields as `type name` with commas between them. A type without a package is a base type. `[]` is a
+sequence, `[<=n]` is a bounded sequence, and `[n]` is an array. A service has `|` between request
+and response.
 """
 
 from __future__ import annotations

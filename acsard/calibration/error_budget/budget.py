@@ -1,14 +1,14 @@
 """Computes the error budget of a drive: the odometry error that each single cause makes.
 
-The errors of one cause are propagated alone through the error model of the odometry
-(`core/motion/uncertainty.py`). For the position error, the computation repeats the measured drive
-until the robot has driven 100 m. For the heading error, it makes all turns left turns, and repeats
-the drive until the robot has turned by 360 deg.
+For each cause, the error model of the odometry (`core/motion/uncertainty.py`) computes the error of
+the pose as if there were no other cause. For the position error, the computation repeats the
+measured drive until the robot has driven 100 m. For the heading error, it mirrors all right turns
+to left turns, and repeats the drive until the robot has turned by 360 deg.
 
-The errors of stamps, quantization, gaps and contradicting wheels are measured with feedback lines.
-The error of the track is measured with a gyro. The noise of the gyro is computed from the variance
-of the heading that the odometry publishes. All other errors are taken from the settings in
-`[odometry]`.
+Four causes are measured with feedback lines: wrong time stamps, quantization, gaps, and wheels that
+contradict each other. The error of the track is measured with a gyro. The noise of the gyro is
+computed from the variance of the heading that the odometry publishes. All other errors are taken
+from the settings in `[odometry]`.
 """
 
 from __future__ import annotations
@@ -144,10 +144,10 @@ class Budget(Struct, frozen=True):
     """True if the encoders are coarse and the daemon does not know their counts per wheel turn."""
 
     def largest(self, *bases: Basis) -> Share | None:
-        """Return the share with the largest position error, or None if all errors are 0.
+        """Return the share with the largest error. Compare only shares whose `basis` is in `bases`.
 
-        Only the shares whose `basis` is in `bases` are compared. If all position errors are 0, the
-        heading errors are compared instead.
+        The position errors are compared. If all of them are 0 or unknown, the heading errors are
+        compared instead. If these are also 0 or unknown, the result is None.
         """
         known = [share for share in self.shares if share.basis in bases]
         for size in (_millimetres, _degrees):
@@ -157,11 +157,11 @@ class Budget(Struct, frozen=True):
         return None
 
     def total(self) -> tuple[float | None, float | None]:
-        """Return a pair of total errors: of the position after 100 m, mm, and of the heading, deg.
+        """Return the total position error, mm, and the total heading error, deg.
 
-        The heading error is that after one full turn. The causes are independent, so a total is
-        the square root of the sum of the squared errors. A total is None if this error is unknown
-        for all causes.
+        The position error applies to 100 m of driving, and the heading error to one full turn of
+        the robot. The causes are independent, so a total is the square root of the sum of the
+        squared errors. A total is None if the error is unknown for all causes.
         """
         return _squares([share.mm_per_100_m for share in self.shares]), _squares(
             [share.deg_per_turn for share in self.shares]
@@ -297,11 +297,16 @@ class _Model:
     ) -> Share:  # fmt: skip
         """Return the errors that one cause makes. They are None if `basis` is "unknown".
 
-        The position error comes from repeating the steps `ahead`. The heading error comes from
-        repeating the steps `left`, in which all turns are to the left. `only` contains the settings
-        of `[odometry]`, in which the errors of all other causes are 0. `counts` (encoder counts per
-        wheel turn) and `scale` (relative standard deviation of the gyro's scale) are 0 if they are
-        not the cause.
+        Args:
+            cause: the cause of the errors.
+            basis: the basis on which the size of the errors is known.
+            ahead: the steps that are repeated for the position error.
+            left: the steps that are repeated for the heading error. All turns are to the left.
+            only: the settings of `[odometry]`, with zeros for the errors of all other causes.
+            counts: encoder counts per wheel turn if the cause is quantization, otherwise 0. They
+                are also 0 if they are unknown.
+            scale: relative standard deviation of the gyro's scale if the cause is the gyro,
+                otherwise 0.
         """
         if basis == "unknown":
             return Share(cause, None, None, basis)

@@ -70,7 +70,10 @@ def budgets(robot: Client, config: Config, seconds: float) -> Iterator[Budget]:
 
 
 def _await_line(robot: Client, lines: Subscription) -> None:
-    """Wait for the first feedback line. From then on, messages on all of `KEYS` arrive."""
+    """Wait for the first feedback line, after which messages on all of `KEYS` arrive.
+
+    Raises `ReplyError` if no line arrives within `FIRST_STATE_TIMEOUT_S`.
+    """
     end = time.monotonic() + FIRST_STATE_TIMEOUT_S
     while lines.try_recv() is None:
         if time.monotonic() > end:
@@ -185,7 +188,10 @@ def _value(diagnostics: DiagnosticArray, key: str) -> str:
 
 
 def _learned(diagnostics: DiagnosticArray) -> tuple[float | None, float, bool]:
-    """Return `learned`, `deviation` and `used` of `Received`."""
+    """Read from `diagnostics` which effective track the daemon has learned with the gyro.
+
+    The results are the fields `learned`, `deviation` and `used` of `Received`.
+    """
     names = ("learned_multiplier", "wheel_separation_multiplier", "learned_multiplier_std")
     learned, configured, std = (_value(diagnostics, name) for name in names)
     used = _value(diagnostics, "multiplier_in_use") == learned != configured

@@ -1,8 +1,8 @@
 """Measures the motion of a drive, and the errors of each step of this motion, from feedback lines.
 
 Some errors of a step are independent of the errors of other steps. They are given as variances.
-Other errors have the same sign in each step and add up. They are given as motion that the pose
-missed.
+Other errors have the same sign in each step and add up. They are given as missed motion, which is
+a distance and a turn by which the pose is wrong.
 """
 
 from __future__ import annotations
@@ -105,8 +105,8 @@ def _even(t: Floats) -> LineTimes:
 def _asked(t: Floats, sent: Floats) -> LineTimes | None:
     """Estimate how late the replies arrived, for a board that answers each line of the daemon.
 
-    Return None if `sent`, the times of the daemon's lines, does not reach from the first reply to
-    the last.
+    `sent` contains the times of the daemon's lines. Return None if it does not contain the line
+    that belongs to each reply.
     """
     if len(sent) < 3 or sent[0] > t[0] or len(sent) < len(t) / 2:
         return None
@@ -124,7 +124,7 @@ def _asked(t: Floats, sent: Floats) -> LineTimes | None:
 def _missing(at: Floats) -> Counts:
     """Return the number of lines that were lost just before each feedback line.
 
-    `at` contains the time of each line, in periods of the lines, from any origin.
+    `at` contains the time of each line, as a number of line periods since any moment.
     """
     count = len(at)
     ahead = at - np.arange(count)
@@ -184,7 +184,7 @@ class Line(Struct, frozen=True):
 class Motion(Struct, frozen=True):
     """The motion from each feedback line to the next line, and its errors.
 
-    The arrays have one row less than there are lines.
+    Each array has one row for each interval between two successive lines.
     """
 
     seconds: float
@@ -224,8 +224,8 @@ def motion(lines: list[Line], sent: Floats, kinematics: Kinematics, whole: bool)
         sent: the time at which the daemon sent each of its lines to the board, s.
         kinematics: the geometry of the robot.
         whole: whether this program received every feedback line that the daemon received. If it is
-            false, a line that is missing here may have reached the daemon. It is then counted as an
-            error only if the odometry of the daemon has a gap too.
+            false, a line that is missing here may have reached the daemon. Such a line counts as
+            lost only if the odometry of the daemon has a gap too.
     """
     t = np.array([line.at for line in lines])
     found = line_times(t, sent)
@@ -291,11 +291,18 @@ def _late(t: Floats, twists: list[Twist], found: LineTimes) -> Floats:
 def _gaps(
     t: Floats, twists: list[Twist], rolled: list[Twist], found: LineTimes, whole: bool
 ) -> tuple[Floats, Floats, int, float]:
-    """Return the four values `filled`, `unfilled`, `missing` and `unseen` of `Motion`.
+    """Compute the errors that lost feedback lines cause.
 
-    `twists` comes from the wheel speeds, and `rolled` from the wheel positions. If `whole` is
-    false, this program itself may have lost lines. Lost lines then count only in gaps that the
-    odometry did not fill.
+    The results are the fields `filled`, `unfilled`, `missing` and `unseen` of `Motion`.
+
+    Args:
+        t: the stamp of each line, s.
+        twists: the twist of the robot at each line, computed from the wheel speeds.
+        rolled: the motion of the robot from each line to the next, computed from the wheel
+            positions.
+        found: the delays of the lines, and the number of lost lines.
+        whole: whether this program received every line that the daemon received. If it is false,
+            a lost line counts only in a gap that the odometry of the daemon did not fill.
     """
     filled, unfilled = np.zeros((len(rolled), 2)), np.zeros((len(rolled), 4))
     lost, unseen = 0, 0.0
@@ -389,7 +396,10 @@ def rounding(speeds: Floats, period: float) -> Rounding:
 
 
 def _runs(values: Floats) -> Floats:
-    """Return the variance of each line's rounding error, divided by (quantization step)^2 / 12."""
+    """Return the variance of each line's rounding error, relative to (quantization step)^2 / 12.
+
+    The result differs from 1 because successive equal speeds have the same error, which adds up.
+    """
     # Of n equal speeds in a row, the last one has the variance n^2, and the others have 0. If the
     # wheel passed through this speed while it became faster or slower, the last one has the
     # variance 1.
@@ -461,7 +471,7 @@ class Driving:
 
     @property
     def tells_gyro(self) -> bool:
-        """Whether the feedback lines show how large the noise of the gyro is."""
+        """True if the variance of the published heading shows how large the gyro's noise is."""
         return self._motion.yaw_variance is not None
 
     def turned_by_gyro(self) -> Steps:
@@ -477,11 +487,11 @@ class Driving:
         return self._steps(squares)
 
     def missed(self) -> Steps:
-        """Return all steps of the drive. Their errors are those that gaps in the feedback cause."""
+        """Return the steps with the errors that gaps in the feedback cause."""
         return self._steps(self._motion.filled, self._motion.unfilled)
 
     def rounded(self) -> Steps:
-        """Return all steps of the drive. Their errors come from the rounding of reported speeds."""
+        """Return the steps with the errors that the rounding of reported speeds causes."""
         found = self._rounding
         if found.count:
             return self._steps(missed=self._of_wheels(found.offset[1:]))
@@ -493,10 +503,10 @@ class Driving:
         return self._steps(np.column_stack(variances))
 
     def contradicted(self) -> Steps:
-        """Return the steps with the errors that differences of front and rear wheels show.
+        """Return the steps with the errors of wheels that contradict each other.
 
-        On each side of the robot, one of the two wheels is assumed to have no error. The mean of
-        both wheels is then wrong by half of the difference between them.
+        On each side of the robot, the computation assumes that either the front or the rear wheel
+        has no error. The mean of both wheels is then wrong by half of their difference.
         """
         turned = np.diff([line.positions for line in self._lines], axis=0)
         front_right, front_left, rear_left, rear_right = turned.T
@@ -504,9 +514,9 @@ class Driving:
         return self._steps(missed=self._of_wheels(np.column_stack([right, left, left, right])))
 
     def _of_wheels(self, off: Floats) -> Floats:
-        """Return the motion that the pose missed: rows of (m, rad, 0, 0).
+        """Convert errors of the wheels' angles to errors of the motion: rows of (m, rad, 0, 0).
 
-        `off` contains the errors of the angles that the wheels rolled, rad.
+        `off` contains the errors of the angles by which the wheels rolled, rad.
         """
         moved = off @ self._weights.T
         return np.hstack([moved, np.zeros_like(moved)])

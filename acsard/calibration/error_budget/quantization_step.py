@@ -40,8 +40,9 @@ Only speeds from coarse encoders have steps of this size.
 def quantization_step(speeds: Floats) -> float:
     """Return the quantization step of wheel speeds, rad/s, or 0 if no step fits.
 
-    `speeds` contains at least three different speeds above 0, rad/s, in rising order. The result
-    is the largest step of which nearly all speeds are multiples, unless it may fit only by chance.
+    `speeds` contains at least three different speeds above 0, rad/s, in rising order. A step fits
+    if nearly all speeds are multiples of it, and if this is hardly possible by chance. If several
+    steps fit, the result is the largest of them.
     """
     spare = max(1, int(MAX_OUTLIER_FRACTION * len(speeds)))
     # The anchor is one of the largest speeds. It is j times the step for a whole number j, so the
@@ -67,10 +68,10 @@ def _non_multiples(speeds: Floats, step: float, relative_error: float) -> int:
 
 
 def _fitted(speeds: Floats, rough: float, spare: int, tries: int) -> float:
-    """Return the quantization step near `rough`, rad/s, by least squares; 0 if none fits.
+    """Refine the quantization step `rough`, rad/s, by least squares. Return 0 if no step fits.
 
-    `spare` speeds need not be multiples of the step. `tries` is the number of candidates tried so
-    far, each of which could fit by chance.
+    The step fits if at most `spare` speeds are not multiples of it. `tries` is the number of
+    candidates that were tried so far. Each further candidate makes a fit by chance more likely.
     """
     whole = np.round(speeds / rough)
     near = np.abs(speeds - whole * rough) <= 2 * ROUNDING

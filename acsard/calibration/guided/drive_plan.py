@@ -101,9 +101,9 @@ class Mean(Struct, frozen=True):
 
 
 class Slant(Struct, frozen=True):
-    """A measurement of the robot's turn, computed from the distances of two points to a line.
+    """A measurement of the robot's turn, computed from its distances to a line on the floor.
 
-    The two points are on the robot. The line may be a wall.
+    The person measures the distances of two points of the robot. The line may also be a wall.
     """
 
     quantity: Quantity
@@ -239,10 +239,10 @@ class Setup(Struct, frozen=True):
         return Move(abs(metres) / self.speed, math.copysign(self.speed, metres))
 
     def spin(self, rate: float, seconds: float) -> Move:
-        """Return a turn in place for `seconds` s, positive to the left.
+        """Return a turn in place that lasts `seconds` s.
 
-        `rate` is the turn rate, rad/s, of a robot that does not skid. A robot that skids turns
-        more slowly.
+        `rate` is the turn rate of a robot that does not skid, rad/s, positive to the left. A robot
+        that skids turns more slowly.
         """
         return Move(seconds, 0.0, self.command(rate))
 

@@ -152,7 +152,7 @@ class LegDriver:
             self._tolerate_briefly(why or deviation, now, disturbed=disturbed)
 
     def wheels(self, fastest: float, now: float) -> None:
-        """Process wheel speeds from the daemon.
+        """Process wheel speeds from the daemon, to detect the standstill at the end of the leg.
 
         `fastest` is the absolute speed of the fastest wheel, rad/s.
         """
@@ -222,9 +222,11 @@ class LegDriver:
             )
 
     def _tolerate_briefly(self, why: str, now: float, *, disturbed: bool) -> None:
-        """Halt the leg after `DEVIATION_TIMEOUT_S` of deviation. `why` is "" without a deviation.
+        """Halt the leg if the robot does not follow its commands for `DEVIATION_TIMEOUT_S`.
 
-        `disturbed` is true if the leg can be repeated.
+        Call this method for each `state` while the robot moves. `why` says why the robot does not
+        follow its commands. It is "" if the robot follows them. `disturbed` is true if the leg can
+        be repeated.
         """
         # A short deviation is harmless. If this computer is busy for a moment, it sends commands
         # late, and the robot only slows down.

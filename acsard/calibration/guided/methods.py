@@ -83,7 +83,7 @@ def once_round(setup: Setup, until: str, asks: tuple[Ask, ...] = (), *measures: 
 
     Args:
         setup: the robot, and the speeds of its drive.
-        until: the end of the instruction "Press SPACE ...".
+        until: the words after "Press SPACE" in the instruction, such as "when it has turned ...".
         asks: the questions after the turn.
         measures: the measurements that follow from the answers.
     """
@@ -424,7 +424,10 @@ def _positions(setup: Setup, track: float) -> tuple[Leg, ...]:
 
 
 def _there_and_back(setup: Setup, rate: float) -> tuple[Move, ...]:
-    """Return a curve there and back that stays on the floor at any heading of the robot."""
+    """Return the moves of a curve forwards, and back on the same path.
+
+    The curve is short enough that the robot stays on the floor, whatever its heading is.
+    """
     metres = min(CURVE_M, FLOOR_M / 2 - setup.from_edge)
     return setup.arc(rate, metres), SHORT, setup.arc(-rate, -metres), SHORT
 

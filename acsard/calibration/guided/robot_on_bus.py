@@ -84,8 +84,8 @@ class Sensor:
     def await_first(self, what: str) -> None:
         """Wait until a message arrives on the key, and discard it.
 
-        Raises `GuideError` if no message arrives within `FIRST_STATE_TIMEOUT_S`. Its text calls the
-        message `what`.
+        Raises `GuideError` if no message arrives within `FIRST_STATE_TIMEOUT_S`. `what` is the name
+        of the message in the text of this error.
         """
         end = clock.steady_s() + FIRST_STATE_TIMEOUT_S
         while not self.receive(lambda message, now: None, 0.0):
@@ -230,8 +230,8 @@ class RobotOnBus:
         """Drive a leg and return its recording.
 
         Raises:
-            DisturbedError: the leg was halted, or the wheel samples have a gap of
-                `NEW_RUN_AFTER_S`. The leg can be repeated.
+            DisturbedError: the leg was halted for a temporary reason, or the wheel samples have a
+                gap of `NEW_RUN_AFTER_S`. The leg can be repeated.
             GuideError: the leg was halted for another reason.
             LogError: there are too few wheel samples, or two wheels of a side contradict each
                 other.

@@ -1,9 +1,10 @@
 """Computes a `Calibration` from tape readings: wheel radii, effective track and improvement.
 
 A reading is one measurement of the robot's motion since its pose was last known: a distance, a
-turn, or a displacement. A Gauss-Newton fit compares all readings with the path of the wheels. A
-reading differs from this path because of the errors of tape and eye, and because the robot skids.
-If there are enough readings, their scatter shows how much the robot skidded.
+turn, or a displacement. A Gauss-Newton fit compares all readings with the path that is computed
+from the wheel speeds. A reading differs from this path because the person measures inaccurately,
+and because the robot skids. If there are enough readings, their scatter shows how much the robot
+skidded.
 """
 
 from __future__ import annotations
@@ -115,7 +116,7 @@ class Reading(Struct, frozen=True, dict=True):
 
 
 class Predicted(Struct, frozen=True):
-    """A prediction of a reading, computed from the rolling of the wheels."""
+    """A prediction of a reading, computed from the angles by which the wheels rolled."""
 
     value: float
     derivatives: Floats
@@ -139,7 +140,7 @@ class TapeFit(Struct, frozen=True):
 
 
 def joined(rides: Sequence[Run]) -> WheelSteps:
-    """Return the rolling of the wheels in several recorded legs as if they were one leg."""
+    """Join several recorded legs to one, and return the angles by which the wheels rolled in it."""
     parts = [wheel_steps(ride) for ride in rides]
     ends = np.cumsum([0.0] + [float(part.t[-1]) for part in parts])
     later = [part.t[1:] + end for part, end in zip(parts, ends, strict=False)]
@@ -151,10 +152,10 @@ def joined(rides: Sequence[Run]) -> WheelSteps:
 
 
 def predicted(steps: WheelSteps, quantity: Quantity, base: Base, parameters: Floats) -> Predicted:
-    """Return a prediction of a reading, computed from the rolling of the wheels.
+    """Return a prediction of a reading, computed from the angles by which the wheels rolled.
 
     Args:
-        steps: the rolling of the wheels in the legs of the reading.
+        steps: the angles by which the wheels rolled in the legs of the reading.
         quantity: the quantity that the reading measures.
         base: the configured geometry.
         parameters: the parameters of the fit, shape (PARAMETER_COUNT,).
@@ -206,7 +207,11 @@ def fit_readings(readings: Sequence[Reading], base: Base) -> TapeFit:
 
 
 def _starting_parameters(readings: Sequence[Reading], base: Base) -> Floats:
-    """Return parameters that are good enough to count the whole turns in `angle` readings."""
+    """Return parameters from which the fit can start.
+
+    An `angle` reading does not include whole turns. These parameters are accurate enough to predict
+    how many whole turns the robot made.
+    """
     start = base.start()
     for reading in readings:
         if reading.quantity == "turned" and reading.deviation < MAX_STARTING_STD * abs(
@@ -427,7 +432,8 @@ def calibrated(
 def _improvement(readings: Sequence[Reading], base: Base, fit: TapeFit, rate: Rates) -> Improvement:
     """Return the errors of the configured and of the new parameters.
 
-    The error of the new parameters in a reading comes from a fit to all other readings.
+    For each reading, the error of the new parameters is computed with a fit to all other readings.
+    If this fit fails, the fit to all readings is used.
     """
     sums = {name: np.zeros(3) for name in ("turn", "straight", "place")}
     present = fit.parameters.copy()

@@ -162,9 +162,10 @@ def _shorter_lines(mcu: McuConfig, rate: float) -> str:
 
 
 def _count_problems(config: Config) -> list[str]:
-    """Return an error if forward motion could look like backward motion.
+    """Return an error if a large `mcu.encoder_counts` makes the direction of motion ambiguous.
 
-    This is possible if `mcu.encoder_counts` is too large, because an encoder count wraps round.
+    The board sends each count modulo 65536. If a count may change by more than half of this range
+    within `MIN_WRAP_PERIODS` control periods, forward motion could look like backward motion.
     """
     counts, fastest = config.mcu.encoder_counts, config.feedback.wheel_speed / math.tau
     lasts = MIN_WRAP_PERIODS / config.rate_hz
@@ -253,7 +254,8 @@ def _repeated(
 ) -> list[str]:
     """Return an error line for each value that repeats an earlier value.
 
-    `names` maps dotted keys to values. Values are the same if `part` returns the same text.
+    `names` maps dotted keys to their values, and `noun` describes a value in the error line. `part`
+    returns the part of a value to compare, such as the host and port of an endpoint.
     """
     first: dict[str, str] = {}
     found = []

@@ -39,7 +39,8 @@ WHEN_TEXTS: dict[When, str] = {
 class Live(Struct, frozen=True):
     """A setting that may change while the daemon runs.
 
-    `when` is a key of `WHEN_TEXTS`. `what` describes the setting for users.
+    `when` says at which moments it may change, and `WHEN_TEXTS` explains the values of `when`.
+    `what` describes the setting for users.
     """
 
     when: When
@@ -169,9 +170,8 @@ def differences(runs: Config, file: Config) -> dict[str, Difference]:
 def changed(config: Config, wishes: Mapping[str, object], at_rest: bool) -> tuple[Config, str]:
     """Return a pair: `config` with new values of settings, and a text that lists the changes.
 
-    The change is applied completely or not at all. If a setting already has the requested value, it
-    is skipped, so that it causes no error even if this setting cannot be changed. The text is "" if
-    nothing changes.
+    The change is applied completely or not at all. A value that is already in force is ignored. It
+    causes no error, even if its setting cannot be changed. The text is "" if nothing changes.
 
     Args:
         config: the configuration in force.

@@ -130,7 +130,11 @@ def longest_reply(fault_s: float) -> float:
 
 
 def _rounded_up(value: float) -> float:
-    """Round up to three decimals, because a message names the result as the least allowed value."""
+    """Round up to three decimals.
+
+    An error line recommends the result as the value of a setting. If it were rounded down, the
+    setting would still be too low.
+    """
     return math.ceil(round(value * 1000, 6)) / 1000
 
 

@@ -1,6 +1,7 @@
 """Runs the rules that relate several keys of `acsard.toml` to each other.
 
-A rule is skipped if it reads a key that has no valid value.
+A rule is skipped if it reads a key that has no valid value. Another error line already reports this
+key.
 """
 
 from __future__ import annotations

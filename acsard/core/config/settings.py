@@ -242,7 +242,10 @@ class BatteryConfig(Struct, frozen=True):
 
     @property
     def bounds(self) -> dict[BatteryLevel, float]:
-        """Threshold of each battery level that has one, V or %, the most severe level last."""
+        """Threshold of each battery level, V or %, from the least to the most severe level.
+
+        A level is left out if its threshold is 0.
+        """
         found: dict[BatteryLevel, float] = {
             "warning": self.warning_below,
             "return": self.return_below,
@@ -456,8 +459,8 @@ class Config(Struct, frozen=True):
     def rate_hz(self) -> float:
         """Control rate, Hz.
 
-        For `"auto"`, it is the highest whole number of Hz at which the lines use at most 80 % of
-        the serial wire's capacity. This number is limited to 100 Hz.
+        The setting `"auto"` means the highest whole number of Hz, up to 100, at which the lines use
+        at most 80 % of the serial wire's capacity.
         """
         if self.control.rate != "auto":
             return float(self.control.rate)

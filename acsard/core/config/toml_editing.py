@@ -81,11 +81,11 @@ def _adjusted(array: object, value: object) -> bool:
 
 
 def _dotted(text: str, keys: Mapping[str, object]) -> tuple[str, dict[str, object]]:
-    """Insert the keys that belong to a table that `text` writes as dotted keys.
+    """Insert new keys into the tables that `text` writes without a header, as dotted keys only.
 
-    A dotted key is a line such as `mcu.port = ...`, without a header `[mcu]`. Only keys that `text`
-    lacks are inserted. Return the new text, and the entries of `keys` that the caller must still
-    put into the text.
+    A dotted key is a line such as `mcu.port = ...`, without a header `[mcu]`. A key that `text`
+    already contains is not inserted. Return the new text, and the entries of `keys` that the caller
+    must still put into the text.
     """
     import tomlkit
 

@@ -56,9 +56,9 @@ class Bus(Protocol):
     def take(self, queries: int) -> BusInput:
         """Return the input from the bus since the last call.
 
-        `queries` is the largest number of queries in the result. Service calls come first. Then
-        comes one slow query (ROS parameters or a `set`), even if the limit is reached already.
-        Other queries follow until the limit is reached. The rest waits for the next call.
+        The result contains at most `queries` queries, in this order: service calls, one slow query
+        (ROS parameters or a `set`), other queries. If service calls alone reach the limit, the slow
+        query is returned in addition. The remaining queries wait for the next call.
         """
 
     def publish(self, key: str, message: Message) -> None:

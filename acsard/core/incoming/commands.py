@@ -50,11 +50,14 @@ the daemon forgets the sender that has sent no command for the longest time."""
 class Bindings:
     """The certificates to which the sender ids are bound.
 
-    A sender id is bound to the certificate with which the daemon first received it. If one id
-    arrives with two certificates, it was copied by mistake, or its secret was stolen. The daemon
-    then refuses the commands with the second certificate, until no command with the first one has
-    arrived for `BINDING_NS`. Senders on ROS keys are not bound, because ROS keys do not contain the
-    name of a certificate. A sender on a ROS key cannot have the public name of a native sender.
+    A sender id is bound to the certificate with which the daemon first received it. If an id
+    arrives with a second certificate, a user copied the id by mistake, or somebody stole its
+    secret. The daemon then refuses the commands with the second certificate. It accepts them only
+    when no command with the first certificate has arrived for `BINDING_NS`.
+
+    Senders on ROS keys are not bound, because ROS keys do not contain the name of a certificate. A
+    sender on a ROS key cannot pretend to be a bound sender, because the public names of the two
+    kinds differ.
     """
 
     def __init__(self) -> None:
@@ -315,17 +318,21 @@ def parts(key: str) -> tuple[str, str, str]:
 def identify(arrival: Arrival) -> Identity:
     """Return the identity of a sample's sender.
 
-    The identity is the first of these that the sample has:
+    The identity depends on the key of the sample:
 
-    - on a native key: the sender id in the attachment, the session that stamped the sample, the key
-    - on a key of rmw_zenoh: the GID
-    - on a key of a bridge: the session that stamped the sample, the key
+    - a native key (one of acsard's own keys): the sender id in the attachment. If there is none,
+      the identity is the session that stamped the sample, or else the key.
+    - a key of rmw_zenoh: the GID.
+    - a key of a bridge: the session that stamped the sample, or else the key.
 
-    Raises `DecodeError` if a sample on a key of rmw_zenoh has no valid attachment. A sender id or a
-    GID belongs to one program. A session or a key may stand for several programs. A router or a
-    bridge stamps the samples of all programs that connect through it. The daemon cannot tell the
-    session of a router from the session of a program. A GID does not prove the identity: ROS
-    discovery publishes the GIDs, so a program that may put on a key of rmw_zenoh can claim any GID.
+    A sender id or a GID belongs to one program. Several programs may share a session or a key: a
+    router or a bridge stamps the samples of all programs that connect through it, and the daemon
+    cannot tell the session of a router from the session of a program.
+
+    A GID does not prove the identity. ROS discovery publishes the GIDs, so a program that may put
+    on a key of rmw_zenoh can claim any GID.
+
+    Raises `DecodeError` if a sample on a key of rmw_zenoh has no valid attachment.
     """
     if arrival.via == "rmw":
         rmw = unpack(arrival.attachment)
@@ -351,7 +358,10 @@ def identify(arrival: Arrival) -> Identity:
 
 
 def _by_gid(gid: bytes) -> str:
-    """Return the public name of a ROS publisher, which differs from those of all native senders."""
+    """Return the public name of a ROS publisher.
+
+    No sender on acsard's own keys has the same public name.
+    """
     return f"gid {public_name(gid.hex())}"
 
 
@@ -360,10 +370,11 @@ def _by_key(arrival: Arrival) -> str:
 
 
 def claimed_identity(arrival: Arrival) -> Identity:
-    """Return the identity of a sample's sender like `identify`, but never raise an error.
+    """Return the identity of a sample's sender, even if the attachment of the sample is not valid.
 
-    For a sample on a key of rmw_zenoh, only the field `sender` is set. It is "" if the attachment
-    is too short for a GID.
+    The result equals that of `identify`, except for a sample on a key of rmw_zenoh. For such a
+    sample, only the field `sender` is set. It is "" if the attachment is too short for a GID. The
+    function never raises an error.
     """
     if arrival.via == "rmw":
         gid = arrival.attachment[-GID_BYTES:]

@@ -4,8 +4,8 @@ A sample is a sensor_msgs/Imu in any encoding. In JSON and msgpack only `angular
 required. The z axis points up, so a turn to the left is positive.
 
 The daemon uses the samples of only one gyro. If this gyro is silent, the daemon may use another
-gyro. The first sample of the new gyro is marked (`GyroSample.anew`), because two gyros have
-different biases.
+gyro. The first sample of the new gyro is marked (`GyroSample.anew`). The odometry then forgets the
+bias of the old gyro, because two gyros have different biases.
 """
 
 from __future__ import annotations

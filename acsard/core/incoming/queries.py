@@ -141,9 +141,9 @@ class Queries:
         """Return the replies to a query, or a `Request` to the robot if the query calls a service.
 
         The list of replies is empty if the daemon has no value for the query. `current` is a
-        function that returns the present message of a published key. `outputs` are those of the
-        last step, or None before the first step. Raises `DecodeError` for a ROS request that cannot
-        be served. The caller then sends the reply that `refused` builds.
+        function that returns the present message of a published key. `outputs` are the outputs of
+        the robot's last step, or None before the first step. Raises `DecodeError` for a ROS request
+        that cannot be served. The caller then sends the reply that `refused` builds.
         """
         if query.via != "native":
             return self._ros(query, 0 if outputs is None else outputs.now.wall_ns)
@@ -366,7 +366,7 @@ def note_of(config: Config, topic: Topic) -> str:
 def interfaces(config: Config, outputs: Outputs | None) -> Interfaces:
     """Return the command and state interfaces of the joints, named as in ros2_control.
 
-    `outputs` are those of the last step, or None before the first step.
+    `outputs` are the outputs of the robot's last step, or None before the first step.
     """
     linked = outputs is not None and outputs.linked
     claimed = outputs is not None and outputs.mode == "driving"

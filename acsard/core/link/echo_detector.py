@@ -1,9 +1,9 @@
 """Detects echoes: lines that the daemon writes to the serial port and then receives back.
 
 Lines come back if TX and RX are connected to each other, or if a device at the far end sends all
-bytes back. A board that answers may be connected behind such a device. This module detects the echo
-of plain lines, and of checked lines (lines with a checksum) that do not ask for a sample of the
-encoders.
+bytes back. A board may be connected behind such a device. The daemon then receives both the echo
+and the replies of the board. This module detects the echo of plain lines, and of checked lines
+(lines with a checksum) that do not ask for a sample of the encoders.
 """
 
 from __future__ import annotations
@@ -73,18 +73,17 @@ class EchoDetector:
     lines are an echo if all of these conditions hold:
 
     - At least `MIN_REPEATED_LINES` successive sent lines came back in order, byte for byte.
-    - Between two successive lines that came back, at most `MAX_OTHER_REPORTS` other reports came.
-      The speeds in these reports do not lie between the speeds in the two lines. A motor that
-      changes from one speed to the other would report speeds between them.
-    - The speed changes from line to line add up to at least `MIN_TOTAL_CHANGE`, and one of them
-      differs by more than `MIN_BEND` from the speed change before it. A motor that lags by a whole
-      number of lines repeats a steady ramp exactly, but it rounds off the start and the end of the
-      ramp.
+    - Between two of these lines, at most `MAX_OTHER_REPORTS` other reports came. Their speeds do
+      not lie between the speeds in the two lines, as the speeds of a real motor would.
+    - The speed changes from line to line add up to at least `MIN_TOTAL_CHANGE`.
+    - One speed change differs by more than `MIN_BEND` from the previous speed change, as at the
+      start or the end of a ramp. A motor that lags by a whole number of lines repeats a steady ramp
+      exactly, but it rounds off the start and the end of the ramp.
 
-    At rest every board looks like an echo, so lines without speed changes prove nothing. A device
-    that echoes and also passes on replies, such as an RS-485 adapter with a board behind it, is
-    detected just as quickly as a device that only echoes. While all ramps are gentle (see
-    `MIN_BEND`), no echo is detected.
+    At rest every board looks like an echo, so lines without speed changes prove nothing. While all
+    ramps are gentle (see `MIN_BEND`), no echo is detected. Some devices echo and also pass on the
+    replies of a board, such as an RS-485 adapter. They are detected just as quickly as a device
+    that only echoes.
 
     A board that reports its set points instead of measured speeds looks exactly like an echo. A
     simulator whose wheels have no lag may look like an echo too. The daemon then does not drive

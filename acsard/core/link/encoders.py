@@ -63,9 +63,10 @@ class Encoders:
         Args:
             counts: encoder counts per wheel turn, 0 if unknown.
             wheel_speed: highest speed of a wheel, rad/s.
-            quiet_ns: time without a line from the board after which the link is stale, ns. If a
-                reading seems to come more than `quiet_ns` too early by the board's clock, the board
-                has probably restarted.
+            quiet_ns: time without a line from the board after which the link is stale, ns. The
+                delay of a reading is its arrival time minus its time by the board's clock. If the
+                delay is more than `quiet_ns` below the least delay so far, the board has probably
+                restarted.
         """
         self._angle = math.tau / counts if counts else 0.0
         self._fastest = wheel_speed / math.tau * counts / 1000

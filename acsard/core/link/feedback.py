@@ -357,9 +357,9 @@ class Timeline:
         return Placed("reads", int(self._end_ns - self._share_ns * self._rest))
 
     def _since_last(self, placed: Placed) -> tuple[float, float]:
-        """Return the time since the last good line, s, and the part in which lines were lost, s.
+        """Return the time since the last good line, and the part of it in which lines were lost.
 
-        `placed` is the time of the present line.
+        Both are in s. `placed` is the time of the present line.
         """
         last = self._last_placed
         back = placed.due_ns < last.due_ns
@@ -392,10 +392,10 @@ class Timeline:
         self._later += DIFFERENCE_GAIN * (later_ns - self._later)
 
     def _late_ns(self, clock: str) -> float:
-        """Return the mean difference between the times that two clocks give to a line, ns.
+        """Return by how much a clock gives later times than `FreeRunningTimes`, on average, ns.
 
-        It is the time by `clock` ("reads", "prompts" or "slots") minus the time by
-        `FreeRunningTimes`.
+        `clock` is "reads", "prompts" or "slots". The caller needs this offset to subtract the times
+        of two lines that come from different clocks.
         """
         if clock == "reads":
             return self._slots.late_ns

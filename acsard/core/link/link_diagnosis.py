@@ -264,10 +264,12 @@ class UnansweredLines:
     """The warning that the board does not answer all lines while the link is up.
 
     After every `WINDOW_LINES` sent lines, the class compares the number of sent lines with the
-    number of good lines received. It warns once. It can warn again only after the board has
-    answered enough lines of a later window, or after the link was lost. A healthy board that
-    reports by its own clock also causes the warning if it sends fewer lines than the daemon and
-    `mcu.reply_period` is not set.
+    number of good lines received. If too many answers are missing, the class warns. It does not
+    repeat the warning until the board has answered enough of a later series of `WINDOW_LINES`
+    lines, or the link was lost.
+
+    A healthy board that reports by its own clock also causes the warning if it sends fewer lines
+    than the daemon and `mcu.reply_period` is not set.
     """
 
     def __init__(self, reply_period: float) -> None:

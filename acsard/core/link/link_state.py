@@ -142,9 +142,9 @@ class Link:
 
         The caller does this if it sent no line for a while, because the board may have had nothing
         to answer. The call has an effect only while the link is up, and only once after each good
-        line. The additional time is limited. Let pause be the time in which the caller sent no
-        line. The link becomes stale at the latest `quiet_ns` + pause + `quiet_ns` / 3 after the
-        last good line. `now_ns` is monotonic.
+        line. Therefore the link becomes stale in any case if no good line comes for the sum of
+        three times: `quiet_ns`, the time without sent lines, and `quiet_ns` / 3. `now_ns` is
+        monotonic.
         """
         if self.state == "up" and not self._waited:
             self._waited = True
@@ -153,8 +153,8 @@ class Link:
     def reset_silences(self) -> None:
         """Reset the count of silences in a row.
 
-        The caller does this if a line came in time, or if the board is not the cause of the
-        silence.
+        After `SPARSE_SILENCES` silences in a row, the board's lines count as too sparse. The caller
+        resets the count if a line came in time, or if the board is not the cause of the silence.
         """
         self._silences, self.sparse_s = 0, 0.0
 

@@ -20,9 +20,9 @@ class MinimumDelay:
     def __init__(self, drift: float = MAX_DRIFT, most: float = math.inf) -> None:
         """Start before the first event.
 
-        `drift` is the largest relative drift between the two clocks. `most` is in the caller's unit
-        of time: a delay that exceeds the minimum by more than `most` is remembered as exceeding it
-        by `most`.
+        `drift` is the largest relative drift between the two clocks. `most` limits the excess of a
+        delay over the least delay, in the caller's unit of time. If an event exceeds the least
+        delay by more than `most`, the least delay rises until the excess is `most`.
         """
         self._drift, self._most = drift, most
         self.late = 0.0
@@ -49,5 +49,9 @@ class MinimumDelay:
         return self.late
 
     def believe(self) -> None:
-        """Set the least delay to the delay of the last measured event if that is smaller."""
+        """Accept the last measured event as true, and update the least delay.
+
+        The least delay falls to the delay of this event if that delay is smaller. It rises if the
+        delay of this event exceeds it by more than `most`.
+        """
         self.late = min(max(0.0, self.late), self._most)

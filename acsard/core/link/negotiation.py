@@ -315,9 +315,8 @@ class Negotiation:
         """Process a correct checked reply, and return the time at which its command was written.
 
         This time is monotonic, in ns. `at_ns` is the monotonic time at which the reply was read.
-        Raises `FrameError` if the command was written more than 0.3 s (`ANSWER_TIMEOUT_NS`) before
-        `at_ns`. Also raises `FrameError` if the sequence number of the reply belongs to no command
-        that waits for an answer.
+        Raises `FrameError` if the sequence number of the reply does not belong to a command that
+        waits for an answer. A command waits for at most 0.3 s (`ANSWER_TIMEOUT_NS`).
         """
         while self._pending and at_ns - self._pending[0][1] > ANSWER_TIMEOUT_NS:
             self._pending.popleft()
@@ -341,9 +340,14 @@ class Negotiation:
     def judge(self, now_ns: int) -> None:
         """Count the last question as unanswered if its answer is overdue.
 
-        Once all questions with and without request letters are unanswered, accept plain lines if
-        `mcu.link_check` is "auto" and the board has never answered with the check. Otherwise set
-        `trouble`. `now_ns` is monotonic.
+        The daemon first sends questions with request letters, and then questions without them. If
+        all of these questions are unanswered, there are two cases:
+
+        - `mcu.link_check` is "auto", and the board has never answered with the check: the daemon
+          accepts plain lines.
+        - Otherwise the method sets `trouble`, and the daemon asks again.
+
+        `now_ns` is monotonic.
         """
         asked_ns = self._asked.last_ns
         if self.state != "asking" or not self._open or asked_ns is None:

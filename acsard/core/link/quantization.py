@@ -1,10 +1,11 @@
 """Adds to each good line the angles in whole encoder counts, and the quantization of its speeds.
 
 A coarse encoder quantizes the reported speed of its wheel. If the counts per turn are configured,
-`whole_counts.py` recovers the counts from the speeds. Otherwise the pose uses speed times time. The
-module does not derive the counts per turn from the speeds. This would be possible only if the
-firmware divided its counts by a fixed period. But then the time between the lines is known, so
-speed times time is wrong only by the rounding of the speeds.
+`whole_counts.py` recovers the counts from the speeds. Otherwise the pose uses speed times time.
+
+The module does not try to find unknown counts per turn from the speeds, because they would not
+help. They can be found only if the firmware divides its counts by a fixed period. In this case, the
+time between the lines is known, and speed times time is wrong only by the rounding of the speeds.
 """
 
 from __future__ import annotations
@@ -53,9 +54,10 @@ class Steps:
     """The size of the steps that an encoder causes in the reported speed of its wheel.
 
     One count more or less in a period T changes the reported speed by 2 pi / (counts per turn x T).
-    This is 31 rad/s at 20 counts per turn and 100 Hz. Such a step is not an acceleration. The size
-    is learned from the reported speeds. So it is right whether the firmware divides counts by its
-    nominal period, divides them by the measured time, or filters the speeds.
+    This is 31 rad/s at 20 counts per turn and 100 Hz. Such a step does not show an acceleration of
+    the wheel. The class learns the size from the reported speeds. Therefore the size is correct for
+    any firmware, even if the firmware filters the speeds or divides the counts by its nominal
+    period instead of the measured time.
 
     `size` is in rad/s. It is `math.inf` until `FIRST_STEPS` steps have occurred.
     """
@@ -156,7 +158,8 @@ class CountRecovery:
         """Return a copy of a good line with the fields `counted`, `steps` and `count` set.
 
         `counted` is None if the angles in whole counts are unknown. If these angles include the
-        motion of a missing line before this line, the field `bridged` becomes 0.
+        motion of a missing line before this line, this motion need not be estimated. The field
+        `bridged` of the copy is then 0.
         """
         elapsed_s, speeds, counted = line.dt - line.bridged, line.speeds.as_tuple(), None
         if self._whole.angle:

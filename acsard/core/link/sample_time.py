@@ -130,14 +130,15 @@ class FreeRunningTimes:
       a missing line only if x exceeds the greatest possible lateness.
 
     The missing slots are spread over the lines of the read. If a line comes before its slot, the
-    class has counted too many slots as missing, so it takes one of them back. Twice a second, c and
-    T are corrected by the least x since the last correction, in a second-order loop with the gain
-    g:
+    class has counted too many slots as missing, so it subtracts one slot.
 
-        (2)  c += g x T                 (3)  T += g^2 / 2 x T / slots
+    Twice a second, a second-order loop corrects c and T. Let x be the least lateness since the last
+    correction, n the number of slots since then, and g the gain of the loop. The corrections are
 
-    In (3), `slots` is the number of slots since the last correction. If lines have no regular
-    period, the class finds no clock. It gives up a clock that the lines contradict.
+        (2)  c += g x T                 (3)  T += g^2 / 2 x T / n
+
+    The class finds no clock if the lines have no regular period. It gives up a clock that the lines
+    contradict.
     """
 
     def __init__(self, known: tuple[float, ...]) -> None:
@@ -175,11 +176,11 @@ class FreeRunningTimes:
         """Slot of the last line that the present clock has placed. None before the first line."""
 
     def read(self, at_ns: int, lines: int, drained: bool) -> int:
-        """Process a read of the port, and return how many lines are missing before its last line.
+        """Process a read of the port, and return the number of missing lines before its last line.
 
-        The result is -1 if earlier reads counted one line too many as missing. `at_ns` is the
-        monotonic time at which the last line of the read was complete. `lines` is the number of
-        lines in the read. `drained` is true if the read took all data from the kernel.
+        The result is -1 if the count of missing lines in earlier reads was too high by one. `at_ns`
+        is the monotonic time at which the last line of the read was complete. `lines` is the number
+        of lines in the read. `drained` is true if the read took all data from the kernel.
         """
         self._stretch = 1.0
         since, self._before = at_ns - self._before, at_ns
@@ -288,9 +289,9 @@ class FreeRunningTimes:
     ) -> Iterator[tuple[list[int], float, float]]:
         """Yield possible clocks of the board, the likelier ones first.
 
-        Each clock is a triple: for each read, the number of the period (slot) in which its last
-        line was due; the largest allowed lateness in slots; and the period in ns. `gaps` are the
-        times between successive reads in `reads`, ns.
+        Each clock is a triple: a list of slots, the largest allowed lateness in slots, and the
+        period in ns. The list of slots contains, for each read, the slot of its last line. `gaps`
+        are the times between successive reads in `reads`, ns.
         """
         # The configured periods come before the measured period, because for jittery lines they are
         # more reliable than half a second of data.
@@ -356,8 +357,9 @@ class FreeRunningTimes:
 def _slots(reads: list[Read], period: float = math.inf) -> list[int]:
     """Return the slot of the last line of each read.
 
-    A slot is the index of a line. The last line of the first read has the slot 0. If `period`, ns,
-    is finite, the lines that are missing according to the times of the reads have slots too.
+    The last line of the first read has the slot 0. By default, only received lines have slots. If
+    `period`, ns, is finite, missing lines have slots too: a time of several periods between two
+    reads shows that lines are missing.
     """
     slots = [0]
     for (before, _), (at, lines) in pairwise(reads):
@@ -378,7 +380,7 @@ def _slope(reads: list[Read], slots: list[int]) -> float:
 def _latest(reads: list[Read], slots: list[int], period: float) -> tuple[float, list[float]]:
     """Return the time of slot 0, ns, and the lateness of each read, in slots.
 
-    The time is the latest one for which no read comes before its slot.
+    The time of slot 0 is chosen so that the earliest read has the lateness 0.
     """
     offsets = [at - slot * period for (at, _), slot in zip(reads, slots, strict=True)]
     first = min(offsets)
@@ -460,15 +462,14 @@ ns."""
 class PromptedTimes:
     """The sample times of a prompted board, from the commands that its replies answer.
 
-    In this class, a line is a command that the daemon wrote. A plain reply does not say which line
-    it answers. However, a board that answers each line takes its sample when the line arrives. So
-    the sample times are the times at which the lines were written, plus a usual delay. The time
-    between two samples is the time between the two lines that the board answered, even if the host
-    reads the replies late.
+    A plain reply does not say which command it answers. However, a board that answers each command
+    takes its sample when the command arrives. So the sample times are the times at which the
+    commands were written, plus a usual delay. The time between two samples is the time between the
+    two commands that the board answered, even if the host reads the replies late.
 
-    Replies come in the order of the lines. A reply may seem to be later than usual by more than
-    half the time from its line to the next line. Then it answers the next line, and the reply to
-    the earlier line was lost.
+    Replies come in the order of the commands. If a reply seems later than usual by more than half
+    of the time to the next command, then it answers the next command, and the reply to the earlier
+    command was lost. The comments in this class also call a command a line.
     """
 
     def __init__(self, soonest_ns: int) -> None:
@@ -534,14 +535,14 @@ class PromptedTimes:
     def varies_delay(self) -> bool:
         """Whether the board itself varies the delay of its replies.
 
-        The criterion: the delay varies by more than this computer and its USB adapter can cause.
+        This is assumed if the delay varies by more than this computer and its USB adapter can
+        cause.
         """
         return self._thinking > BOARD_JITTER_FRACTION and not self._batched
 
     @property
     def lossy(self) -> bool:
-        """Whether an adapter batches the replies, and a share of them above `LOSSY_FRACTION` is
-        lost."""
+        """Whether an adapter batches the replies, and more than `LOSSY_FRACTION` are lost."""
         return self._batched and self._losses > LOSSY_FRACTION
 
     @property
@@ -653,8 +654,9 @@ class PromptedTimes:
             self._spread = 0.0
 
     def _weigh(self, lines: int, since: int, cut: bool) -> None:
-        """Give up the commands whose replies were lost on a batched link.
+        """Stop waiting for replies that were lost, if an adapter holds replies back.
 
+        If a read shows that such a reply was only late, its command waits for the reply again.
         `lines` is the number of complete replies in the read. `since` is the time since the
         previous read, ns. `cut` is true if the read also contains the first part of one more reply.
         """
@@ -694,11 +696,11 @@ class PromptedTimes:
         self._delay = self._base
 
     def _given_up_too_early(self, delay: float) -> bool:
-        """Stop waiting for replies that seem lost, and return whether an earlier call was wrong.
+        """Stop waiting for replies that seem lost. Return whether the last call did so too early.
 
-        An earlier call was wrong if it stopped waiting for a reply that was only late. The present
-        reply is then this late reply. Call this only if the last read of the port contained a
-        single reply.
+        The last call did so too early if a reply that seemed lost was only late. The present reply
+        is then this late reply. Call this only if the last read of the port contained a single
+        reply.
         """
         left, at, wide = self._left, self._at, 4 * self._spread
         lost, self._lost = self._lost, False
@@ -735,10 +737,15 @@ class PromptedTimes:
     def _shift(self, line: int) -> int:
         """Return an estimate of the extra time that the board took for the present reply, ns.
 
-        `line` is the time at which the answered command was written, ns. USB and the scheduler
-        cause a part of the difference from the usual delay. The result is 0 if they explain the
-        usual deviation, or if the deviation is so large that an adapter must cause it. The present
-        reply must be the only reply in its read of the port.
+        USB and the scheduler also change the delay, so the result is only a part of the difference
+        from the usual delay. The result is 0 in these cases:
+
+        - USB and the scheduler explain the mean deviation from the usual delay.
+        - The mean deviation is so large that an adapter must cause it.
+        - A stall has probably delayed this reply.
+
+        `line` is the time at which the answered command was written, ns. The present reply must be
+        the only reply in its read of the port.
         """
         delay, spread = self._delay, self._spread
         if delay is None or self._batched:

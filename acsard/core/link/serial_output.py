@@ -95,7 +95,7 @@ class SerialOutput:
 
         `handed` are the bytes that `prepare` returned for `line`. The result is "superseded" if the
         kernel did not accept all of these bytes, or if `prepare` replaced the line with a stop.
-        Bytes that the kernel did not accept are dropped.
+        Otherwise the result is "sent". Bytes that the kernel did not accept are dropped.
         """
         whole = taken == len(handed)
         if whole:

@@ -187,10 +187,10 @@ class McuSession:
     def line(self, now_ns: int, speeds: WheelSpeeds) -> bytes | None:
         """Return the line to the board that commands `speeds`, or None if no line is due.
 
-        The line has a checksum if the board answers checked lines, and none otherwise. While the
-        board does not answer, or while the daemon asks whether it knows checked lines, every line
-        is a stop, whatever `speeds` is. The first of these stops is due immediately, because the
-        board may still execute the previous line. `now_ns` is monotonic.
+        The line has a checksum only if the board answers checked lines. Every line is a stop,
+        whatever `speeds` is, while the board does not answer, and while the daemon asks whether the
+        board supports checked lines. The first of these stops is due immediately, because the board
+        may still execute the previous line. `now_ns` is monotonic.
         """
         line = self._next_line(now_ns, speeds)
         self._made = None if line is None else (line, now_ns)

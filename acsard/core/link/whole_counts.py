@@ -9,14 +9,14 @@ However, n is a whole number, so T can be found from the speeds:
 1. Each possible n of the fastest wheel implies a time T = n a / speed. The search starts at the n
    whose T is nearest to the host's estimate.
 2. The search ends at the first n with which the counts of the other wheels are whole numbers too.
-3. A large part of the difference between the host's estimate and T is added to the host's estimate
-   for the next line. The reason: if the board took a sample later than the host estimated, less
-   time is left until the next sample. The addition also corrects the error in the next line if n
-   was wrong.
+3. If T is longer than the host's estimate, the board took this sample later than the host thought,
+   so less time is left until the next sample. Therefore the host's estimate for the next line is
+   reduced by most of the difference, and raised if T is shorter. This also corrects the error in
+   the next line if n was wrong.
 
 With fine encoders, the host's estimate is too inaccurate to find n. Then the angle of each wheel is
-its speed times the host's estimate, which includes the addition from the previous line. So no time
-is lost or counted twice.
+its speed times the host's estimate, which includes the correction from the previous line. So no
+time is lost or counted twice.
 
 If the previous line is missing, there are two cases. If the board answered and its reply was lost,
 T covers only the time since that reply. If the command was lost, the board did not answer, and T
@@ -210,12 +210,12 @@ class WholeCounts:
         return abs(number - expected_s * fastest / self.angle) <= MAX_COUNT_ERROR
 
     def _number(self, speeds: Motors, fastest: float, expected_s: float) -> tuple[int, bool | None]:
-        """Return the count n of the fastest wheel, 0 if unknown, and whether n is proved.
+        """Return the count n of the fastest wheel (0 if unknown), and whether the speeds prove n.
 
-        The second value is True if the speeds prove that the wheels made whole counts, False if
-        they prove the opposite, and None otherwise. `fastest` is the largest absolute value in
-        `speeds`, rad/s. `expected_s` is the host's estimate of the time between the two samples
-        plus the addition from the previous line.
+        The second value is True if the speeds prove that they are whole counts, False if they prove
+        that they are not, and None if they prove nothing. `fastest` is the largest absolute value
+        in `speeds`, rad/s. `expected_s` is the host's estimate of the time between the two samples,
+        corrected by the error in the previous line.
         """
         count = fastest / self.angle
         exact = expected_s * count  # counts if the host's time were right

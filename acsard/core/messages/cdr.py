@@ -288,7 +288,7 @@ _Part = _Numbers | _Text | _List
 
 @cache
 def _compiled(cls: Any) -> tuple[tuple[_Part, ...], Build]:
-    """Return the codecs of the parts of `cls`, and a function that builds it from values."""
+    """Return the codecs of the parts of `cls`, and a function that builds a `cls` from values."""
     info = struct_info(cls)
     parts: list[_Part] = []
     run: list[tuple[str, inspect.Type]] = []

@@ -57,9 +57,9 @@ def _effect(ends: Mapping[str, int], now_ns: int) -> str:
 def first_expiry(ends: Mapping[str, int]) -> tuple[str, int]:
     """Return the certificate that expires first, as a pair: its owner and its expiry time.
 
-    `ends` maps owners to expiry times, wall-clock ns since 1970. The time of the owner "" may come
-    from the TLS gateway, which reports only the earliest expiry of all certificates. If another
-    owner has the same time, that certificate is the one that expires first, so the result names
-    its owner.
+    `ends` maps owners to expiry times, wall-clock ns since 1970. The owner "" stands for the
+    robot's own certificate, or for the report of the TLS gateway, which does not name the owner. If
+    another owner has the same expiry time, the report is about the certificate of that owner.
+    Therefore the result names that owner.
     """
     return min(ends.items(), key=lambda one: (one[1], one[0] == ""))

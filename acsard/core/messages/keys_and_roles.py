@@ -138,7 +138,10 @@ client that gets an answer on a key has at least the role of that key."""
 
 
 def whoami_key(role: str) -> str:
-    """Return the key that only clients with the role `role` or a higher role can query."""
+    """Return the key with which a client finds out whether it has the role `role` or a higher one.
+
+    Only clients with such a role can query the key.
+    """
     return WHOAMI.replace("<role>", role)
 
 

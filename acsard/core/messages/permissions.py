@@ -38,9 +38,11 @@ def has(role: str, least: Role) -> bool:
 def keys_for(role: Role, use: Use, rows: Iterable[Topic]) -> list[str]:
     """Return the keys of `rows` for which `role` is the lowest role with the permission `use`.
 
-    Two kinds of keys are left out. Command keys contain the names of sources, which only the
-    configuration defines: `source_keys` returns these keys, and `COMMAND_ROLE` is their lowest
-    role. The other kind are keys that only programs on the robot's own machine may use.
+    These keys are left out:
+
+    - Command keys, because only the configuration defines the names of the sources in these keys.
+      `source_keys` returns the command keys, and `COMMAND_ROLE` is their lowest role.
+    - Keys that only programs on the robot's own machine may use.
     """
     exact = (pair for row in rows if not row.local for pair in _exact(row, use))
     return [key for key, least in exact if least == role and "<" not in key]
@@ -62,9 +64,10 @@ def _exact(row: Topic, use: Use) -> Iterator[tuple[str, Role]]:
 def least_role(key: str) -> Role:
     """Return the lowest role that has the main permission for a Zenoh key.
 
-    The main permission is the first of these that the table of keys gives to any client: to put on
-    the key, to query the key, to subscribe to the key. For example, the result for `imu` is
-    "maintainer", because only a maintainer may put on this key, although a viewer may query it.
+    The main permission is the first of these that the table of keys gives to at least one role: to
+    put on the key, to query the key, to subscribe to the key. For example, the result for `imu` is
+    "maintainer", because only a maintainer may put on this key, although a viewer may query it. If
+    no role has any of these permissions, the result is "maintainer".
 
     Args:
         key: the part of the key after the robot's id, such as `state`. A `json/` in front of it is

@@ -1,9 +1,9 @@
 """Keeps the last events for the topic `events`.
 
-An event and its repetitions share one row with a count. If each repetition had its own row, a
-computer that misses a control period every second would push a fault out of the twenty rows within
-20 s. An event whose `news` is true always gets its own row. The log has its own limit
-(`event_throttle.py`).
+An event whose `news` is true always gets its own row. Other events repeat often: an event and its
+repetitions share one row with a count. If each repetition had its own row, a computer that misses a
+control period every second would push a fault out of the twenty rows within 20 s. The log has its
+own limit (`event_throttle.py`).
 """
 
 from __future__ import annotations

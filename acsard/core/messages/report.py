@@ -226,7 +226,11 @@ class Report:
         return String(self.description) if self.description else None
 
     def _odom(self, estimate: Estimate, live: bool = True) -> Odometry:
-        """Return the message `odom`. `live` is False if the board no longer sends feedback."""
+        """Return the message `odom`.
+
+        If `live` is False, the board no longer sends feedback. The twist is then 0, with the
+        covariance `UNKNOWN_COVARIANCE`.
+        """
         frames, pose = self._config.odometry, estimate.pose
         of_pose = self._covariances.of_pose(estimate.covariance)
         of_twist = (

@@ -517,7 +517,7 @@ class SetPose(Message, frozen=True):
 
 
 class Release(Message, frozen=True):
-    """Payload of the services `clear` and `activate`."""
+    """Payload of the services `clear` and `activate`, with the latch that they release."""
 
     latch: LatchNumber | None = None
     """Number of the latch to release, as in `RobotState.latch`.

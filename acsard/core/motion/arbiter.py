@@ -82,10 +82,11 @@ class _Source:
             sender.use(self.timeout_ns, self.pause_ns)
 
     def add(self, name: str, now_ns: int) -> Sender | None:
-        """Add the sender `name` and return it, or return None if there is no room for it.
+        """Add the sender `name` and return it, or return None if the source is full.
 
-        If the source is full, the new sender replaces the sender with the lowest rank (`_account`).
-        There is no room if each of the `MAX_SENDERS` senders may keep control of the robot.
+        A source remembers at most `MAX_SENDERS` senders. A further sender replaces the sender with
+        the lowest rank (`_account`). However, a sender that may keep control of the robot is never
+        replaced. If all remembered senders are of this kind, the result is None.
         """
         if len(self.senders) >= MAX_SENDERS:
             least = min(self.senders, key=lambda other: self._account(other, now_ns))
@@ -96,25 +97,31 @@ class _Source:
         return added
 
     def _account(self, name: str, now_ns: int) -> tuple[bool, bool, int]:
-        """Return the rank of the sender `name`. `add` replaces the sender with the lowest rank."""
+        """Return the rank of the sender `name`. `add` replaces the sender with the lowest rank.
+
+        Senders that may keep control of the robot have the highest ranks, and armed senders the
+        next. Among equal senders, the one that sent the newest message has the highest rank.
+        """
         sender = self.senders[name]
         holds = sender.holds(now_ns)
         return holds, holds or sender.armed(now_ns), sender.noticed_ns
 
     def cancel_zeros(self, at_ns: int) -> None:
-        """Cancel the zeros of all senders with a shared identity: one may have sent a speed.
+        """Cancel the zeros of all shared identities, because one of them may have sent a speed.
 
-        A canceled zero does not arm its sender. A zero stays valid if `commands.neutral_pause` was
-        already over at the monotonic time `at_ns`, ns.
+        A canceled zero does not arm its sender. A zero is not canceled if its
+        `commands.neutral_pause` was already over at the monotonic time `at_ns`, ns.
         """
         for sender in self.senders.values():
             sender.cancel_zero(at_ns)
 
     def undo_zeros(self, command: Command, was_set: bool) -> None:
-        """Undo the effect of zeros of the sender of `command`, because its clock is in doubt.
+        """Undo the effect of earlier zeros of the sender of `command`.
 
-        If `was_set` is true, the clock was set, and the sender must send a zero again. Otherwise
-        the clock is unproven, and only the earlier zeros that were not accepted lose their effect.
+        The clock of this sender is in doubt. If `was_set` is true, the clock was set. All zeros of
+        the sender lose their effect, and it must send a zero again. If `was_set` is false, the
+        clock is not proven yet. Only zeros in commands that the arbiter did not accept lose their
+        effect.
         """
         sender = self.senders.get(command.sender)
         # Behind a bridge, several programs with clocks of their own share one identity. Therefore a
@@ -128,9 +135,10 @@ class _Source:
             sender.unlearn()
 
     def present(self, now_ns: int) -> list[Sender]:
-        """Return the present senders: armed ones first, then live ones, then the others.
+        """Return the senders that take part in the choice of the arbiter.
 
-        Within each of these groups, the sender that began to send first comes first.
+        Armed senders come first, then live ones, then the others. Within each of these groups, the
+        sender that began to send first comes first.
         """
         present = []
         for sender in self.senders.values():
@@ -156,18 +164,20 @@ class _Source:
             sender.require_neutral()
 
     def neutral(self, sender: Sender, lasts: float = 0.0) -> Wait:
-        """Return the condition that `sender` must send a zero.
+        """Return the `Wait` which says that `sender` must send a zero before it drives the robot.
 
-        `lasts` is the time for which the sender has sent only speeds, s, rounded down to one of
-        `REPORTED_DURATIONS_S`; 0 leaves it out.
+        `lasts` is the time, s, for which the sender has sent only speeds, rounded down to one of
+        `REPORTED_DURATIONS_S`. If `lasts` is 0, the result does not report this time.
         """
         pause = self.pause_ns / NS_PER_S
         return Wait("neutral", self.name, pause, lasts=lasts, ros=sender.ros, shared=sender.shared)
 
     def doubt_wait(self, now_ns: int) -> Wait | None:
-        """Return the condition for a sender whose recent commands have doubtful stamps, or None.
+        """Return why a sender with doubtful stamps does not drive the robot.
 
-        If the source has several of these senders, use the one that sent the newest message.
+        The arbiter did not accept the recent commands of such a sender because of their stamps. If
+        the source has several such senders, the result is about the sender with the newest message.
+        Return None if the source has no such sender.
         """
         doubtful = [sender for sender in self.senders.values() if sender.doubtful(now_ns)]
         if not doubtful:
@@ -175,7 +185,7 @@ class _Source:
         return self.stale_wait(max(doubtful, key=lambda sender: sender.noticed_ns), now_ns)
 
     def stale_wait(self, sender: Sender, now_ns: int) -> Wait:
-        """Return the condition that `sender`, which is not live, waits for."""
+        """Return why `sender`, which is not live, does not drive the robot."""
         if not sender.doubtful(now_ns):
             return self.stalled
         if sender.doubt == "stale":
@@ -183,9 +193,10 @@ class _Source:
         return self.proof if sender.armed(now_ns) else self.neutral(sender)
 
     def wait_of(self, sender: Sender, now_ns: int, lasting: bool = True) -> Wait:
-        """Return the condition that keeps `sender` from driving.
+        """Return why `sender` does not drive the robot.
 
-        If `lasting` is true, the result says for how long an unarmed sender has sent speeds.
+        If `lasting` is true, and the sender is live but not armed, the result also says for how
+        long the sender has sent speeds.
         """
         if not sender.live(now_ns):
             return self.stale_wait(sender, now_ns)
@@ -233,9 +244,9 @@ class Arbiter:
         """Begin a control step at the monotonic time `now_ns`, ns. Call this before `accept`.
 
         If the previous step was more than `LATE_STEP_NS` ago, the daemon stood still, and the bus
-        may not have delivered the commands of that time yet. Each sender then takes part in the
-        choice for a short time more, and a running `commands.neutral_pause` takes longer (see
-        `Sender.resume`).
+        may not have delivered the commands of that time yet. Therefore each sender takes part in
+        the choice for a short additional time. The time of the stall does not count toward a
+        running `commands.neutral_pause` (see `Sender.resume`).
         """
         before_ns, self._begun_ns = self._begun_ns, now_ns
         if now_ns - before_ns > LATE_STEP_NS:
@@ -271,13 +282,16 @@ class Arbiter:
         return "" if verdict in ("fresh", "set") else "unproven"
 
     def notice(self, source: str, sender: str, arrived_ns: int, shared: bool = False) -> None:
-        """Record that a message to `source` was lost or unusable. It may have been a speed.
+        """Record that a message to `source` was lost or unusable.
 
-        If `shared` is true or `sender` is "" (unknown), any sender with a shared identity may have
-        sent the message. The zero command of such a sender does not arm it any more, unless
-        `commands.neutral_pause` was already over at the monotonic time `arrived_ns`, ns. The time
-        of a lost message is unknown: pass "" as `sender` and 0 as `arrived_ns`. This cancels each
-        zero command that has not armed its sender yet.
+        The message may have been a speed. If `shared` is true or `sender` is "" (unknown), a
+        program with any shared identity may have sent the message. In this case, the method cancels
+        the zeros of all shared identities of the source, so that these zeros do not arm their
+        senders. A zero is not canceled if its `commands.neutral_pause` was already over at the
+        monotonic time `arrived_ns`, ns.
+
+        The sender and the time of a lost message are unknown: pass "" as `sender` and 0 as
+        `arrived_ns`. Then each zero that has not armed its sender yet is canceled.
         """
         known = self._sources.get(source)
         if known is None:
@@ -327,7 +341,11 @@ class Arbiter:
         return Choice(source.name, sender.twist, wait, sender.arrived_ns, sender.name)
 
     def _kept(self, holder: _Source, now_ns: int) -> str:
-        """Return the source whose speeds have no effect, because `holder` sends zeros; or ""."""
+        """Return the name of a source whose speeds have no effect because `holder` sends zeros.
+
+        If another sender of `holder` itself sends these speeds, the text begins with "another
+        sender of". The text is "" if no source sends speeds.
+        """
         for source in self._ranking:
             senders = (each for each in source.present(now_ns) if each is not self._followed)
             if any(sender.twist != REST for sender in senders):
@@ -336,10 +354,11 @@ class Arbiter:
 
     @property
     def clock_adjustment_ns(self) -> int:
-        """Total increase of command delays that was attributed to adjusted clocks, ns.
+        """Total rise of command delays that the daemon accepted as adjustments of clocks, ns.
 
-        An increase does not count if the stamps of the sender show the adjustment. `freshness.py`
-        limits the total by a budget, except for an increase after a pause of the sender.
+        The total contains only rises for which the stamps of the sender do not show an adjustment,
+        so the daemon had to assume one. A budget in `freshness.py` limits these rises, except for a
+        rise after a pause of the sender.
         """
         return self._freshness.forgiven_ns
 

@@ -129,7 +129,11 @@ class CommandEvents:
         return events + self._kept_waiting(mode, choice)
 
     def _kept_waiting(self, mode: Mode, choice: Choice) -> list[Event]:
-        """Report once that the speeds of a source have had no effect for a while."""
+        """Return a warning if the speeds of a source have had no effect for a while.
+
+        Either the sender of the speeds is not armed, or another sender keeps the robot at rest with
+        zeros. The list is empty if there is no such source, or if the warning was already given.
+        """
         wait, kept = choice.wait, ""
         if mode not in (Mode.READY, Mode.DRIVING) or wait.what not in ("neutral", "zeros"):
             self._kept = ""

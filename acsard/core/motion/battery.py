@@ -198,7 +198,7 @@ class Battery:
     def _level(self, now_ns: int) -> BatteryLevel | None:
         """Return the battery level, or None until the reports cover `SETTLE_S`.
 
-        The method also updates `stopped_now`.
+        The method also sets `stopped_now`, which says whether the level has just fallen to "stop".
         """
         measure, values = self._config.measure, self._values
         if measure not in values:

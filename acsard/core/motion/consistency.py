@@ -106,8 +106,11 @@ class ConsistencyChecks:
 
         Call this after the pose was recomputed over earlier feedback lines without a faulty wheel.
         `turn` is the angle, rad, by which the recomputation changed the robot's turn in the lines
-        for which `on_trial` was true. If the gyro is proven by now, the result is `turn`, because
-        the heading was already corrected to the gyro's turn. Otherwise the result is 0.
+        for which `on_trial` was true, because the gyro was not proven at that time.
+
+        If the gyro is proven by now, the heading already agrees with the gyro. The change must
+        therefore be undone, and the result is `turn`. Otherwise the result is 0. If the gyro may
+        still be proven later, the method changes the pending correction of the heading by -`turn`.
         """
         return 0.0 if self.gyro is None else self.gyro.undo_recomputation(turn)
 

@@ -3,16 +3,16 @@
 `BoardInput` is the common base class of `EmergencyStop` and of the bumpers (`bumpers.py`). A board
 that has reported an input once must continue to report this input. After `SILENCE_TIMEOUT_S`
 without a report, the input counts as pressed: a cable may be cut, or the emergency stop may have
-cut the board's own supply. `lifecycle.py` keeps the latch of the stop. Only the call `clear`
-releases it.
+cut the board's own supply. A pressed emergency stop latches a stop (`lifecycle.py`). The stop lasts
+until a client calls `clear`.
 
-When the port is opened again, another board may answer, which need not have the input. The input
-then keeps its state until the board reports it, or until `session.py` finds that the board does not
-report it.
+When the serial port is opened again, a different board may answer, and this board may not have the
+input. The input keeps its state until the board reports it, or until `session.py` finds that the
+board does not report it.
 
-This software is not the safety function. The hardware emergency stop cuts the power of the motors
-by itself. The daemon only learns of that, commands zeros, and keeps the robot stopped after the
-button is released.
+This software is not the safety function: the hardware emergency stop cuts the power of the motors
+without the daemon. The board only reports the press to the daemon. The daemon then commands zeros,
+and keeps the robot stopped after the button is released.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ class BoardInput(ABC):
 
     @property
     def why(self) -> str:
-        """Reason, as text, why an input counts as pressed; "" while no input counts as pressed."""
+        """Why an input counts as pressed, as text; "" while no input counts as pressed."""
         if self.state == "silent":
             return self.silent
         return self.words() if self.state == "pressed" else ""
@@ -110,16 +110,24 @@ class BoardInput(ABC):
     def missing(self) -> bool:
         """Whether the robot needs the inputs, but the board has not reported them.
 
-        Only reports since the serial port was last opened count.
+        Only reports since the serial port was last opened count. While this is true, the robot
+        cannot drive.
         """
         return self.use == "required" and self._awaited
 
     def reopen(self) -> None:
-        """Record that the serial port was opened. Another board may answer from now on."""
+        """Record that the serial port was opened, so that another board may answer from now on.
+
+        The inputs keep their state until the board reports them, or until `forget` is called.
+        """
         self._awaited = True
 
     def forget(self) -> None:
-        """Forget the state, unless the board has reported the inputs since the port was opened."""
+        """Forget the state if the board has not reported the inputs since the port was opened.
+
+        Call this when it is certain that this board does not report the inputs. Otherwise, a press
+        that an earlier board has reported would prevent `clear` forever.
+        """
         if self._awaited:
             self.state, self.pressed = "", None
 
@@ -217,7 +225,11 @@ class EmergencyStop(BoardInput):
         return events
 
     def powered(self) -> None:
-        """Record that no stop is latched any more, so that driver faults count from now on."""
+        """Record that `clear` has released the stop, so that driver faults count from now on.
+
+        Before that, the motor drivers may have no power, and a driver without power reports a
+        fault.
+        """
         self._unpowered = False
 
     def read(self, status: BoardStatus) -> tuple[bool, ...] | None:
@@ -225,7 +237,7 @@ class EmergencyStop(BoardInput):
         return None if status.estop is None else (status.estop,)
 
     def words(self) -> str:
-        """Return the reason of a stop by a pressed emergency stop, as text."""
+        """Return the text that names the pressed emergency stop as the reason of a stop."""
         return PRESSED_REASON
 
     def released(self, before: EstopState) -> str:

@@ -10,10 +10,10 @@ Autonomous Mobile Robots, 5.2.4). Let L be the effective track, m. The step has 
     var(dyaw) = k (|dl| + |dr|) / L^2
     cov(d, dyaw) = k (|dr| - |dl|) / (2 L)
 
-In addition, skidding gives each turn the variance `yaw_variance_per_radian` for each radian. The
-errors of parameters, such as a wheel radius, do not average out, so they are not noise (Borenstein
-& Feng, Measurement and Correction of Systematic Odometry Errors in Mobile Robots, 1996). `columns`
-returns one `Column` for each parameter.
+Skidding adds the variance `yaw_variance_per_radian` to dyaw for each radian that the robot turns.
+The errors of parameters, such as a wheel radius, do not average out, so they are not noise
+(Borenstein & Feng, Measurement and Correction of Systematic Odometry Errors in Mobile Robots,
+1996). `columns` returns one `Column` for each parameter.
 """
 
 from __future__ import annotations
@@ -181,12 +181,13 @@ class TwistUncertainty:
     - q is the quantization step of the wheel speeds. Each wheel has the variance q^2 / 12. a_v and
       a_w follow from the kinematics, with two wheels on each side.
     - T is the mean period of the feedback lines. A line reports the mean speed over one period.
-    - var(d) and var(dyaw) are the noise of one period. With them, the integrated twists are as
-      uncertain as the pose.
+    - var(d) and var(dyaw) are the noise of one period. Because of these terms, a pose that a
+      program integrates from the twists is as uncertain as the pose of the odometry.
     - The sums are over the uncertain parameters of the kinematics (c_1 to c_4: see `columns`).
 
     If the wheels slip, `slipping` multiplies the variances by `SLIP_FACTOR`. For a robot at rest,
-    `at_rest` allows only a motion that is too small for the encoders.
+    `at_rest` returns smaller variances: they cover only a motion that is too slow for the encoders
+    to show.
     """
 
     def __init__(self, model: ErrorModel, counts: int) -> None:
@@ -259,10 +260,10 @@ class TwistUncertainty:
         return self._to_linear * square, self._to_angular * square
 
     def slipping(self, variances: TwistVariances) -> TwistVariances:
-        """Return `variances` times `SLIP_FACTOR`, but at most `MAX_TWIST_VARIANCE`. Use this while
-        the wheels slip.
+        """Return the variances of the twist while the wheels slip.
 
-        The lateral variance grows too, because the wheels may slip in any direction.
+        They are `variances` times `SLIP_FACTOR`, but at most `MAX_TWIST_VARIANCE`. The lateral
+        variance grows too, because the wheels may slip in any direction.
         """
         return TwistVariances(
             min(SLIP_FACTOR * variances.linear, MAX_TWIST_VARIANCE),

@@ -88,8 +88,11 @@ class EventThrottle:
     def _may(self, name: EventName, news: bool, now_ns: int) -> bool:
         """Return whether a line may be written now. If it may, count it as written.
 
-        Each name gets one line per second. Up to `BURST` lines may be written without a delay if
-        `news` is true, or if `name` is "stop", because the time of each stop matters.
+        Each name gets one line per second. Up to `BURST` lines may be written without a delay in
+        two cases:
+
+        - `news` is true: at least one event of the line does not only repeat an earlier event.
+        - `name` is "stop": the time of each stop matters.
         """
         free_ns, at_once = self._free_ns.get(name, now_ns), news or name == "stop"
         if free_ns > now_ns + (BURST - 1 if at_once else 0) * NS_PER_S:

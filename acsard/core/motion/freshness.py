@@ -1,13 +1,14 @@
 """Decides whether a stamped command is fresh, although the sender's clock is not synchronized.
 
-The delay of a command is its time of arrival by the daemon's clock minus its stamp. This is the
-true delay plus the unknown offset of the two clocks. The offset cancels out if a delay is compared
-with the minimum of all delays. A command is stale if its delay exceeds the minimum by more than the
-timeout of its source, or if its stamp is earlier than that of an accepted command.
+The delay of a command is its time of arrival by the daemon's clock minus its stamp. This difference
+is the true delay plus the unknown offset between the two clocks. The offset cancels out when the
+daemon compares a delay with the minimum of all delays. A command is stale if its delay exceeds the
+minimum by more than the timeout of its source, or if its stamp is earlier than that of an accepted
+command.
 
-The delays of a new sender must first prove constant. A later change of the delay is trusted only
-within limits, because a congested network looks like a clock that was set. The comment below gives
-the rules.
+A new sender does not drive until its delays have been constant for some time. If the delay changes
+later, either the sender's clock was set or the network is congested. Both causes can look the same,
+so the daemon trusts the new delay only within limits. The comment below gives the rules.
 """
 
 from __future__ import annotations
@@ -127,10 +128,10 @@ Verdict = Literal["fresh", "first", "unproven", "stale", "set"]
 class _Proof:
     """A test whether the delays of a clock have become constant. It starts with one command.
 
-    The test compares the minimum delays of successive intervals. An interval is called a half,
-    because it lasts half of the nominal duration of the test. The delays are constant if the minima
-    of the first two halves differ by little enough (`EVEN_DIVISOR`, `CREEP_DIVISOR`). Otherwise the
-    test goes on.
+    The test compares the minimum delays of successive intervals. Each interval lasts half of the
+    nominal duration of the test, and is called a half. The delays are constant if the minima of the
+    first two halves are nearly equal (`EVEN_DIVISOR`, `CREEP_DIVISOR`). Otherwise the test goes on
+    with further halves.
     """
 
     def __init__(
@@ -194,7 +195,7 @@ class _Proof:
 
 
 class _Clock:
-    """One clock of a sender, with the estimated minimum delay of the commands that it stamped."""
+    """A clock that stamps commands, with the estimated minimum delay of these commands."""
 
     def __init__(self, at_ns: int) -> None:
         self.state: State = "new"
@@ -241,7 +242,10 @@ class _Clock:
 
     @property
     def was_known(self) -> bool:
-        """Whether a command of this clock was accepted since its last pause of `FORGET_NS`."""
+        """Whether the daemon has already accepted a command with a stamp of this clock.
+
+        After a pause of the sender longer than `FORGET_NS`, only later commands count.
+        """
         return self._accepted is not None
 
     def judge(self, command: Command, stamp_ns: int, timeout_ns: int) -> Verdict:
@@ -292,17 +296,25 @@ class _Clock:
         return stamp_ns <= self._stamp_ns or (accepted is not None and stamp_ns <= accepted[0])
 
     def _later_than_lowest(self, delay: int, silence: int) -> int:
-        """Return by how much `delay` exceeds the lowest delay of this steady clock, ns."""
+        """Return by how much `delay` exceeds the lowest delay so far, ns.
+
+        The method also updates the lowest delay. Call it only for a steady clock, which is a clock
+        that is never adjusted. `silence` is the time since its last command, ns.
+        """
         floor = delay if self._floor is None else self._floor + silence // SECONDS_PER_DRIFT
         self._floor = min(floor, delay)
         return delay - self._floor
 
     def _look_for_adjustment(self, stamp_ns: int, silence: int, number: int) -> None:
-        """Record a pause of the sender, or an adjustment of its clock.
+        """Record a pause of the sender or an adjustment of its clock, if this command shows one.
 
-        A stamp that goes back or stands still shows an adjustment. The next command must confirm
-        the adjustment: its stamp must also go back or stand still, or must not be later than the
-        last stamp before the adjustment.
+        If the stamp of a command is not later than the previous stamp, the clock was probably set
+        back. But the network may have swapped or repeated a command instead. Therefore the
+        adjustment counts only after the next command has confirmed it. That command confirms it in
+        two cases:
+
+        - Its stamp is again not later than the previous stamp.
+        - Its stamp is not later than the last stamp before the adjustment.
 
         If commands were lost, the network may have caused the silence, so no pause is recorded. The
         adjustment is then measured from the stamp of the last accepted command.
@@ -370,11 +382,14 @@ class _Clock:
         return "stale"
 
     def _forgive(self, proof: _Proof, at_ns: int) -> bool:
-        """Trust the new constant delay that `proof` has found, and return True, if it is plausible.
+        """Return whether the new constant delay that `proof` has found is plausible.
 
-        A larger delay is plausible after a pause of the sender. It is also plausible if visible
-        adjustments of the clock, the budget for invisible adjustments (`FORGIVE_NS`), or both
-        explain it.
+        If it is plausible, the clock uses it from now on. A smaller delay is always plausible. A
+        larger delay is plausible in two cases:
+
+        - The sender has paused, so its clock may have been set meanwhile.
+        - The increase can be explained by visible adjustments of the clock, by the budget for
+          invisible adjustments (`FORGIVE_NS`), or by both together.
         """
         self._accrue(at_ns, FORGET_NS)
         hidden = proof.least - self._least
@@ -442,7 +457,10 @@ class Freshness:
         return verdict
 
     def _in_order(self, command: Command, gap_ns: int) -> Verdict:
-        """Judge a command without a stamp. After `gap_ns` of silence, its numbers may restart."""
+        """Judge a command without a stamp by its sequence number.
+
+        After a silence of more than `gap_ns`, the sender may start its sequence numbers again.
+        """
         number, at_ns = command.sequence, command.arrived_ns
         if number is None:
             return "fresh"

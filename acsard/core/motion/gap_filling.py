@@ -3,7 +3,7 @@
 `Rolling` computes the angles that the wheels rolled since the last plausible feedback line. A line
 is implausible if `sanity.py` or `Confirmation` rejects it. `Rolling` uses the first of these
 sources that exists: the encoder counts in the line, whole counts that are recovered from the speeds
-in the line, or these speeds times the time. It uses each time and each count exactly once.
+in the line, or these speeds times the time. No time and no encoder count is used twice or left out.
 
 In a gap that no line covers, `Rolling` assumes two speeds: the speed before the gap for the first
 half, and the speed after the gap for the second half. If the motors were commanded to rest in the
@@ -97,7 +97,7 @@ class Rolling:
     """
 
     def __init__(self, quiet: float = math.inf) -> None:
-        """Start with no implausible feedback lines to take into account.
+        """Start without implausible feedback lines.
 
         `quiet` is the time without feedback after which a running daemon commands rest, s.
         """
@@ -105,7 +105,10 @@ class Rolling:
         self.forget()
 
     def forget(self) -> None:
-        """Forget the implausible feedback lines since the last plausible line."""
+        """Forget the implausible feedback lines since the last plausible line.
+
+        The next call of `take` does not include the motion during these lines.
+        """
         self._lost = self._gap = self._bridged = self._counted = self._driven = 0.0
         """Durations, s.
 
@@ -143,7 +146,7 @@ class Rolling:
             self._turned = plus(self._turned, line.turned)
 
     def _driven_in(self, line: Feedback) -> float:
-        """Return the time in the gaps before `line` until the motors were commanded to rest, s."""
+        """Return how much of the gaps before `line` passed before the daemon commanded rest, s."""
         return self._bridged + line.driven if line.bridged else self._driven
 
     def take(self, line: Feedback, before: WheelSpeeds) -> Rolled:
@@ -201,10 +204,10 @@ def _some(*pieces: Motors) -> tuple[Motors, ...]:
 
 
 def _until_rest(before: Motors, driven: float, after: Motors, bridged: float) -> Motors:
-    """Return the wheel angles, rad, in a gap with a command to rest after `driven` s.
+    """Return the angles that the wheels rolled in a gap, rad.
 
-    `before` and `after` are the wheel speeds before and after the gap, rad/s. `bridged` is the
-    duration of the gap, s.
+    The daemon commanded rest `driven` s after the gap began. `before` and `after` are the wheel
+    speeds before and after the gap, rad/s. `bridged` is the duration of the gap, s.
     """
     # A board that computes its speeds since its last reply reports the means over the gap. These
     # means are large enough for the motion until the command to rest. A smaller speed is the speed
@@ -236,9 +239,9 @@ class Confirmation:
     lines agree if no wheel alone has changed its speed by more than a limit, which is smaller after
     a longer gap.
 
-    A line of the usual duration is used immediately. A line that covers more time is used
-    immediately if it agrees with the last line that was used. Otherwise it is held, and the next
-    line decides:
+    A line with encoder counts is used immediately, and so is a line that covers the usual time
+    between two lines. A line that covers more time is used immediately if it agrees with the last
+    line that was used. Otherwise it is held, and the next line decides:
 
     - If the next line agrees with the held line, both are used, because one wheel really changed
       its speed alone.
@@ -308,8 +311,8 @@ class Confirmation:
 def _alone(a: Motors, b: Motors, steps: Motors) -> float:
     """Return the largest speed change that one wheel of a side made without the other, rad/s.
 
-    `a` and `b` are the wheel speeds in two lines. A change does not count as far as the wheel's
-    quantization step in `steps`, rad/s, explains it.
+    `a` and `b` are the wheel speeds in two lines, rad/s. `steps` contains the quantization step of
+    each wheel, rad/s. The result leaves out the part of a change that one such step can explain.
     """
     changes, largest = tuple(map(sub, a, b)), 0.0
     # The wheels i and 3 - i in `WHEELS` order are those of one side.
@@ -330,8 +333,9 @@ class Gaps:
     `follow` measures s while lines arrive without gaps. The configured acceleration limits are not
     used, because robots seldom accelerate that much. The deviation is limited to the motion at the
     highest of three speeds: the speed before the gap, the speed after the gap, and the highest
-    speed commanded in the gap (for `MAX_COMMANDED_S` at most). Therefore a robot that stood still
-    before and after a gap, and had no command to move, is assumed not to have moved in the gap.
+    speed commanded in the gap. The commanded speed counts for at most `MAX_COMMANDED_S` of the gap.
+    Therefore a robot that stood still before and after a gap, and had no command to move, is
+    assumed not to have moved in the gap.
     """
 
     def __init__(self) -> None:
@@ -341,15 +345,18 @@ class Gaps:
         self.interrupt(REST)
 
     def interrupt(self, twist: Twist) -> None:
-        """Discard the unfinished measurement of the acceleration. Start a new one at `twist`."""
+        """Discard the unfinished measurement of the acceleration, and start a new one.
+
+        `twist` is the present twist of the robot, with which the new measurement starts.
+        """
         self._first, self._seconds, self._distance, self._turn = twist, 0.0, 0.0, 0.0
         self._bridged, self._given = 0.0, (0.0, 0.0)
 
     def follow(self, twist: Twist, dt: float) -> None:
         """Use a feedback line from the board to measure the acceleration of the robot.
 
-        The line reports that the robot moved with `twist` in the last `dt` s. There must be no
-        silence of the board before this line.
+        The line reports that the robot moved with `twist` in the last `dt` s. Call this only if no
+        gap precedes the line.
         """
         linear, angular = twist.linear, twist.angular
         self._bridged, self._given = 0.0, (0.0, 0.0)
@@ -389,8 +396,9 @@ class Gaps:
             after: the twist after the gap.
             commanded: the highest speeds that were commanded in the gap, m/s and rad/s, both
                 without sign.
-            doubtful: the part of the gap, s, in which the robot is assumed to have had the twist
-                `after`, but had the twist `before` with the probability 1/2.
+            doubtful: the time, s, after a command to rest that the board may not have received. The
+                odometry assumes the twist `after` for this time. With the probability 1/2, the
+                robot still had the twist `before`.
         """
         bridged, given = self._bridged + seconds, self._given
         along, yaw = self.unseen(bridged, before, after, commanded)
@@ -475,11 +483,13 @@ class Rounding:
     def square(self) -> float:
         """Sum of the squares of the quantization steps before and after the gap, rad2/s2.
 
-        A speed that is rounded to one step has the variance step^2 / 12. In a gap of t s, the speed
-        before the gap is assumed for t / 2 s, and the speed after the gap for another t / 2 s. So
-        the variance of the motion is (t / 2)^2 times the sum of the variances of both speeds. Two
-        facts double each of these variances. Both wheels of a side turn alike, so their errors are
-        equal. A single line can contain an encoder edge too many or too few. Therefore the variance
-        of the motion is t^2 times the sum of the variances of both speeds for independent wheels.
+        `TwistUncertainty.rounding` converts this sum to variances of speeds, for wheels with
+        independent errors. In a gap of t s, the speed before the gap is assumed for t / 2 s, and
+        the speed after the gap for the other t / 2 s. Therefore the variances of the motion are t^2
+        / 4 times the variances of the speeds. Each of two facts doubles this result, so the caller
+        multiplies by t^2:
+
+        - Both wheels of a side turn alike, so their errors are equal and not independent.
+        - A single line can contain an encoder edge too many or too few.
         """
         return self._before**2 + self._after**2

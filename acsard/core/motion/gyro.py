@@ -2,8 +2,8 @@
 
 The method is gyrodometry (Borenstein & Feng, Gyrodometry: a new method for combining data from
 gyros and odometry in mobile robots, 1996): skidding wheels do not affect a gyro, and a gyro's bias
-does not affect the wheels. The gyro's reading at rest is its bias (`gyro_bias.py`). A comparison
-of gyro and wheels gives the gyro's delay and the effective track (`gyro_match.py`).
+does not affect the wheels. The gyro's reading at rest is its bias (`gyro_bias.py`). A comparison of
+gyro and wheels gives the gyro's delay and the effective track (`gyro_match.py`).
 
 Until gyro and wheels have agreed in a turn, the heading comes from the wheels. After that turn, the
 heading is corrected by the gyro's turn minus the wheels' turn up to then. A gyro that reads the
@@ -13,9 +13,10 @@ if its rate does not match the wheels at all, the heading comes from the wheels.
 A sample that arrives late is included in the turn of the next line, so no turn is lost.
 
 A sample whose rate jumps counts only if the next sample confirms the jump. A gyro that repeats one
-rate exactly while the wheels stand still is assumed to hang, and its turn is taken back. If gyro
-and wheels contradict each other for so long that the gyro is not used any more, either of them may
-be right. The difference of their turns is then added to the uncertainty of the heading.
+rate exactly while the wheels stand still is assumed to hang. The wheels' turn then replaces the
+turn that the gyro has measured since it began to repeat this rate. If gyro and wheels contradict
+each other for so long that the gyro is not used any more, either of them may be right. The
+difference of their turns is then added to the uncertainty of the heading.
 """
 
 from __future__ import annotations
@@ -121,8 +122,9 @@ STATUS_TEXTS: dict[GyroDoes, str] = {
 class Turn(Struct, frozen=True, gc=False):
     """Turn of the robot since the previous feedback line, measured by a gyro.
 
-    `angle` is in rad, and `variance` is its variance, rad2. The variance does not include the error
-    of the gyro's scale, which does not average out (`uncertainty.py`).
+    If earlier turns of the gyro were in doubt, it may instead be the wheels' turn with a correction
+    of these earlier turns. `angle` is in rad, and `variance` is its variance, rad2. The variance
+    does not include the error of the gyro's scale, which does not average out (`uncertainty.py`).
     """
 
     angle: float
@@ -215,7 +217,10 @@ class Gyro:
 
     @property
     def learned(self) -> Track | None:
-        """Effective track learned from this gyro or an earlier one; None before enough turns."""
+        """Effective track learned from this gyro or an earlier one.
+
+        It is None until the robot has turned enough.
+        """
         match = self._match
         if match.blocks < TRUSTED_BLOCKS or match.ratio <= 0.0:
             return self._learned
@@ -224,8 +229,9 @@ class Gyro:
     def add_samples(self, samples: tuple[GyroSample, ...]) -> None:
         """Store the `samples` that arrived since the last control step, in the order of arrival.
 
-        A sample with `anew` is the first one of another gyro. Everything that was learned from the
-        earlier gyro is then forgotten, except the effective track and the doubt about the heading.
+        If `anew` is true, a sample is the first one of another gyro. The values that were learned
+        from the earlier gyro are then forgotten, except the effective track. The heading stays as
+        uncertain as before.
         """
         for sample in samples:
             if sample.anew:
@@ -240,7 +246,8 @@ class Gyro:
         """Return the turn of the robot since the previous feedback line, measured by the gyro.
 
         Return None if the wheels must provide the turn, for example because the gyro is silent or
-        not proven.
+        not proven. There is one exception: if earlier turns of the gyro are in doubt, the result is
+        the wheels' turn, with a correction or an additional uncertainty for these earlier turns.
 
         Args:
             at_ns: Monotonic time of this line, ns.
@@ -293,7 +300,10 @@ class Gyro:
         return Turn(angle, variance, self._rate, noise, rolled, self._does == "disagrees")
 
     def drop_corrections(self) -> None:
-        """Drop pending corrections and doubts of the heading, because a new pose was set."""
+        """Drop the pending corrections of the heading, because a new pose was set.
+
+        This includes the uncertainty that the next turn would add to the heading.
+        """
         self._contradicted = self._doubt = 0.0
         self._forget_owed()
         self._forget_repeated()
@@ -317,11 +327,15 @@ class Gyro:
     def undo_recomputation(self, turn: float) -> float:
         """Return the angle that the caller must subtract from the heading, rad.
 
-        Call this after the pose was recomputed over feedback lines for which `owes` was true.
-        `turn` is the angle by which the recomputation changed the robot's turn in these lines, rad.
-        If the gyro is proven by now, the heading has already been corrected to the gyro's turn, so
-        the change must be undone: the result is `turn`. Otherwise the result is 0, and a pending
-        correction of the heading changes by -`turn`.
+        Call this after the pose was recomputed over earlier feedback lines. `turn` is the angle,
+        rad, by which the recomputation changed the robot's turn in the lines in which the gyro was
+        not proven yet (`owes`).
+
+        - If the gyro is proven now, the heading was already corrected to the gyro's turn. The
+          result is `turn`, so that the caller undoes the change.
+        - If the gyro has no verdict yet, the result is 0, and the pending correction of the heading
+          changes by -`turn`.
+        - If the gyro was refuted, the result is 0, and no correction is pending.
         """
         verdict = self._trial.verdict
         if verdict == "none yet":
@@ -387,13 +401,18 @@ class Gyro:
     def _hangs(self) -> bool:
         """Whether the gyro has repeated its rate for so long that it must have a defect.
 
-        A gyro that often repeats its rate without a defect is never found in this way.
+        If the gyro often repeats its rate without a defect, the repetitions prove nothing, and the
+        value is always False.
         """
         share = (self._usual_repeats + 1) / (self._usual + 1)
         return share < MAX_REPEATING and share**self._repeats < MIN_CHANCE
 
     def _end_repetition(self) -> None:
-        """End the repetition of one rate, because the rate of the gyro has changed."""
+        """Process the end of a repetition: the rate of the gyro has changed.
+
+        If the gyro seems to have hung, its turns during the repetition make the heading more
+        uncertain. If the repeated rate may be a new bias, the bias becomes more uncertain.
+        """
         # The gyro may have hung while it contradicted the wheels. But a gyro without noise also
         # repeats its rate in an even turn with slipping wheels. Then the repetition begins with the
         # slip, and the wheels turn more than the robot.
@@ -443,10 +462,10 @@ class Gyro:
         self._slipped_s = self._slipped_s + dt if self._slip_s > 0.0 else 0.0
 
     def _sum_up(self, angle: float, wheels: float, dt: float) -> None:
-        """Add a line to the sums of the turns that are in doubt if the gyro proves wrong.
+        """Record the turns of a feedback line, which are needed if the gyro later proves wrong.
 
         `angle` and `wheels` are the turns of the robot according to gyro and wheels, rad. `dt` is
-        the time of the line, s; 0 after a gap, in which only the gyro knows the turn.
+        the time of the line, s. It is 0 after a gap, in which only the gyro has measured the turn.
         """
         off = angle - wheels
         self._repeated_gaps += 0.0 if dt > 0.0 else angle * angle
@@ -455,21 +474,29 @@ class Gyro:
         self._contradicted = self._contradicted + off if self._slip_s > 0.0 else 0.0
 
     def _end_contradiction(self) -> None:
-        """Add the turns that gyro and wheels contradicted to the doubt of the heading.
+        """Add the difference between gyro and wheels to the uncertainty of the heading.
 
-        Call this if the daemon can no longer find out whether the gyro or the wheels were right,
-        for example because the gyro has been silent for `LOST_NS`.
+        The difference is that of their turns since they began to contradict each other. Call this
+        if the daemon can no longer find out whether the gyro or the wheels were right, for example
+        because the gyro has been silent for `LOST_NS`.
         """
         self._doubt += self._contradicted * self._contradicted
         self._contradicted = 0.0
 
     def _doubted(self, wheels: float, dt: float, noise: float, lost: bool) -> Turn | None:
-        """Return the turn of a line if earlier turns are in doubt; otherwise None.
+        """Return the wheels' turn, corrected for doubtful earlier turns of the gyro.
 
-        Call this in lines whose turn comes from the wheels. The result is the wheels' turn of the
-        line, `wheels` rad in `dt` s, with the correction and the uncertainty of the earlier turns.
-        `noise` is the variance of its rate, rad2/s2. `lost` is whether samples of the gyro are
-        missing; then a contradiction may go on.
+        Return None if no earlier turn is in doubt, or if `dt` is 0. Call this for a feedback line
+        in which the wheels provide the turn. If the gyro hangs, the result contains a correction
+        that replaces its earlier turns by those of the wheels. In any case, the variance of the
+        result contains the uncertainty of the earlier turns.
+
+        Args:
+            wheels: the turn according to the wheels, rad.
+            dt: the time of the line, s; 0 after a gap.
+            noise: the variance of the turn rate in the result, rad2/s2.
+            lost: whether samples of the gyro are missing. A contradiction between gyro and wheels
+                then does not end with this line, so it is not added to the uncertainty yet.
         """
         angle = 0.0
         if self._frozen:

@@ -41,9 +41,10 @@ Verdict = Literal["none yet", "good", "reversed", "in degrees", "dead", "not bel
 
 
 class Trial:
-    """Compares a gyro with the wheels until the gyro is proven, even after it was refuted.
+    """Compares a gyro with the wheels until the gyro is proven.
 
-    `verdict` is the result of the comparison, which may change until the gyro is proven.
+    `verdict` is the result so far. A gyro that was refuted can still be proven later, so a
+    refutation does not end the comparison.
     """
 
     def __init__(self) -> None:

@@ -68,7 +68,8 @@ class LearnedTrack:
     def look(self, learned: Track | None) -> None:
         """Choose the effective track to use. `learned` is the track learned so far, or None.
 
-        This updates `use`, `used` and `event`.
+        The method stores the chosen track in `used`, the reason in `use`, and a log event in
+        `event`.
         """
         before, self.event = self.use, None
         self.use = _use(learned, before)

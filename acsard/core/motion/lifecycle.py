@@ -93,7 +93,11 @@ class Lifecycle:
     # facts
 
     def begin(self, now: Instant) -> None:
-        """Record `now` as the time of the first step. A later call changes nothing."""
+        """Record `now` as the time of the first step. A later call changes nothing.
+
+        For `LATCH_REQUIRED_S` after this time, `clear` and `activate` must name the number of the
+        latch.
+        """
         if self._began_ns is None:
             self._began_ns = now.mono_ns
 
@@ -161,8 +165,8 @@ class Lifecycle:
         """Latch a stop with a new number, and return a text for the client.
 
         A repeated request does not change the latch. A request counts as repeated if the latch
-        already names this client, and if `asked_ns` is not later than the arrival of the latest
-        request for a stop so far.
+        already names this client, and if an accepted request for a stop arrived at `asked_ns` or
+        later.
 
         Args:
             by: the name of the client; "" if it is unknown.

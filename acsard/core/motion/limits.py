@@ -196,9 +196,10 @@ def _approach(
 
 
 def _flattenable(away: float, step: float, dt: float) -> float:
-    """Return the largest acceleration that can fall to zero while the speed changes by `away`.
+    """Return the largest acceleration that can fall to zero before the speed passes its goal.
 
-    The acceleration falls by `step` in each period of `dt` s.
+    `away` is the difference between the goal and the speed. The jerk limit lets the acceleration
+    fall by `step` in each period of `dt` s.
     """
     # If the acceleration starts at s and falls for n more periods, the speed changes by
     # dt ((n + 1) s - step n (n + 1) / 2).

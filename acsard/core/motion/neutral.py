@@ -1,15 +1,16 @@
 """Applies the neutral-first rule to one sender: only an armed sender may drive the robot.
 
 Only a zero, which is a command to rest, arms a sender. Silence does not. The sender stays armed
-until `require_neutral`, `disarm` or `unlearn` is called. A zero arms a sender immediately, unless
-several programs may share the sender's identity. A shared identity becomes armed only if no speed
-of any shared identity of the source follows for `commands.neutral_pause`.
+until `require_neutral`, `disarm` or `unlearn` is called. A zero usually arms its sender
+immediately. If several programs may share the sender's identity, the zero arms this identity only
+after `commands.neutral_pause`. In this time, a speed from any shared identity of the same source
+cancels the zero.
 
 A sender is live while its last accepted command is not older than the timeout of its source. A
-sender is present while it takes part in the choice of the arbiter. A live sender is present. After
-a stall of the daemon, or while its stamps are doubtful, a sender stays present for at most
-`CANDIDATE_NS` after its last accepted command. Without this extra time, a sender that keeps the
-robot at rest would lose control to a sender of speeds.
+sender is present while the arbiter may choose it. Every live sender is present. After a stall of
+the daemon, or while its stamps are doubtful, a sender stays present for at most `CANDIDATE_NS`
+after its last accepted command. Without this extra time, a sender that keeps the robot at rest with
+zeros would lose control to another sender that sends speeds.
 """
 
 from __future__ import annotations
@@ -120,18 +121,18 @@ class Sender:
         )
 
     def rank(self, now_ns: int) -> tuple[bool, int]:
-        """Return the sort key for the order in which the arbiter prefers present senders.
+        """Return the sort key by which the arbiter orders present senders. The lowest key wins.
 
-        The key compares senders of sources with equal priorities. Live senders come before senders
-        that are not live. Otherwise, the sender that began to send first comes first. Within one
-        source, however, armed senders always come before unarmed senders.
+        Live senders come before senders that are not live. Otherwise, the sender that began to send
+        first comes first. The key does not say whether a sender is armed: `_Source.present` puts
+        the armed senders of a source before the unarmed ones.
         """
         return not self.live(now_ns), self.came_ns
 
     def doubtful(self, now_ns: int) -> bool:
         """Return whether a recent command was not accepted because of its stamp.
 
-        A command is recent for the timeout of its source.
+        A command is recent if it is not older than the timeout of the sender's source.
         """
         return self._doubted_ns is not None and now_ns - self._doubted_ns <= self._timeout_ns
 
@@ -198,11 +199,11 @@ class Sender:
             self._proven_zero_ns = self._zero_ns if proven else None
 
     def cancel_zero(self, at_ns: int) -> None:
-        """Record that a program with a shared identity may have sent a speed at `at_ns`.
+        """Cancel the zero of a shared identity, because one of its programs may have sent a speed.
 
-        `at_ns` is a monotonic time, ns. If this sender's identity is shared, and
-        `commands.neutral_pause` after its zero was not over at that time, the zero no longer arms
-        the sender.
+        That program may have sent the speed at `at_ns`, a monotonic time, ns. A canceled zero does
+        not arm the sender. If `commands.neutral_pause` was already over at `at_ns`, the zero has
+        armed the sender, and the sender stays armed.
         """
         self._settle(at_ns)
         self._zero_ns = self._proven_zero_ns = None
@@ -220,9 +221,10 @@ class Sender:
     ) -> None:
         """Process a command that was not refused.
 
-        A command from an unproven clock ("first", "unproven") does not drive the robot yet, but a
-        zero with such a verdict arms the sender until `unlearn`. If the command is a speed of a
-        shared identity, the caller must first call `cancel_zero` of each sender of the source.
+        If `verdict` is "first" or "unproven", the delays of the sender are not proved yet. Such a
+        command does not drive the robot, but a zero already counts for arming. `unlearn` undoes
+        this effect. If the command is a speed of a shared identity, the caller must first call
+        `cancel_zero` of each sender of the source.
 
         Args:
             command: the command.
@@ -267,10 +269,10 @@ class Sender:
             self._ended = replace(command, stamp_ns=None)
 
     def _update_times(self, zero: bool, now_ns: int, present: bool) -> None:
-        """Update `zeros_ns` and `speeds_ns` with a command that arrived at `now_ns`.
+        """Update `zeros_ns` and `speeds_ns`, which say since when only zeros or speeds arrive.
 
-        `zero` says whether the command is a zero. `present` is false if this command ends a silence
-        of the sender.
+        `now_ns` is the monotonic time at which the command arrived, ns. `zero` says whether the
+        command is a zero. `present` is false if this command ends a silence of the sender.
         """
         since_ns = self.zeros_ns if zero else self.speeds_ns
         if since_ns is None or not present:
@@ -307,7 +309,11 @@ class Sender:
         self._doubted_ns, self.doubt, self.ros = command.arrived_ns, why, command.ros
 
     def _settle(self, now_ns: int) -> None:
-        """Arm a shared identity if `commands.neutral_pause` is over after its zero."""
+        """Arm the sender if `commands.neutral_pause` has passed since its zero.
+
+        Only a sender with a shared identity must wait for this pause. `now_ns` is the monotonic
+        time, ns.
+        """
         if self._zero_ns is not None and now_ns - self._zero_ns >= self._pause_ns:
             self._armed = True
             if self._proven_zero_ns == self._zero_ns:

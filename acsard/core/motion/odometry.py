@@ -151,8 +151,8 @@ class Odometry:
         """Set the pose of base_link in odom, with the uncertainty of an initial pose.
 
         Some motion is not in the pose yet, for example the motion in feedback lines that are held
-        back or implausible. This motion is dropped, because it happened before this call. The
-        angles of the wheels keep the small motion at rest (`_held`).
+        back or implausible. This motion is dropped, because it happened before this call. However,
+        a small motion at rest (`_held`) is still added to the angles of the wheels.
         """
         self._positions = plus(self._positions, self._held)
         self._held = AT_REST
@@ -217,9 +217,9 @@ class Odometry:
     def fold(self, feedback: Feedback) -> Estimate:
         """Advance the pose by one feedback line, and return the new estimate.
 
-        - The angles that the wheels rolled come from the encoder counts of the line. A line without
-          counts gives the speeds times dt. After a gap that cannot be filled, only the uncertainty
-          grows.
+        - The angles that the wheels rolled come from the encoder counts of the line. Without
+          counts, each angle is the speed of the wheel times dt. After a gap that cannot be filled,
+          only the uncertainty grows.
         - While the robot is at rest, a motion of up to two encoder counts does not change the pose
           yet.
         - If a gyro provides the turn since the previous line, the wheels provide only the distance.
@@ -268,7 +268,11 @@ class Odometry:
         )
 
     def _settled(self, rolled: Rolled, at_rest: bool) -> tuple[Motors, ...]:
-        """Return the wheel angles of each arc, but keep small motions at rest in `_held`."""
+        """Return the wheel angles to add to the pose now, rad, one item for each arc.
+
+        A small motion at rest is stored in `_held` and not returned yet, because a wheel at rest
+        may rock between the edges of one encoder count.
+        """
         turned = rolled.turned
         if self._held != AT_REST:
             turned = plus(self._held, turned)
@@ -308,7 +312,9 @@ class Odometry:
     ) -> list[tuple[float, float]]:
         """Return the arcs that the robot drove, as pairs of distance (m) and turn (rad).
 
-        `share` is the effective track divided by the configured track.
+        `pieces` contains the angles that the wheels rolled, rad, one item for each arc. If `gyro`
+        is not None, the result is a single arc with the gyro's turn. `share` is the effective track
+        divided by the configured track.
         """
         believed, kinematics = self.checks.wheels.believed, self._kinematics
         arcs = []

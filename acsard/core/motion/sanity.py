@@ -252,5 +252,5 @@ class Sanity:
 
 
 def _proven(line: Feedback) -> Motors | None:
-    """Return the wheel angles that encoder counts prove, rad, or None for a line without counts."""
+    """Return the wheel angles that come from encoder counts, rad; None without counts."""
     return line.counted if line.turned is None else line.turned

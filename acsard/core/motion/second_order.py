@@ -1,9 +1,9 @@
 """Adds the effects of second order to the covariance of the pose.
 
-If the true heading deviates from the estimated one and returns, the robot does not get as far as
-the estimated position, and never farther. This is an effect of second order. On a straight drive,
-it causes nearly all of the error along the path. After 60 m with k = 1e-5 (`error_model.py`), the
-first-order error is 17 mm, but the true error is 0.12 m.
+If the true heading deviates from the estimated one, the robot gets less far in the estimated
+direction. This is so for a deviation to either side, so the effect does not average out. It is an
+effect of second order. On a straight drive, it causes nearly all of the error along the path. After
+60 m with k = 1e-5 (`error_model.py`), the first-order error is 17 mm, but the true error is 0.12 m.
 
 The path is divided into stretches. Each stretch composes the error e of the path before it with its
 own error w. The formula of Baker, Campbell and Hausdorff gives the composed error, where [a, b] is

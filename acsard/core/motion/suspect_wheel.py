@@ -190,7 +190,11 @@ class Suspect:
         return self.sign == "stuck" and not self._known and self._seconds >= STUCK_TIME_S
 
     def _plain(self, ballot: _Ballot) -> bool:
-        """Return False if slip of the other wheel can explain the sign "stuck"."""
+        """Return whether only a faulty encoder can explain the sign of this wheel.
+
+        If the sign is "stuck", the wheel may also be healthy while the other wheel slips. Then the
+        result is False, unless the two wheels differ by at least `MIN_STUCK_FRACTION`.
+        """
         return self.sign != "stuck" or ballot.share >= MIN_STUCK_FRACTION
 
 

@@ -162,7 +162,10 @@ class PoseUncertainty:
         self._publish()
 
     def doubt(self, along: float, yaw: float) -> None:
-        """Add the variances `along` of distance, m2, and `yaw` of turn, rad2, to the last step."""
+        """Increase the uncertainty of the last step, because it filled a gap in the feedback.
+
+        `along` is the additional variance of its distance, m2, and `yaw` that of its turn, rad2.
+        """
         if not self._lost:
             self._p = added(self._p, along, yaw, 0.0, self._cos, self._sin)
             self._publish()

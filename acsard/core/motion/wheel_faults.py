@@ -228,7 +228,11 @@ class _Side:
         return False
 
     def was_faulty(self, before: WheelSpeeds, now: WheelSpeeds) -> bool:
-        """Return whether the ignored wheel may have been wrong already at the speeds `before`."""
+        """Return whether the ignored wheel may have been wrong already in an earlier line.
+
+        `before` contains the wheel speeds in that line, and `now` the present wheel speeds, all in
+        rad/s.
+        """
         if self.out is None:
             return False
         own, other = self.wheels[self.out], self.wheels[1 - self.out]
@@ -327,8 +331,9 @@ class WheelFaults:
     def watch(self, commanded: WheelSpeeds | None, seen: WheelSpeeds, dt: float) -> str:
         """Compare the wheel speeds in a feedback line with their commands.
 
-        Return the reason of a fault, which names the wheel, if a wheel has contradicted its command
-        for `feedback.fault_time`. Otherwise return "". The caller must then call `look`.
+        If a wheel has contradicted its command for `feedback.fault_time`, return the reason of a
+        fault, which names the wheel. Otherwise return "". In both cases, the caller must call
+        `look` for the same line next.
 
         Args:
             commanded: the commanded wheel speeds, rad/s. None means that the motors may have no
@@ -455,7 +460,11 @@ class WheelFaults:
         return self._found is not None and self._found.was_faulty(before, self._last)
 
     def _seek(self, speeds: WheelSpeeds, dt: float) -> None:
-        """Learn the angle of a count, which is the smallest angle that recurs (`RECURRENCES`)."""
+        """Learn the angle of one encoder count from the speeds in a feedback line.
+
+        A wheel that turns reports at least one count. Therefore the smallest angle that recurs in
+        the lines is the angle of a count (`RECURRENCES`).
+        """
         self._period += PERIOD_GAIN * (dt - self._period)
         self._looked += 1
         if self._looked > LEARNING_LINES:
@@ -489,6 +498,6 @@ class WheelFaults:
 
 
 def slow_text(slow: tuple[str, ...]) -> str:
-    """Return a text about the wheels in `WheelsStatus.slow`."""
+    """Return a text that names the slow wheels. `slow` is the value of `WheelsStatus.slow`."""
     wheels = [f"{one.replace(' ', ' reaches ')} of its expected speed" for one in slow]
     return f"wheels are slower than commanded: {', '.join(wheels)}"

@@ -131,7 +131,10 @@ class Witness:
         self.forget()
 
     def forget(self) -> None:
-        """Drop the evidence of faults, but keep the facts about the motion of the wheel."""
+        """Drop the evidence of faults, but keep `driven`, `ratio` and `slow`.
+
+        These three values describe the motion of the wheel and stay valid.
+        """
         self.speed = 0.0
         """Measured speed, smoothed, rad/s."""
         self._seen, self._begins = 0.0, True

@@ -185,7 +185,10 @@ class ListReply(Struct, frozen=True):
 
 
 class Names(Struct, frozen=True):
-    """Request with names of parameters, whose values, types or descriptors the reply contains."""
+    """Request that contains names of parameters.
+
+    The reply contains the values, the types or the descriptors of these parameters.
+    """
 
     names: NameList[str]
 

@@ -405,7 +405,7 @@ class FakeMcu(Faults):
         return self._input("estop", "pressed", after_s, length_s)
 
     def estop_silent(self, after_s: float, length_s: float) -> Fault:
-        """Make the board report a released emergency stop, and stop these reports for some time.
+        """Make the board report a released emergency stop, with a pause in these reports.
 
         The pause begins `after_s` s after this fault is switched on, and lasts `length_s` s. If
         `length_s` is 0, the pause does not end.
@@ -431,7 +431,7 @@ class FakeMcu(Faults):
         return self._input("bumpers", "".join(marks), after_s, length_s)
 
     def bumpers_silent(self, after_s: float, length_s: float) -> Fault:
-        """Make the board report released bumpers, and stop these reports for some time.
+        """Make the board report released bumpers, with a pause in these reports.
 
         The pause begins `after_s` s after this fault is switched on, and lasts `length_s` s. If
         `length_s` is 0, the pause does not end.

@@ -84,7 +84,10 @@ class Faults:
             setattr(self, name, value)
 
     def _catch_up(self) -> None:
-        """Simulate the vehicle up to now. `FakeMcu` implements this."""
+        """Simulate the vehicle up to now with the present switches, before a switch changes.
+
+        `FakeMcu` implements this.
+        """
 
     def _hit(self, what: str, every: int) -> bool:
         """Count an event. Return True for every n-th event, where n is `every`."""
@@ -132,7 +135,7 @@ class Faults:
         return self._with(stuck=wheel)
 
     def frozen_encoder(self, wheel: int) -> Fault:
-        """Make the board repeat the last speed that it has reported for motor `wheel` forever.
+        """Make the board repeat the last speed that it has reported for motor `wheel`.
 
         `wheel` is 0 to 3 for the motors a to d, even if encoders are swapped.
         """

@@ -34,7 +34,10 @@ class VirtualWire:
         return self._now_ns
 
     def late_ns(self) -> int:
-        """Return the delay that this computer has caused, ns. It is always 0 in virtual time."""
+        """Return for how long the simulated board waited for a processor, ns.
+
+        In virtual time, the board never waits, so the result is always 0.
+        """
         return 0
 
     def send(self, data: bytes) -> None:

@@ -2,8 +2,9 @@
 
 Zenoh denies every message that no rule allows.
 
-- Zenoh checks the rules in the session at the far end of a client's link. That session belongs to
-  the daemon or, over TLS, to the TLS gateway. It knows only the neighbor on the link, so a client
+- The session that accepts a client's link checks the rules. It belongs to the daemon or, over TLS,
+  to the TLS gateway.
+- This session sees only the certificate of the program at the other end of the link. So a client
   that connects through a router has the permissions of the router.
 - A rule allows a message only if one of the rule's key expressions includes the whole key
   expression of the message. A query with a wildcard therefore needs a rule with a wildcard.
@@ -161,9 +162,10 @@ class _Keys:
         """Key expressions on which the daemon publishes, or whose queries it answers."""
 
     def of(self, role: Role, use: Use) -> list[str]:
-        """Return the keys for which `role` is the lowest role with the permission `use`.
+        """Return the keys that `role` may use, but no lower role.
 
-        Command keys that end with a certificate's name are in `commands_by` only.
+        `use` is the kind of use: publish, subscribe or query. The result does not contain the
+        command keys that end with a certificate's name. The method `commands_by` returns those.
         """
         rows = self._incoming if use == "publish" else self._readable
         keys = [full_key(self._robot, key) for key in keys_for(role, use, rows)]
@@ -180,7 +182,8 @@ class _Keys:
     def _least(self, endpoint: Endpoint) -> Role | None:
         """Return the lowest role that may use a ROS endpoint.
 
-        Return None for the commands of a source that is not configured.
+        Return None for the commands of a source that is not configured, because no role may send
+        them.
         """
         native = endpoint.native
         if native.startswith(PARAMETERS_PREFIX):
@@ -207,8 +210,8 @@ def _uses(endpoint: Endpoint) -> tuple[Use, ...]:
 def access_control(config: Config) -> dict[str, object]:
     """Return the value of Zenoh's setting `access_control` for the session of the daemon.
 
-    Every TLS link of that session leads to a router. The daemon accepts commands with the name of
-    any certificate from the router, because the router has checked the certificate of each client.
+    Every TLS link of that session leads to a router. The router checks the certificate of each
+    client. So the rules let the router forward the commands of every certificate.
     """
     return _access(config, LOCAL_RULES, gateway=False)
 
@@ -217,8 +220,9 @@ def gateway_access(config: Config) -> dict[str, object]:
     """Return the value of Zenoh's setting `access_control` for the session of the TLS gateway.
 
     Zenoh assigns access rules to "subjects". Each role is a subject. Each certificate that may
-    command is a further subject, which may put on the command keys of this certificate. The
-    gateway's link to the daemon is its only link without a certificate, and passes all messages.
+    command is a further subject, which may publish on the command keys of this certificate. The
+    gateway's link to the daemon is its only link without a certificate. The rules allow all
+    messages on this link.
     """
     return _access(config, ("pass",), gateway=True)
 
@@ -226,8 +230,9 @@ def gateway_access(config: Config) -> dict[str, object]:
 def _access(config: Config, local: tuple[str, ...], *, gateway: bool) -> dict[str, object]:
     """Return the value of Zenoh's setting `access_control` for one session.
 
-    `local` contains the names of the rules for links without a certificate. Only the session of the
-    TLS gateway limits each certificate to its own command keys.
+    `local` contains the names of the rules for links without a certificate. `gateway` is true for
+    the session of the TLS gateway. Only this session limits each certificate to its own command
+    keys.
     """
     keys = _Keys(config)
     rules = _rules(keys)

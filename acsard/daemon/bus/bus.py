@@ -66,18 +66,20 @@ class ZenohBus:
 
     @property
     def wanted(self) -> frozenset[str]:
-        """Native keys of the published topics that have a subscriber or are latched.
+        """Keys of the topics whose messages the daemon must publish now.
 
-        A subscriber of a topic's ROS key counts too.
+        These topics are latched or have a subscriber. The subscriber may use the topic's native key
+        (the key in the table of keys), its JSON key or its ROS key. The set contains native keys.
         """
         return self._outlets.wanted
 
     def take(self, queries: int) -> BusInput:
         """Return the samples and queries that have arrived since the last call.
 
-        The result also contains changes of the connections to routers, the number of messages that
-        were dropped, and whether the bus has begun to block. It contains at most `queries` queries,
-        plus one slow query (see `Inbox.take`). Further queries wait for the next call.
+        The result contains at most `queries` queries, plus one slow query: a `set` request or a
+        query for ROS parameters. Further queries wait for the next call. The result also contains
+        changes of the connections to routers, the number of messages that were dropped, and
+        whether the bus has begun to block.
         """
         taken = self._inbox.take(queries)
         routers = self._links.changed()
@@ -155,7 +157,8 @@ class ZenohBus:
     def _conflict(self, tokens: set[str]) -> str:
         """Return an error message if another daemon uses this robot's id or ROS names, or "".
 
-        `tokens` are those of this robot's liveliness tokens that other sessions have declared.
+        `tokens` is the result of `_others`: liveliness tokens that another session has declared,
+        although they belong to this robot.
         """
         if self._alive in tokens:
             return (
@@ -239,10 +242,11 @@ class ZenohBus:
 
 
 def _others(session: zenoh.Session, alive: str, claims: tuple[str, ...]) -> set[str]:
-    """Return those of this robot's liveliness tokens that other sessions have declared already.
+    """Return the liveliness tokens of this robot that another session has already declared.
 
-    `alive` is the token of the robot's id, and `claims` are the tokens of its ROS names. Blocks for
-    up to `TWIN_TIMEOUT_S`.
+    Such a token shows that another daemon uses this robot's id or ROS names. `alive` is the token
+    of the robot's id, and `claims` are the tokens of its ROS names. Blocks for up to
+    `TWIN_TIMEOUT_S`.
     """
     liveliness = session.liveliness()
     subscribers = {

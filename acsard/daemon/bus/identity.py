@@ -46,8 +46,8 @@ class Identity(Struct, frozen=True):
         """Return the reason, in words, why this client may not use a Zenoh key of the robot.
 
         Return "" if the client may use the key. If the robot answered no query for the client's
-        role, the role is unknown. In this case, return the text of `silence`, which is "" for a
-        client without a certificate.
+        role, the role is unknown. In this case, return the likely reasons for the robot's silence
+        or, for a client without a certificate, "".
 
         Args:
             key: the part of the Zenoh key after the robot's id, such as `state`.

@@ -208,9 +208,10 @@ class Inbox:
         """Return the samples since the last call, and the first of the waiting queries.
 
         The stops come first, and then the other samples in the order of their arrival. The queries
-        are in this order: service calls, one slow query, other queries. At most `queries` queries
-        are returned. If service calls alone reach this limit, the slow query is returned in
-        addition.
+        are in this order: service calls, one slow query, other queries. A slow query is a `set`
+        request or a query for ROS parameters, whose answer takes much processor time. At most
+        `queries` queries are returned. If service calls alone reach this limit, the slow query is
+        returned in addition.
         """
         if not self._any:
             return NO_INPUT
@@ -242,9 +243,10 @@ class Inbox:
         self._arrived(sample, key, str(sample.encoding), "native")
 
     def on_ros_sample(self, endpoint: Endpoint, sample: zenoh.Sample) -> None:
-        """Queue a sample of a ROS key as if the sample had arrived on the native key of `endpoint`.
+        """Queue a sample that arrived on a ROS key.
 
-        A sample from ROS does not name its encoding, so `endpoint.encoding` is used.
+        The sample is queued as if it had arrived on `endpoint.native`, the key of acsard with the
+        same meaning. A sample from ROS does not name its encoding, so `endpoint.encoding` is used.
         """
         key = str(sample.key_expr)
         native = endpoint.native if key == endpoint.key else key
@@ -297,10 +299,11 @@ class Inbox:
         self._waker.stop()
 
     def on_query(self, topic: str, query: zenoh.Query) -> None:
-        """Queue a query on a native key.
+        """Queue a query that a queryable has received on the key `topic`, without the robot's id.
 
-        A query with a wildcard is dropped if it matches a service or a JSON key. `topic` is the
-        native key of the queryable that has received the query.
+        A query with a wildcard is dropped if `topic` is a service, because a wildcard must not call
+        a service. It is also dropped on a JSON key, because the same topic answers it on its other
+        key.
         """
         asked = str(query.key_expr).removeprefix(self._prefix)
         if asked != topic and (topic in VERBS or topic.startswith(JSON_TREE)):
@@ -313,7 +316,7 @@ class Inbox:
     def on_ros_query(self, endpoint: Endpoint, query: zenoh.Query) -> None:
         """Queue a query on a ROS key, such as a call of a ROS service.
 
-        A query with a wildcard is dropped.
+        A query with a wildcard is dropped, because it must not call a service.
         """
         if str(query.key_expr) == endpoint.key:
             native = endpoint.native
@@ -359,7 +362,10 @@ class Inbox:
 
 
 def _bytes(payload: zenoh.ZBytes | None, most: int) -> bytes:
-    """Return at most `most` + 1 bytes: the extra byte shows that the payload is too long."""
+    """Return the first `most` + 1 bytes of a payload, or b"" if `payload` is None.
+
+    If the result is longer than `most` bytes, the payload is too long.
+    """
     return b"" if payload is None else payload.to_bytes()[: most + 1]
 
 

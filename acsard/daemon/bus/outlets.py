@@ -1,8 +1,8 @@
-"""Publishes the messages of each topic on those of the topic's keys that have a subscriber.
+"""Publishes the messages of each topic on every key of the topic that has a subscriber.
 
-A topic has native keys and perhaps ROS keys. Each key has an outlet, which is the publisher on that
-key. A message is encoded once per encoding, and only if an outlet with that encoding has a
-subscriber.
+A topic has native keys (one for msgpack, one for JSON) and perhaps ROS keys. Each key has an
+outlet, which is the publisher on that key. A message is encoded once per encoding, and only if an
+outlet with that encoding is latched or has a subscriber.
 
 The control loop only puts a message into the slot of its topic, which is a bounded queue. A thread
 encodes and sends the messages. So if the bus blocks, messages are lost, but the control loop misses

@@ -1,4 +1,4 @@
-"""Finds, follows or stops the robots that an `--id` names, and explains why a robot is silent.
+"""Finds, follows or stops the robots that the option `--id` names, and explains a robot's silence.
 
 Over TLS the access rules allow only exact keys, because a few wildcards can take all the
 processor time of a router. So a client over TLS must name each robot.
@@ -49,10 +49,10 @@ def parse_ids(text: str) -> tuple[str, ...]:
 
 
 def running_robots(session: zenoh.Session, ids: Sequence[str], endpoint: str) -> list[str]:
-    """Return the sorted ids of those robots in `ids` whose daemon is running.
+    """Return the ids in `ids` of the robots whose daemon is running, sorted.
 
-    An id "*" stands for all robots. If `ids` contains "*" and no robot is visible, raise
-    `NoAnswerError`. `endpoint` is the client's endpoint, for the text of this error.
+    The id "*" stands for all robots. Raises `NoAnswerError` if `ids` contains "*" and no robot is
+    visible. The text of this error names `endpoint`, the client's endpoint.
     """
     found = set()
     for robot_id in ids:

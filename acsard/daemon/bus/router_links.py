@@ -92,9 +92,9 @@ def unreached(mode: str, endpoints: tuple[str, ...], ends: set[str]) -> tuple[st
         mode: Zenoh's mode. In mode "client" there is only one link. If this link exists, no
             endpoint counts as unreached.
         endpoints: the endpoints of `bus.connect`.
-        ends: the address at the far end of each link, such as "tcp/192.168.0.2:7447". A program
-            that has itself connected to the daemon, such as the TLS gateway, has an ephemeral port,
-            so it matches no endpoint.
+        ends: the address at the far end of each link, such as "tcp/192.168.0.2:7447". The link of a
+            program that connects to the daemon, such as the TLS gateway, does not count, because
+            its address has a random port that matches no endpoint.
     """
     if mode == "client":
         return () if ends else endpoints

@@ -372,9 +372,10 @@ def _server_certificate_error(code: int, reason: str, host: str, directory: str)
 
 
 def _client_certificate_error(reason: str, host: str, directory: str) -> str:
-    """Return the error message for a TLS handshake that the server ends.
+    """Return the error message for a TLS handshake that the server rejects.
 
-    `reason` is OpenSSL's name of the error, usually of an alert that the server sent.
+    The server usually rejects this client's certificate. `reason` is OpenSSL's name of the error,
+    usually of an alert that the server sent.
     """
     certificate = f"{directory}/{CERTIFICATE}"
     if "CERTIFICATE_EXPIRED" in reason:

@@ -151,16 +151,20 @@ def certificate_trouble(authority: Path, certificate: Path, key: Path) -> str:
 
 
 def reachable(endpoint: str) -> str:
-    """Return the endpoint with which a program on this machine can connect to `endpoint`.
+    """Return the endpoint to which a program on this machine can connect.
 
-    Another program listens at `endpoint`. An address that stands for all addresses of the machine
-    (0.0.0.0 or [::]) is replaced by the loopback address. Any other endpoint is returned unchanged.
+    `endpoint` is the endpoint at which another program on this machine listens. An address that
+    stands for all addresses of the machine (0.0.0.0 or [::]) is replaced by the loopback address.
+    Any other endpoint is returned unchanged.
     """
     return endpoint.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:")
 
 
 def no_endpoint(text: str) -> UsageError:
-    """Return the error that says that `text` is not a Zenoh endpoint, and how to write one."""
+    """Return the error for a `text` that is not a Zenoh endpoint.
+
+    The error's text says how an endpoint is written.
+    """
     lack = ", because its port is missing" if _lacks_port(text) else ""
     return UsageError(f'{text} is not an endpoint{lack}; write it like "tcp/127.0.0.1:7448"')
 
@@ -296,8 +300,9 @@ def _tls(directory: str) -> dict[str, object]:
 def _command_limits(config: Config) -> dict[str, object]:
     """Return the setting that limits the rate of messages on each input key.
 
-    Zenoh counts each connection separately. All certificates of a source share one limit. All
-    sources that are not configured also share one limit.
+    Zenoh counts the messages of each connection separately. On one connection, the keys of all
+    certificates of a source share one limit. The keys of all unconfigured sources also share one
+    limit.
     """
     names = [*(source.name for source in config.commands.sources), "*"]
     below = [*source_keys(names), *source_keys(names, "*"), IMU, SPEED_LIMIT]

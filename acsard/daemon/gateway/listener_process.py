@@ -121,8 +121,8 @@ class SessionHealth:
         """Return a log event with the reason why the process must restart, or None.
 
         Args:
-            observed: the latest observation. If several calls get the same observation, Zenoh may
-                hang.
+            observed: the latest observation. If it stays the same for too long, the observing
+                thread is stuck, because Zenoh does not respond.
             passed_ns: time since the last call, ns.
         """
         new, self._last_ns = observed.at_ns != self._last_ns, observed.at_ns

@@ -53,7 +53,7 @@ class SerialPort:
     """The serial port to the board, as an asynchronous context manager.
 
     The port is opened when the context is entered. When the context is left, the port sends STOP
-    and closes. A lost port is reopened while `keep_open` runs.
+    and closes. While `keep_open` runs, it opens a port that was lost, or that was absent at first.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""Tests of a benchmark's table: every figure has its place, and missing measurements are marked."""
+"""Tests of a benchmark's table: it shows every figure, and marks missing measurements."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of the sentences that say why a process of a benchmark ended."""
+"""Tests of the messages that say why a process of a benchmark ended."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""ROS 2 bags of simulated drives: their messages, and files that the library rosbags writes."""
+"""ROS 2 bags of simulated drives, as messages and as files that the library rosbags writes."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ PERIOD_S = 0.01
 
 def message(topic: str, kind: str, at: float, *, came: float | None = None, **fields: object
             ) -> RosMessage:  # fmt: skip
-    """Return a message that was made at `at` and recorded at `came`, s since the start."""
+    """Return a message that has the stamp `at` and was recorded at `came`, s since the start."""
     made_ns = START_NS + round(at * 1e9)
     wall_ns = made_ns if came is None else START_NS + round(came * 1e9)
     (cls,) = (cls for cls in NAMES if cls.__name__ == kind)
@@ -39,7 +39,7 @@ def joint_states(
     seen: Drive, topic: str = "/joint_states", names: Sequence[str] = JOINTS, *,
     speeds: bool = False,
 ) -> Iterator[RosMessage]:  # fmt: skip
-    """Yield the wheels: angles at the end of each period, or speeds in its middle.
+    """Yield the wheels' messages: angles at the end of each period, or speeds in its middle.
 
     The first half of the joints are on the left.
     """
@@ -54,9 +54,9 @@ def joint_states(
 
 def imu(seen: Drive, topic: str = "/imu/data", axis: int = 2, sign: float = 1.0, late: float = 0.0
         ) -> Iterator[RosMessage]:  # fmt: skip
-    """Yield the gyro, whose axis `axis` points up (`sign` 1) or down (-1).
+    """Yield the messages of a gyro whose `axis` points up (`sign` 1) or down (`sign` -1).
 
-    Its clock is `late` seconds behind.
+    The gyro's clock is `late` seconds behind.
     """
     none = [0.0] * 9
     noise = np.random.default_rng(0).normal(0.0, 0.01, (len(seen.gyro_t), 3))
@@ -95,7 +95,7 @@ def odometry(
 
 
 def wheel_odometry(seen: Drive, track: float = 1.4, topic: str = "/odom") -> Iterator[RosMessage]:
-    """Yield the odometry of a driver that computes it from the same wheels."""
+    """Yield the odometry that the robot's driver computes from its wheels."""
     turn = (seen.right - seen.left) * RADIUS / (SEPARATION * track) * PERIOD_S
     yaw = np.cumsum(turn)
     ahead = (seen.right + seen.left) / 2 * RADIUS * PERIOD_S
@@ -110,7 +110,7 @@ def in_order(*topics: Iterator[RosMessage]) -> list[RosMessage]:
 def write_mcap(
     path: Path, messages: Sequence[RosMessage], compression: CompressionType = CompressionType.ZSTD
 ) -> Path:
-    """Write a bag's file by the MCAP library."""
+    """Write the messages as a bag file with the MCAP library."""
     with path.open("wb") as stream:
         writer = Writer(stream, chunk_size=1 << 16, compression=compression)
         writer.start("ros2", "libmcap")
@@ -129,9 +129,9 @@ def write_mcap(
 
 
 def write_bag(directory: Path, seen: Drive, *, sqlite: bool = False) -> Path:
-    """Write wheels, gyro and positions of a drive as a bag, encoded by the library rosbags alone.
+    """Write the wheels, gyro and positions of a drive as a bag with the library rosbags.
 
-    It shares no code with acsard.
+    This function shares no code with acsard.
     """
     store = get_typestore(Stores.ROS2_JAZZY)
     types = store.types

@@ -1,4 +1,4 @@
-"""Helpers that cut logs into the parts that the calibration modules take."""
+"""Helpers that convert drives and logs to the inputs of the calibration modules."""
 
 from __future__ import annotations
 
@@ -36,9 +36,9 @@ def usual(seed: int = 3, plan: Plan = GUIDED) -> Drive:
 
 
 def table(seen: Drive, *, gyro: bool = True, places: bool = True) -> Table:
-    """Return the table that `read` makes of `seen.csv`, without the time for writing and reading.
+    """Return the table that `read` would make of the drive's CSV text, without writing the text.
 
-    `test_a_table_made_directly_equals_that_of_the_written_log` compares both.
+    `test_a_table_made_directly_equals_that_of_the_written_log` compares both tables.
     """
     sensors = [
         (seen.t, {"left": seen.left, "right": seen.right}, 2, True),
@@ -64,7 +64,7 @@ def log_of_runs(
     drives: Iterable[Drive], *, gyro: bool = True, places: bool = True,
     recorded: Callable[..., Table] = table,
 ) -> reading.Log:  # fmt: skip
-    """Return a log in which each drive is a run. `recorded` makes the table of a drive."""
+    """Return a log in which each drive is a run. `recorded` converts a drive to a table."""
     runs = [log_of(recorded(seen, gyro=gyro, places=places)).runs[0] for seen in drives]
     named = [structs.replace(run, name=str(at + 1)) for at, run in enumerate(runs)]
     return reading.Log(tuple(named), ())

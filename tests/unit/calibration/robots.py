@@ -1,7 +1,8 @@
 """Simulated skid-steer robots and their logs. This module uses none of the code under test.
 
-The truth is integrated in steps of 5 ms. Wheels are reported at 100 Hz in two decimals, as means of
-their period. The gyro has its own rate, a delay, a bias and noise. Positions arrive at 5 Hz.
+It integrates the true motion in steps of 5 ms. The wheels report their mean speed of each period at
+100 Hz in two decimals. The gyro has its own rate, a delay, a bias and noise. Positions come at 5
+Hz.
 """
 
 from __future__ import annotations
@@ -164,7 +165,7 @@ def drive(robot: Robot, plan: Plan, start: float = 0.0) -> Drive:
 
 
 def _counted(robot: Robot, times: Floats, speeds: Floats, samples: Floats) -> Floats:
-    """Return the mean speed of both wheels of a side between samples, as their counts show it."""
+    """Return the mean speed of a side between samples, computed from whole encoder counts."""
     angle = np.interp(samples, times, np.append(0.0, np.cumsum(speeds) * STEP))
     if robot.counts:
         step = 2 * np.pi / robot.counts

@@ -1,4 +1,7 @@
-"""Tests of Gauss-Newton and the jackknife with a known answer, of evidence and of multipliers."""
+"""Tests of the Gauss-Newton fit and the jackknife on data with a known answer.
+
+Further tests check the evidence and the multipliers.
+"""
 
 from __future__ import annotations
 
@@ -24,9 +27,9 @@ TRUTH = np.array([0.99, 1.01, 0.7])
 
 
 def fitted(rng: np.random.Generator, shared: float, own: float, blocks: int = 20) -> Fit:
-    """Fit blocks of 30 rows, linear in left, right and turn.
+    """Fit a model that is linear in left, right and turn to blocks of 30 rows each.
 
-    The `shared` noise is equal within a block.
+    The `shared` noise is equal for all rows of a block.
     """
     block = np.repeat(np.arange(blocks), 30)
     columns = rng.normal(size=(len(block), 3))
@@ -62,7 +65,10 @@ def test_standard_deviations_cover_the_truth_however_errors_are_correlated(
 
 
 def test_errors_that_last_for_a_whole_run_widen_the_deviations_by_run() -> None:
-    """Each of six runs of four blocks has errors of its own, which a deviation by blocks misses."""
+    """Each of six runs has its own constant error.
+
+    A standard deviation from the differences between blocks does not contain this error.
+    """
     known, runs = np.diag([0.0] * 3 + [1.0] * (PARAMETER_COUNT - 3)), np.repeat(np.arange(6), 4)
     normal = np.zeros((24, PARAMETER_COUNT, PARAMETER_COUNT))
     normal[:, range(3), range(3)] = 1.0

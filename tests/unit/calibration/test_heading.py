@@ -1,4 +1,4 @@
-"""Tests of the gyro's bias and delay, of the rows that follow from them, and of their evidence."""
+"""Tests of the gyro's bias and delay, of the fit's rows made with them, and of their evidence."""
 
 from __future__ import annotations
 

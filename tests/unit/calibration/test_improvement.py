@@ -27,7 +27,7 @@ RATE = Rates(0.5, 1.0)
 
 
 def held(seen: Drive, *, places: bool = True) -> tuple[list[Fold], Improvement]:
-    """Return the folds of a fit to this drive, and its improvement."""
+    """Fit this drive, and return its cross-validation folds and the measured improvement."""
     log = table(seen, places=places)
     made, runs = ready(log), log_of(log).runs
     fitted = fit(made.sources, made.start, places=places)
@@ -78,7 +78,7 @@ def test_without_a_drive_to_leave_out_no_improvement_is_sure() -> None:
 
 
 def test_a_slow_curve_is_not_taken_for_a_straight_drive() -> None:
-    """The robot turns as slowly as a straight drive may, but turns much more in each metre."""
+    """The turn rate is as low as in a straight drive, but the turn per metre is much larger."""
     _, better = held(ideal([*GUIDED, (60.0, 0.04, 0.06)]), places=False)
     assert better.straight.before is not None
     assert better.straight.before < 5.0

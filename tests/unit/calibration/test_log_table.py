@@ -363,7 +363,7 @@ def test_a_message_without_wheels_or_turns_is_not_a_row(message: Message) -> Non
 
 
 def test_a_table_made_directly_equals_that_of_the_written_log() -> None:
-    """`cut.table` spares the other tests the text between a drive and its table."""
+    """The other tests use `cut.table`, which makes the table without writing a log."""
     seen = cut.usual()
     for gyro, places in ((False, True), (True, False), (True, True)):
         direct = cut.table(seen, gyro=gyro, places=places)

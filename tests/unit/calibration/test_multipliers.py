@@ -13,7 +13,10 @@ NAMES = ("turns", "straight")
 
 
 def follow(values: np.ndarray, number: int) -> Extent:
-    """Return a way of 5 m for wheels as configured, or of 9 m that ends near its start."""
+    """Return the extent of a path of 5 m, or of a path of 9 m that ends near its start.
+
+    Both grow with the wheels' size in `values`.
+    """
     size = float(values[1:].mean())
     return Extent(5.0 * size, 5.0 * size) if number else Extent(0.1 * size, 9.0 * size)
 

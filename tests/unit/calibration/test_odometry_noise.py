@@ -1,14 +1,16 @@
-"""The geometry and the noise that a log gives describe drives that it has not seen.
+"""The geometry and the noise from the calibration of a log also describe other drives.
 
-`-m "soak or not soak" -s` prints the table of `tests/README.md`. A row has these figures for the
-robots of one kind:
+`-m "soak or not soak" -s` prints the table of `tests/README.md`. A row describes the robots of one
+kind by these figures:
 
-- the NEES of three degrees of freedom at the end of drives of a minute, and that with the default
-  noise,
-- the squared errors of heading and distance after 10 s, in the variances that the odometry states,
-- the error of the heading after 10 s, and that of the best track and radii, which least squares
-  find in the truth of the same drives,
-- z, the error of the track and of the ratio of left to right in their standard deviations.
+- the NEES with three degrees of freedom after drives of a minute, with the fitted noise and with
+  the default noise,
+- the squared errors of heading and distance after 10 s, divided by the variances that the odometry
+  states,
+- the error of the heading after 10 s, and the same error with the best track and radii, which a
+  least-squares fit to the true motion finds,
+- z, the errors of the track and of the ratio of left to right, divided by their standard
+  deviations.
 """
 
 from __future__ import annotations
@@ -73,7 +75,8 @@ LINKS = {"plain": (2, 3e-4), "checked": (2, 0.0), "counts": (9, 0.0)}
 def stalled(seen: Drive, *, gyro: bool, places: bool) -> Table:
     """Return the log of a computer that stalls for 50 to 250 ms, twelve times a minute.
 
-    It stamps each sample of wheels and gyro when it reads it, so those of a stall at its end.
+    The computer stamps each sample when it reads it. It reads the samples of a stall when the stall
+    ends.
     """
     rng = np.random.default_rng(len(seen.t))
     late = replace(seen, t=seen.t.copy(), gyro_t=seen.gyro_t.copy())
@@ -99,7 +102,10 @@ def held(seen: Drive, *, gyro: bool, places: bool) -> Table:
 
 
 def lying(seen: Drive, *, gyro: bool, places: bool) -> Table:
-    """Return the log in a bag of an IMU on its side, with the axis that its refusal names."""
+    """Return the log of a bag whose IMU lies on its side.
+
+    The refusal of the bag proposes an axis, and the log is made with that axis.
+    """
     assert gyro
     assert not places
     messages = in_order(joint_states(seen), imu(seen, axis=0, sign=-1.0))
@@ -110,7 +116,7 @@ def lying(seen: Drive, *, gyro: bool, places: bool) -> Table:
 
 
 class Set(Struct, frozen=True):
-    """Robots of one kind, and how many drives of which length each of them logs."""
+    """Robots of one kind, with the number and the length of the drives in the log of each robot."""
 
     robot: Robot
     drives: int = 1
@@ -121,7 +127,7 @@ class Set(Struct, frozen=True):
     """Makes the table of a drive."""
 
     def log(self, rng: np.random.Generator, scale: float = 1.0) -> list[Drive]:
-        """Return the drives of a log. `scale` is that of the gyro."""
+        """Return random drives for a log. The gyro's values are multiplied by `scale`."""
         made = [self.drive(rng, wander(rng, self.seconds)) for _ in range(self.drives)]
         return [replace(one, gyro=one.gyro * scale) for one in made]
 
@@ -209,7 +215,7 @@ A log of 90 s with a perfect sensor has 1.1. Positions with an error of 1 cm sho
 
 
 def configs(found: Calibration) -> tuple[DriveConfig, OdometryConfig]:
-    """Return the configuration that `--write` makes of the default one."""
+    """Return the configuration that `--write` makes from the defaults and this calibration."""
     drive_config: dict[str, object] = {}
     noise: dict[str, object] = {}
     for key, value in keys(found).items():
@@ -223,9 +229,10 @@ def configs(found: Calibration) -> tuple[DriveConfig, OdometryConfig]:
 def judged(
     seen: Drive, begin: int, end: int, robot: tuple[DriveConfig, OdometryConfig], counts: int
 ) -> tuple[float, float, float]:
-    """Return the NEES of a part of a drive, and the shares of heading and distance.
+    """Return the NEES of a part of a drive, and the normalized squares of two errors.
 
-    Each is the square of the error in the variance that the odometry states.
+    These are the squared errors of heading and distance, divided by the variances that the odometry
+    states.
     """
     odom = Odometry(robot[1], Kinematics(robot[0]), counts)
     end = begin + (end - begin) // LINES * LINES
@@ -324,7 +331,7 @@ def rms(values: Floats | Sequence[float]) -> float:
 def test_the_noise_of_a_calibration_describes_drives_outside_of_its_log(
     name: str, way: str
 ) -> None:
-    """A gyro does not show errors of the distance, so only the heading is judged there."""
+    """With a gyro only the heading is compared, because a gyro shows no errors of distance."""
     shown = (name, way) in SHOWN
     row = measured(ROWS[name, way], way, ROBOTS if shown else FEWER)
     print(
@@ -382,7 +389,10 @@ def test_noise_is_written_beside_the_geometry_and_reported(found: Calibration) -
 
 @pytest.mark.slow
 def test_noise_that_is_already_right_stays_as_configured(found: Calibration) -> None:
-    """The geometry of the log is wrong again, and only it is written."""
+    """The configuration has the right noise and a wrong geometry.
+
+    The calibration changes only the geometry.
+    """
     log = log_of_runs(LOG)
     again = calibrate(log, DriveConfig(), None, configs(found)[1])
     assert again.noise is not None
@@ -393,7 +403,7 @@ def test_noise_that_is_already_right_stays_as_configured(found: Calibration) -> 
 
 @pytest.mark.slow
 def test_noise_of_a_robot_whose_geometry_is_right_is_written_alone(found: Calibration) -> None:
-    """The deviations of the radii give way to that of their ratio, which contains them."""
+    """The calibration replaces the configured deviation of each radius by that of their ratio."""
     geometry = configs(found)[0]
     present = OdometryConfig(left_wheel_radius_multiplier_std=0.002)
     log = log_of_runs(LOG)
@@ -438,7 +448,7 @@ def test_a_log_with_only_a_gyro_gives_no_distance_noise() -> None:
 
 
 def test_the_search_finds_the_noise_that_made_the_residuals() -> None:
-    """The windows have steps of noise per radian, noise that lasts, and that of the sensor."""
+    """The residuals contain noise per radian, noise that lasts, and noise of the sensor."""
     rng, size, count = np.random.default_rng(3), 8, 600
     effects = np.zeros((count, SOURCE_COUNT, size, size))
     sums = np.minimum.outer(np.arange(1.0, size + 1), np.arange(1.0, size + 1))

@@ -1,4 +1,4 @@
-"""Tests of paths, their alignment with positions, and the search for a start of the fit."""
+"""Tests of paths, of their alignment with positions, and of the fit's start values."""
 
 from __future__ import annotations
 

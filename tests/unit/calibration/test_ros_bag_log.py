@@ -115,7 +115,7 @@ def total(t: list[float], angles: list[float]) -> float:
 
 
 def test_uneven_times_do_not_change_the_angle() -> None:
-    """The time of every second message is 9 ms late, as after a read of two at once."""
+    """Every second message is 9 ms late, as if the logger read two messages at once."""
     t = [k * 0.01 + 0.009 * (k % 2) for k in range(2000)]
     assert total(t, [5.0 * k * 0.01 for k in range(2000)]) == pytest.approx(99.9, abs=0.2)
 
@@ -209,7 +209,10 @@ def test_poses_give_a_yaw_only_if_they_have_an_orientation(yaw: bool) -> None:
 
 
 def test_a_tilted_pose_gives_the_yaw_of_its_quaternion() -> None:
-    """30 deg of yaw after 10 deg of roll, against a constant yaw would be 30.4 by z and w alone."""
+    """The pose has 30 deg of yaw and 10 deg of roll.
+
+    A computation from z and w alone would give 30.4 deg.
+    """
 
     def tilted() -> Iterator[RosMessage]:
         for at in np.arange(0.0, 10.0, 0.2):

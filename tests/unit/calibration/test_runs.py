@@ -182,7 +182,7 @@ def test_positions_that_a_logger_repeats_until_the_next_sample_are_taken_once() 
 
 
 def test_positions_of_half_the_rate_are_recognized_in_one_note_for_all_runs() -> None:
-    """Positions of 10 Hz stand in rows of 20 Hz; in some of the runs fewer than half repeat."""
+    """Rows of 20 Hz contain positions of 10 Hz. In some runs fewer than half are repeated."""
     rows = []
     for run in range(12):
         early = run % 2  # so many more positions are new
@@ -212,7 +212,7 @@ def test_one_note_sums_an_event_over_all_runs() -> None:
 def test_a_repeated_position_of_the_drive_is_not_taken_for_the_rest_after_it() -> None:
     """The logger repeats positions of 1 Hz in every row.
 
-    The rows after the stop therefore still hold the last position of the drive.
+    The rows after the stop therefore still contain the last position from the drive.
     """
     way = [0.04 * min(i, 550) for i in range(1000)]
     rows = [f"{i / 100},{4 * (i < 550)},{4 * (i < 550)},{way[i // 100 * 100]:.3f},0"

@@ -1,6 +1,6 @@
-"""Tests with simulated robots of each kind.
+"""Tests of whole calibrations of simulated robots of each kind.
 
-The heading improves, and the standard deviations cover the truth.
+The heading must improve, and the standard deviations must cover the errors.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ def robots(way: str, count: int) -> list[tuple[Calibration, Drive]]:
 
 
 def off(seen: Drive, values: Floats) -> float:
-    """Return the rms error of the heading after 10 s, rad."""
+    """Return the rms error of the heading after 10 s with these parameters, rad."""
     track, left, right = values
     turns = (right * seen.right - left * seen.left) * RADIUS / (SEPARATION * track) * 0.01
     ends = np.arange(0, len(turns), 1000)
@@ -105,9 +105,10 @@ SUBSETS = 20
                             for kind in ("constant track", "squares"))],
 )  # fmt: skip
 def test_standard_deviations_are_as_wide_as_the_errors(kind: str, way: str) -> None:
-    """The truth of a track that grows is the constant that fits best at the drive's turn rates.
+    """A track that grows with the turn rate has no single true value.
 
-    Each run of a set of squares has its own ratio of left to right, because it slips differently.
+    The test uses the constant that fits the drive's turn rates best. Each run of squares has its
+    own ratio of left to right, because it slips differently.
     """
     chi, rate, slip, plan = SETS[kind]
     gyro, places = WAYS[way]
@@ -150,9 +151,9 @@ def test_the_reported_remaining_error_is_the_error_that_remains(way: str, count:
 
 
 def away(drives: Sequence[Drive], values: Floats) -> float:
-    """Return the rms position error over whole drives by the wheels alone, m.
+    """Return the rms position error of wheel odometry over whole drives, m.
 
-    Each path begins at the true place, in the true direction.
+    The odometry starts at the true position and heading of each drive.
     """
     squares = []
     for seen in drives:
@@ -175,7 +176,10 @@ def slow_drives(seed: int, **other: float) -> list[Drive]:
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 3, 6])
 def test_slow_squares_do_not_worsen_the_odometry_of_a_sound_robot(seed: int) -> None:
-    """The errors of the wheels hide the small turns of a short block, so its track is too wide."""
+    """The wheels' errors hide small turns in short blocks.
+
+    A fit to such blocks makes the track too wide.
+    """
     log = log_of_runs(slow_drives(seed, wheel_noise=0.05), gyro=False)
     elsewhere = slow_drives(seed + 100, wheel_noise=0.05)
     before = after = away(elsewhere, np.ones(3))
@@ -207,7 +211,7 @@ def manoeuvres(seed: int, count: int, slip: float) -> list[Drive]:
 
 
 def turned_wrong(drives: Sequence[Drive], track: float) -> float:
-    """Return the heading error of the drives as a fraction of the turned angle."""
+    """Return the error of the heading divided by the turned angle."""
     off = angle = 0.0
     for seen in drives:
         turns = (seen.right - seen.left) * RADIUS / (SEPARATION * track) * 0.01
@@ -253,7 +257,7 @@ def test_a_log_is_refused_with_the_quantities_that_are_too_inaccurate(
 
 
 def test_turns_on_the_spot_with_one_faster_side_give_the_track_by_a_gyro() -> None:
-    """The left wheels always roll 1 % less far than the right wheels."""
+    """The left wheels always roll 1 % less than the right wheels."""
     plan: Plan = [(3, 0, 0), (20, 0.00075, 1), (20, -0.00075, -1)]
     found = calibrated(table(drive(Robot(rng=np.random.default_rng(0)), plan), places=False))
     assert found.stays_configured == (RATIO,)
@@ -321,9 +325,9 @@ def test_an_uncertain_bias_widens_the_deviation_of_left_to_right() -> None:
 
 
 def test_coarse_encoders_at_a_high_rate_do_not_distort_the_track() -> None:
-    """At 1 kHz, 20 counts per turn read as 0 or 314 rad/s.
+    """At 1 kHz a wheel with 20 counts per turn reports 0 or 314 rad/s.
 
-    The mean of their squares therefore says nothing.
+    The mean square of these speeds is therefore no measure of the true speed.
     """
     seen = usual(plan=wander(np.random.default_rng(2), 100.0))
     t = np.arange(seen.t[0], seen.t[-1], 0.001)
@@ -360,7 +364,10 @@ def test_the_remaining_turn_error_uses_the_gyro_with_its_scale_corrected() -> No
 
 @pytest.mark.slow
 def test_positions_that_do_not_show_the_direction_do_not_contradict_the_gyro() -> None:
-    """The robot drives one small square. Pieces of four seconds are straights and noise."""
+    """The robot drives one small square.
+
+    Pieces of four seconds therefore show only straight lines and noise.
+    """
     side: Plan = [(4, 0.3, 0), (0.5, 0, 0), (4, 0, np.pi / 2 * 1.5 / 4), (0.5, 0, 0)]
     robot = Robot(chi=1.5, rate=0.0, outliers=0.0, lever=0j, rng=np.random.default_rng(3))
     found = calibrated(table(drive(robot, [(3, 0, 0), *side * 4, (3, 0, 0)]))).multipliers

@@ -1,4 +1,4 @@
-"""The response time and the highest speed of wheels come from their commands in a log."""
+"""Tests that find the response time and the highest speed of wheels in a log with commands."""
 
 from __future__ import annotations
 
@@ -74,7 +74,10 @@ def test_the_response_time_is_found(seconds: float) -> None:
 
 
 def test_a_slow_robot_that_reverses_would_be_faulty_and_its_response_time_is_proposed() -> None:
-    """Its wheels roll on behind the command for longer than the fault time allows."""
+    """The wheels follow a reversed command only after more than the fault time.
+
+    The calibration therefore proposes a longer response time.
+    """
     made = found(REVERSING, 2.0)
     assert made.false_fault
     assert made.proposed is not None
@@ -92,7 +95,7 @@ def test_the_proposed_response_time_is_at_least_the_one_that_fits_best(seconds: 
 
 
 def test_if_no_response_time_leaves_a_reserve_the_sentence_names_the_fault_time() -> None:
-    """Something holds the wheels for 1.5 s in the middle of the drive."""
+    """An obstacle blocks the wheels for 1.5 s in the middle of the drive."""
     rest, ahead = (3.0, 0.0, 0.0), (4.0, 0.5, 0.0)
     (run,) = log([rest, ahead, (1.5, 0.0, 0.0), ahead, rest], 0.2).runs
     (wished,) = log([rest, ahead, (1.5, 0.5, 0.0), ahead, rest], 0.2).runs

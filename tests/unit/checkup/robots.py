@@ -1,6 +1,6 @@
 """Simulated robots on blocks for the tests of the checkup.
 
-They consist of a fake MCU, a wire in virtual time, and a person.
+A simulation has a fake MCU, a wire in virtual time, and a person.
 """
 
 from __future__ import annotations
@@ -29,7 +29,10 @@ class Robot(VirtualWire):
     """A robot with these faults that records every line it receives."""
 
     def __init__(self, *faults: str, config: Config | None = None, **mcu: Any) -> None:
-        """`config` describes the hardware, and `mcu` the keys of the host that differ from it."""
+        """Simulate the hardware that `config` describes, with these faults.
+
+        `mcu` are keys of `[mcu]` that the host has configured differently.
+        """
         self.built = config or Config()
         self.config = configured(self.built, **mcu)
         super().__init__(FakeMcu(self.built))
@@ -59,9 +62,9 @@ class Robot(VirtualWire):
 
     @contextmanager
     def board(self, rest: bool = True) -> Iterator[Board]:
-        """Yield the board alone, with the line open.
+        """Yield the checkup's board with an open port.
 
-        By default the motors are proven to stand still.
+        By default the motors have been shown to stand still, so that the board may turn them.
         """
         with self.faulty(), Board(self, self.config.mcu, self.config.rate_hz) as board:
             if rest:
@@ -70,16 +73,15 @@ class Robot(VirtualWire):
             yield board
 
     def later(self) -> list[float]:
-        """Return the motors' set points after everything that was sent has arrived."""
+        """Return the size of the motors' set points a second later, when all lines have arrived."""
         self.mcu.advance(self.now_ns() + 1000 * MS)
         return [abs(speed) for speed in self.mcu.vehicle.set_points]
 
 
 class Busy(Robot):
-    """A robot on an overloaded computer, until `until_s` of the check.
+    """A robot on a computer that is overloaded for the first `until_s` seconds of the check.
 
-    Every `every`-th wait ends `late_s` too late, and the kernel holds the bytes that arrived
-    meanwhile.
+    Every `every`-th wait ends `late_s` too late. The kernel holds the bytes that arrive meanwhile.
     """
 
     def __init__(
@@ -136,13 +138,13 @@ class Starved(Busy):
 
 
 def configured(config: Config, **mcu: Any) -> Config:
-    """Return the configuration with these keys of `[mcu]` replaced."""
+    """Return the configuration with these values in `[mcu]`."""
     changed = msgspec.structs.replace(config.mcu, **mcu)
     return msgspec.structs.replace(config, mcu=changed)
 
 
 class Nobody:
-    """An operator who confirms everything and sees nothing, as with `--yes`."""
+    """An operator who confirms everything and reports nothing, as with `--yes`."""
 
     def doing(self, text: str) -> None: ...
 
@@ -211,5 +213,5 @@ class Checked:
 
 
 def check(*faults: str, person: bool = False, **how: Any) -> Checked:
-    """Check a robot with these faults."""
+    """Check a robot with these faults and return the findings."""
     return Checked(Robot(*faults, **how), person)

@@ -121,7 +121,7 @@ def test_a_board_that_falls_silent_while_its_motors_must_stop_is_reported_as_sil
 
 def test_a_board_that_ignores_lines_with_the_other_ending_is_not_reported_as_silent() -> None:
     class Picky(Robot):
-        """A robot that does not stop, and sends no replies after 2 s."""
+        """A robot that does not stop, and whose replies end after 2 s."""
 
         def listen(self, until_ns: int) -> list[tuple[int, bytes]]:
             super().listen(until_ns)

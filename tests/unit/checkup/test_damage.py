@@ -47,7 +47,7 @@ def test_firmware_that_obeys_parts_of_lines_is_reported(fault: str, verdict: str
 
 def test_firmware_that_reads_a_last_number_that_is_cut_is_reported() -> None:
     def scanned(line: bytes) -> protocol.Command | None:
-        """Parse as `sscanf` does: it reads the last number as far as it goes."""
+        """Parse as `sscanf` does: accept a last number whose end is missing."""
         got = re.match(rb"ap(\d\d\.\d\d),bp(\d\d\.\d\d),cp(\d\d\.\d\d),dp([\d.]+),?\r\n\Z", line)
         return got and protocol.Command({m: float(got[m + 1]) for m in range(4)})
 

@@ -1,4 +1,4 @@
-"""Tests of the inputs in the check: the operator presses each of them, and the board reports it."""
+"""Tests of the check of inputs: the operator presses each input, and the board reports it."""
 
 from __future__ import annotations
 
@@ -20,9 +20,10 @@ def checked(
     safety: SafetyConfig = SafetyConfig(),  # noqa: B008
     reports: int = 2,
 ) -> tuple[Finding, list[str]]:
-    """Return the finding for a board that reports this number of bumpers, and the texts shown.
+    """Return the finding for a board with this number of bumpers, and the texts on the screen.
 
-    `presses` has the input that the person presses for each name: 0 is the emergency stop.
+    `presses` maps the name of an input to the input that the person really presses. 0 is the
+    emergency stop.
     """
     front: Place = "front"
     places = (front,) * reports

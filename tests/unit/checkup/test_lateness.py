@@ -1,4 +1,4 @@
-"""Findings are not judged when this computer ran the check too late."""
+"""The check reports a finding as not judged when this computer ran late."""
 
 from __future__ import annotations
 

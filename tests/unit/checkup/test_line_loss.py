@@ -1,6 +1,6 @@
-"""Lost and damaged lines are counted, and the motors show the direction in which they are lost.
+"""The check counts lost and damaged lines, and finds the direction in which they are lost.
 
-A rate is given only for enough lines. No direction is stated if the motors cannot show it.
+It needs enough lines to state a rate. It states no direction if the motors do not show it.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from tests.unit.checkup.robots import Checked, Nobody, Robot, check, configured
 
 
 def known(board: Board) -> None:
-    """Run the steps of the check that come before the count."""
+    """Run the steps of the check that come before the count of lost lines."""
     for step in (dialect.baud, dialect.rate, dialect.check):
         step(board)
 

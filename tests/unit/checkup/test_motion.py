@@ -14,7 +14,7 @@ from acsard.core.link.checked_line import Reading
 def course(
     speed: float, per_turn: int, period_ms: int = 20, seconds: float = 1.0, sampled: bool = False
 ) -> list[Reply]:
-    """Return replies in which whole counts between two replies give the speed of motor b."""
+    """Return replies in which the speed of motor b follows from its whole counts."""
     found, before = [], 0
     for n in range(1, int(seconds * 1000 / period_ms)):
         counts = math.floor(speed * n * period_ms / 1000 / math.tau * per_turn)

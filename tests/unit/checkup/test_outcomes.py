@@ -1,4 +1,4 @@
-"""Each outcome has its text and says where to look."""
+"""Each outcome of the check has a text, which tells the operator where to look."""
 
 from __future__ import annotations
 

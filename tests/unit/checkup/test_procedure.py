@@ -1,4 +1,4 @@
-"""Tests of the whole check in virtual time: good robots pass, and each planted fault is named."""
+"""Tests of the whole check in virtual time: good robots pass, and the check names each fault."""
 
 from __future__ import annotations
 
@@ -278,7 +278,7 @@ def test_a_missing_comma_is_found_with_coarse_encoders(counts: int) -> None:
 def test_the_check_asks_about_a_wheel_with_a_coarse_encoder_only_when_it_stands(
     counts: int,
 ) -> None:
-    """The simulated person of the check fails if a wheel still turns."""
+    """The simulated person fails the test if a wheel still turns when the check asks."""
     config = Config(sim=SimConfig(encoder_counts=counts))
     assert check("plain_only", config=config, person=True).failed == []
 
@@ -332,7 +332,7 @@ def test_only_zeros_are_sent_until_the_wheels_are_confirmed_to_be_lifted() -> No
 
 @pytest.mark.parametrize("typed", ["q\n", "Q\n"])
 def test_a_q_typed_while_a_motor_turns_ends_the_check(typed: str) -> None:
-    """The operator holds the key, so further keys arrive during the last zeros."""
+    """The operator holds the key, so further keys arrive while the check sends its last zeros."""
     robot = Robot("no_watchdog")
     questions: list[str] = []
 
@@ -361,10 +361,10 @@ def test_another_word_typed_while_a_motor_turns_does_not_end_the_check() -> None
 
 
 class Stalls(Robot):
-    """A robot whose check stands still once, while all `turning` motors have a set point.
+    """A robot whose check stalls once, while all motors in `turning` have a set point.
 
-    With more than four motors to turn, the check stands still when a test calls `stall`. The host's
-    clock advances in the stall only if the computer is not `asleep`.
+    If `turning` has more than four motors, the check stalls when a test calls `stall`. The
+    monotonic clock advances in the stall unless the computer is `asleep`.
     """
 
     def __init__(self, seconds: float, *, asleep: bool = False, turning: int = 5) -> None:
@@ -386,7 +386,10 @@ class Stalls(Robot):
         return self.stall(until_ns)
 
     def stall(self, until_ns: int = 0) -> list[tuple[int, bytes]]:
-        """Let the check stand still from `until_ns`, or from now on if that is later."""
+        """Stall the check for the given seconds.
+
+        The stall starts at `until_ns`, or now if that is later.
+        """
         self.stalled = True
         stall_ns = int(self._seconds * 1e9)
         if self._asleep:
@@ -467,7 +470,7 @@ def test_before_a_wheel_has_turned_only_a_long_stall_ends_the_check(
 
 def test_a_step_spoilt_by_a_suspend_before_a_wheel_has_turned_is_repeated() -> None:
     class Loses(Stalls):
-        """A robot of which the host loses replies after a suspend while it counts lost lines."""
+        """A robot whose replies are lost after a suspend, while the check counts lost lines."""
 
         counts, waits = False, 0
 
@@ -594,10 +597,10 @@ def test_a_runaway_ends_the_check_before_any_faster_command() -> None:
 
 
 class Regulates(Robot):
-    """A robot whose firmware regulates speed.
+    """A robot whose firmware controls the speed with the encoder's feedback.
 
-    A motor with a dead or reversed encoder runs to full speed. One with a reversed encoder does so
-    even at a command of zero, unless it stands still. Only the watchdog stops it.
+    A motor with a dead encoder therefore runs to full speed. A motor with a reversed encoder does
+    so even at a command of zero, unless it stands still. Only the watchdog stops these motors.
     """
 
     FULL = 20.0
@@ -643,7 +646,7 @@ def test_firmware_that_regulates_is_not_left_at_full_speed(fault: str, most_s: f
 
 
 def zeros_after(sent: Sequence[bytes]) -> int:
-    """Return the number of writes after the last one that commands a speed."""
+    """Return the number of lines after the last line that commands a speed."""
     return next(n for n, line in enumerate(reversed(sent)) if b"3.00" in line)
 
 
@@ -783,7 +786,7 @@ def test_no_motor_is_commanded_above_3_rad_s_or_for_4_s() -> None:
 
 def test_a_last_motor_that_obeys_zeros_only_with_a_comma_needs_the_trailing_comma() -> None:
     def obeys(line: bytes) -> protocol.Command | None:
-        """Parse plain lines; a zero for motor d is accepted only with a comma after it."""
+        """Parse lines without a final comma, but accept a zero for motor d only with this comma."""
         command = None if b"#" in line else protocol.reference(line)
         if command and not command.values[3] and not line.endswith(b",\r\n"):
             command.values.pop(3)
@@ -850,7 +853,7 @@ def test_a_step_that_a_late_moment_spoilt_is_repeated() -> None:
 
 @pytest.mark.slow
 def test_lost_lines_of_a_board_without_a_measured_reply_rate_are_not_judged() -> None:
-    """Lines that the board sends on its own clock do not match our lines one to one."""
+    """A free-running board does not answer each line, so missing replies prove no loss."""
     unpaced = 0
     for until_s in range(2, 10):
         late = Busy(
@@ -908,7 +911,7 @@ def test_a_board_that_falls_silent_fails_despite_small_delays_of_the_host() -> N
 
 
 def test_no_motor_is_turned_again_after_a_silence() -> None:
-    """This holds no matter how late this computer was during the check."""
+    """The check sends no further speed, even if this computer was late."""
 
     class Sags(Busy):
         silences = 0
@@ -960,7 +963,7 @@ def test_a_fault_beyond_what_the_lateness_explains_is_reported(
 
 def test_a_later_step_reports_a_fault_that_an_earlier_step_could_not_judge() -> None:
     class Refuses(Busy):
-        """A robot that is late and ignores lines without a comma in the line format step."""
+        """A robot that ignores lines without a comma, on a computer that is late in one step."""
 
         looked = False
 

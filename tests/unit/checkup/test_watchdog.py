@@ -21,7 +21,7 @@ ALL = (0, 1, 2, 3)
 
 
 class ByItsOwnClock(Robot):
-    """A robot whose firmware reports momentary speeds, as a fixed control period measures them."""
+    """A robot whose firmware measures each speed over one of its own fixed control periods."""
 
     def __init__(self, *faults: str, config: Config | None = None) -> None:
         super().__init__(*faults, config=config)
@@ -30,7 +30,7 @@ class ByItsOwnClock(Robot):
 
 @contextmanager
 def turned(robot: Robot) -> Iterator[Board]:
-    """Yield the board after the steps that come before the watchdog's; the motors stand at last."""
+    """Run the steps before the watchdog test, and yield the board with motors at rest."""
     with robot.board() as board:
         dialect.rate(board)
         dialect.check(board)

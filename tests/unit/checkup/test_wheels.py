@@ -1,4 +1,4 @@
-"""Tests of the turned motors, and of the findings about motor and encoder channels."""
+"""Tests of the step that turns each motor, and of its findings about motors and encoders."""
 
 from __future__ import annotations
 

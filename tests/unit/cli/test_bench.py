@@ -1,4 +1,4 @@
-"""Tests of the durations and speeds that options take."""
+"""Tests of the durations and speeds that the options of `acsard bench` accept."""
 
 from __future__ import annotations
 

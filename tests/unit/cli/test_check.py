@@ -1,4 +1,4 @@
-"""`acsard check` prints the configuration in force or says which part of it is wrong."""
+"""`acsard check` prints the effective configuration, or says which part of it is wrong."""
 
 from __future__ import annotations
 

@@ -36,9 +36,9 @@ class Places:
 
 @pytest.fixture(name="places")
 def _places(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Places:
-    """Set up a machine without any configuration.
+    """Set up a machine without any configuration file.
 
-    No file is named, and there is none in this directory or in /etc.
+    No option or variable names a file, and there is no file in this directory or in /etc.
     """
     places = Places(tmp_path)
     places.here.parent.mkdir()

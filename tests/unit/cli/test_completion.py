@@ -49,7 +49,7 @@ def require(shell: str) -> None:
 
 
 def offers(*words: str) -> list[str]:
-    """Return the words that a shell command prints, without their descriptions."""
+    """Return the completions that a shell command prints, without their descriptions."""
     done = subprocess.run(words, capture_output=True, text=True, timeout=30.0)
     assert done.returncode == 0, done
     return [line.split("\t")[0] for line in done.stdout.splitlines() if line]

@@ -102,7 +102,7 @@ def test_echo_survives_any_payload(payload: bytes) -> None:
 
 
 def printed(robots: str, senders: str, most: int | None, timeout: float | None = None) -> int:
-    """Print one message of each sender, in this order, and return the exit code."""
+    """Print the messages of these senders in order, and return the exit code."""
     samples: Any = [
         SimpleNamespace(
             key_expr=f"acsard/{sender}/state",

@@ -82,7 +82,10 @@ def set_age(where: Path, seconds: float) -> None:
 
 @pytest.mark.parametrize("cut", ["crash", "bug", "disk"])
 def test_the_list_marks_a_crash(cut: str, tmp_path: Path) -> None:
-    """A full disk leaves the robot with its daemon."""
+    """The list does not mark a recording that ended because the disk was full.
+
+    In that case the daemon and the robot went on.
+    """
     writing = RecordingWriter(
         tmp_path / "000001-20270115T080000Z.mcap", About("acsar", "1", "3", 1, 2)
     )
@@ -208,7 +211,7 @@ def test_a_part_of_a_story_by_seconds_and_by_the_time_of_day(
 
 
 def starts_at(world: World, hours: int, minutes: int, seconds: float, days: int = 0) -> None:
-    """Set the world's clock to this time of day."""
+    """Set the simulated wall clock to this time of day."""
     day = time.localtime(START.wall_ns / 1e9)
     begin = (day.tm_year, day.tm_mon, day.tm_mday + days, hours, minutes, 0, 0, 0, -1)
     world.wall_offset_ns = int((time.mktime(begin) + seconds) * 1e9) - world.now_ns
@@ -217,9 +220,8 @@ def starts_at(world: World, hours: int, minutes: int, seconds: float, days: int 
 def taped(where: Path, set_to: tuple[int, int, float, int] | None) -> Tape:
     """Record from two seconds before midnight to three seconds after it.
 
-    With `set_to`, the clock is set at midnight instead.
-
-    A stop happens in the first second of the new day.
+    A stop happens half a second after midnight. If `set_to` is given, the clock is set to that time
+    at midnight.
     """
     tape, world = recorded_world()
     starts_at(world, 23, 59, 58.0)
@@ -474,9 +476,9 @@ def test_recover_replaces_its_earlier_result_only_with_force_and_reports_it(
 
 
 def harmed(data: bytes, dice: random.Random) -> bytes:
-    """Return the data with one kind of damage.
+    """Return the data of a recording with one kind of damage.
 
-    They are truncated before or after the first chunk, or damaged in one or many places.
+    The data is truncated before or after the first chunk, or damaged in one or many places.
     """
     begin = chunks(data)[0][0]
     kind = dice.randrange(4)
@@ -490,7 +492,7 @@ def harmed(data: bytes, dice: random.Random) -> bytes:
 
 @pytest.mark.slow
 def test_no_verb_raises_on_truncated_or_damaged_recordings(tmp_path: Path) -> None:
-    """The recordings begin at a start, begin with a saved state, or end by an internal error."""
+    """Recordings may begin with the daemon's start or a saved state, or end by an error."""
     tape, dice, ends = Tape(every=200), random.Random(6), Counter[int]()
     world = World(recorder=tape)
     world.drive(0.5, seconds=2.0)

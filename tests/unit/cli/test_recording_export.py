@@ -158,7 +158,7 @@ def test_a_file_that_is_not_a_recording_is_refused(
 
 
 def spin_and_curve(world: World) -> None:
-    """Drive the motions that calibration asks for: rest, straight both ways, turns both ways."""
+    """Drive the motions that a calibration needs: rest, straight and back, turns to both sides."""
     world.run(3.0)
     for linear, angular, seconds in (
         (0.5, 0.0, 5.0), (-0.5, 0.0, 5.0), (0.0, 1.5, 8.0), (0.0, -1.5, 8.0),

@@ -1,4 +1,4 @@
-"""Tests of --from and --to without FILE, which search the whole ring of recordings."""
+"""Tests of --from and --to without FILE, which search all recordings of the directory."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ STEPS = 200
 
 
 def local(seconds: float) -> str:
-    """Return a time after the start of the world, as a person types it."""
+    """Return the local time this many seconds after the recording's start, as a person types it."""
     at = START.wall_ns / 1e9 + seconds
     return time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(at)) + f"{at % 1:.3f}"[1:]
 
 
 def rotated(tape: Tape, where: Path, count: int) -> list[str]:
-    """Write the tape as `count` files of `STEPS` steps each, and return their names."""
+    """Write the recorded steps as `count` files of `STEPS` steps each, and return their names."""
     names = [f"{number + 1:06}-20270115T080000Z.mcap" for number in range(count)]
     for number, name in enumerate(names):
         first = number * STEPS
@@ -45,7 +45,7 @@ def rotated(tape: Tape, where: Path, count: int) -> list[str]:
 def ring(tmp_path_factory: pytest.TempPathFactory) -> Ring:
     """Return a directory, the names of its 30 recordings, and the time of a stop in each.
 
-    The times are seconds after the start of the world.
+    The times are in seconds after the start of the simulation.
     """
     where, tape = tmp_path_factory.mktemp("ring"), Tape(every=STEPS)
     world, stops = World(recorder=tape), []
@@ -151,7 +151,7 @@ def test_a_time_of_day_is_looked_up_before_now_in_the_ring(
 
 @pytest.mark.slow
 def test_a_drive_across_a_rotation_is_one_drive(tmp_path: Path) -> None:
-    """The drive begins in the first of four files and ends in the last one."""
+    """The drive begins in the first of four files and ends in the last file."""
     tape, world = recorded_world(every=STEPS)
     world.run(0.5)
     world.drive(0.5, seconds=2.0)

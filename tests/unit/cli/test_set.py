@@ -1,4 +1,4 @@
-"""The words after `acsard set` are settings by their keys."""
+"""Tests of the words after `acsard set`, which give settings as key=value."""
 
 from __future__ import annotations
 

@@ -60,7 +60,7 @@ def files(directory: Path) -> dict[str, bytes]:
 
 
 def tables(printed: str) -> bytes:
-    """Return those printed lines that are a part of acsard.toml."""
+    """Return the printed lines that belong into acsard.toml."""
     lines = printed.splitlines()
     keep, inside = [], False
     for line in lines:
@@ -80,7 +80,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(name="own")
 def _own(made: Path, tmp_path: Path) -> Path:
-    """Return a copy of that directory that a test may change."""
+    """Return a copy of the directory of `made` that a test may change."""
     return Path(shutil.copytree(made, tmp_path / "tls"))
 
 
@@ -261,7 +261,7 @@ def test_add_issues_one_certificate_by_the_same_authority_and_changes_no_file(ow
 def test_a_certificate_whose_name_looks_like_a_host_is_valid_and_names_its_owner(
     own: Path, name: str
 ) -> None:
-    """A client without a readable common name commands on a key that TLS does not admit."""
+    """Zenoh's access rules know a client by its certificate's common name."""
     assert tls("add", name, "--directory", str(own)) == 0
     assert bus_tls.common_name(str(own / "clients" / name)) == name
 
@@ -412,7 +412,7 @@ sys.exit(main(["tls", *sys.argv[1:]]))
 def locked() -> Iterator[Path]:
     """Yield a directory that every user may enter and no user may write to.
 
-    It is not inside a directory that only root may enter.
+    All of its parent directories may be entered by every user too.
     """
     with tempfile.TemporaryDirectory() as name:
         directory = Path(name)
@@ -664,7 +664,10 @@ def test_an_encrypted_authority_without_a_terminal_is_refused_with_the_reason(ow
 def test_the_printed_lines_are_those_that_write_writes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Without --write, `tls init` reads the file too, even if it already needs certificates."""
+    """Without --write, `tls init` must also read acsard.toml.
+
+    The file may contain a TLS endpoint whose certificates do not exist yet.
+    """
     monkeypatch.chdir(tmp_path)
     text = '[bus]\nlisten = ["tcp/127.0.0.1:9", "tls/0.0.0.0:99"]\n'
     for before in ('[bus]\nlisten = ["tcp/127.0.0.1:9"]\n', text):

@@ -1,6 +1,6 @@
 """`acsard topics --ros` lists the topics that a ROS machine will see.
 
-It lists none when both trees are off.
+It lists no topic if the configuration switches off both ROS transports.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""A wait is explained once, and only if no message arrives."""
+"""A tool explains once why it waits, and only if no message arrives."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def test_a_silence_that_ends_with_the_timeout_is_explained_before_it_ends(
 
 
 def told(lines: int, capsys: pytest.CaptureFixture[str]) -> str:
-    """Return everything on standard error as soon as it has this many lines."""
+    """Wait until standard error has this many lines, and return its text."""
     said, end = "", time.monotonic() + 10.0
     while said.count("\n") < lines:
         assert time.monotonic() < end, f"told only: {said}"

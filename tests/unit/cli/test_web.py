@@ -28,9 +28,9 @@ def test_an_invitation_without_a_reachable_address_names_the_file_that_was_read(
 def told(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> Callable[..., str]:
-    """Return a function that runs a successful call and returns its output.
+    """Return a function that runs `acsard web` with exit code 0 and returns its output.
 
-    The call has its own certificate and state directory.
+    It uses a temporary certificate and state directory.
     """
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path / "state"))

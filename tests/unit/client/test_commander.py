@@ -1,4 +1,4 @@
-"""Tests of the wishes that are sent to the robot, of their times, and of the last zero."""
+"""Tests of the commands that a commander sends, of their timing, and of the last zero."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Panel:
         self.gone: list[Twist] = []
 
     def wait(self, span_ns: int) -> None:
-        """Let time pass and send everything that falls due."""
+        """Let this time pass, and send every command when it is due."""
         end = self.now + span_ns
         while (due := self.commander.due_ns()) is not None and due <= end:
             self.now = max(self.now, due)

@@ -1,7 +1,4 @@
-"""Tests of the errors that prevent a connection.
-
-The client exports every one of these errors.
-"""
+"""Tests of the errors that prevent a connection. The client exports all of them."""
 
 from __future__ import annotations
 

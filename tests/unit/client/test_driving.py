@@ -1,4 +1,4 @@
-"""Tests of the client's drive in virtual time, step by step: it follows `state` and ends by it."""
+"""Tests of the client's `drive` in virtual time. It watches the `state` and ends by it."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ class World:
         return sample_of(replace(state, stamp=Time.from_ns(int(self.now * NS_PER_S))))
 
     def set_clock(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        """Let the clock of this computer that also advances during a suspend show `now`."""
+        """Let the clock that also advances during a suspend show `now`."""
         monkeypatch.setattr(clock, "steady_s", lambda: self.now)
 
     def drive(self, monkeypatch: pytest.MonkeyPatch, seconds: float = 1.0) -> float:
@@ -131,7 +131,10 @@ class World:
 
 
 def followed(t: float, last: float, sent: list[float]) -> RobotState:
-    """Return a state that is armed after 0.3 s and rolls on for 0.4 s after the last command."""
+    """Return the state of a daemon at time `t`, s.
+
+    The sender is armed after 0.3 s. The robot rolls on until 1.8 s after its last command.
+    """
     if t < 0.3:
         return OPENING
     return replace(FOLLOWED, linear=last or (0.2 if any(sent) and t < 1.8 else 0.0))
@@ -163,9 +166,10 @@ def test_a_state_that_is_rarely_published_is_queried(monkeypatch: pytest.MonkeyP
 def test_an_answer_of_another_thread_is_processed_on_the_driving_thread(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The received state, its time and its objection must belong to one state.
+    """Only one thread may process states.
 
-    With two threads they could belong to two.
+    With two threads the drive could combine the time of one state with the refusal in another
+    state.
     """
     world, readers = World(followed), set()
     world.published = False
@@ -290,7 +294,7 @@ def test_a_short_time_in_which_the_robot_follows_no_source_does_not_end_a_drive(
 def test_a_drive_ends_after_the_client_program_stalled(
     monkeypatch: pytest.MonkeyPatch, begins: float
 ) -> None:
-    """The daemon publishes its state during the stall, and one state waits in the queue."""
+    """The daemon publishes its state during the stall, so a state waits in the client's queue."""
     world = World(followed)
     world.stalls = begins, 4.0
     words = r"sent no command for 4\.[01] s.*not finished.*suspended"
@@ -353,7 +357,7 @@ def test_a_client_may_stall_while_it_only_waits_for_the_robot_to_stop(
 def test_a_stored_state_of_a_dead_robot_does_not_keep_a_drive_running(
     monkeypatch: pytest.MonkeyPatch, seconds: float, dies: float
 ) -> None:
-    """The storage belongs to a router and answers with the robot's last state."""
+    """A router's storage answers queries with the last state of a robot that is off."""
     world = World(followed)
     world.dies = dies
     with pytest.raises(NoAnswerError, match="nothing received"):

@@ -1,4 +1,4 @@
-"""Tests of the newest state of a robot, of its age, and of what proves that the daemon runs."""
+"""Tests of a follower: the newest state of a robot, its age, and the proof that the daemon runs."""
 
 from __future__ import annotations
 

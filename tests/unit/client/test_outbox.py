@@ -1,4 +1,4 @@
-"""The thread that sends commands drops those that are too old, and never dies unnoticed."""
+"""The thread that sends commands drops old commands, and reports it if it fails."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def test_an_outdated_speed_is_dropped_but_a_zero_is_sent_at_any_age(bus: Bus) ->
 def test_a_speed_that_waited_for_a_burst_during_a_suspend_is_dropped(
     bus: Bus, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The monotonic clock stands still in a suspend."""
+    """The age of a command must include the suspend, in which the monotonic clock stands still."""
     asleep_ns = 0
     monkeypatch.setattr(clock, "asleep_ns", lambda: asleep_ns)
     dropped: list[bool] = []

@@ -1,4 +1,4 @@
-"""Tests of the commands that the client sends and the messages that it decodes, without a bus."""
+"""Tests of the synchronous client without a bus: sent commands and decoded messages."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ def test_each_command_has_its_sender_its_sequence_number_and_its_time(session: S
 
 
 def test_two_clients_of_one_connection_keep_the_spacing_between_commands(session: Session) -> None:
-    """The daemon drops a command that arrives within a millisecond of another one on its key."""
+    """The daemon drops a command that arrives less than 1 ms after another one on the same key."""
     one = client_of(session)
     other = one.sibling("acsar")
     begun = time.monotonic()
@@ -104,7 +104,7 @@ def test_two_clients_of_one_connection_keep_the_spacing_between_commands(session
 def test_the_commands_of_two_threads_leave_in_their_order_and_with_the_pause(
     session: Session, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The bus delays the speed of one thread, while the other thread sends a zero."""
+    """The bus delays the speed of the first thread, and then a second thread sends a zero."""
     client, put, began = client_of(session), session.put, threading.Event()
     puts_s: list[float] = []
 

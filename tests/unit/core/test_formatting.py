@@ -1,4 +1,4 @@
-"""Texts of unknown senders are harmless, and values are formatted alike in every message."""
+"""Text from unknown senders is made harmless, and all messages format values in the same way."""
 
 from __future__ import annotations
 

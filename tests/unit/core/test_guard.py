@@ -1,6 +1,6 @@
-"""Tests of the guard, which checks every line last.
+"""Tests of the guard, which checks every line just before it is sent.
 
-They cover the lines it passes, the lines it replaces, and its reasons.
+They cover the lines that it passes, the lines that it replaces, and its reasons.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ LATE = "the line still moves a wheel although the longest ramp to zero has ended
 
 
 def line(*wheels: float) -> bytes:
-    """Return the line for a, b, c, d; one number applies to all of them."""
+    """Return the line with these speeds for a, b, c, d. A single number is for all of them."""
     return CODEC.encode(WheelSpeeds(*(wheels * 4 if len(wheels) == 1 else wheels)))
 
 
@@ -75,9 +75,9 @@ def outputs(
     age_ms: float | None = 0.0,
     at_ns: int = NOW_NS,
 ) -> Outputs:
-    """Return a step's outputs with this line.
+    """Return the outputs of a step that sends this line.
 
-    By default a fresh command is followed on a live link.
+    By default the link is up and the robot follows a fresh command.
     """
     return Outputs(
         now=Instant(at_ns, at_ns),
@@ -97,7 +97,7 @@ def outputs(
 
 
 def coasting(data: bytes) -> Outputs:
-    """Return outputs with this line and without any commander."""
+    """Return the outputs of a step that sends this line although no command is fresh."""
     return outputs(data, mode="ready", source="", age_ms=None)
 
 
@@ -135,7 +135,7 @@ def guard() -> Guarded:
 
 
 def sent(guard: Guarded, *wheels: float) -> Guarded:
-    """Return the guard after it passed a line with these speeds and the line was sent."""
+    """Return a guard that has passed a line with these speeds, which was then sent."""
     data = line(*wheels)
     assert guard.check(outputs(data)) == data
     guard.note_sent()
@@ -374,7 +374,10 @@ SLOW_TO_STOP = LimitsConfig(
 
 
 class Clocked:
-    """A guard with its time in ms after the last fresh command; lines that pass are sent."""
+    """A guard with a simulated time, in ms after the last fresh command.
+
+    All lines that the guard passes are sent.
+    """
 
     def __init__(self, limits: LimitsConfig = SLOW_TO_STOP) -> None:
         self.guard = Guard(STOP, Config(limits=limits))
@@ -387,7 +390,7 @@ class Clocked:
     def trip(self, ms: float, mode: str, speed: float = 10.0, line_due: bool = True) -> str:
         """Return the guard's objection to a line at this time.
 
-        A command is fresh only in mode driving.
+        The step has a fresh command only if the mode is driving.
         """
         fresh = mode == "driving"
         found = outputs(
@@ -638,7 +641,7 @@ def test_one_trip_causes_one_fault_that_names_its_reason() -> None:
 
 @st.composite
 def legal(draw: st.DrawFn) -> Config:
-    """Return a configuration whose slowest ramps are often as long as the rules allow."""
+    """Return a random valid configuration. Its slowest ramps are often the longest allowed ones."""
     drive = DriveConfig(
         draw(st.floats(0.03, 0.2)),
         draw(st.floats(0.2, 0.8)),
@@ -746,7 +749,7 @@ EACH_CONFIG = pytest.mark.parametrize(
 
 
 def random_walk(rng: random.Random, config: Config) -> Loop:
-    """Run three seconds in which the port, the MCU, the wire and the operators behave randomly."""
+    """Run three seconds with random behaviour of the port, the MCU, the wire and the operators."""
     loop, port_open, heard, goes = Loop(config), True, 1, 1.0
     twist = REST
     verbs: tuple[Verb, ...] = ("stop", "clear", "clear", "activate", "deactivate")

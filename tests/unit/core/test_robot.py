@@ -1,4 +1,7 @@
-"""Tests of `Robot.step`, one step at a time: link, modes, commands, lines, answers and counters."""
+"""Tests of `Robot.step`, one step at a time.
+
+They cover the link, modes, commands, lines, answers and counters.
+"""
 
 from __future__ import annotations
 
@@ -59,7 +62,7 @@ ROLLING = WheelSpeeds(10.0, 10.0, 10.0, 10.0)
 
 
 class Bench:
-    """A robot with its time and an MCU that answers every period with `reply`."""
+    """A robot with a simulated time, and an MCU that answers in every period with `reply`."""
 
     def __init__(
         self,
@@ -100,9 +103,9 @@ class Bench:
     ) -> Outputs:
         """Run one step a period later, or `ms` later, and return its outputs.
 
-        A `clear` or `activate` names the latch of the step before, as the tools do. `gyro` is the
-        rate of a sample. With `late_ms`, the commands carry stamps that old by a clock of their
-        own.
+        A `clear` or `activate` names the latch that the last step reported, as the tools do. `gyro`
+        is the rate in a gyro sample. With `late_ms`, another clock stamps the commands, and the
+        stamps are `late_ms` old.
         """
         held = self.out.latches.in_force
         latch = held.number if ask in ("clear", "activate") and held else None
@@ -135,7 +138,7 @@ class Bench:
         return self
 
     def driving(self, twist: Twist = GO, steps: int = 60) -> Bench:
-        """Link up, arm with a zero, and follow the twist until it is reached."""
+        """Bring the link up, arm with a zero, and send the twist until the robot has reached it."""
         self.linked().step(REST)
         for _ in range(steps):
             self.step(twist)
@@ -143,7 +146,7 @@ class Bench:
         return self
 
     def let_go(self) -> Bench:
-        """Send zeros until one arrives a timeout after the last speed."""
+        """Return to neutral: send zeros until one arrives a timeout after the last speed."""
         for _ in range(27):
             self.step(REST)
         return self
@@ -163,7 +166,7 @@ class Bench:
         return answer
 
     def said(self) -> WheelSpeeds | None:
-        """Return the wheel speeds of the last line, or None without a line."""
+        """Return the wheel speeds of the last sent line, or None if no line was sent."""
         return None if self.out.line is None else self.codec.decode(self.out.line.rstrip(b",\r\n"))
 
     @property
@@ -173,7 +176,7 @@ class Bench:
         return 0 if latch is None else latch.number
 
     def set(self, settings: dict[str, Plain]) -> dict[str, float]:
-        """Change settings and return the limits that are kept lowered afterwards."""
+        """Change settings, and return the limits that stay lowered after a restart."""
         self.now_ns += 10 * MS
         requests = (Request("set", 7, settings=settings),)
         self.out = self.robot.step(Inputs(self.now, True, True, self.opened, requests=requests))
@@ -800,7 +803,10 @@ def test_each_board_must_report_a_required_input_before_the_robot_is_ready() -> 
 
 
 def test_a_board_that_restarts_must_still_report_its_inputs() -> None:
-    """A board that only restarts has the same firmware, so its silence is a broken wire."""
+    """After a restart the board has the same firmware and must report the same inputs.
+
+    A missing input then means a broken wire.
+    """
     bench = Button(PRESSED_LINE)
     bench.linked()
     bench.status(b"!acsard-mcu 1\r\n").step()
@@ -1528,7 +1534,7 @@ def test_implausible_lines_are_reported_as_rejected() -> None:
 
 
 def silence(bench: Bench, speed: float) -> Bench:
-    """Let the board be silent for 0.3 s, and then report this speed of one wheel of four."""
+    """Let the board be silent for 0.3 s. It then reports this speed for one wheel."""
     reply, bench.reply = bench.reply, None
     for _ in range(30):
         bench.step()
@@ -1586,7 +1592,7 @@ def test_after_a_guard_trip_the_robot_continues_from_the_stop_that_was_sent() ->
 
 
 def impossible(bench: Bench, lines: int) -> Bench:
-    """Feed impossible feedback for this many lines, then the earlier reply again."""
+    """Let the board send this many impossible lines, then its earlier reply again."""
     reply, bench.reply = bench.reply, bench.codec.encode(WheelSpeeds(99.0, 99.0, 99.0, 99.0))
     for _ in range(lines):
         bench.step(GO)
@@ -1934,9 +1940,9 @@ def test_at_a_slow_rate_a_commanded_zero_brakes_by_the_whole_deceleration() -> N
 
 
 def test_a_flood_of_bytes_faster_than_the_wire_raises_no_error() -> None:
-    """A board floods the USB link, or the baud rate is set too low.
+    """A board floods the USB link, or the configured baud rate is too low.
 
-    Reads with one and the same time are not a clock.
+    Many reads have the same time, so the host cannot estimate the board's clock from them.
     """
     robot = Robot(Config())
     good = b"a0.00,b0.00,c0.00,d0.00\r\n"

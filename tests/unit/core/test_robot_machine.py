@@ -1,8 +1,8 @@
-"""Robot and guard under any order of events, joined as the control loop joins them.
+"""Tests of robot and guard under any order of events, connected as in the control loop.
 
-Hypothesis chooses the events. The machine keeps its own record: which senders were neutral, which
-command is fresh, which lines were good, and which lines left for the motors. It shares only the
-configuration with the robot. After every step it compares the outputs with its record.
+Hypothesis chooses the events. The test keeps its own record of which senders have sent a zero,
+which command is fresh, which lines were good, and which lines were sent to the motors. It shares
+only the configuration with the robot. After every step it compares the outputs with its record.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ places = st.floats(-1e6, 1e6)
 
 
 def read(line: bytes) -> Wheels:
-    """Return the wheel speeds of a line from the host, by fixed columns; fail on any other form."""
+    """Return the wheel speeds of a line from the host. Fail on any other form of line."""
     found = []
     for letter, start in zip("abcd", (0, 8, 16, 24), strict=True):
         token = line[start : start + 7].decode("ascii")
@@ -140,7 +140,7 @@ def numbers(value: object) -> Iterator[float]:
 class Books:
     """The test's own record of one source.
 
-    It follows the text of SAFETY section 1 and is independent of the robot.
+    It follows section 1 of SAFETY.md and shares no code with the robot.
     """
 
     def __init__(self, source: Source, neutral_first: bool) -> None:
@@ -230,7 +230,7 @@ class RobotMachine(RuleBasedStateMachine):
             self.cruise("app", Twist(0.7, 0.5), 30, 1)
 
     def clocks_become_known(self) -> None:
-        """Send steady zeros from all sources before the port is open."""
+        """Send zeros from all sources before the port opens. The senders' clocks are then known."""
         for _ in range(50):
             self.now_ns += 50 * MS
             for name in NAMES:
@@ -370,14 +370,20 @@ class RobotMachine(RuleBasedStateMachine):
         off=st.sampled_from([0, 0, 0, -1, 1, None]),
     )
     def somebody_asks(self, verb: Verb, now: bool, off: int | None) -> None:
-        """A clear or an activate names the current latch, one next to it or none."""
+        """Request a service.
+
+        A `clear` or `activate` names the latch, a number next to it, or none.
+        """
         self.ask(verb, off)
         if now:
             self.step(reply=True)
 
     @rule()
     def everything_is_released(self) -> None:
-        """Clear both latches, activate and open the port; otherwise most runs end in a latch."""
+        """Clear both latches, activate the robot and open the port.
+
+        Without this rule, most runs would end with a latched robot.
+        """
         self.opened += not self.port_open
         self.port_open, self.blocked = True, False
         if self.reported is not None:
@@ -395,7 +401,10 @@ class RobotMachine(RuleBasedStateMachine):
 
     @rule(button=st.sampled_from([None, False, True]), count=st.integers(0, 60))
     def the_emergency_stop_changes(self, button: bool | None, count: int) -> None:
-        """The board reports it in each step from now on, or is silent about it with None."""
+        """Change the emergency-stop input that the board reports in each step.
+
+        None means no report.
+        """
         self.button = button
         for i in range(count):
             if i % 4 == 0:
@@ -543,9 +552,9 @@ class RobotMachine(RuleBasedStateMachine):
         self.before = outputs
 
     def note_limits(self, settings: dict[str, Plain]) -> None:
-        """Check new limits, which hold from this step on.
+        """Check new limits, which apply from this step on.
 
-        A lower deceleration or another wheel speed may take effect only at rest.
+        A lower deceleration or another wheel speed may apply only when the robot is at rest.
         """
         before, at_rest = self.limits, self.broken or self.sent_twist == REST
         for key, value in settings.items():
@@ -561,7 +570,7 @@ class RobotMachine(RuleBasedStateMachine):
     def keep_books(
         self, outputs: Outputs, commands: tuple[Command, ...], requests: tuple[Request, ...]
     ) -> None:
-        """Record which sources must be neutral again and which command counts."""
+        """Record which sources must send a zero again, and which command is fresh."""
         lost = self.was_open and not self.port_open
         over = lost or self.opened != self.last_opened or self.reset_seen
         over = over or any(event.name == "fault" for event in outputs.events)
@@ -622,7 +631,10 @@ class RobotMachine(RuleBasedStateMachine):
             assert outputs.linked
 
     def check_latches(self, outputs: Outputs, requests: tuple[Request, ...]) -> None:
-        """Only a clear that names the latch, or names none long after it, releases it."""
+        """Check that a latch ends only by a correct `clear`.
+
+        A correct `clear` names the latch, or names none and comes long after the latch.
+        """
         before, after = self.latches, outputs.latches
         self.latches = after
         done = [r for r, a in zip(requests, outputs.answers, strict=True) if did(a)]
@@ -648,7 +660,10 @@ class RobotMachine(RuleBasedStateMachine):
         assert not held or outputs.mode not in ("waiting", "ready", "driving")
 
     def check_emergency_stop(self, outputs: Outputs, requests: tuple[Request, ...]) -> None:
-        """While it is pressed, or silent for long, the robot is stopped, and no clear succeeds."""
+        """Check that an emergency stop that is pressed, or silent for long, stops the robot.
+
+        No clear succeeds meanwhile.
+        """
         since_ns = self.now_ns - self.reported_ns
         # A late computer is excused once for 0.1 s.
         silent = self.reported is not None and since_ns > 600 * MS + 2 * self.late_ns
@@ -666,11 +681,12 @@ class RobotMachine(RuleBasedStateMachine):
             assert self.robot.snapshot(self.now_ns).estop == "released"
 
     def check_odometry(self, outputs: Outputs) -> None:
-        """No step is longer than the fastest wheel at either of its ends allows in the time since.
+        """Check that the pose moves no further than the wheels allow since the last line.
 
-        Long silences are not filled. A line has the time of its slot, which may be some periods
-        before its arrival and is never later than it. Only when a wheel is found faulty may more be
-        undone at once: the effect of its last lines on the pose.
+        The faster wheel speed of both ends of this time counts. Odometry does not fill long
+        silences. A line has the time of its sample slot, which may be some periods before its
+        arrival and is never later. Only when odometry excludes a faulty wheel, the pose may move
+        more: it loses the wheel's last lines.
         """
         drive, feedback = self.config.drive, self.config.feedback
         left_out = self.robot.snapshot(self.now_ns).doubt.left_out
@@ -694,7 +710,7 @@ class RobotMachine(RuleBasedStateMachine):
         self.pose = self.robot.snapshot(self.now_ns).pose
 
     def send(self, outputs: Outputs) -> None:
-        """Do the rest of `ControlLoop._send` and watch the wire."""
+        """Send the line as `ControlLoop._send` does, and check the bytes on the wire."""
         line, self.trip = self.guard.check(outputs)
         assert self.trip == ""
         if line is None:
@@ -734,7 +750,7 @@ class RobotMachine(RuleBasedStateMachine):
         return wheels
 
     def check_says(self, wheels: Wheels, outputs: Outputs) -> None:
-        """The line contains the speeds that are reported as applied."""
+        """Check that the line contains the speeds that the outputs report as applied."""
         drive, twist = self.config.drive, outputs.applied
         half = twist.angular * drive.wheel_separation / 2
         right = (twist.linear + half) / drive.wheel_radius
@@ -743,7 +759,7 @@ class RobotMachine(RuleBasedStateMachine):
             assert abs(said - meant) <= ROUNDING
 
     def check_commanded(self, outputs: Outputs) -> None:
-        """A command is followed only if it is fresh and its source has been neutral."""
+        """Check that the robot follows only a fresh command of a source that has sent a zero."""
         assert outputs.mode == "driving"
         book = self.books[outputs.source]
         assert book.neutral
@@ -770,7 +786,7 @@ class RobotMachine(RuleBasedStateMachine):
             assert now <= max(0.0, last, min(wish, most)) + 1e-9
 
     def check_limits(self, outputs: Outputs) -> None:
-        """No axis changes faster than its limits since the last line that left."""
+        """Check that each axis changes within its limits since the last line that was sent."""
         limits, applied, last = self.limits, outputs.applied, self.sent_twist
         dt = (self.now_ns - self.sent_ns) / NS_PER_S
         silent = self.reported is not None and self.now_ns - self.reported_ns > 500 * MS

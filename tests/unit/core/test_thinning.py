@@ -1,4 +1,4 @@
-"""Long series are shortened without losing the points that a person looks for."""
+"""Thinning shortens long series of values and keeps the extremes that a person looks for."""
 
 from __future__ import annotations
 

@@ -1,11 +1,11 @@
-"""Records latenesses without a cause in the kernel, under the load that the machine has.
+"""Records late periods that have no cause in the kernel, under the normal load of the machine.
 
     python -m tests.unit.daemon.normal_load FILE SECONDS
 
-A thread keeps periods of 10 ms as the control loop does, and is late by sleeping. The kernel's
-counters show no cause of that, whatever other programs do meanwhile. Each line of the file is one
-lateness as the watch judges it. A lateness that the machine itself caused must not be in the file,
-so a lateness for which the thread waited for a processor is left out. The output says how many.
+A thread keeps periods of 10 ms as the control loop does, and sometimes sleeps too long on purpose.
+The kernel's counters show no cause for this, although other programs run. Each line of the file is
+one late period as the daemon's watch sees it. If the thread also waited for a processor, the
+machine has caused the lateness itself. Such periods are left out, and the output says how many.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class Noting(LateWatch):
 
 
 def record(seconds: float) -> list[Lateness]:
-    """Make a lateness in every `EVERY` periods, and return all of them."""
+    """Be late once in every `EVERY` periods, and return all late periods."""
     late_watch.PAUSE_NS = 0
     with Noting() as watch:
         due = time.monotonic()

@@ -1,4 +1,4 @@
-"""Tests of the calls that the parts of the daemon receive when it ends."""
+"""Tests of the order in which the daemon ends its parts."""
 
 from __future__ import annotations
 
@@ -51,7 +51,10 @@ def test_the_recording_ends_with_the_error_of_the_daemon_and_the_error_is_raised
 def test_systemd_receives_stopping_before_the_daemon_cleans_up_after_an_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """After STOPPING=1 systemd no longer checks its watchdog, which would hide the error."""
+    """After STOPPING=1 systemd no longer checks its watchdog.
+
+    Otherwise a timeout of the watchdog could hide the error.
+    """
     world = World()
 
     def broken(late: Instant | None = None) -> tuple[Received, ...]:

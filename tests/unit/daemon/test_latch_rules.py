@@ -1,4 +1,4 @@
-"""Tests of the latch file's content: no damage by a disk can make a stop disappear."""
+"""Tests of the latch file's content: no damage to the file can make a stop disappear."""
 
 from __future__ import annotations
 
@@ -193,7 +193,10 @@ def test_each_latch_of_a_file_that_cannot_be_written_takes_a_new_number() -> Non
 
 
 def test_two_unwritable_starts_with_a_wall_clock_set_back_have_different_numbers() -> None:
-    """Otherwise a clear of what the first one latched releases a stop that the crash has lost."""
+    """With equal numbers, a `clear` for the first start's latch could release the second start's.
+
+    The latch at the second start stands for a stop that a crash has lost.
+    """
     wall_ns = NOW.wall_ns - 40_828_000_000_000
     starts = [
         after_failed_write(ALL, "", Instant(mono_ns, wall_ns))
@@ -213,7 +216,7 @@ def test_a_file_without_a_stop_that_cannot_be_written_starts_the_robot_stopped()
 
 
 class Keeper:
-    """A store of latches that holds its latches only when the test tells it to."""
+    """A store of latches that saves them only when the test tells it to."""
 
     def __init__(self) -> None:
         self.given: list[Latches] = []
@@ -302,7 +305,10 @@ def test_a_stop_that_no_step_served_is_newer_than_the_stop_before_it(ahead: int)
 
 
 def test_a_stop_that_no_step_served_is_newer_than_a_stop_that_was_released() -> None:
-    """The wall clock went back, and the released stop had the number after that of `INACTIVE`."""
+    """The wall clock was set back.
+
+    The number of the released stop is one above that of `INACTIVE`.
+    """
     keeper, now = Keeper(), Instant(NOW.mono_ns, NOW.wall_ns - 9 * NS_PER_S)
     life = Lifecycle(active=True, latches=Latches(inactive=INACTIVE))
     life.stop("joe", 1, Instant(1, now.wall_ns))

@@ -1,4 +1,4 @@
-"""Each cause of lateness is named from the kernel's files, and normal load has no cause."""
+"""The daemon finds each cause of lateness in the kernel's files, and no cause in normal load."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ SLEPT = (0.0, 0.0)
 
 
 def planted(late_ms: int) -> dict[str, tuple[dict[str, str], tuple[float, float]]]:
-    """Return for each cause the files that change in a lateness, and what the loop's thread did."""
+    """Return for each cause the kernel files that change and the activity of the loop's thread."""
     ticks = max(3, late_ms // 10)
     return {
         "undervoltage": ({HWMON + "in0_lcrit_alarm": "1\n", FIRMWARE: "50005\n"}, RAN),
@@ -68,7 +68,7 @@ def planted(late_ms: int) -> dict[str, tuple[dict[str, str], tuple[float, float]
 
 
 def judged(root: Path, name: str, late_ms: int) -> Lateness:
-    """Return a lateness with one planted cause."""
+    """Return the judgement of a late period with one simulated cause."""
     files, (ran, waited) = planted(late_ms)[name]
     kernel, late_ns = Kernel(write(root, QUIET)), late_ms * MS
     before = kernel.read()

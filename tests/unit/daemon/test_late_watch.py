@@ -1,4 +1,4 @@
-"""The watch reports the cause of a late period, and reads the kernel's files beside the loop."""
+"""The watch reports the cause of a late period. It reads the kernel's files in its own thread."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ MS = 1_000_000
 
 
 class PlannedKernel(Kernel):
-    """A kernel whose readings a test sets. It notes the thread that reads them."""
+    """A stand-in for the kernel with values from the test. It records the threads that read it."""
 
     def __init__(self) -> None:
         super().__init__(Path("/nonexistent"))
@@ -40,7 +40,7 @@ class PlannedKernel(Kernel):
 
 @pytest.fixture(autouse=True)
 def times(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
-    """The file of the thread's times. A busy machine must not add a cause of its own."""
+    """The file with the thread's waiting times, replaced so that a busy machine adds no cause."""
     path = tmp_path / "schedstat"
     path.write_bytes(b"0 0 1\n")
     monkeypatch.setattr(late_watch, "THREAD_TIMES_FILE", str(path))
@@ -61,7 +61,7 @@ def watching(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[LateWatch, Plann
 
 
 def period(watch: LateWatch, late_ns: int, missed: int) -> None:
-    """Let a period begin that was due just now, so that the last reading is older."""
+    """Begin a period that was due just now, so that the last reading of the kernel is older."""
     watch.period(clock.mono_ns() + late_ns, late_ns, missed)
 
 
@@ -72,7 +72,7 @@ def reported(watch: LateWatch) -> Event:
 
 
 def judged(kernel: PlannedKernel, then: int) -> None:
-    """Wait until the watch has read the kernel twice more, so that a lateness is judged."""
+    """Wait until the watch has read the kernel twice and has therefore judged the lateness."""
     until(lambda: kernel.readings >= then + 2, 5.0, "two readings")
 
 

@@ -33,7 +33,7 @@ def spread_of(values: list[float]) -> Spread:
 
 
 def order_statistic(values: list[float], share: float) -> float:
-    """Return the smallest value that at least `share` of all values do not exceed."""
+    """Return the quantile `share`: the smallest value that at least this share do not exceed."""
     return sorted(values)[max(0, math.ceil(share * len(values)) - 1)]
 
 

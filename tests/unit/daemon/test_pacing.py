@@ -1,4 +1,7 @@
-"""A line leaves every period, and at once for a new command, but never two too close together."""
+"""The daemon sends a line in every period, and an extra line at once for a new command.
+
+Two lines are never too close together.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +19,7 @@ GAP_NS = WIRE_NS + REPLY_TIME_NS
 
 
 class Paced:
-    """A pace and the calls of its control loop."""
+    """The pacing under test, called as the control loop calls it."""
 
     def __init__(self, period_ns: int = PERIOD_NS) -> None:
         self.pace = Pace(WIRE_NS, period_ns)
@@ -24,14 +27,14 @@ class Paced:
         """Time of the last sent line, as the port remembers it."""
 
     def ticks(self, at_ns: int, missed: int = 0) -> bool:
-        """End a period without a new command and return whether its line left."""
+        """End a period without a new command, and return whether a line was sent."""
         due = self.pace.period_ended(missed)
         self.pace.record_step(due, due, due, False, False)
         self.sent_ns = at_ns if due else self.sent_ns
         return due
 
     def hears(self, at_ns: int, *, news: bool = True, goes: bool = True) -> bool:
-        """Take a command between two periods and return whether a line for it was tried."""
+        """Receive a command between two periods. Return whether the loop tried to send a line."""
         due = news and self.at_once(at_ns)
         self.pace.record_step(False, due, due and goes, news, True)
         self.sent_ns = at_ns if due and goes else self.sent_ns
@@ -46,7 +49,7 @@ class Paced:
 
 
 def ticked() -> Paced:
-    """Return a pace after the line of a period at 0."""
+    """Return the pacing after a period whose line was sent at time 0."""
     paced = Paced()
     assert paced.ticks(0)
     return paced

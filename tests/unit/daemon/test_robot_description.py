@@ -1,4 +1,4 @@
-"""A file in `[ros] urdf` is published as it is, or refused with the fix."""
+"""The daemon publishes the file of `[ros] urdf` unchanged, or refuses it and names the remedy."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def test_a_file_that_is_not_urdf_is_refused(text: str | bytes, said: str, tmp_pa
 
 
 def test_a_urdf_with_only_the_xacro_namespace_is_accepted(tmp_path: Path) -> None:
-    """The output of xacro keeps the name of its namespace."""
+    """The output of xacro is a plain URDF, but still declares the XML namespace of xacro."""
     text = '<robot xmlns:xacro="http://www.ros.org/wiki/xacro" name="r7"/>'
     assert robot_description(str(written(tmp_path, text))) == text
 

@@ -1,4 +1,4 @@
-"""A TLS gateway that cannot be started is reported and retried while the robot drives on."""
+"""The supervisor reports a TLS gateway that does not start, and retries while the robot drives."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_a_thread_that_cannot_be_started_is_reported(monkeypatch: pytest.MonkeyP
 
 
 def program(monkeypatch: pytest.MonkeyPatch, where: Path, text: str) -> None:
-    """Replace the `acsard` program by this text."""
+    """Replace the `acsard` program by a script with this text."""
     file = where / "program"
     file.write_text(f"#!{sys.executable} -S\n{text}\n")
     file.chmod(0o755)
@@ -95,7 +95,7 @@ def test_a_router_that_once_ran_is_started_again_when_its_files_are_wrong(
 def test_the_first_router_that_could_be_started_counts_as_the_first(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """A start that the system refused shows nothing about the router's files."""
+    """If the system refuses to start the process, this says nothing about the router's files."""
     monkeypatch.setattr("acsard.daemon.supervisor.LONG_RESTART_PAUSE_S", 0.01)
     program(monkeypatch, tmp_path, "raise SystemExit(78)")
     executable = sys.executable

@@ -1,4 +1,4 @@
-"""The period follows the daemon's own clock, whatever the kernel's timers do."""
+"""The daemon's own clock determines the periods, even if the kernel's timers are inaccurate."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ PERIOD_NS = 10_000_000
 
 
 class Kernel:
-    """A timer whose clock NTP slews, so that it waits `rate` times too long."""
+    """A kernel timer whose clock is slewed by NTP: it waits `rate` times as long as requested."""
 
     def __init__(self) -> None:
         self.now_ns, self.rate, self.at_ns = 5_000_000_000, 1.0, 0
@@ -128,7 +128,7 @@ async def test_in_a_flood_of_stops_one_step_is_early_and_the_period_takes_the_re
     ends = False
 
     def step() -> Next | None:
-        """Take the stops that wait; `Next` says whether the period has ended."""
+        """Process the waiting stops. `Next` says whether the period has ended."""
         nonlocal waiting
         steps.append(waiting)
         waiting = 0

@@ -1,10 +1,10 @@
-"""A stand-in for the Foxglove server, which keeps the status messages that viewers would see."""
+"""A stand-in for the Foxglove server, which records the status messages that viewers would see."""
 
 from __future__ import annotations
 
 
 class Server:
-    """The server's status messages: each text, or the id of one that was withdrawn."""
+    """The recorded status messages: the text of each message, or the id of a withdrawn message."""
 
     def __init__(self) -> None:
         self.shown: list[str] = []

@@ -1,4 +1,4 @@
-"""The bridge learns the facts about its robot again after each restart of the daemon."""
+"""The Foxglove bridge reads the facts about its robot again after each restart of the daemon."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class World:
         self._take(SimpleNamespace(kind=kind))
 
     def restart(self) -> None:
-        """Let the daemon restart with another timeout, which tells its facts from earlier ones."""
+        """Restart the daemon with another timeout, so that the test can recognize the new facts."""
         self.daemon(zenoh.SampleKind.DELETE)
         (app,) = (one for one in self.facts.config.commands.sources if one.name == "app")
         sources = (replace(app, timeout=app.timeout + 1.0),)
@@ -66,7 +66,7 @@ class World:
         self.daemon(zenoh.SampleKind.PUT)
 
     def passes(self, seconds: float) -> None:
-        """Run rounds for this time, with the pauses of the main loop."""
+        """Run the bridge for this time, in rounds with the pauses of its main loop."""
         end_ns = self.now_ns + seconds * NS_PER_S
         while self.now_ns < end_ns:
             self.now_ns += round((0.015 if self.bridge._wake.is_set() else 0.5) * NS_PER_S)

@@ -1,4 +1,4 @@
-"""Tests of the viewer's commands that reach the bus, of their stamps, and of a bus that fails."""
+"""Tests of how a viewer's commands reach the bus: their stamps, and failures of the bus."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ class Viewers:
         self.drives.received(viewer, channel, encode(message, "cdr"))
 
     def heard(self, viewer: int, count: int) -> list[Command]:
-        """Wait until this viewer has sent at least `count` commands, and return them."""
+        """Wait until the bus has at least `count` commands of this viewer, and return them."""
         heard = self.sessions[viewer].heard
         until(lambda: len(heard) >= count, HOLD_S, f"{count} commands of {viewer}, not {heard}")
         return heard
@@ -122,7 +122,10 @@ def test_a_viewer_that_leaves_while_its_message_is_decoded_sends_nothing_more(
 
 
 def test_a_viewer_that_has_just_connected_sends_no_zero_of_its_own(viewers: Viewers) -> None:
-    """Its button may have been held since before the connection."""
+    """The bridge adds no zero, because the viewer's button may already be held.
+
+    A zero would arm the viewer, and the robot would move at once.
+    """
     for channel in (1, 2):
         viewers.drives.withdrawn(1, channel)
     viewers.drives.advertised(1, 3, "/cmd_vel", "cdr", "geometry_msgs/msg/Twist")
@@ -176,7 +179,7 @@ def test_a_command_that_waited_for_another_viewer_s_locked_bus_is_dropped(
 def test_a_viewer_does_not_drive_after_a_suspend(
     viewers: Viewers, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The monotonic clock stands still in a suspend."""
+    """The bridge must include the suspend, in which the monotonic clock stands still."""
     viewers.publish(1, AHEAD)
     assert list(viewers.drives.driving()) == [1]
     monkeypatch.setattr(clock, "asleep_ns", lambda: 10**15)
@@ -216,7 +219,7 @@ def test_a_command_on_a_channel_beyond_the_limit_is_reported(viewers: Viewers) -
 
 
 def told_slow(every_ns: float) -> bool:
-    """Return whether a panel that publishes at this interval is told that it is slow."""
+    """Return whether the bridge warns a panel that publishes at this interval to be too slow."""
     robot: Any = None
     viewer = Viewer(robot)
     times = [round(n * every_ns) for n in range(6)]

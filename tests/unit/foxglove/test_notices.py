@@ -1,4 +1,4 @@
-"""Viewers get each notice once, and those who come later the ones that last."""
+"""Each viewer gets each notice once. A viewer that connects later gets the lasting notices."""
 
 from __future__ import annotations
 

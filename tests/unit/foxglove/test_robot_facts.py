@@ -1,4 +1,4 @@
-"""The topics offered to a viewer follow from the known facts about the robot."""
+"""The known facts about a robot determine the topics that the bridge offers to a viewer."""
 
 from __future__ import annotations
 

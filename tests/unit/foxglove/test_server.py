@@ -1,4 +1,7 @@
-"""A viewer's parameters are exactly the live settings, and follow them while a viewer looks."""
+"""A viewer's parameters are exactly the live settings.
+
+Their values are updated while a viewer is subscribed.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +37,7 @@ NOW = live_settings(effective(Config()))
 
 
 class Robot:
-    """A client of a robot whose setting somebody else has changed."""
+    """A client of a robot of which another client has changed a setting."""
 
     def __init__(self) -> None:
         self.asked: list[dict[str, Any]] = []
@@ -53,7 +56,7 @@ class Robot:
 
 
 def of_robot(robot: Robot) -> tuple[Settings, Callable[[], list[str]]]:
-    """Return the settings of a robot, and a function that returns what the viewers were told."""
+    """Return the settings of a robot, and a function that returns the updates to the viewers."""
     told = list[str]()
     notices = Notices(told.append, lambda: None)
 

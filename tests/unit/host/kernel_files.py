@@ -1,8 +1,8 @@
 """Files of the kernel as text, for tests of the causes of lateness.
 
-The files of `QUIET` below /proc and of the cgroup were recorded on a virtual machine. Those of the
-Raspberry Pi, of the processor's clock and of the cooling devices have the form that the kernel's
-documentation gives (hwmon, cpufreq, thermal sysfs), because the machine of the tests has none.
+The files of `QUIET` below /proc and of the cgroup were recorded on a virtual machine. The files of
+the Raspberry Pi, of the processor's clock and of the cooling devices do not exist on that machine.
+They have the form of the kernel's documentation (hwmon, cpufreq, thermal sysfs).
 """
 
 from __future__ import annotations

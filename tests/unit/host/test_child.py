@@ -1,4 +1,4 @@
-"""A child starts, lives, is limited and ends as its parent says, and never outlives it."""
+"""The parent starts a child, limits it and ends it. The child never outlives its parent."""
 
 from __future__ import annotations
 
@@ -53,7 +53,10 @@ def started(text: str) -> subprocess.Popen[bytes]:
 
 
 def is_alive(pid: int) -> bool:
-    """Return whether a process runs. One that has ended and is not yet collected does not."""
+    """Return whether a process runs.
+
+    A process that has ended but is not yet reaped does not run.
+    """
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except OSError:

@@ -14,9 +14,9 @@ WALL_NS = 1_800_000_000_000_000_000
 
 
 class Machine:
-    """A machine that takes the core away for 0.2 s, `takes` times.
+    """A machine that suspends this process for 0.2 s, for the first `takes` times.
 
-    It does so right before the wall clock is read.
+    It does so right before each reading of the wall clock.
     """
 
     def __init__(self, takes: int) -> None:

@@ -18,7 +18,10 @@ from tests.system.harness import ROOT
 
 
 def installed(where: Path, **direct: object) -> Distribution:
-    """Return a distribution with two extras that was installed from `direct`."""
+    """Return a distribution with two extras.
+
+    `direct` is the content of its direct_url.json, which says from where pip installed it.
+    """
     info = where / "acsard-1.dist-info"
     info.mkdir()
     lines = ["Name: acsard", "Requires-Dist: zenoh", "Requires-Dist: one<2,>=1; extra == 'tls'"]

@@ -1,4 +1,4 @@
-"""The kernel's files become values; a file that is missing counts as zeros."""
+"""The daemon parses the kernel's files into values. A missing file counts as zeros."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ from tests.each import each
 
 
 class Journal:
-    """The journal's end of the socket."""
+    """A stand-in for systemd's journal at the other end of the socket."""
 
     def __init__(self, path: Path) -> None:
         self.path = str(path)
@@ -38,10 +38,7 @@ class Journal:
 
 
 def fields(text: str) -> dict[str, str]:
-    """Parse a datagram in which each line must be NAME=value.
-
-    The journal must accept the name.
-    """
+    """Parse a datagram to the journal. Each line must be NAME=value with a valid name."""
     found: dict[str, str] = {}
     for line in text.removesuffix("\n").split("\n"):
         name, equals, value = line.partition("=")
@@ -196,7 +193,7 @@ def test_a_journal_that_disappears_raises_no_error(
 def written(
     path: Path, *events: Event, form: Literal["json", "console", "logfmt"] = "json"
 ) -> list[str]:
-    """Return the lines of a log in this format after these events."""
+    """Write these events to a log of this format, and return its lines."""
     with (path / "log").open("w+") as stream:
         log = Log(LogConfig(format=form), stream)
         for event in events:

@@ -45,7 +45,7 @@ def test_a_full_mailbox_drops_its_oldest_items_and_reports_each_to_the_writer() 
 
 
 class Flooded(deque[int]):
-    """The items of a mailbox into which another thread puts one for each that is taken."""
+    """The items of a mailbox. For each item that is taken, another thread adds a new one."""
 
     def popleft(self) -> int:
         item = super().popleft()
@@ -198,7 +198,10 @@ def test_two_threads_may_ring_at_the_same_moment() -> None:
     lock = bell._lock
 
     class Between:
-        """The bell's lock, with another thread that rings between the look and the ring."""
+        """The lock of the bell.
+
+        Another thread rings after the check of the bell and before the ring.
+        """
 
         def locked(self) -> bool:
             lock.release()

@@ -1,4 +1,4 @@
-"""Tests that find the processes that have a device open, on ptys of this process."""
+"""Tests of the search for processes that have a device open, with ptys of this process."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ sys.stdin.read()
 
 @contextmanager
 def another(path: str, *words: str) -> Iterator[int]:
-    """Yield the pid of a process that has the device open.
+    """Yield the pid of another process that has the device open.
 
-    A further word makes it lock the device.
+    With a second argument the process also locks the device.
     """
     with subprocess.Popen(
         [sys.executable, "-c", HOLD, path, *words], stdin=subprocess.PIPE, stdout=subprocess.PIPE
@@ -46,7 +46,7 @@ def another(path: str, *words: str) -> Iterator[int]:
 
 @pytest.fixture
 def device() -> Iterator[str]:
-    """Yield a pty of which this process has both ends open."""
+    """Yield the path of a pty. This process has opened both of its ends."""
     ends = pty.openpty()
     yield os.ttyname(ends[1])
     for end in ends:

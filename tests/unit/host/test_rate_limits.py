@@ -1,4 +1,7 @@
-"""A bucket passes its burst, then its rate; places are limited per name and in all."""
+"""Tests of the token bucket and of limited places.
+
+A bucket allows a burst and then its rate. Places are limited for each name and in total.
+"""
 
 from __future__ import annotations
 

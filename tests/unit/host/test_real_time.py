@@ -1,4 +1,4 @@
-"""Tests of the request for real-time scheduling, in processes of their own."""
+"""Tests of the request for real-time scheduling. Each test runs it in a separate process."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Messages to the service manager on a real datagram socket are correct, rare and never block."""
+"""The daemon's messages to the service manager are correct and rare, and sending never blocks."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ HALF = Twist(0.5, 0.0)
 
 
 class Manager:
-    """The service manager's end of the socket."""
+    """A stand-in for the service manager at the other end of the socket."""
 
     def __init__(self, address: str) -> None:
         self.address = address
@@ -32,7 +32,7 @@ class Manager:
         self._socket.setblocking(False)
 
     def heard(self) -> list[dict[str, str]]:
-        """Return the datagrams since the last call, each as its assignments."""
+        """Return the datagrams since the last call, each as a dict of NAME=value assignments."""
         datagrams: list[dict[str, str]] = []
         while True:
             try:
@@ -277,7 +277,7 @@ def test_a_change_of_speed_is_sent_at_most_once_a_second(manager: Manager) -> No
 
 
 def fill(there: Systemd) -> int:
-    """Send more messages than the socket holds and return the number of steps."""
+    """Run many steps, which send more messages than the socket can hold. Return their number."""
     for step in range(1, 10_000):
         there.step(outputs(step * 100 * MS))
     return step

@@ -1,4 +1,4 @@
-"""Tests of blocking calls that run in threads of their own."""
+"""Tests of blocking calls, each of which runs in a separate thread."""
 
 from __future__ import annotations
 

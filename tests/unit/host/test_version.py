@@ -1,4 +1,4 @@
-"""The version has the commit of the clone from which the code runs or was installed."""
+"""The version contains the commit of the clone from which the code runs or was installed."""
 
 from __future__ import annotations
 

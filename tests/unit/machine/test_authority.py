@@ -1,4 +1,7 @@
-"""An authority signs for the robot's names and private addresses, as OpenSSL reads it."""
+"""An authority's certificates are valid for the robot's names and private addresses only.
+
+OpenSSL checks this in the tests.
+"""
 
 from __future__ import annotations
 
@@ -42,7 +45,7 @@ def authority(tmp_path_factory: pytest.TempPathFactory) -> tuple[Authority, Path
 
 
 def connects(where: Path, server: Path, name: str, client: Path) -> bool:
-    """Connect by TLS in memory; each side checks the other one."""
+    """Return whether a TLS connection in memory succeeds. Each side checks the other one."""
     there, here = ssl.MemoryBIO(), ssl.MemoryBIO()
     serving = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     serving.verify_mode = ssl.CERT_REQUIRED

@@ -1,4 +1,4 @@
-"""The doctor names the certificate that ends, and its advice works as it is printed."""
+"""The doctor names the certificate that expires. Its advice works exactly as printed."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def days_left(directory: Path) -> int:
 
 
 def typed(mend: str, where: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Type the command of an advice in this directory."""
+    """Run the `acsard` command that an advice contains, in this directory."""
     (command,) = re.findall(r"`acsard ([^`]+)`", mend)
     monkeypatch.chdir(where)
     assert main(shlex.split(command)) == 0
@@ -95,7 +95,10 @@ def test_without_the_authoritys_key_the_advice_asks_for_it(fleet: Path) -> None:
 def test_the_advised_commands_renew_the_certificate_of_a_robot_of_a_fleet(
     fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, days: float
 ) -> None:
-    """The directory of robot4 on the robot has no key of the authority."""
+    """The authority's key is not on robot4.
+
+    The operator renews the certificate on another computer.
+    """
     Authority.load(fleet, str).issue(fleet / "clients" / "robot4", "robot4", ["10.0.0.4"], days)
     there = tmp_path / "etc tls"
     shutil.copytree(fleet / "clients" / "robot4", there)

@@ -1,8 +1,8 @@
 """Hostile content for the robot state in a recording.
 
 `python -m tests.unit.recording.attacks` reads each attack and prints the refusals as JSON. The
-caller must limit its time and memory, because an attack that hangs or fills them counts as a
-failure.
+caller must limit the time and memory of this process. An attack fails the test if it hangs or uses
+all of the memory.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def named(module: str, name: str) -> bytes:
 
 
 def whole(body: bytes) -> bytes:
-    """Return a pickle with its first and last opcodes."""
+    """Return a complete pickle: this content between the first and the last opcode."""
     return pickle.PROTO + bytes([PICKLE_PROTOCOL]) + body + pickle.STOP
 
 
@@ -44,7 +44,7 @@ def doubled(times: int) -> bytes:
 
 
 def counted_again(keys: int, times: int) -> bytes:
-    """Return a large dict and this many counters made from it."""
+    """Return a large dict, and `times` objects of `Counter` that are made from it."""
     pairs = b"".join(pickle.BININT + struct.pack("<i", key) + ONE for key in range(keys))
     given = pickle.EMPTY_DICT + pickle.MARK + pairs + pickle.SETITEMS + pickle.TUPLE1
     made = (pickle.BINGET + b"\x00" + pickle.BINGET + b"\x01" + pickle.REDUCE) * times
@@ -63,8 +63,8 @@ def of_one_hash(keys: int) -> bytes:
 def tuples_of_one_hash(keys: int) -> bytes:
     """Return a dict whose keys are pairs of numbers that all have one hash on a 64-bit machine.
 
-    The hash of a tuple is xxHash, which has no secret key. So the second number of each pair can be
-    computed from the first number and the wanted hash.
+    The hash of a tuple is xxHash without a secret key. An attacker can therefore compute the second
+    number of a pair from the first number and the wanted hash.
     """
     pairs, first, inverse = bytearray(), 0, pow(XXHASH_PRIME_2, -1, 1 << 64)
     while keys:
@@ -89,7 +89,7 @@ def _rotated(lane: int) -> int:
 
 
 def attributes(*pairs: tuple[bytes, bytes]) -> bytes:
-    """Return a dict of attributes and the opcode that sets them on the object below."""
+    """Return the opcodes that set these attributes on the object on top of the pickle's stack."""
     inside = b"".join([key + value for key, value in pairs])
     return pickle.EMPTY_DICT + pickle.MARK + inside + pickle.SETITEMS + pickle.BUILD
 

@@ -1,4 +1,4 @@
-"""A directory of recordings stays within its bounds, and protected files are deleted last."""
+"""A directory of recordings stays within its size limits, and protected files are deleted last."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def record(one: RecordingDirectory, size: int = 10, kind: Kind = "plain", days: 
 
 
 def later(one: RecordingDirectory) -> None:
-    """Trim after the clock has run steadily for long enough."""
+    """Delete surplus recordings after the clock has run steadily for long enough."""
     for mono_ns in (0, STEADY_CLOCK_NS):
         now = Instant(mono_ns, NOW_NS + mono_ns)
         one.maintain(now)
@@ -350,7 +350,7 @@ def test_two_daemons_cannot_record_to_the_same_directory(tmp_path: Path) -> None
 
 
 def test_a_pipe_or_a_link_with_the_name_of_a_recording_is_not_a_recording(tmp_path: Path) -> None:
-    """A pipe would block its reader forever, and a link leads elsewhere."""
+    """A pipe would block its reader forever, and a link may point to any other file."""
     whole = tmp_path / "000001-20260101T000000Z.mcap"
     whole.touch()
     os.mkfifo(tmp_path / "000002-20260101T000000Z.mcap")
@@ -371,7 +371,7 @@ def test_a_pipe_or_a_link_with_the_name_of_a_recording_is_not_a_recording(tmp_pa
 def test_a_cut_file_that_this_version_cannot_read_stays_and_is_reported(
     tmp_path: Path, event: bytes
 ) -> None:
-    """The file comes from a later version, or contains an event that no version writes."""
+    """The truncated file comes from a later version, or has an event that no version writes."""
     part = tmp_path / f"000007-20270115T080000Z{PART_SUFFIX}"
     writing = RecordingWriter(part, replace(about(), format="acsard/99") if not event else about())
     writing.add("events" if event else "steps", NOW_NS, event or b"later")
@@ -428,10 +428,9 @@ def test_a_recording_that_could_not_be_deleted_does_not_count_as_freed(
 def test_a_file_that_another_process_removes_meanwhile_does_no_harm(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The file disappears between the listing and the look at it.
+    """The file disappears after the daemon has listed it and before it opens the file.
 
-    This is tested while space is freed, when the clock is set, and while a truncated file is
-    recovered.
+    The test covers freeing of space, a change of the clock, and the recovery of a truncated file.
     """
 
     def found(where: Path) -> list[Path]:

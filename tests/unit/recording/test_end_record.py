@@ -1,4 +1,4 @@
-"""The end of a recording is found without unpacking the file."""
+"""acsard finds the end record of a recording without unpacking the file."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ def test_a_file_without_a_valid_end_has_no_end_record(data: bytes, tmp_path: Pat
 def test_the_time_to_search_many_names_of_the_record_is_proportional_to_their_number(
     tmp_path: Path,
 ) -> None:
-    """Only the last one that has the form of the record is decoded."""
+    """The search decodes only the last place that has the form of an end record."""
     path, name = (
         tmp_path / "a.mcap",
         struct.pack("<I", len(END_RECORD_NAME)) + END_RECORD_NAME.encode(),

@@ -1,6 +1,6 @@
-"""Exported files can be read by third-party programs.
+"""Third-party programs can read exported files.
 
-The tests also cover files that are already in their place.
+The tests also cover an export to the path of an existing file.
 """
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ def test_the_mcap_library_finds_the_export_finished_indexed_and_compressed(
 
 
 def counted(reader: Any) -> Counter[str]:
-    """Return the number of messages per topic, all decoded."""
+    """Decode all messages of a file, and return their number for each topic."""
     counts: Counter[str] = Counter()
     with reader:
         for connection, _, data in reader.messages():
@@ -425,7 +425,7 @@ def test_calibration_reads_the_steps_between_a_missing_beginning_and_the_next_ga
 def test_an_export_does_not_compare_the_end_record_with_the_events(
     path: Path, tmp_path: Path
 ) -> None:
-    """This check reads the whole recording again, and only a replay uses its result."""
+    """The comparison would read the whole recording again, and only a replay uses its result."""
 
     class Counted(Recording):
         reads = 0

@@ -1,4 +1,4 @@
-"""A chunk can be read after each of its seconds, and as far as it is whole."""
+"""A reader can read a growing chunk after each second, and a damaged one up to the damage."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ ALL = [message for second in SECONDS for message in second]
 
 
 def grown(seconds: list[list[Message]]) -> tuple[bytes, list[int], bytes]:
-    """Return the chunk that still grows, where each second ends in it, and the complete chunk."""
+    """Return a growing chunk's bytes, the end of each second in them, and the complete chunk."""
     chunk, data, ends = GrowingChunk(), GROWING_HEAD, []
     for second in seconds:
         for message in second:
@@ -125,7 +125,10 @@ def test_the_time_to_read_a_chunk_is_proportional_to_the_number_of_its_blocks() 
 
 
 def test_the_time_to_read_chunks_that_claim_megabytes_is_proportional_to_their_number() -> None:
-    """Each claims a message of 4 MB that does not end, so each must be decompressed."""
+    """Each chunk announces a message of 4 MB that does not end.
+
+    The reader must therefore decompress the whole chunk.
+    """
     inside = struct.pack("<BQ", 5, MAX_MESSAGE_BYTES - 100) + bytes(MAX_MESSAGE_BYTES - 200)
     packed = zstandard.ZstdCompressor(compression_params=ZSTD_PARAMETERS).compress(inside)
     data = MAGIC + (GROWING_HEAD + packed[:-20]) * 1000
@@ -143,7 +146,10 @@ EACH = len(GROWING_HEAD + FRAME_HEAD + LONG) + 3
 
 
 def with_a_shared_tail(count: int, tail: bytes, head: bytes = GROWING_HEAD) -> bytes:
-    """Return chunks that each have all later ones, as one raw block, and the same tail behind."""
+    """Return nested chunks.
+
+    Each one contains all later chunks as one raw block, and the same tail.
+    """
     parts = []
     for number in range(count):
         size = len(LONG) + EACH * (count - number - 1)
@@ -156,13 +162,13 @@ REPEATED = (1 << 17 << 3 | 2).to_bytes(3, "little") + b"x"
 
 
 def raw(data: bytes) -> bytes:
-    """Return a block that holds these bytes as they are."""
+    """Return a compression block that stores these bytes without compression."""
     return (len(data) << 3).to_bytes(3, "little") + data
 
 
 @each("first", [b"\0", struct.pack("<BQ", 5, 1 << 28), struct.pack("<BQ", 5, MAX_MESSAGE_BYTES)])
 def test_a_few_bytes_that_claim_gigabytes_get_no_memory(first: bytes) -> None:
-    """The first byte of a message is its type, the next eight are its length."""
+    """The first byte of a message is its type. The next eight bytes are its length."""
     data = GROWING_HEAD + FRAME_HEAD + raw(first) + REPEATED * 30_000
     began = time.process_time()
     got = read_chunk(data, 0)

@@ -1,4 +1,4 @@
-"""A recording stores rounded estimates, and a checksum of the exact ones."""
+"""A recording stores rounded estimates, and a checksum of the exact estimates."""
 
 from __future__ import annotations
 

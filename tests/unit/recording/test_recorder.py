@@ -1,4 +1,4 @@
-"""Tests of the recorder between a loop that never waits and a disk that may fail in any way."""
+"""Tests of the recorder: the control loop never waits for it, and the disk may fail in any way."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def config(where: Path, megabytes: float = 10.0) -> Config:
 
 
 class Bench:
-    """A world whose recorder writes on request, because its thread waits for the end."""
+    """A simulated world whose recorder writes only when the test calls `write`."""
 
     def __init__(
         self,
@@ -60,11 +60,11 @@ class Bench:
         self.world = World(config(where, megabytes), recorder=self.recorder, latches=latches)
 
     def write(self) -> None:
-        """Do the work that the thread does each second."""
+        """Do the work that the recorder's thread does once a second."""
         self.recorder._writer.write(self.recorder._taken(), False)
 
     def drive(self, seconds: float) -> None:
-        """Drive on, and write each second."""
+        """Continue the drive for this time, and let the recorder write after each second."""
         for _ in range(round(seconds)):
             self.world.hold(0.5, 0.2, seconds=1.0)
             self.write()
@@ -159,7 +159,10 @@ def test_if_the_queue_is_full_steps_are_lost_and_counted_and_the_loop_never_wait
 
 @contextmanager
 def slow_syncs(bench: Bench, seconds: float, stalls: bool = False) -> Iterator[None]:
-    """Make each sync take this time, s. The robot drives in it, or this process stalls."""
+    """Make each sync of the disk last this long, s.
+
+    The robot drives during the sync, or this process stalls.
+    """
     sync = os.fsync
 
     def slow(handle: int) -> None:
@@ -312,7 +315,7 @@ def test_the_minute_before_and_after_an_incident_is_retained(
 
 
 def die(bench: Bench) -> None:
-    """Close the open files and nothing else, as the kernel does for a killed process."""
+    """Close the open files and do nothing else, as the kernel does for a killed process."""
     side = bench.recorder._writer
     assert side._writing is not None
     assert side._directory is not None
@@ -354,7 +357,7 @@ def test_the_minute_around_an_incident_is_retained_over_a_restart(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A fault is followed by an orderly restart, or the other way round."""
+    """An orderly restart follows a fault, or a fault follows an orderly restart."""
     before = Bench(tmp_path, monkeypatch)
     before.world.drive(0.5, 0.2, seconds=1.0)
     if fault_before:
@@ -378,13 +381,13 @@ BUG = "a fault of our own"
 
 
 def ends_by(bench: Bench, error: Exception) -> list[Path]:
-    """Close the recorder as the daemon does after such an error in a task of the loop."""
+    """Close the recorder as the daemon does after this error in a task, and return the files."""
     bench.recorder.close(ExceptionGroup("unhandled errors in a TaskGroup", [error]))
     return listed(bench.where)
 
 
 def break_robot(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Make the robot raise an error at the next request."""
+    """Make the robot raise an error when the next request arrives."""
     whole = Robot.step
 
     def step(robot: Robot, inputs: Inputs) -> Outputs:
@@ -514,7 +517,7 @@ def test_a_jump_of_the_clock_costs_no_recording(
 ) -> None:
     """A robot without a real-time clock was off for weeks.
 
-    It gets the time only while it drives.
+    Its wall clock is set only while the robot drives.
     """
     monkeypatch.setattr(step_writer, "MAX_FILE_NS", 2_000_000_000)
     monkeypatch.setattr(retention, "INCIDENT_MARGIN_NS", 0)
@@ -553,13 +556,13 @@ def test_a_file_that_the_disk_cut_keeps_its_retention_class(bench: Bench) -> Non
 
 
 def no_copies(handle: int) -> None:
-    """Fail each sync of a recovered copy."""
+    """Make each sync of a recovered copy fail."""
     if os.readlink(f"/proc/self/fd/{handle}").endswith(".new"):
         raise OSError(errno.EIO, os.strerror(errno.EIO))
 
 
 def full(handle: int) -> None:
-    """Fail as a disk without free space, which reports that only at a sync."""
+    """Fail like a sync on a disk without free space."""
     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
@@ -573,14 +576,17 @@ def eager(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> Bench:
 
 
 def rounds(bench: Bench, count: int = 3) -> None:
-    """Run short rounds: the first one retries the disk, the second one starts a file."""
+    """Run short rounds of the recorder.
+
+    After an error the first round retries the disk, and the second round starts a file.
+    """
     for _ in range(count):
         bench.world.hold(0.5, 0.2, seconds=0.1)
         bench.write()
 
 
 def refuse(bench: Bench) -> None:
-    """Make the disk refuse a write, then let the retry succeed."""
+    """Let the disk refuse a write, and then let the retry succeed."""
     bench.recorder._writer._fail(OSError(errno.EIO, os.strerror(errno.EIO)))
     rounds(bench)
 
@@ -659,7 +665,7 @@ def test_steps_that_the_disk_refused_are_counted_exactly(eager: Bench) -> None:
 def test_steps_that_the_disk_did_not_sync_are_counted_exactly(
     over: bool, eager: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The sync fails for a chunk, or at the end of a file."""
+    """The sync of a chunk fails, or the sync at the end of a file."""
     (part,) = listed(eager.where)
     synced = part.stat().st_size
     if over:
@@ -775,7 +781,7 @@ def test_a_disk_that_hangs_delays_the_end_of_the_daemon_only_briefly(
 def test_protected_files_are_not_all_deleted_for_a_disk_that_keeps_refusing(
     eager: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The disk may lack inodes, for example, and another program takes each one that is freed."""
+    """For example, the disk has no free inodes, and another program takes each freed inode."""
     die(eager)
     ring = RecordingDirectory(config(eager.where).record)
     before = [
@@ -827,7 +833,7 @@ def test_a_directory_that_was_removed_is_reported_and_created_again(bench: Bench
 def test_the_control_loop_only_appends_to_the_queue(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A thousand steps pass while the thread hangs in a sync."""
+    """The loop runs a thousand steps while the recorder's thread waits for a sync."""
     asked, goes, sync = threading.Event(), threading.Event(), os.fsync
     who = set[str]()
 

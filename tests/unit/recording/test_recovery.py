@@ -1,4 +1,4 @@
-"""A truncated file is recovered in place if there is no room for a copy."""
+"""acsard recovers a truncated file in place if the disk has no room for a copy."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> bytes:
 
 @pytest.fixture(scope="module")
 def growing(tmp_path_factory: pytest.TempPathFactory) -> bytes:
-    """A file whose only chunk still grows, as a crash leaves it."""
+    """Provide a file whose only chunk is incomplete, as a crash leaves it."""
     tape, path = Tape(), tmp_path_factory.mktemp("record") / "part.mcap"
     World(recorder=tape).drive(0.5, 0.2, seconds=8.0)
     tape.write(path, Config(), apart=False)
@@ -85,7 +85,7 @@ def test_all_readable_data_stays_and_the_end_record_names_the_cut(
 def test_a_disk_that_refuses_the_end_costs_no_chunk_and_is_reported(
     data: bytes, torn: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A disk without free space repeats its error, sometimes only at a sync."""
+    """A disk without free space fails again and again, in some cases only at a sync."""
     part, whole = tmp_path / "a.part", tmp_path / "a.mcap"
     cut = data[: chunks(data)[-1][1]] + torn
     part.write_bytes(cut)
@@ -215,7 +215,7 @@ def test_a_chunk_that_still_grew_keeps_all_its_seconds(
 def test_a_short_file_with_a_bad_sector_at_its_beginning_stays_and_is_reported(
     growing: bytes, at: str, room: bool, tmp_path: Path
 ) -> None:
-    """The seconds behind the bad sector cannot be read by this version."""
+    """This version cannot read the seconds after the bad sector, and a later version may."""
     part, whole, bad = tmp_path / "a.part", tmp_path / "a.mcap", bytearray(growing)
     begin = growing.index(GROWING_HEAD) + len(GROWING_HEAD) if at == "chunk" else 0
     bad[begin : begin + 512] = bytes(512)
@@ -254,7 +254,7 @@ def test_a_power_cut_before_the_heads_of_several_chunks_leaves_a_file_that_any_r
 def test_a_recovery_in_place_that_a_power_cut_interrupted_is_completed(
     growing: bytes, tail: bytes, tmp_path: Path
 ) -> None:
-    """The power failed when the end was on the disk and the chunk's head was not."""
+    """The power failed when the file's end was on the disk and the chunk's header was not."""
     part, whole = tmp_path / "a.part", tmp_path / "a.mcap"
     part.write_bytes(growing)
     recover(part, whole, "crash", room=False)

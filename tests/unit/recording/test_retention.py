@@ -1,6 +1,7 @@
 """Tests of the order in which recordings are deleted.
 
-The oldest goes first and protected ones last, and other programs keep a share of the disk.
+The oldest recording is deleted first, and protected ones last. A part of the disk stays free for
+other programs.
 """
 
 from __future__ import annotations

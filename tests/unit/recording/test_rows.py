@@ -1,6 +1,6 @@
-"""A batch of steps reproduces exactly its inputs and outputs.
+"""A stored batch of steps gives back exactly the same inputs and outputs.
 
-A batch of steps that no daemon can have recorded is refused.
+The reader refuses a batch that no daemon can have recorded.
 """
 
 from __future__ import annotations
@@ -105,7 +105,7 @@ def test_all_inputs_are_read_back(inputs: list[Inputs], first: int) -> None:
 
 @cache
 def driven() -> list[FinishedStep]:
-    """Return the steps of a drive through faults."""
+    """Return the steps of a drive with several faults."""
     tape = Tape()
     drive_through_faults(World(recorder=tape), 3.0)
     return tape.taken

@@ -1,4 +1,7 @@
-"""A robot survives the round trip through bytes and another configuration; no byte runs code."""
+"""A robot's saved state can be restored, also under another configuration.
+
+No byte of a saved state can run code.
+"""
 
 from __future__ import annotations
 
@@ -62,7 +65,7 @@ def test_a_robot_with_every_odometry_error_is_read_back_although_it_has_tuples_a
 
 
 def test_senders_of_one_command_soon_leave_the_state() -> None:
-    """The state is saved in a step of the loop whenever a file begins, so it must stay small."""
+    """The control loop saves the state whenever a recording file begins, so it must stay small."""
     freshness = Freshness()
     for number in range(5000):
         stamp_ns = number * NS_PER_S // 1000
@@ -103,7 +106,10 @@ def test_with_any_bit_flipped_the_bytes_are_a_robot_or_refused() -> None:
 
 
 def of_older_code(path: Path, forget: Callable[[Robot], None]) -> Recording:
-    """Record a drive from its middle, with a saved robot from which `forget` removed something."""
+    """Record a drive from its middle. `forget` removes attributes from the saved robot.
+
+    An older version of the code would have saved such a robot.
+    """
     first, tape = 100, Tape(every=100)
     World(recorder=tape).drive(0.5, seconds=2.0)
     robot, memory = thaw(tape.states[first])
@@ -213,14 +219,14 @@ def test_a_defect_of_the_report_is_not_reported_as_a_wrong_robot_state(
 
 
 def replace_state(tape: Tape, state: bytes) -> Tape:
-    """Return the same drive with another robot as its first state."""
+    """Return the recording of the same drive with this robot as its first state."""
     other = Tape()
     other.taken, other.states = tape.taken, {100: state}
     return other
 
 
 def drawn(recording: Recording) -> None:
-    """Replay a recording as a report does."""
+    """Replay a recording as the drawing of a report does."""
     looked = DisplayReplay(recording)
     report = ReportData(looked.config, robot_errors=looked.state_errors)
     for step, outputs, robot in looked.steps():
@@ -253,7 +259,10 @@ def test_a_missing_part_that_a_new_robot_lacks_too_gives_a_message(tmp_path: Pat
 def test_forged_states_after_gaps_take_time_in_proportion_to_the_file(
     taped: Tape, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Each state compresses to a few bytes and takes 0.2 s. A gap comes before each."""
+    """Each state compresses to a few bytes and takes 0.2 s to restore.
+
+    A gap precedes each state.
+    """
     thawed: list[bytes] = []
 
     def counted(data: bytes) -> State:

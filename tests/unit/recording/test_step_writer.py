@@ -19,7 +19,7 @@ from tests.scenarios.world import World
 
 
 def test_a_second_above_the_largest_message_is_divided_and_read_back(tmp_path: Path) -> None:
-    """The reader refuses larger messages, and with one the rest of its chunk."""
+    """The reader refuses a larger message, and then also loses the rest of its chunk."""
     tape, dice, each = Tape(), random.Random(1), MAX_MESSAGE_BYTES // 40
     World(recorder=tape).run(0.5)
     items = [

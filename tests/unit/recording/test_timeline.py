@@ -103,7 +103,7 @@ def test_a_drive_that_has_ended_has_no_second_entry() -> None:
 
 
 def held_by_neutral_first() -> tuple[Tape, float]:
-    """Return a drive after whose stop the sender sends speeds for 2.5 s without a zero.
+    """Return a drive that is stopped, and whose sender then sends speeds for 2.5 s without a zero.
 
     Also returns the wall-clock time at which these speeds begin, s.
     """
@@ -131,7 +131,7 @@ def test_a_reason_that_changes_without_the_mode_has_an_entry() -> None:
 
 
 def two_senders(world: World, first: str, second: str, seconds: float = 3.0) -> None:
-    """Drive with the source `first`, and let the source `second` send speeds meanwhile."""
+    """Drive with the source `first`, while another sender sends speeds to the source `second`."""
     world.drive(0.5, seconds=1.0, source=first)
     for _ in range(round(seconds * 20)):
         world.send(0.5, source=first)
@@ -160,7 +160,7 @@ def test_a_sender_that_waits_for_another_source_or_sender_has_one_entry_with_bot
 
 @pytest.mark.slow
 def test_a_sender_of_an_unknown_source_has_no_entry() -> None:
-    """The robot refuses its commands, and the log has an event about that."""
+    """The robot refuses the sender's commands, and the log already has an event for this."""
     assert waits("nav", "stranger") == []
 
 
@@ -241,7 +241,7 @@ def test_a_link_that_is_lost_briefly_has_the_reason_of_its_event_only() -> None:
 
 
 def restarted(identity: bytes) -> list[TimelineEntry]:
-    """Return the timeline of a board that loses the link, and names itself in two reads."""
+    """Return the timeline after a board was silent and then sent `identity` in two pieces."""
     tape, world = recorded_world(BOARD)
     world.run(1.0)
     with world.mcu.mute():

@@ -1,4 +1,4 @@
-"""Drives of the simulator as data of a report, for the tests of the report."""
+"""Drives of the simulator, converted to a report's data for the tests of the report."""
 
 from __future__ import annotations
 
@@ -38,9 +38,10 @@ def report_from(
     ending: str = "",
     state: State | None = None,
 ) -> ReportData:
-    """Return the report's data of these steps, and of the way in which the recording ended.
+    """Return a report's data for these steps and this end of the recording.
 
-    `state` is the robot's state before the first step, or None if the steps begin with the start.
+    `state` is the robot's state before the first step. It is None if the steps begin with the
+    daemon's start.
     """
     config = config or Config()
     report, replay = ReportData(config, begin, end), Replay(config, *(state or ()))
@@ -53,7 +54,10 @@ def report_from(
 
 
 def two_drivers(world: World) -> None:
-    """Drive with nav, let teleop take over, stop and clear, then send from an unknown source."""
+    """Drive with the source nav, then with teleop. Stop and clear.
+
+    At last a sender sends to an unknown source.
+    """
     world.drive(0.5, 0.3, seconds=2.0, source="nav", hz=10.0)
     for n in range(40):
         world.send(0.5, 0.3, "nav")
@@ -69,5 +73,8 @@ def two_drivers(world: World) -> None:
 
 @lru_cache
 def drive_of_two() -> tuple[ReportData, list[Step]]:
-    """Return the drive with two sources, which no test changes."""
+    """Return the report's data and the steps of a drive with two sources.
+
+    Tests must not change them.
+    """
     return report_of(two_drivers)

@@ -1,4 +1,4 @@
-"""Reads the content of a picture, for the tests."""
+"""Reads the content of a figure of a report, for the tests."""
 
 from __future__ import annotations
 

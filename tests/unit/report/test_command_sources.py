@@ -1,4 +1,4 @@
-"""Tests of the sources in a report: which one drives, waits or is refused."""
+"""Tests of the sources in a report: each one drives, waits, or sends refused commands."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def test_an_invalid_message_is_refused_with_its_reason() -> None:
 
 
 def put(world: World, sequence: int) -> None:
-    """Send a zero with a number. It is refused if a newer command has been accepted."""
+    """Send a zero with a sequence number. The robot refuses it after a newer command."""
     signed = Signature("a/b", sequence=sequence).pack()
     world.put("cmd/app", encode(Twist(Vector3(), Vector3()), "json"), attachment=signed)
     world.run(0.05)

@@ -1,4 +1,4 @@
-"""Plotly accepts the pictures, and their numbers are those of the report's data."""
+"""Plotly accepts the figures, and they show the numbers of the report's data."""
 
 from __future__ import annotations
 

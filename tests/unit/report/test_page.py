@@ -1,4 +1,4 @@
-"""The report is one page that loads nothing, and no text from others becomes markup."""
+"""The report is one HTML file that loads nothing, and no recorded text becomes markup in it."""
 
 from __future__ import annotations
 

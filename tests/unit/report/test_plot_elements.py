@@ -1,4 +1,4 @@
-"""Tests of the texts, numbers and paths that plotly receives."""
+"""Tests of the texts, numbers and lines that plotly receives."""
 
 from __future__ import annotations
 

@@ -177,7 +177,10 @@ MS = 1_000_000
 
 
 def linked(answers: dict[int, int], seconds: int = 10, in_flight: int = 0) -> SerialCounts:
-    """Return the counts of 100 lines a second; `answers` has seconds with another number."""
+    """Return the line counts of a link with 100 lines a second in each direction.
+
+    `answers` maps a second to another number of received lines.
+    """
     link, sent, good = SerialCounts(), 0, 0.0
     for n in range(100 * seconds):
         second = n // 100
@@ -223,9 +226,9 @@ def test_an_implausible_line_counts_as_dropped() -> None:
 
 
 def late(lates: list[float], ahead: frozenset[int] = frozenset()) -> Lateness:
-    """Return the lateness after periods of 10 ms, each late by this many ms.
+    """Return the lateness of periods of 10 ms, each late by this many ms.
 
-    Periods in `ahead` had a line that left at once.
+    In the periods of `ahead` the daemon has already sent a line at once for a new command.
     """
     lateness, number = Lateness(100.0), 0
     for n, ms in enumerate(lates):

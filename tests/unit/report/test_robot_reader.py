@@ -17,7 +17,7 @@ from tests.scenarios.world import World
 
 @contextmanager
 def errors() -> Iterator[None]:
-    """Convert the errors of a robot as a replay does."""
+    """Convert a TypeError of a robot to a RecordingError, as a replay does."""
     try:
         yield
     except TypeError as error:

@@ -26,7 +26,7 @@ OPTIONAL = Ask("How far, if you like?", "m", 0.0, 3.0, 0.0)
 class Program:
     """A parent program that answers the prompt's questions.
 
-    It gives its next answer to each question and keeps every line in `said`.
+    It gives the next answer of a list to each question, and records every line in `said`.
     """
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -73,7 +73,7 @@ class Program:
                         self.say({"answer": said["question"], "value": value})
 
     def told(self, name: str) -> list[Any]:
-        """Close the output and return the value of every message that has this key."""
+        """Close the output, and return the value of this key in every message that has it."""
         self._told.close()
         self._thread.join()
         return [one[name] for one in self.said if name in one]
@@ -163,7 +163,7 @@ def test_the_prompt_ends_even_if_standard_error_is_closed(
 
 
 def test_the_prompt_ends_even_if_its_output_is_not_read(program: Program) -> None:
-    """The parent program hangs while its pipe is full, and later disappears."""
+    """The parent program hangs, so that its pipe fills, and later ends."""
     reader, writer = os.pipe()
     fcntl.fcntl(writer, fcntl.F_SETPIPE_SZ, 4096)
     os.write(writer, b"x" * 4096)

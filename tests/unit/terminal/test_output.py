@@ -1,4 +1,7 @@
-"""Tables and sentences fit a terminal, and are plain and whole anywhere else."""
+"""Tables and sentences fit the width of a terminal.
+
+In a pipe or a file they have no colours and are not shortened.
+"""
 
 from __future__ import annotations
 

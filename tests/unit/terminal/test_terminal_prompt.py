@@ -1,4 +1,4 @@
-"""Tests of the two operator prompts: a terminal prompt, and no operator at all."""
+"""Tests of the prompt at a terminal, and of the prompt that asks no questions."""
 
 from __future__ import annotations
 

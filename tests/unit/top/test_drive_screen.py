@@ -1,4 +1,4 @@
-"""`acsard drive` shows the whole reason, units, and help that stays, at any width."""
+"""`acsard drive` shows the whole reason, the units and the help at any width."""
 
 from __future__ import annotations
 

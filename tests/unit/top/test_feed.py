@@ -33,7 +33,7 @@ class Robot:
         self.queue: deque[Any] = deque()
 
     def ask(self, name: str, take: Any) -> None:
-        """Get no answer."""
+        """Do nothing: the query of the follower gets no answer."""
 
     def key(self, name: str) -> str:
         return f"acsard/acsar/{name}"

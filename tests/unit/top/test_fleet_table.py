@@ -1,4 +1,4 @@
-"""Each robot has a line that states its activity, shows when it has gone, and fits."""
+"""Each robot has a line that says what it does and when it was last seen, and fits the terminal."""
 
 from __future__ import annotations
 
@@ -271,7 +271,7 @@ def session() -> Session:
 def fleet_of(
     session: Session, ids: Sequence[str] = ("*",), answering: Collection[str] = ()
 ) -> Roster:
-    """Return a fleet in which the robots of `answering` answer queries."""
+    """Return a fleet in which only the robots in `answering` answer queries."""
     robot: Any = SimpleNamespace(session=session, where=Address("tcp/127.0.0.1:7448", "acsar", ""))
     stamps = count(2000)
     robot.sibling = lambda name: SimpleNamespace(ask=lambda key, take: answer(name, key, take))
@@ -336,7 +336,7 @@ def test_the_version_of_a_robot_that_publishes_its_state_often_is_queried(
 def test_a_state_from_before_a_suspend_is_old(
     session: Session, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The monotonic clock stands still in a suspend."""
+    """The age must include the suspend, in which the monotonic clock stands still."""
     fleet = fleet_of(session)
     session.comes("robot1")
     fleet._state(sample_of(STATE, "acsard/robot1/state"))

@@ -1,4 +1,4 @@
-"""Tests of keyboard driving: a key press drives for a while, then zeros follow, then silence."""
+"""Tests of keyboard driving: a key press drives for a while, then zeros are sent, then nothing."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ SPEEDS = [
 
 
 def silent() -> Keyboard:
-    """Return a keyboard at 0.5 m/s and 2 rad/s whose initial zeros were sent."""
+    """Return a keyboard at 0.5 m/s and 2 rad/s that sent its first zeros and now sends nothing."""
     keys = Keyboard(0.5, 2.0)
     while keys.wish(0.0) is not None:
         pass
@@ -186,14 +186,14 @@ class Robot:
         return SimpleNamespace(try_recv=lambda: self.said.popleft() if self.said else None)
 
     def ask(self, name: str, take: Any) -> None:
-        """Get no answer."""
+        """Do nothing: the query of the follower gets no answer."""
 
     def send(self, linear: float, angular: float = 0.0) -> None:
         self.sent.append(linear)
 
 
 class Drive:
-    """A ride with a clock that the test sets."""
+    """A keyboard drive with a clock that the test sets."""
 
     def __init__(self, robot: Any, monkeypatch: pytest.MonkeyPatch) -> None:
         self.now, self.asleep = 100.0, 0.0
@@ -258,7 +258,7 @@ def test_keys_that_a_stalled_connection_held_back_do_not_drive(
 def test_a_key_that_was_pressed_before_or_in_a_stall_does_not_drive_after_it(
     reads: list[str], asleep: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The computer was suspended for `asleep` s of the stall. Keys were typed in the meantime."""
+    """The computer is suspended for `asleep` s of the stall. Keys are typed during the stall."""
     robot = Robot()
     drive = Drive(robot, monkeypatch)
     drive.step("i", times=5)
@@ -343,7 +343,7 @@ NOT_FOLLOWING = [
 
 
 class Held(Drive):
-    """A ride with a key that is held until a state shows that the robot does not follow."""
+    """A keyboard drive with a held key. A state then shows why the robot does not obey it."""
 
     def __init__(self, why: RobotState, monkeypatch: pytest.MonkeyPatch) -> None:
         self.robot = Robot(replace(STATE, counters={"lines": 9}))
@@ -356,7 +356,7 @@ class Held(Drive):
         self.robot.sent.clear()
 
     def drives(self, typed: str, times: int = 20) -> bool:
-        """Return whether a speed is sent while this is typed at each step."""
+        """Type this text at each step, and return whether the drive sends a speed."""
         sent = len(self.robot.sent)
         self.step(typed, times)
         return any(self.robot.sent[sent:])
@@ -387,7 +387,10 @@ def test_delayed_keys_do_not_release_a_key_that_no_longer_drives(
 def test_a_delayed_space_does_not_release_a_key_that_no_longer_drives(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The key was held before the stall too. A space that arrives in time releases it."""
+    """The key is held before and after a stall.
+
+    Only a space that arrives in time releases the key.
+    """
     held = Held(STOPPED, monkeypatch)
     held.robot.said.append(sample_of(STATE))
     held.step("i", times=10)
@@ -402,7 +405,10 @@ def test_a_delayed_space_does_not_release_a_key_that_no_longer_drives(
 def test_delayed_keys_do_not_drive_if_the_robot_was_stopped_late_in_their_delay(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The connection stalls for 3 s with the key held. The stop and the clear come after 2 s."""
+    """The connection stalls for 3 s while a key is held.
+
+    After 2 s the robot is stopped and cleared.
+    """
     held = Held(STATE, monkeypatch)
     held.step("i", times=10)
     held.step(times=40)

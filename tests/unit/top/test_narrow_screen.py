@@ -1,4 +1,4 @@
-"""A narrow screen shows every figure of a wide one in full."""
+"""A narrow screen shows every figure of the wide screen without shortening it."""
 
 from __future__ import annotations
 

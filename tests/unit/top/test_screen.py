@@ -1,4 +1,4 @@
-"""One screen of a robot's state shows the important facts and survives any message from the bus."""
+"""The screen shows the important facts about a robot, and no message from the bus can break it."""
 
 from __future__ import annotations
 
@@ -179,7 +179,7 @@ def test_a_hostile_text_changes_only_its_own_field() -> None:
 
 
 def harmless(sent: str) -> bool:
-    """Return whether a terminal would obey nothing in this text except colours and line ends."""
+    """Return whether the only control sequences in this text are colours and line ends."""
     rest = re.sub(r"\x1b\[[0-9;]*m", "", sent).replace("\n", "")
     return all(sign.isprintable() for sign in rest)
 

@@ -1,4 +1,4 @@
-"""Tests of the reports of keyboard driving, and of the table of robots on a terminal."""
+"""Tests of the lines that keyboard driving prints, and of the table of robots on a terminal."""
 
 from __future__ import annotations
 
@@ -59,7 +59,10 @@ def test_output_to_a_file_has_the_help_once() -> None:
 
 
 class Ended:
-    """A drive that has ended: each look at the robot sees its next state, and then the last."""
+    """A drive that has ended.
+
+    Each `take` shows the robot's next state, and at the end the last one.
+    """
 
     def __init__(self, *states: RobotState) -> None:
         self.states = list(states)

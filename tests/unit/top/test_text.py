@@ -1,4 +1,4 @@
-"""Values become short text: correct, bounded in length and harmless in a terminal."""
+"""acsard shows values as short text that is correct and safe for a terminal."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The sections below the mode show each value in its place and with its unit."""
+"""The sections of the wide screen show each value in its place and with its unit."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Helpers for tests in which a read of a file does not return, because the file is a named pipe."""
+"""Helpers that replace a file by a named pipe, so that a read hangs as on a failing disk."""
 
 from __future__ import annotations
 

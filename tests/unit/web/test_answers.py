@@ -1,6 +1,6 @@
-"""Tests of the page's files.
+"""Tests of how the server delivers the page's files.
 
-They are served by plain names only, compressed where it helps, and reloaded on change.
+It accepts plain file names only, compresses files if this helps, and reloads changed files.
 """
 
 from __future__ import annotations
@@ -98,7 +98,10 @@ def test_the_page_has_stop_and_its_style_in_itself_and_allows_them_by_their_hash
 
 
 def test_a_page_that_the_browser_has_already_keeps_its_policy() -> None:
-    """The headers of a 304 replace the kept ones."""
+    """The headers of a 304 answer replace those in the browser's cache.
+
+    The answer must therefore contain the content security policy again.
+    """
     page = Files().get("index.html")
     assert page is not None
     first = sent(make_mocked_request("GET", "/"), page)

@@ -1,4 +1,4 @@
-"""The page's server lists the settings, and checks tokens even if the disk hangs."""
+"""The page's server lists the settings, and checks tokens even while the disk hangs."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ async def test_a_phone_leaves_if_the_disk_hangs_and_only_one_thread_waits_for_th
 async def test_the_age_of_a_picture_counts_a_suspend(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The monotonic clock stands still in a suspend."""
+    """The age must include the suspend, in which the monotonic clock stands still."""
     counts, headers = Counts(), dict[str, str]()
     parts = Parts(robots(None), Guide(Reach("", "", "", ""), ""), counts)
     page = Page(parts, Vault(tmp_path, "acsar"), frozenset(), Acceptor(counts))

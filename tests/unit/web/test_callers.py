@@ -1,6 +1,6 @@
-"""Tests of the place of a client and of the page that asks.
+"""Tests of where a client is, and of which page sends its request.
 
-A client is on the machine, or uses one of the robot's names.
+A client runs on the robot's machine, or reaches it by one of the robot's names.
 """
 
 from __future__ import annotations
@@ -146,7 +146,10 @@ def test_a_mapped_ipv4_address_is_shown_as_ipv4() -> None:
 
 
 def test_a_page_reads_its_own_cookie_first_and_no_other_robot_s_cookie() -> None:
-    """A browser sends the cookies of all ports of a host."""
+    """A page also receives the cookies of other robots.
+
+    A browser sends the cookies of all ports of a host.
+    """
     shown = {
         cookie_name("robot1", 8444): "elsewhere",
         cookie_name("robot2", 8443): "another robot's",

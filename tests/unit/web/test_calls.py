@@ -1,4 +1,4 @@
-"""Each stop is confirmed by one that was requested after it, however many there are."""
+"""The server merges many stops, but confirms a stop only by a call that began after its request."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def calls_of(
     interrupt_guide: Callable[[], Awaitable[Ending]] = nothing,
     is_known: Callable[[str], bool] = lambda robot: False,
 ) -> Calls:
-    """Return the calls of a server without a check, whose viewers see no robot."""
+    """Return the calls of a page's server that runs no board check and knows no other robot."""
     return Calls(known, interrupt_guide, is_known)
 
 
@@ -249,7 +249,10 @@ async def test_a_robot_that_a_page_shows_is_stopped_however_many_stops_were_refu
         calls = calls_of(known, is_known=fleet.sees)
 
         async def stop(robot: str) -> str:
-            """Return the answer of the bus, which has no such service, or the refusal."""
+            """Stop this robot, and return the message of the answer or the reason of the refusal.
+
+            No robot is on the bus, so the answer is an error.
+            """
             try:
                 return (await calls.call(MAINTAINER, "stop", {}, robot)).message
             except RefusedError as error:

@@ -1,4 +1,7 @@
-"""Tests of a fleet's rows, present and gone, in a session that reaches no other program."""
+"""Tests of the rows of a fleet, for present and for lost robots.
+
+The Zenoh session reaches no other program.
+"""
 
 from __future__ import annotations
 
@@ -62,7 +65,7 @@ def robots(client: Client | None) -> Robots:
 
 
 async def row(fleet: Fleet, look: Callable[[Row], Any]) -> Row:
-    """Return the first row for which `look` is true."""
+    """Wait for a row for which `look` is true, and return it."""
     async with asyncio.timeout(PATIENCE_S):
         while True:
             for one in fleet.rows():

@@ -1,4 +1,7 @@
-"""A page that is opened gets the last minute: thinned, bounded and without invented values."""
+"""A page that opens receives the states of the last minute.
+
+They are thinned, limited in number, and contain no invented values.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +33,7 @@ WISHED = Twist(Vector3(0.3, 0.0, 0.0), Vector3(0.0, 0.0, -0.6))
 
 
 def lived(seconds: float, look_ns: int = NS_PER_S // 10) -> Minute:
-    """Return the minute after each state was offered as it arrived."""
+    """Return the stored last minute after the robot has sent states for this time."""
     minute = Minute()
     for at_ns in range(0, int(seconds * NS_PER_S) + 1, look_ns):
         if minute.due(at_ns):
@@ -91,7 +94,7 @@ def test_without_new_states_the_plots_become_empty_within_a_minute() -> None:
 
 
 def test_a_whole_minute_is_less_than_32_kib_of_json() -> None:
-    """Values have at most three decimals, so that a phone loads them fast."""
+    """Values have at most three decimals, so that the page opens fast on a phone."""
     minute = Minute()
     for n in range(1000):
         if minute.due(n * STEP_NS):

@@ -1,4 +1,4 @@
-"""Requests beyond a limit are refused, until time passes or a client leaves."""
+"""The server refuses requests beyond a limit until time passes or a client leaves."""
 
 from __future__ import annotations
 
@@ -162,7 +162,7 @@ def test_each_token_has_its_own_rate_limit() -> None:
 
 
 def _filled(*networks: str) -> Sockets[str]:
-    """Return places that are all taken by strangers from these networks, in turn."""
+    """Return TCP places that are all used by other clients, by turns from these networks."""
     sockets = Sockets[str](MAX_TCP_CONNECTIONS)
     for n in range(MAX_TCP_CONNECTIONS):
         assert sockets.enter(networks[n % len(networks)], f"stranger {n}") is None

@@ -1,6 +1,6 @@
-"""An invitation leads to the address on which the page listens.
+"""An invitation contains the address on which the page listens.
 
-That address has a certificate, or there is no invitation.
+The server makes no invitation if its certificate does not cover that address.
 """
 
 from __future__ import annotations

@@ -19,9 +19,9 @@ STATE = RobotState(
 
 
 def parsed(told: str) -> dict[tuple[str, frozenset[tuple[str, str]]], float]:
-    """Return samples by name and labels, as Prometheus' own client reads them.
+    """Parse metrics with Prometheus' own client, and return the samples by name and labels.
 
-    Each must have a type, and no two may be the same.
+    Each metric must have a type, and no two samples may have the same name and labels.
     """
     found: dict[tuple[str, frozenset[tuple[str, str]]], float] = {}
     for family in text_string_to_metric_families(told):

@@ -1,4 +1,4 @@
-"""The description has every key, and every reference in it leads to a definition."""
+"""The OpenAPI description has every key, and every reference in it leads to a definition."""
 
 from __future__ import annotations
 

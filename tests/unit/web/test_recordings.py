@@ -1,4 +1,4 @@
-"""The page lists the recordings, and another process draws one report at a time, bounded."""
+"""The page lists the recordings. Another process with limits draws one report at a time."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def test_a_file_in_place_of_the_directory_is_an_error(tmp_path: Path) -> None:
 async def test_many_requests_at_once_read_the_disk_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A viewer that asks without end must not take processor time from the stops of others."""
+    """A viewer with very many requests must not delay the stops of other clients."""
     looked: list[Path] = []
 
     def look(place: Path) -> list[Recording]:
@@ -79,12 +79,12 @@ WAITS = "import sys, time; print(40, file=sys.stderr, flush=True); time.sleep(10
 
 
 def drawn_by(program: str) -> Reports:
-    """Return reports that are drawn by this program instead of acsard's own."""
+    """Return reports that this program draws instead of acsard."""
     return Reports((sys.executable, "-S", "-c", program))
 
 
 async def become(found: Reports, path: Path, *states: str, stamp: int = 1) -> ReportState:
-    """Return the progress once it has one of these states."""
+    """Wait until the report's progress has one of these states, and return the progress."""
     async with asyncio.timeout(PATIENCE_S):
         while (told := found.ask(path, (stamp, 0))).report not in states:
             await asyncio.sleep(0.01)
@@ -160,7 +160,7 @@ async def test_a_failed_report_has_its_reason_and_the_next_request_starts_it_aga
     [("'ä is missing'.encode()", "xä is missing"), ("b'\\xc3'", "x\N{REPLACEMENT CHARACTER}")],
 )
 async def test_a_character_across_two_reads_of_an_error_text_is_whole(end: str, shown: str) -> None:
-    """The server reads at most 4096 bytes at once."""
+    """The server reads at most 4096 bytes at once, so a read may end inside a UTF-8 character."""
     program = f"import sys; sys.stderr.buffer.write(b'x' * 4095 + {end}); sys.exit(1)"
     told = await become(drawn_by(program), A, "failed")
     assert told.text.lstrip("x") == shown.lstrip("x")

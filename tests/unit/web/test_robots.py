@@ -1,4 +1,7 @@
-"""The page tells that its robot is silent, by its published states and by its answers."""
+"""The page's server finds out that its robot is silent.
+
+It uses the published states and the answers to queries.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +38,7 @@ ABOUT = About("1", False, 1.0, 4.0, 10.0, "", {"teleop": 0.25, "app": 0.25})
 
 
 class World:
-    """A page's robot whose time passes as fast as the page looks."""
+    """A page's robot in virtual time, which advances each time the page checks the robot."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.now, self.asleep = 100.0, 0.0
@@ -57,7 +60,7 @@ class World:
         return sample_of(replace(STATE, stamp=Time.from_ns(round(self.now * NS_PER_S))))
 
     def told(self, seconds: float, publishes: Callable[[float], Any]) -> list[tuple[float, str]]:
-        """Return each change of `gone` in this time, with when it was told.
+        """Run for this time, and return each change of `gone` with the time of its report.
 
         `publishes` returns the sample that the robot publishes at a time, or None.
         """
@@ -85,7 +88,7 @@ class World:
 
 
 class Answering(Robot):
-    """The client, whose queries the world answers."""
+    """A client whose queries are answered by the test's `World`."""
 
     def __init__(self, world: World) -> None:
         super().__init__()
@@ -195,7 +198,10 @@ async def test_the_page_says_why_it_cannot_follow_the_robot_yet(
 async def test_the_page_learns_about_its_robot_although_a_thread_could_not_start_once(
     failing: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The threads connect, subscribe to the state, and query the two keys `info` and `config`."""
+    """Threads connect, subscribe to `state`, and query `info` and `config`.
+
+    In each run of the test one of these threads fails to start once.
+    """
     starts = itertools.count()
 
     async def in_thread(call: Callable[[], Any], *_: object) -> Any:

@@ -1,4 +1,4 @@
-"""The table of paths: only a short, fixed list is open to strangers or free of rate limits."""
+"""Only a short, fixed list of paths needs no token or has no rate limit."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_a_parameter_is_one_part_of_a_path() -> None:
 
 
 def named(cell: str) -> set[tuple[str, str]]:
-    """Return the method and the paths in the first cell of a line of the page's table."""
+    """Return the method with each path that the first cell of a table row on the page names."""
     method = re.search("GET|POST", cell)
     return {(method[0], path) for path in re.findall(r"(/\S+)`", cell)} if method else set()
 

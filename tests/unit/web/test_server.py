@@ -1,4 +1,7 @@
-"""The page's server loads a new certificate, and starts no further threads while the disk hangs."""
+"""The page's server loads renewed certificates.
+
+While the disk hangs, it starts only one thread for this.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""A message from a page is exactly one frame, or it is refused whole with a reason."""
+"""The server accepts a message from a page only if it is one complete, valid frame.
+
+Otherwise it refuses the whole message with a reason.
+"""
 
 from __future__ import annotations
 

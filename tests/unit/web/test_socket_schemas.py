@@ -1,4 +1,4 @@
-"""Every message of `/ws` matches one of its schemas, and a damaged one matches none."""
+"""Every message of `/ws` matches one of its schemas, and a damaged message matches no schema."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A key is due as often as requested, whatever else is sent meanwhile."""
+"""The server sends each key as often as the page requested, whatever else it sends."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The newest sample of a key is kept.
+"""The server stores only the newest sample of a key.
 
 An answer to a query never replaces a published sample.
 """
@@ -56,7 +56,7 @@ def test_an_answer_older_than_a_published_message_is_ignored(samples: list[zenoh
 def test_the_age_of_a_message_counts_a_suspend(
     samples: list[zenoh.Sample], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The monotonic clock stands still in a suspend."""
+    """The age must include the suspend, in which the monotonic clock stands still."""
     stream = Stream()
     stream.take(samples[0])
     slept_ns = clock.asleep_ns() + 3600 * NS_PER_S
@@ -67,7 +67,10 @@ def test_the_age_of_a_message_counts_a_suspend(
 def test_an_age_is_never_negative(
     samples: list[zenoh.Sample], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A reading is late if NTP speeds up two of its clocks while the thread waits for a core."""
+    """The age comes from several clocks that are read one after the other.
+
+    If the thread waits for a core between two readings, the difference may be negative.
+    """
     stream = Stream()
     with monkeypatch.context() as patched:
         slept_ns = clock.asleep_ns() + NS_PER_S
@@ -77,7 +80,10 @@ def test_an_age_is_never_negative(
 
 
 def test_periodic_keys_of_another_robot_are_not_queried(session: zenoh.Session) -> None:
-    """A router's storage holds the last state of a robot that is off, which would look current."""
+    """A router's storage would answer for a robot that is off.
+
+    Its last state would look current.
+    """
 
     async def story(robot: str, key: str) -> bytes:
         streams = Streams()

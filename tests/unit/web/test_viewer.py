@@ -1,4 +1,4 @@
-"""What cannot be put on the bus is dropped and counted, and the next command is looked at."""
+"""The server drops and counts a command that it cannot publish, and processes the next command."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def test_a_token_that_commands_without_end_is_refused_except_a_zero_after_a_spee
 
 @pytest.mark.slow
 async def test_a_zero_is_obeyed_beyond_the_limit_on_messages() -> None:
-    """A burst of other messages, as after a gap of the network, must not keep a robot moving."""
+    """A burst of messages, for example after a gap of the network, must not prevent the zero."""
     put: list[tuple[float, str]] = []
 
     class Fake:

@@ -1,7 +1,7 @@
-"""Random drives, the lines made from them, and the error of odometry that uses those lines.
+"""Random drives, the board's lines in them, and the error of odometry from these lines.
 
-The path is the truth. Lines are made from it with one cause of error switched on, and summed as
-odometry does, in numpy. This module shares no code with the budget that it judges.
+The true path is known. Each function makes lines with one cause of error and sums them in numpy, as
+odometry does. This module shares no code with the error budget that it tests.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ Real wheels do not turn more evenly.
 
 
 class Told(Struct, frozen=True):
-    """The lines of a drive and the distance between its true end and the end they give."""
+    """The lines of a drive, and the final position error of odometry that uses these lines."""
 
     lines: list[Line]
     metres: float
@@ -59,9 +59,9 @@ class Drive:
         dt: Array,
         kept: npt.NDArray[np.bool_] | None = None,
     ) -> Told:
-        """Sum speeds x dt of the lines with these stamps, as odometry does.
+        """Integrate the speeds of the lines as odometry does, and return lines and final error.
 
-        `kept` marks the lines that arrive.
+        `at` has the timestamps of the lines. `kept` marks the lines that arrive.
         """
         x, y, _ = _path(np.diff(self.left), np.diff(self.right))
         moved = left * dt, right * dt
@@ -83,9 +83,9 @@ class Drive:
 
 
 def late(seed: int, seconds: float, how: str) -> Told:
-    """Return a drive whose stamps are the times at which the host read the lines.
+    """Return a drive whose timestamps are the times at which the host read the lines.
 
-    The lines pass a batching adapter, or the host is busy.
+    `how` says why they are late: an adapter that sends lines in batches, or stalls of the host.
     """
     drive = Drive(seed, seconds)
     left, right = drive.speeds()
@@ -106,9 +106,9 @@ def late(seed: int, seconds: float, how: str) -> Told:
 
 
 def rounded(seed: int, seconds: float, counts: int = 0) -> Told:
-    """Return a drive with speeds in two decimals.
+    """Return a drive with speeds rounded to two decimals.
 
-    With `counts`, the firmware counts this many edges per turn in each period.
+    If `counts` is not 0, the firmware computes each speed from whole counts, `counts` per turn.
     """
     drive = Drive(seed, seconds)
     left, right = drive.speeds()
@@ -124,9 +124,10 @@ def rounded(seed: int, seconds: float, counts: int = 0) -> Told:
 
 
 def lost(seed: int, seconds: float, share: float, longest: int, stands: bool = False) -> Told:
-    """Return a drive that loses this share of its lines, up to `longest` in a row.
+    """Return a drive that loses about this share of its lines, up to `longest` in a row.
 
-    After a loss the next line's speed covers all of the missing time, or the pose `stands`.
+    The next line's speed is used for all of the missing time. With `stands`, a gap of more than 0.1
+    s adds no motion.
     """
     drive = Drive(seed, seconds)
     left, right = drive.speeds()
@@ -150,7 +151,7 @@ def _path(left: Array, right: Array) -> tuple[Array, Array, Array]:
 
 
 def _ramped(rng: np.random.Generator, count: int, lowest: float, most: float, rate: float) -> Array:
-    """Return a speed that moves at `rate` between random targets.
+    """Return a speed that changes at `rate` towards random targets.
 
     A sixth of the targets are zero.
     """

@@ -43,7 +43,10 @@ def share(found: Budget, cause: Cause) -> Share:
 
 
 def as_predicted(case: str, seconds: float, seeds: int) -> float:
-    """Return the rms over drives of the final error divided by the error in the budget."""
+    """Divide the final error of each drive by the error in its budget, and return the rms.
+
+    The result is 1 if the budget predicts the errors well.
+    """
     cause, make = CASES[case]
     ratios = []
     for seed in range(seeds):
@@ -138,8 +141,8 @@ def test_with_a_gyro_no_error_of_the_wheels_changes_the_heading() -> None:
 def with_a_gyro(lines: list[Line], before: float = 0.0) -> Share:
     """Return the gyro's share of the budget.
 
-    The gyro's noise is 1e-6 rad2 in each line that moves. Its scale error grows with all turns
-    since the pose was set; `before` of them precede these lines.
+    The gyro has a noise of 1 µrad² in each line with motion. A scale error grows with the heading
+    since the last reset of the pose, which is `before` turns at the first line.
     """
     heading, noise, made = before * math.tau, 0.0, list[Line]()
     for last, line in pairwise([lines[0], *lines]):
@@ -190,7 +193,7 @@ def test_if_lines_are_missing_here_the_shares_of_time_and_gaps_are_unknown() -> 
 
 
 def test_a_wheel_that_contradicts_its_neighbour_is_measured_slip() -> None:
-    """The front right wheel reports nothing, so the mean of its side is half of the true value."""
+    """The front right wheel reports zeros, so the mean of its side is half of the true value."""
     lines = [
         replace(line, positions=(0.0, *line.positions[1:]), speeds=(0.0, *line.speeds[1:]))
         for line in driven().lines
@@ -227,7 +230,7 @@ def test_the_largest_cause_is_chosen_among_the_requested_bases() -> None:
 def test_a_robot_that_only_moved_to_and_fro_within_a_step_has_no_measured_errors(
     back: float,
 ) -> None:
-    """In a long measurement the steps are long, so the motion in them cancels."""
+    """The budget divides a long measurement into long steps, in which the motion cancels."""
     radius, lines, angle = CONFIG.drive.wheel_radius, [], 0.0
     for number in range(30_000):
         ahead, behind = 1000 <= number < 1110, 1110 <= number < 1220

@@ -19,7 +19,7 @@ DRIVEN = Budget(
 
 
 def of(*shares: tuple[Cause, float | None, Basis], **fields: Any) -> Budget:
-    """Return a budget with these shares by cause, error in mm and basis."""
+    """Return a budget with these shares: cause, error in mm per 100 m, and basis."""
     made = tuple(Share(cause, mm, mm, basis) for cause, mm, basis in shares)
     return replace(DRIVEN, shares=made, **fields)
 

@@ -83,7 +83,10 @@ SPEED = 10.0
 
 
 def ahead(at: list[float], moved: list[float] | None = None) -> list[Line]:
-    """Return lines of a straight drive; `moved` is the motion of odometry in each line, rad."""
+    """Return the lines of a straight drive forward with these timestamps.
+
+    `moved` is how far odometry turns the wheels in each line, rad.
+    """
     speeds = (SPEED,) * 4
     steps = [SPEED * PERIOD] * len(at) if moved is None else moved
     turned = np.cumsum(steps).tolist()
@@ -149,9 +152,9 @@ def four(*columns: Floats) -> Floats:
 @pytest.mark.slow
 @pytest.mark.parametrize("ripple", [0.0, 0.03])
 def test_the_variance_is_that_of_the_sum_of_the_rounding_errors(ripple: float) -> None:
-    """A steady wheel has the same rounding error all the time.
+    """A wheel with a steady speed has the same rounding error in every line.
 
-    A wheel that trembles has a new one in each line.
+    A wheel whose speed varies has a new rounding error in each line.
     """
     rng = np.random.default_rng(1)
     errors, told = [], []

@@ -20,7 +20,7 @@ def found(speeds: list[float]) -> float:
 
 
 def reported(quantum: float, wholes: list[int]) -> list[float]:
-    """Return speeds of these whole counts per period, in two decimals."""
+    """Return the speeds for these whole counts per period, rounded to two decimals."""
     return [round(whole * quantum, 2) for whole in wholes]
 
 

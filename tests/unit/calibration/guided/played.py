@@ -73,7 +73,7 @@ class Player:
         return self._run(made)
 
     def _run(self, made: Drive) -> Run:
-        """Return the reported samples as a run, without going through a file."""
+        """Convert the sensor samples of a drive to a run directly, without a CSV file."""
         sensors = [{"t": made.t, "left": made.left, "right": made.right}]
         if self.gyro:
             sensors.append({"t": made.gyro_t, "yaw_rate": made.gyro})
@@ -131,12 +131,12 @@ class Asked(NoPrompt):
 
 
 def play(way: str, player: Player) -> Calibration:
-    """Play a calibration to its end."""
+    """Run a guided calibration with the simulated person and robot to its end."""
     return guide(way, usual_setup(), Asked(player), player.ride)
 
 
 def leg(way: str, name: str, track: float = 1.6) -> Leg:
-    """Return one leg of a way for a track."""
+    """Return the leg with this name of a calibration method, for a robot with this track."""
     (found,) = [one for one in METHODS[way].legs(usual_setup(), track) if one.name == name]
     return found
 

@@ -1,4 +1,4 @@
-"""The true path of a robot in the room, step by step.
+"""The true path of a robot in a room during a guided calibration, step by step.
 
 This module uses none of the code under test.
 """
@@ -29,10 +29,10 @@ Drive = tuple[Start, Sequence[Leg]]
 
 
 def drives(way: str, setup: Setup, track: float) -> Iterator[Drive]:
-    """Yield every drive of a calibration if `track` is the estimated track.
+    """Yield every drive of a calibration whose estimated track is `track`.
 
-    A drive begins with a leg before which the person sets the robot by hand. In the poses x is
-    forward and y is left.
+    Before the first leg of a drive a person puts the robot at its start. In the poses x is forward
+    and y is left.
     """
     aside = (SIDE - side_of_square(setup)) / 2
     starts: dict[str, Start] = {
@@ -50,10 +50,10 @@ def drives(way: str, setup: Setup, track: float) -> Iterator[Drive]:
 
 
 def places(drive: Drive, setup: Setup, track: float, bend: float) -> Iterator[complex]:
-    """Yield every position of the robot's middle during a drive.
+    """Yield every position of the robot's centre during a drive.
 
-    `track` is the true effective track divided by the geometric one. `bend` is the share by which
-    the right wheels are larger than the left ones.
+    `track` is the true effective track divided by the geometric one. `bend` is how much larger the
+    right wheels are than the left ones, as a fraction.
     """
     (place, yaw), legs = drive
     geometric = setup.drive.wheel_separation
@@ -72,11 +72,10 @@ def places(drive: Drive, setup: Setup, track: float, bend: float) -> Iterator[co
 
 
 def beyond(way: str, setup: Setup, track: float, taken: float, bend: float) -> float:
-    """Return how far some point of the robot leaves the room in the worst case, m.
+    """Return the distance by which a part of the robot leaves the room in the worst case, m.
 
-    The distance is negative if no point leaves it.
-
-    The robot may touch a wall at the near edge, because the person pushes it there.
+    The distance is negative if the whole robot stays inside. The robot may touch the wall where the
+    person pushes it against that wall.
     """
     most = -SIDE
     for drive in drives(way, setup, taken):

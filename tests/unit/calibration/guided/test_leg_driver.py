@@ -28,7 +28,7 @@ Late = Callable[[RobotState], RobotState]
 
 
 def telling(twist: Twist) -> RobotState:
-    """Return the state of a robot that follows this twist, sent by app."""
+    """Return the `state` of a robot that follows this twist of the source `app`."""
     left, right = (
         (twist.linear + side * twist.angular * TRACK / 2) / RADIUS for side in (-1.0, 1.0)
     )
@@ -132,7 +132,7 @@ PASSING = {
 
 @each("why", STOPS)
 def test_a_leg_that_halts_on_a_fault_never_moves_again(why: str) -> None:
-    """Only a passing disturbance lets the leg be repeated."""
+    """The leg may be repeated only after a disturbance that ends by itself."""
     world = World(Leg("", "", (Move(10.0, 0.3),))).until_moving().run(2.0)
     world.tells = STOPS[why]
     world.run(3.0)
@@ -156,7 +156,7 @@ TWO = [
 
 
 def of_two(leg: Leg, sender: str) -> World:
-    """Return a world whose daemon receives two calibrations and follows this one."""
+    """Return a world whose daemon receives commands of two calibrations and obeys `sender`."""
     world = World(leg)
     world.tells = changed(sources=TWO, sender=sender)
     return world
@@ -215,9 +215,9 @@ def test_a_calibration_that_was_held_up_halts_and_does_not_blame_the_daemon() ->
 
 
 def test_a_calibration_that_was_held_up_does_not_continue_on_queued_messages() -> None:
-    """The process stands still after Ctrl-Z, after Ctrl-S, or when it gets no core.
+    """Ctrl-Z, Ctrl-S or a busy computer suspends the calibration.
 
-    It receives the messages of that time when it continues.
+    When it continues, it first receives old messages, and these must not keep the leg running.
     """
     world = World(LEG).until_moving()
     world.now += 1.5

@@ -1,6 +1,6 @@
 """Tests that play each guided calibration with simulated robots.
 
-The simulated person reads to a few mm.
+The simulated person reads the tape with errors of a few mm.
 """
 
 from __future__ import annotations
@@ -218,7 +218,7 @@ def test_the_return_leg_stops_short_of_the_wall() -> None:
 
 
 class Exact(Player):
-    """A person who notes where the squares of a robot without noise ended."""
+    """A player without noise that records the robot's final position after each square."""
 
     def __init__(self, robot: Robot) -> None:
         super().__init__(robot)
@@ -233,10 +233,8 @@ class Exact(Player):
 def test_small_errors_give_the_ratio_of_borenstein_and_feng() -> None:
     """Compare with the equations for E_d and E_b of Borenstein and Feng.
 
-    They use the mean ends of left and right squares.
-
-    Their nominal robot is one whose squares would close: it has equal wheels and the track that was
-    used to command the turns.
+    These use the mean final positions of left and right squares. Their nominal robot has equal
+    wheels and the track that was used to command the turns.
     """
     robot = replace(Robot(chi=1.3, left=0.999, right=1.001), **IDEAL)  # type: ignore[arg-type]
     player = Exact(robot)

@@ -47,10 +47,10 @@ def wheels(seconds: float, right: float, left: float) -> JointState:
 
 
 def recorded() -> Recorder:
-    """Record wheel messages and a gyro.
+    """Record wheel messages and gyro messages through the bus.
 
-    The wheel messages have another clock's stamps and arrive at least 0.1 s late. The gyro has no
-    stamps.
+    The wheel messages have stamps of another clock and arrive at least 0.1 s late. The gyro
+    messages have no stamps.
     """
     recorder = Recorder(JOINTS)
     for k in range(100):
@@ -149,7 +149,7 @@ class Laptop(NoPrompt):
         monkeypatch.setattr(robot_on_bus, "queue_on", lambda *_, **__: self)
 
     def keys(self, wait_s: float) -> str:
-        """Wait for a key. Nobody presses one."""
+        """Let the time `wait_s` pass. The simulated person presses no key."""
         self.now += wait_s
         if self.now > 102.0 and not self.asleep:
             self.now, self.asleep = self.now + 60.0, 60.0
@@ -166,7 +166,7 @@ class Laptop(NoPrompt):
         self.sent.append(linear)
 
     def try_recv(self) -> None:
-        """Return that no message of a sensor waits."""
+        """Return None, because no message of a sensor waits."""
 
 
 class States:

@@ -43,7 +43,7 @@ def test_a_drive_resumes_at_the_last_leg_whose_measurement_stands_alone(
 
 
 class Disturbed:
-    """A drive in which the first rides of one leg are disturbed half-way."""
+    """A guided calibration in which one leg is disturbed half-way, the first `times` times."""
 
     def __init__(self, way: str, leg: str, times: int) -> None:
         self._way, self._leg, self._left = way, leg, times

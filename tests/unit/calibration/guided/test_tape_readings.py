@@ -81,7 +81,10 @@ def test_whole_turns_that_were_not_counted_do_not_matter() -> None:
 
 @pytest.mark.parametrize("what", ["turned", "distance", "ahead", "aside"])
 def test_derivatives_are_those_of_small_steps(what: Quantity) -> None:
-    """The computed derivatives ignore a small second-order effect of the rate parameter."""
+    """Compare the computed derivatives with finite differences.
+
+    The computed derivatives ignore a small second-order effect of the rate parameter.
+    """
     steps = joined([driven(CURVE)[0]])
     start = np.array([0.99, 1.01, 0.7, 0.03, 0.0, 0.0, 0.0])
     told = predicted(steps, what, BASE, start)
@@ -157,7 +160,7 @@ def test_the_number_of_turns_fits_into_the_time_for_turning(track: float, rate: 
 
 
 def once(chi: float) -> Reading:
-    """Return the reading of a first turn with this track, ended after about one revolution."""
+    """Return the reading after a first turn of about one revolution by a robot with this track."""
     player = Player(replace(Robot(chi=chi), **IDEAL))  # type: ignore[arg-type]
     run = player.ride(once_round(usual_setup(), ""))
     return Reading((run,), "turned", player.yaw, 0.01)

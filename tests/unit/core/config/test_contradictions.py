@@ -1,4 +1,4 @@
-"""Tests of contradictions in the bus, access and ROS tables, each with its correction."""
+"""Tests of contradictions in the tables for bus, access and ROS. Each error names a correction."""
 
 from __future__ import annotations
 

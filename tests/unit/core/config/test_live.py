@@ -1,6 +1,6 @@
 """Tests of the settings that can change while the daemon runs.
 
-A change is checked by the same rules as the file.
+The rules for a change are the rules for the configuration file.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""A configuration with dangerous limits is refused with a correction.
+"""The daemon refuses a configuration with dangerous limits and proposes a correction.
 
-The robot could not stop in time, or would fault in normal driving.
+With such limits the robot could not stop in time, or would report a fault in normal driving.
 """
 
 from __future__ import annotations

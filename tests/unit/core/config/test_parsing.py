@@ -431,7 +431,8 @@ def test_broken_rules_between_keys_are_reported_with_the_mistakes_of_other_keys(
 def test_a_rule_is_not_applied_to_a_key_with_an_unknown_value() -> None:
     """The rules must not complain about keys whose values are unknown.
 
-    These are 100 Hz at the default baud rate, and endpoints whose `insecure` was misspelt.
+    Here the baud rate is invalid, so no rule may compare it with the rate. `insecure` is misspelt,
+    so no rule may complain about the endpoints.
     """
     text = """
         [mcu]

@@ -1,4 +1,4 @@
-"""Tests of the keys: their defaults match the design, and their ranges hold at both edges."""
+"""Tests of the configuration keys: their defaults, and both ends of their ranges."""
 
 from __future__ import annotations
 

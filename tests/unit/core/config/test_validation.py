@@ -1,6 +1,6 @@
-"""Tests of generic validation: a table becomes a struct, or one line per mistake.
+"""Tests of generic validation: it converts a table to a struct, or reports a line per mistake.
 
-The tests define their own structs, because validation knows msgspec types and nothing about robots.
+The tests define their own structs, because validation depends only on msgspec types.
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ def arrival(payload: bytes, encoding: str = "") -> Arrival:
 
 
 class GatewayDaemon:
-    """The daemon's record of the gateway's reports."""
+    """The part of the daemon that records the reports of the TLS gateway."""
 
     def __init__(self) -> None:
         self.told, self.counters = GatewayFollower(), Counter[str]()
@@ -71,7 +71,7 @@ A, B = "tcp/127.0.0.1:7447", "tcp/robot.local:7447"
 
 
 class Daemon:
-    """The daemon's record of its routers."""
+    """The part of the daemon that records its connections to routers."""
 
     def __init__(self) -> None:
         self.told, self.counters = RouterFollower(), Counter[str]()

@@ -1,6 +1,6 @@
-"""A sample becomes a command or is refused whole, and `DecodeError` is the only error.
+"""A message from the bus becomes a command or is refused; the only error is `DecodeError`.
 
-It says who sent it, and its sender is bound to a certificate.
+The command names its sender. The sender is bound to a certificate.
 """
 
 from __future__ import annotations
@@ -57,9 +57,9 @@ def arrival(payload: bytes, key: str = "cmd/app", **changes: Any) -> Arrival:
 
 
 def written(body: dict[str, Any], form: Format) -> bytes:
-    """Return a body as bytes.
+    """Encode the fields of a command in this format.
 
-    CDR carries no names, so it needs the message's type and not its fields.
+    CDR carries no field names, so the function first converts the fields to their message type.
     """
     if form != "cdr":
         return encode(body, form)
@@ -625,7 +625,7 @@ NASTY = [
 def damage(payload: bytes, other: bytes, rnd: random.Random) -> bytes:
     """Return a valid payload with one or two random changes.
 
-    They are bit flips, cuts, copies, splices and other numbers.
+    A change flips bits, cuts, copies or splices bytes, or replaces a number.
     """
     for _ in range(rnd.randint(1, 2)):
         a = rnd.randrange(len(payload) + 1)
@@ -764,7 +764,10 @@ def test_a_wildcard_put_or_a_delete_on_a_ros_key_is_refused(via: str) -> None:
 
 
 def test_the_clock_of_a_header_is_kept_apart_from_that_of_a_stamping_router() -> None:
-    """A router stamps for every sender behind it. A header shows the sender's own clock."""
+    """One clock stamps the messages of all senders behind a router.
+
+    The stamp in a message's header comes from the sender's own clock.
+    """
     arbiter = Arbiter(CommandsConfig())
     reasons = []
     for step in range(20):
@@ -936,7 +939,10 @@ def test_shared_and_ros_senders_are_not_bound_to_a_certificate() -> None:
 
 
 def test_a_sender_id_is_never_taken_for_a_session_that_stamps_for_others() -> None:
-    """The zero of a sender id arms immediately. The id of a router's session is no secret."""
+    """The zero of a sender id arms it at once, but the zero of a router's session does not.
+
+    A sender must not get the other treatment by using the session's id, which is not secret.
+    """
     stamped_by = command(twist(), sender="z1", stamp_ns=5).sender
     for name in ("z1", "session z1", "session/z1", f"{stamped_by}/z1"):
         attachment = msgspec.msgpack.encode({"sender": name})

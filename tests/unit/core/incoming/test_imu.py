@@ -1,4 +1,4 @@
-"""A gyro's sample on the bus is read in every encoding, or refused whole with the reason."""
+"""The daemon reads gyro samples in every encoding, or refuses a sample and gives the reason."""
 
 from __future__ import annotations
 

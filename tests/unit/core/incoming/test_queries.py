@@ -1,4 +1,4 @@
-"""Every row of the table answers as designed, and a service runs only under its exact key."""
+"""Each key that can be queried gives the designed answer; a service needs its exact key."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A speed limit only lowers the highest speed, whatever clients set meanwhile."""
+"""A speed limit only lowers the highest speed, whatever clients change while it applies."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ def test_a_damaged_message_is_refused_or_gives_a_limit_of_at_least_zero(
 
 
 class Robot:
-    """The configuration of a robot, which obeys `set` as `core/robot.py` does."""
+    """A robot's configuration, which applies `set` requests as `core/robot.py` does."""
 
     def __init__(self) -> None:
         self.config = Config()
@@ -132,7 +132,7 @@ class Robot:
         self.limiter.receive(said(value, percentage=percentage), 1.0, [])
 
     def step(self, *wishes: Mapping[str, Plain], at_rest: bool = True) -> dict[int, Answer]:
-        """Take a step with a `set` for each of these wishes, and return the answers by number."""
+        """Run a step with a `set` request for each dict. Return the answers by request number."""
         self.now_ns += MIN_INTERVAL_NS
         requests = [
             Request("set", number, settings=dict(wish)) for number, wish in enumerate(wishes, 1)
@@ -227,7 +227,10 @@ def test_a_limit_and_a_higher_set_in_one_step_leave_the_limit_in_force() -> None
 
 
 def test_a_set_that_contradicts_the_setting_under_the_limit_is_refused() -> None:
-    """At 0.3 m/s the deceleration would do. At 1 m/s, after the limit, it would not."""
+    """The new deceleration is enough at the limited 0.3 m/s.
+
+    It is not enough at the configured 1 m/s, which applies again after the limit.
+    """
     robot = Robot()
     robot.limit(0.3)
     robot.step()
@@ -257,7 +260,7 @@ def test_an_invalid_set_is_refused_in_the_same_way_with_and_without_a_limit(
 
 
 def test_two_sets_of_one_step_are_processed_one_after_the_other() -> None:
-    """Alone each is right, but together they contradict each other once the limit ends."""
+    """Each request is valid alone. Together they contradict each other when the limit ends."""
     robot = Robot()
     robot.limit(0.3)
     robot.step()

@@ -1,9 +1,9 @@
-"""Drives as coarse encoders report them, with the pose from the raw counters for comparison.
+"""Drives as coarse encoders report them, and the pose from the raw counters for comparison.
 
-A drive covers 450 m at random: 600 s at 100 Hz, with stops. The truth is a chain of arcs by the
-wheels' true angles at each report. The raw counter sums the exact differences of their whole counts
-instead. This module is written in numpy from the equations and shares no code with the modules that
-it judges.
+A drive is a random path of 450 m with stops: 600 s at 100 Hz. The true path is a chain of arcs
+between the wheels' true angles at each report. The pose from the raw counters uses whole counts
+instead of these angles. This module is written in numpy from the equations and shares no code with
+the modules that it tests.
 """
 
 from __future__ import annotations
@@ -47,7 +47,10 @@ def speeds(rng: np.random.Generator, seconds: float) -> Array:
 
 
 def angles(rng: np.random.Generator, seconds: float) -> Array:
-    """Return the wheels' true angles, rad, shape (periods + 1, 4), each with its own phase."""
+    """Return the wheels' true angles, rad, shape (periods + 1, 4).
+
+    Each wheel starts at a random angle.
+    """
     sides = speeds(rng, seconds) * PERIOD
     wheels = np.vstack([np.zeros(4), np.cumsum(sides[:, [0, 1, 1, 0]], axis=0)])
     return wheels + rng.uniform(0, math.tau, 4)
@@ -63,7 +66,7 @@ def counted(wheels: Array, counts: int | NDArray[np.int_]) -> Array:
 
 
 def end(turned: Array) -> tuple[float, float]:
-    """Return x and y after these wheel angles, by exact arcs."""
+    """Return the final x and y, m, of a chain of exact arcs between these wheel angles."""
     right, left = (turned[:, 0] + turned[:, 3]) / 2, (turned[:, 1] + turned[:, 2]) / 2
     distance, turn = (right + left) / 2 * RADIUS, (right - left) * RADIUS / TRACK
     heading = np.cumsum(turn) - turn / 2
@@ -72,7 +75,7 @@ def end(turned: Array) -> tuple[float, float]:
 
 
 def text(row: Array) -> bytes:
-    """Return a line as firmware writes it."""
+    """Return the line that firmware writes for these speeds."""
     return (
         ",".join(
             f"{motor}{'n' if speed < 0 else 'p'}{abs(speed):05.2f}"
@@ -83,10 +86,10 @@ def text(row: Array) -> bytes:
 
 
 class Host:
-    """The host's processing of lines: session, slew check and odometry, as in `core/robot.py`."""
+    """The host's path from lines to a pose: session, slew check, odometry as in `core/robot.py`."""
 
     def __init__(self, feedback: FeedbackConfig | None = None, counts: int = 0) -> None:
-        """Start with these configured counts per turn, 0 if unknown."""
+        """`counts` is the configured number of counts per turn, or 0 if it is unknown."""
         self.session = McuSession(McuConfig(encoder_counts=counts), 100.0)
         self.sanity = Sanity(feedback or FeedbackConfig())
         self.odometry = Odometry(OdometryConfig(), Kinematics(DriveConfig()), counts)

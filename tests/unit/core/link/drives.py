@@ -1,7 +1,7 @@
-"""Random drives, the lines that an MCU makes from them, and the times at which a host reads those.
+"""Random drives, the lines that an MCU makes from them, and the times at which a host reads them.
 
-The path is the truth. The result of the session under test is compared with it, and with the floor:
-every line with its true time. All randomness comes from the seed.
+The tests compare the pose of the session under test with the true path. They also compare it with
+the floor, which is the pose if each line had its true time. The seed determines all random numbers.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ Adapter = Literal["acm", "ftdi"]
 
 
 class Path:
-    """Wheel angles of both sides over time, of a drive with turns and stops."""
+    """Wheel angles of both sides over time in a drive with turns and stops."""
 
     def __init__(self, rng: np.random.Generator, seconds: float) -> None:
         count = int((seconds + 2.0) / GRID)
@@ -87,7 +87,7 @@ class Path:
 def _ramped(
     rng: np.random.Generator, count: int, most: float, rate: float, lowest: float | None = None
 ) -> np.ndarray:
-    """Return a speed that moves at `rate` between random targets.
+    """Return a speed that changes at `rate` towards random targets.
 
     A sixth of the targets are zero.
     """
@@ -104,7 +104,7 @@ def _ramped(
 
 
 class Case(Struct, frozen=True):
-    """Properties of the connection between MCU and host, in s and shares."""
+    """Properties of the connection between MCU and host. Times are in s, shares are from 0 to 1."""
 
     adapter: Adapter = "acm"
     prompted: bool = False
@@ -122,7 +122,7 @@ class Case(Struct, frozen=True):
 
 
 class Line(Struct):
-    """One report, made at time `at` in s, for the time since `before`."""
+    """One report of mean speeds from `before` to `at`. The MCU makes it at `at`. Times are in s."""
 
     at: float
     before: float
@@ -131,7 +131,7 @@ class Line(Struct):
 
 
 class Host:
-    """The session under test, and two other poses from the same lines."""
+    """The session under test, its pose, and two poses from the same lines for comparison."""
 
     def __init__(self, case: Case, seed: int, seconds: float) -> None:
         self.case, self.seconds = case, seconds
@@ -160,7 +160,7 @@ class Host:
     # the microcontroller
 
     def report(self, at: float, nominal: float | None) -> Line:
-        """Return the line about the wheels' motion since the last one, made at time `at`."""
+        """Make the MCU's next line at time `at`, s, with the mean speeds since its last line."""
         now, then = self.path.angles(at), self.path.angles(self._reported)
         dt = at - self._reported if nominal is None else nominal
         left, right = (round((a - b) / dt, 2) for a, b in zip(now, then, strict=True))
@@ -174,7 +174,7 @@ class Host:
     # the path to the host
 
     def lost(self, line: Line) -> bool:
-        """Return whether nothing of this line arrives."""
+        """Return whether the connection loses this line completely."""
         gone = any(begin <= line.at < end for begin, end in self._bursts)
         return gone or self.rng.random() < self.case.lost
 
@@ -196,21 +196,21 @@ class Host:
         return at
 
     def ticks(self) -> Iterator[float]:
-        """Yield the times of the control steps; missed steps are left out."""
+        """Yield the times of the control steps, s. A step that a stall prevents has no time."""
         at = 0.0
         while True:
             at = max(self.awake((int(at * RATE + 1e-6) + 1) / RATE), at + 1e-6)
             yield at
 
     def tick(self, at: float) -> bool:
-        """Run one control step and return whether a line leaves with it."""
+        """Run one control step, and return whether the host sends a line in it."""
         self.now = at
         now = _instant(at)
         self._update(now, ())
         return self.session.line(now.mono_ns, ROLLING) is not None
 
     def read(self, at: float, data: bytes) -> None:
-        """Read the bytes that the kernel holds, one piece at a time."""
+        """Let the host read these bytes piece by piece, as an adapter delivers them."""
         for start in range(0, len(data), PIECE):
             now = _instant(at + start / PIECE * 0.0002)
             self._update(now, (Received(now, data[start : start + PIECE]),))
@@ -227,7 +227,10 @@ class Host:
     # the end of the drive
 
     def errors(self) -> np.ndarray:
-        """Return the errors in m and deg of the session, of the floor and of arrival times."""
+        """Return the final errors, in m and deg, of three poses.
+
+        The poses come from the session, from true times (the floor), and from arrival times.
+        """
         truth = self._truth()
         rows = []
         for odometry in (self.found, self.floor, self.by_arrival):
@@ -246,7 +249,7 @@ class Host:
 
 
 class Arcs:
-    """The path of a robot of default size by the angles that its sides roll, rad."""
+    """The pose of a robot of default size, computed from the angles that its sides roll, rad."""
 
     def __init__(self) -> None:
         self._path = way.Path()
@@ -267,7 +270,7 @@ def _instant(at: float) -> Instant:
 def _times(
     rng: np.random.Generator, seconds: float, every: float, length: float
 ) -> list[tuple[float, float]]:
-    """Return the starts and ends of a repeated disturbance that has no fixed phase."""
+    """Return random start and end times, s, of a disturbance that recurs about every `every` s."""
     starts = np.arange(every * 0.7, seconds - 1.0, every) + rng.uniform(0, every * 0.2)
     starts += rng.uniform(0, every * 0.1, len(starts))
     return [(start, start + length) for start in starts.tolist()]
@@ -292,9 +295,9 @@ def drive(case: Case, seed: int, seconds: float) -> Host:
 
 
 def reporting(host: Host) -> None:
-    """Simulate an MCU that makes a line in every period of its own clock.
+    """Simulate a free-running MCU, which makes a line in every period of its own clock.
 
-    It divides by the nominal period.
+    The MCU divides the counts by the nominal period.
     """
     arrivals: deque[tuple[float, bytes]] = deque()
     period = PERIOD * (1 + host.rng.uniform(-DRIFT, DRIFT))
@@ -310,7 +313,10 @@ def reporting(host: Host) -> None:
 
 
 def _prompted(host: Host) -> None:
-    """Simulate an MCU that answers each line after 1 ms or more and divides by the true time."""
+    """Simulate a prompted MCU, which answers each line after 1 ms or more.
+
+    The MCU divides the counts by the true time since its last line.
+    """
     arrivals: deque[tuple[float, bytes]] = deque()
     free = last = 0.0
     for tick in host.ticks():

@@ -1,4 +1,7 @@
-"""Status lines: every form, every refusal, and damage that must never look like a release."""
+"""Tests of the board's status lines: accepted forms, refused forms, and damage.
+
+No damage may make a pressed emergency stop look released.
+"""
 
 from __future__ import annotations
 
@@ -143,7 +146,7 @@ def test_no_reply_with_two_wrong_bits_or_a_cut_is_a_status_line(reply: bytes) ->
 
 
 def damaged(line: bytes, others: tuple[bytes, ...], dice: random.Random) -> bytes:
-    """Return the line after one kind of damage that a wire, an adapter or a full buffer does.
+    """Return the line with one kind of damage by a wire, an adapter or a full buffer.
 
     `others` are the lines that may follow it.
     """
@@ -172,7 +175,7 @@ def damaged(line: bytes, others: tuple[bytes, ...], dice: random.Random) -> byte
 
 
 def wrongly_taken(count: int, check: bool) -> Counter[str]:
-    """Damage `count` lines, and count the accepted ones whose emergency stop is wrong."""
+    """Damage `count` lines, and count the accepted lines with a wrong emergency stop."""
     dice, taken = random.Random(33), Counter[str]()
     extra = (b"", b" volts=24.31", b" bumpers=..X. volts=24.31 charge=87%")
     for _ in range(count):
@@ -242,7 +245,10 @@ def test_damage_never_changes_the_state_of_a_bumper(
 
 
 def test_a_false_press_needs_half_a_second_of_damage() -> None:
-    """About half of the lines are lost. Only five lost lines in a row make a false press."""
+    """The damage destroys about half of the status lines.
+
+    The daemon assumes a pressed emergency stop only after five lost status lines in a row.
+    """
     dice, estop = random.Random(5), EmergencyStop("auto")
     step_ns, presses, runs, last_ns = NS_PER_S // 100, 0, 0, 0
     for step in range(200_000):

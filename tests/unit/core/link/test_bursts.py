@@ -1,7 +1,7 @@
-"""The covariance covers bursts of 0.1 to 0.5 s of lost plain lines.
+"""The covariance contains the errors of bursts of 0.1 to 0.5 s without plain lines.
 
-Run it with `pytest -s -m soak core/link/test_bursts.py`. The pose error after 450 m is in
-`test_line_time.py`; the case with counts is in `scenarios/test_bursts.py`.
+Run it with `pytest -s -m soak core/link/test_bursts.py`. `test_line_time.py` tests the pose error
+after 450 m, and `scenarios/test_bursts.py` tests boards that send counts.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ BURSTS = Case(burst_every=30.0)
 
 
 def drive(seed: int, seconds: float, model: Model, robots: int) -> Array:
-    """Return the NEES of robots with equal commands on ground that makes each err differently."""
+    """Return the NEES of robots that get the same commands and slip differently."""
     host = Host(BURSTS, seed, seconds)
     host.found = Odometry(model.config(), Kinematics(DriveConfig()))
     reporting(host)
@@ -54,9 +54,9 @@ def drive(seed: int, seconds: float, model: Model, robots: int) -> Array:
 def test_after_bursts_of_lost_lines_the_covariance_is_consistent(
     model: Model, least: float
 ) -> None:
-    """The wheels err by 3 mm per metre, so the bursts cause most of the error.
+    """The wheels err by only 3 mm per metre, so lost lines cause most of the error.
 
-    The covariance overestimates the error of the bursts a little.
+    The covariance is a little larger than the error from the lost lines.
     """
     values = np.concatenate([drive(seed, 90.0, model, 10) for seed in range(100)])
     inside = float((values < REGION).mean())

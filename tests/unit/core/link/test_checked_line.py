@@ -1,4 +1,4 @@
-"""The suffix is built exactly, and accepted only if all of it is right."""
+"""The suffix of a checked line is built exactly, and is accepted only if all of it is right."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def crc(data: bytes) -> int:
 
 
 def closed(body: bytes) -> bytes:
-    """Return the body with its correct check, even if the body is wrong."""
+    """Return the body with its correct checksum, even if the body itself is wrong."""
     return b"%b*%04X" % (body, crc(body))
 
 

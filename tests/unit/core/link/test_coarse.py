@@ -1,6 +1,7 @@
-"""Coarse encoders from bytes to pose: no true line is dropped, and the error is the raw counter's.
+"""Tests of coarse encoders from received bytes to pose.
 
-Run it with `pytest -m slow -s core/link/test_coarse.py`.
+No true line is dropped, and the error is that of the raw counters. Run it with `pytest -m slow -s
+core/link/test_coarse.py`.
 """
 
 from __future__ import annotations
@@ -30,9 +31,10 @@ FINER = (1000, 2000, 4000)
 
 
 class Driven(Struct, frozen=True):
-    """Distance from the truth at the end of a drive, m.
+    """Distance between the computed and the true end of a drive, m, for three computations.
 
-    `raw` uses counts, `plain` the reports times their period, and `ours` the session under test.
+    `raw` uses counts, `plain` multiplies each reported speed by the period, and `ours` is the
+    session under test.
     """
 
     raw: float
@@ -83,7 +85,7 @@ def test_with_configured_counts_a_drive_ends_exactly_where_the_raw_counter_says(
 @pytest.mark.parametrize("counts", COUNTS + FINER)
 @pytest.mark.parametrize("configured", [False, True], ids=["", "configured"])
 def test_the_error_after_450_m_is_that_of_the_raw_counter(counts: int, configured: bool) -> None:
-    """Without the setting, two decimals of a board with a fixed period cost 1 m more at most."""
+    """Without configured counts, speeds in two decimals add 1 m of error at most."""
     drives = [drive(counts, seed, 600.0, counts if configured else 0) for seed in range(20)]
     raw, plain, ours = (
         float(np.mean([getattr(one, what) for one in drives])) for what in ("raw", "plain", "ours")
@@ -137,9 +139,9 @@ def test_no_line_of_a_firmware_that_filters_is_dropped(counts: int, share: float
 
 
 def wild(wheels: int, seed: int) -> Host:
-    """Return the host of a drive in which `wheels` wheels report random speeds until the fault.
+    """Return the host of a drive in which `wheels` wheels report random speeds until a fault.
 
-    The host joins after the drive has begun.
+    The drive has already begun when the host receives its first line.
     """
     host, dice = Host(), np.random.default_rng(seed)
     for right, left in speeds(np.random.default_rng(seed), 9.0)[150:]:
@@ -157,5 +159,5 @@ def test_a_wheel_that_jumps_at_random_is_suspected_because_the_other_wheels_step
 
 
 def test_two_wheels_that_jump_at_random_are_not_suspected() -> None:
-    """They could equally be two coarse encoders among fine ones."""
+    """The same speeds could come from two coarse encoders on a robot with two fine ones."""
     assert not wild(2, 1).sanity.doubtful

@@ -221,9 +221,9 @@ def test_a_line_that_was_read_back_is_written_identically(
 
 
 def independent(line: bytes) -> Motors | None:
-    """Parse a line by code that shares nothing with the product.
+    """Parse a line with code that shares nothing with acsard.
 
-    Return None if the line is not a frame.
+    Return None if the line is not well-formed.
     """
     tokens = line.split(b",")
     if len(tokens) == 5 and not tokens[4].strip(b" "):
@@ -260,7 +260,7 @@ def test_the_independent_reader_refuses_every_refused_line(line: bytes) -> None:
 
 
 def valid(rng: random.Random) -> bytes:
-    """Return a well-formed line in one of the forms in use."""
+    """Return a random well-formed line in one of the accepted forms."""
     letters = "abcd" if rng.random() < 0.9 else "".join(rng.sample("abcd", 4))
     form = rng.choice(("%05.2f", "%05.2f", "%05.2f", "%.2f", "%.3f"))
     comma = rng.choice((",", ",", ", "))
@@ -302,7 +302,7 @@ def damaged(rng: random.Random, line: bytes, other: bytes) -> bytes:
 
 
 def wire(rng: random.Random, count: int) -> Iterator[bytes]:
-    """Yield `count` lines, one in five undamaged, in pieces that are cut anywhere."""
+    """Yield `count` lines in random pieces. One in five lines is undamaged."""
     other, held = valid(rng), b""
     for _ in range(count):
         line = valid(rng)

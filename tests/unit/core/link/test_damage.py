@@ -35,7 +35,7 @@ AT = Instant(0, 0)
 
 
 def drive(rng: random.Random, count: int) -> list[bytes]:
-    """Return the replies of a driving robot, with each wheel near its last speed, as at 100 Hz."""
+    """Return the replies of a driving robot, whose speeds change little from line to line."""
     speeds, goals, lines = [0.0] * 4, [0.0] * 4, []
     for i in range(count):
         if i % 100 == 0:
@@ -51,7 +51,7 @@ def drive(rng: random.Random, count: int) -> list[bytes]:
 
 
 def hurt(kind: int, line: bytes, after: bytes, chance: float, place: int) -> bytes:
-    """Return the bytes of `line` and its line end after one accident at `place`."""
+    """Return the bytes of `line` and its line end after one kind of damage at `place`."""
     match kind:
         case 0:
             flipped = line[place] ^ (1 << int(chance * 8))
@@ -106,7 +106,7 @@ def test_damage_raises_no_exception_and_is_rarely_accepted(count: int) -> None:
 def plausible(
     sanity: Sanity, before: WheelSpeeds, speeds: WheelSpeeds, steps: Motors = (0.0,) * 4
 ) -> bool:
-    """Return whether the slew check accepts these speeds one period after those.
+    """Return whether the slew check accepts a change between two lines in one period.
 
     `steps` are the quantization steps of the encoders.
     """
@@ -122,10 +122,10 @@ def test_the_slew_check_distinguishes_a_leap_from_a_step() -> None:
 
 
 def live(lines: list[bytes], every: int) -> tuple[int, int, int]:
-    """Count the wrong readings when one bit in one of `every` lines is flipped.
+    """Flip one bit in one of `every` lines, and count the wrong readings.
 
-    The quantization steps are learned from all lines. Return the number of wrong readings, of those
-    accepted, and of those that would be accepted without the learned steps.
+    Return the number of wrong readings, the number of accepted ones, and the number that would be
+    accepted without the quantization steps learned from all lines.
     """
     rng, codec, recovery = random.Random(5), Codec(WheelMap()), CountRecovery()
     sanity, wrong, believed, before = Sanity(FeedbackConfig()), 0, [0, 0], STILL

@@ -23,7 +23,7 @@ CODEC = Codec(WheelMap())
 
 
 class Echoes:
-    """A detector, and a far end whose report arrives some lines later."""
+    """An echo detector, and a board whose report arrives some lines later."""
 
     def __init__(self) -> None:
         self.detector = EchoDetector()
@@ -148,7 +148,7 @@ def test_a_steady_ramp_shows_no_echo() -> None:
 def test_a_motor_that_lags_by_a_whole_number_of_lines_is_not_an_echo(
     acceleration: float, lag: int, reports: int
 ) -> None:
-    """The board measures exactly, over the time since its last report."""
+    """The board reports the exact mean speed since its last report."""
     bench, speed, kept = Echoes(), 0.0, math.exp(-1.0 / (lag * reports))
     sent = 0.0
     for goal in (0.0, 4.0, 9.0, -3.0, 0.0):

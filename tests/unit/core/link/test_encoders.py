@@ -1,4 +1,4 @@
-"""Counts and the MCU's clock, both modulo 65536, become angles or the reason why they cannot."""
+"""Counts and the MCU's clock, both modulo 65536, give angles or the reason for a refusal."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ WRAP_MS = 32768 / (FASTEST / math.tau * COUNTS) * 1000
 
 
 class Bench:
-    """The readings of an MCU with the host's time of each."""
+    """The readings of an MCU, and the host's time of each reading."""
 
     def __init__(self, counts: int = COUNTS) -> None:
         self.encoders = Encoders(counts, FASTEST, 100 * MS)

@@ -25,7 +25,7 @@ DEGREE = math.tau / 360
 
 
 class Bench:
-    """A timeline with the clocks of the host and the MCU."""
+    """The sample-time estimation under test, with simulated clocks of the host and the MCU."""
 
     def __init__(self, wheels: WheelMap | None = None, counts: int = COUNTS) -> None:
         wheels = wheels or WheelMap()
@@ -154,7 +154,7 @@ def test_counts_are_ignored_unless_they_are_configured() -> None:
 
 
 def reporting(bench: Bench, lines: int = 80) -> Bench:
-    """Feed this many lines one by one, every 10 ms."""
+    """Let the host read this many lines one by one, every 10 ms."""
     for _ in range(lines):
         bench.timeline.written(bench.now_ns)
         bench.line()
@@ -162,9 +162,9 @@ def reporting(bench: Bench, lines: int = 80) -> Bench:
 
 
 def read(bench: Bench, ms: float, lines: int, silent: bool = False) -> list[Feedback]:
-    """Read this many lines `ms` after the last read.
+    """Read this many lines at once, `ms` after the last read.
 
-    With `silent`, the first one ends a silence.
+    With `silent`, the first line follows a silence.
     """
     bench.now_ns += int(ms * MS)
     at = Instant(bench.now_ns, bench.now_ns + 7)
@@ -292,9 +292,9 @@ def test_a_board_with_its_own_rate_has_its_own_period(period: int) -> None:
 
 
 def prompted(bench: Bench, lines: int = 60) -> Bench:
-    """Send a line every 10 ms and answer it 8 ms later.
+    """Send a line every 10 ms, and let the board answer it 8 ms later.
 
-    One stall of the host reveals that the board answers.
+    The host stalls once. The missing answers in this stall show that the board is prompted.
     """
     for number in range(lines):
         bench.timeline.written(bench.now_ns + 2 * MS)
@@ -313,7 +313,7 @@ def test_the_dt_of_an_answer_is_the_time_between_the_prompting_lines() -> None:
 
 
 def test_replies_that_waited_in_a_stall_beyond_the_open_commands_cover_no_time_of_it() -> None:
-    """The board samples only when a command arrives, and in the stall none arrived."""
+    """A prompted board samples only when a command arrives, and no command arrived in the stall."""
     bench = prompted(Bench(counts=0), 80)
     bench.timeline.written(bench.now_ns + 2 * MS)
     bench.now_ns += 1200 * MS
@@ -379,7 +379,10 @@ def test_a_change_of_the_clock_neither_adds_nor_loses_time() -> None:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_a_change_from_slots_to_answers_as_the_clock_keeps_the_elapsed_time(seed: int) -> None:
-    """A slot lies at the time of the minimum delay, an answer at that of the mean delay."""
+    """The estimation changes from sample slots to matched answers while the time goes on.
+
+    A slot is timed with the minimum delay, and an answer with the mean delay.
+    """
     bench, chance, total = Bench(counts=0), random.Random(seed), 0.0
     began = bench.now_ns
     for number in (*range(200), *range(215, 230)):  # the stall reveals that the board answers
@@ -395,9 +398,10 @@ def test_a_change_from_slots_to_answers_as_the_clock_keeps_the_elapsed_time(seed
 
 
 def test_answers_after_a_phase_of_sparse_replies_are_not_matched_to_old_lines() -> None:
-    """While only every fifth line is answered, the board seems to report by its own clock.
+    """While the board answers only every fifth line, it looks like a free-running board.
 
-    Its replies are then assigned to no line, so the lines that left before must not count later.
+    The replies of this time are matched to no line. The lines sent in this time must not be matched
+    to later replies.
     """
     bench = Bench(counts=0)
     timeline = bench.timeline
@@ -439,7 +443,7 @@ def test_answers_after_a_phase_of_sparse_replies_are_not_matched_to_old_lines() 
 def test_a_host_stall_reveals_whether_the_board_reports_by_itself(
     configured: bool, stalls: list[tuple[int, float, int]], speaks: bool | None
 ) -> None:
-    """Each stall gives the lines that came, its periods, and the lines that left."""
+    """Each stall has three numbers: received lines, length in periods, and sent lines."""
     style = ReplyStyle(configured)
     for lines, periods, left in stalls:
         for _ in range(left):

@@ -1,7 +1,7 @@
-"""Drives of 450 m through the session show the pose error from the host's delays and lost lines.
+"""Drives of 450 m show how delays of the host and lost lines change the pose.
 
-Each is compared with the floor of the same drive: every line with its true time. `pytest -m soak
--s` runs all drives and prints each row of the table with its goal and its result.
+Each pose is compared with the floor, which is the pose if each line had its true time. `pytest -m
+soak -s` runs all drives and prints a table with the goal and the result of each drive.
 """
 
 from __future__ import annotations
@@ -23,7 +23,10 @@ EFFORT = pytest.mark.parametrize(("seconds", "seeds"), [SHORT, FULL])
 
 
 def errors(name: str, goal: str, case: Case, seconds: float, seeds: int) -> np.ndarray:
-    """Return the mean errors in m and deg of the session, of the floor and of arrival times."""
+    """Return the mean errors, in m and deg, of three poses.
+
+    The poses come from the session, from true times (the floor), and from arrival times.
+    """
     found = np.mean([drive(case, seed, seconds).errors() for seed in range(seeds)], axis=0)
     (m, deg), (times, times_deg) = found[FOUND], found[FOUND] / found[FLOOR]
     by, by_deg = found[ARRIVAL]
@@ -62,9 +65,9 @@ SLACK = np.array([0.02, 0.05])
 
 
 def slack(seeds: int) -> np.ndarray:
-    """Return the allowance for this number of drives.
+    """Return the allowed excess over the goal, which is 0 unless there is only one drive.
 
-    The mean of twenty drives needs none, because its floor is 0.05 to 0.13 m and 0.065 deg.
+    The goals hold for the mean of twenty drives, whose floor is 0.05 to 0.13 m and 0.065 deg.
     """
     return SLACK if seeds == 1 else 0.0 * SLACK
 
@@ -98,9 +101,9 @@ def test_losing_a_fifth_of_the_lines_adds_little_pose_error(
 def test_answers_that_take_1_to_5_ms_give_half_the_error_of_arrival_times(
     seconds: float, seeds: int
 ) -> None:
-    """The remaining error is the MCU's delay, which the host cannot separate from its own.
+    """The remaining error comes from the MCU's delay, which the host cannot measure separately.
 
-    Arrival times have it too.
+    The pose from arrival times contains this error too.
     """
     case = Case(prompted=True, thinking=0.004, stall=0.09)
     name = "stalls of 0.09 s, answers 1 to 5 ms late"
@@ -129,9 +132,9 @@ def test_losses_on_a_batched_link_give_no_more_error_than_arrival_times(
 
 @pytest.mark.slow
 def test_a_batched_link_that_loses_one_answer_in_a_hundred_keeps_its_clock() -> None:
-    """Without the clock, a stall is spread over earlier lines.
+    """Without the clock of the answers, the host would spread a stall over earlier lines.
 
-    That costs 0.44 m in this drive.
+    The error of this drive would then be 0.44 m larger.
     """
     host = drive(Case("ftdi", prompted=True, lost=0.01, stall=0.15), 0, 60.0)
     assert host.errors()[FOUND, 0] <= 0.25

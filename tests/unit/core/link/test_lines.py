@@ -1,6 +1,6 @@
-"""Any cut of the bytes gives the same lines.
+"""However the bytes are cut into pieces, they give the same lines.
 
-Noise costs nothing else, and a newline always recovers.
+Noise destroys only the lines that it hits. Each newline begins a new line.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ streams = st.lists(pieces, max_size=12).map(b"".join)
 
 
 def feed(reader: LineReader, *chunks: bytes) -> list[bytes]:
-    """Return the lines of all chunks in order."""
+    """Feed the chunks in order, and return all lines."""
     return [line for chunk in chunks for line, _ in reader.feed(chunk)]
 
 

@@ -1,6 +1,6 @@
-"""A link that is down is explained by what was received, or by a delay of this computer.
+"""The daemon explains a link that is down by the received bytes, or by a delay of this computer.
 
-A link that loses lines is reported once, in whichever direction they are lost.
+It reports a link that loses lines once, in whichever direction they are lost.
 """
 
 from __future__ import annotations
@@ -126,9 +126,9 @@ def test_lines_that_the_host_read_late_give_no_advice_about_the_board(port: str)
 
 
 def after(*steps_ms: int, good: bool = False, simulated: bool = False) -> Lateness:
-    """Look after each of these steps, beginning with a good line at 0.
+    """Check the lateness after each of these time steps. A good line arrives at time 0.
 
-    `good` tells whether the last step brings a good line.
+    `good` says whether another good line arrives in the last step.
     """
     lateness = Lateness(simulated, QUIET_NS)
     now_ns = 0

@@ -1,4 +1,4 @@
-"""Trust in the link grows by good lines in a row and is lost by silence, damage and restarts."""
+"""Good lines in a row bring the link up. Silence, damage and restarts bring it down."""
 
 from __future__ import annotations
 

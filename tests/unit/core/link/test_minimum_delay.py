@@ -1,6 +1,6 @@
-"""Tests of lateness relative to the minimum delay so far.
+"""Tests of the lateness of a message, measured against the smallest delay so far.
 
-The two clocks were never compared.
+The clocks of both ends are not synchronized.
 """
 
 from __future__ import annotations

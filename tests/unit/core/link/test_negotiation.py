@@ -1,6 +1,6 @@
-"""Tests of the negotiation of the check: questions, accepted answers, and the mode agreed on.
+"""Tests of the negotiation of the link check: questions, accepted answers, and agreed mode.
 
-They also cover a board that only echoes the lines it gets.
+They also cover a board that only echoes the lines it receives.
 """
 
 from __future__ import annotations
@@ -37,14 +37,17 @@ REQUIRE = McuConfig(link_check="require")
 
 
 class Bench:
-    """A negotiation with its time; a line counts as sent unless `settle(False)` says otherwise."""
+    """A negotiation with a simulated time.
+
+    A line counts as sent unless `settle(False)` says otherwise.
+    """
 
     def __init__(self, mcu: McuConfig = AUTO) -> None:
         self.check = Negotiation(mcu, STOP)
         self.now_ns = 1000 * MS
 
     def ask(self, ms: float = 0) -> list[bytes]:
-        """Return the questions sent within this time in periods of 10 ms, all unanswered."""
+        """Let this time pass in periods of 10 ms without answers, and return the sent questions."""
         asked = []
         for _ in range(int(ms / 10) + 1):
             self.check.settle(True)
@@ -87,7 +90,7 @@ def sequence_of(line: bytes) -> int:
 
 
 def kind(line: bytes) -> str:
-    """Return plain, checked or sampled."""
+    """Return the kind of a line: plain, checked or sampled."""
     suffix = line.partition(b"#")[2]
     return ("sampled" if suffix[2:3] == b"S" else "checked") if suffix else "plain"
 

@@ -1,4 +1,4 @@
-"""The steps that encoders cause in the speeds are measured, and coarse encoders are noticed."""
+"""The daemon measures the quantization steps of the speeds and notices coarse encoders."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def speeds(counts: int) -> Array:
 
 
 def look(recovery: CountRecovery, rows: Array, counts: bool = False) -> list[Feedback]:
-    """Feed each row as a line, with counts of its own if `counts`."""
+    """Process each row as a line. With `counts`, the lines contain counts."""
     turned = (0.0,) * 4 if counts else None
     lines = (Feedback(AT, WheelSpeeds(*row), PERIOD, turned=turned) for row in rows.tolist())
     return [recovery.look(line) for line in lines]

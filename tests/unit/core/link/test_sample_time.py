@@ -1,7 +1,7 @@
-"""The time of a sample: from the board's own clock, and from the line that it answers.
+"""Tests of a sample's time, from the clock of a free-running board or from an answered line.
 
-The board's clock is found from the times of reads. It counts neither too many nor too few slots,
-and it is given up in time.
+The host estimates the board's clock from the times of its reads. It counts each sample slot once,
+and soon discards a wrong clock.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ PERIOD = 0.01
 
 
 class Bench:
-    """Lines at a fixed period, and the slots that the clock counts for them.
+    """Lines with a fixed period, and the number of sample slots that the clock counts for them.
 
-    Each line is read at once or late.
+    The host reads each line at once or late.
     """
 
     def __init__(self, period: float = PERIOD, known: tuple[float, ...] = (PERIOD,)) -> None:
@@ -40,7 +40,10 @@ class Bench:
         return int(5e12 + self.made * self.period_ns)
 
     def line(self, late_ms: float = 0.0, lost: bool = False, held: bool = False) -> None:
-        """Make the MCU's next line: it is lost, or held back, or read with all lines held back."""
+        """Make the MCU's next line.
+
+        The host loses it, or leaves it, or reads it with all waiting lines.
+        """
         self.made += 1
         self.waiting += not lost
         if held or not self.waiting:
@@ -66,7 +69,7 @@ class Bench:
 
     @property
     def error(self) -> float:
-        """Return the number of slots counted beyond those that existed."""
+        """Return how many slots too many the clock has counted."""
         return self.counted - (self.made - self.began)
 
 
@@ -147,10 +150,10 @@ def test_a_batched_link_without_loss_counts_each_line_once(seed: int, held: int)
 
 
 def packets(size: int, lines: int, phase: float) -> list[tuple[int, int]]:
-    """Return the times in ns and line counts of reads through an adapter at 115200 baud.
+    """Return the time in ns and the line count of each read through an adapter at 115200 baud.
 
-    The adapter passes 62 bytes on at once, and fewer bytes every 16 ms. Lines of `size` bytes come
-    every 10 ms.
+    Lines of `size` bytes come every 10 ms. The adapter passes on 62 bytes as soon as it has them,
+    and the rest every 16 ms.
     """
     fed = [(round((k * 10 + phase) * MS + (i + 1) * MS / 11.52), i == size - 1)
            for k in range(1, lines + 1) for i in range(size)]  # fmt: skip
@@ -287,7 +290,7 @@ def test_lines_missing_in_a_backlog_are_counted_with_the_backlog() -> None:
 
 
 def forgets(bench: Bench, lines: Iterable[Callable[[], None]]) -> bool:
-    """Return whether the clock is given up during these lines."""
+    """Return whether the host discards the clock during these lines."""
     for line in lines:
         line()
         if bench.slots.period is None:
@@ -366,7 +369,7 @@ class Prompted:
     ) -> list[float]:
         """Read this many replies; return the dt and the filled gap of each, in ms.
 
-        `cut` says whether the read has a part of one more reply.
+        `cut` says whether the read also contains the beginning of the next reply.
         """
         self.prompts.read(int(ms * MS), lines, cut)
         said = []
@@ -378,7 +381,7 @@ class Prompted:
         return said
 
     def talk(self, count: int = 20) -> Prompted:
-        """Send a line every 10 ms and answer each; the last one leaves at (count - 1) x 10."""
+        """Send `count` lines, one every 10 ms from time 0, and answer each of them."""
         for number in range(count):
             self.leave(number * 10)
             self.reply(number * 10 + DELAY_MS)
@@ -451,7 +454,7 @@ def test_a_reply_before_the_minimum_delay_of_a_line_answers_an_earlier_line() ->
 
 
 def test_two_lines_that_leave_close_together_after_a_stall_make_no_gap() -> None:
-    """No gap is filled, because the answer to the first line, read late, covers the whole stall."""
+    """The answer to the first line comes late and covers the stall. Nothing is left to fill."""
     bench = Prompted().talk()
     bench.leave(400.0)
     bench.leave(403.0)
@@ -460,7 +463,10 @@ def test_two_lines_that_leave_close_together_after_a_stall_make_no_gap() -> None
 
 
 def test_all_lines_of_a_silence_that_begins_with_two_close_lines_stay_unanswered() -> None:
-    """No earlier line's answer can be so late that the second line's own answer would be due."""
+    """The board answers none of the lines that were sent in the silence.
+
+    The first reply after it must not be taken for a late answer to one of them.
+    """
     bench = Prompted().talk()
     for ms in (200.0, 203.9, 220.0, 320.0, 420.0, 520.0, 620.0):
         bench.leave(ms)
@@ -524,10 +530,10 @@ def test_without_loss_the_dts_add_up_to_the_time_between_the_lines(seed: int) ->
 
 
 def assigned(prompts: PromptedTimes, replies: dict[int, float], hz: int) -> list[float]:
-    """Return by how much older each reply's assigned line is than the line which it answers, ms.
+    """Return by how many ms each reply is matched to a line that is too old.
 
-    Lines are sent for 10 s from 100 ms on. `replies` has the delay of each line's reply, ms, by the
-    number of the line.
+    Lines are sent for 10 s from 100 ms on. `replies` maps the number of an answered line to the
+    delay of its reply, ms.
     """
     lines = [100 + number * 1000 / hz for number in range(10 * hz)]
     events = [(line, 0.0) for line in lines]
@@ -547,7 +553,7 @@ def assigned(prompts: PromptedTimes, replies: dict[int, float], hz: int) -> list
 def test_a_first_reply_that_is_read_late_hides_no_lost_replies() -> None:
     """The first reply is read 44 ms late. Later only every 16th of 300 lines a second is answered.
 
-    Then no reply is assigned to a line that is more than one line too old.
+    No reply may be matched to a line that is more than one line too old.
     """
     prompts, chance = PromptedTimes(soonest_ns=2 * MS), random.Random(1)
     prompts.written(0)
@@ -562,7 +568,7 @@ def test_a_first_reply_that_is_read_late_hides_no_lost_replies() -> None:
 def test_a_varying_delay_hides_lost_replies_only_briefly(hz: int, each: int, seed: int) -> None:
     """A board takes 8 to 16 ms for a reply, and after 2 s answers only some of the lines.
 
-    Then no reply is assigned to a line that is more than 20 ms too old.
+    After that no reply may be matched to a line that is more than 20 ms too old.
     """
     prompts, chance = PromptedTimes(soonest_ns=2 * MS), random.Random(seed)
     replies, last = {}, 0.0
@@ -592,11 +598,10 @@ def batched(
     lost: tuple[int, ...] = (),
     offs: list[int] | None = None,
 ) -> float:
-    """Return the time that batched answers cover after the first second, ms.
+    """Send a line every 10 ms and read the answers in batches every 16 ms.
 
-    Lines are sent every 10 ms, and their answers arrive every 16 ms.
-
-    `offs` collects the distance from each reply's own line to the line it was matched to, up to a
+    Returns the sum of the times that the answers after the first second cover, ms. `offs` collects
+    for each reply the distance, in lines, between its true line and the matched line, plus a
     constant.
     """
     chance, told = random.Random(seed), 0.0
@@ -626,7 +631,7 @@ def test_on_a_batched_link_each_answer_is_matched_to_its_line(seed: int) -> None
 
 
 def test_answers_that_an_adapter_holds_after_a_stall_are_matched_to_their_lines() -> None:
-    """The adapter hands over whole packets first, and the rest with its next batch."""
+    """The adapter passes on full packets at once, and the rest with its next batch."""
     bench = Prompted()
     batched(bench, 0, 200)
     for n in range(11):
@@ -675,7 +680,7 @@ def test_a_delay_that_varies_by_4_ms_counts_as_processing_time_of_the_mcu() -> N
 
 
 def test_an_early_first_reply_does_not_hide_that_the_delay_varies() -> None:
-    """All later replies seem to be delayed by a stall."""
+    """Compared with the early first reply, every later reply looks delayed by a stall."""
     bench, chance = Prompted(), random.Random(1)
     bench.prompts = PromptedTimes(0)
     bench.leave(0)
@@ -687,7 +692,7 @@ def test_an_early_first_reply_does_not_hide_that_the_delay_varies() -> None:
 
 
 def test_a_stall_of_the_board_does_not_change_the_usual_delay() -> None:
-    """After the stall, the board answers its queue of lines, one reply per read."""
+    """After the stall the board answers the waiting lines, and each read has one reply."""
     bench = Prompted().talk(200)
     delay = bench.prompts.latest_ns - 1990 * MS
     for number in range(200, 230):

@@ -1,4 +1,4 @@
-"""Tests of the send stage, which never queues a line."""
+"""Tests of the serial output, which sends or drops each line at once and queues none."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ GO = b"ap10.00,bp10.00,cp10.00,dp10.00\r\n"
 
 
 class Wire:
-    """A send stage and a kernel that accepts part of each line."""
+    """A serial output, and a kernel that accepts only a part of each line."""
 
     def __init__(self, baud_rate: int = 115200, stop: bytes = STOP, period_ms: int = 10) -> None:
         self.gate = SerialOutput(baud_rate, stop, period_ms * MS)

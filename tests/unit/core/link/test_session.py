@@ -1,4 +1,4 @@
-"""Tests of the link's states, and of the time, gap and session of each good line."""
+"""Tests of the link's states, and of the time, the gap and the session number of good lines."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ SLOW = WheelSpeeds(1.0, 1.0, 1.0, 1.0)
 
 
 class Bench:
-    """A session with its time and a port that can be opened and closed."""
+    """A session with a simulated time, and a port that can be opened and closed."""
 
     def __init__(
         self, mcu: McuConfig | None = None, rate_hz: float = 100.0, longest_reply: float = 0.25
@@ -55,7 +55,7 @@ class Bench:
         return seal(GOOD, int(line.partition(b"#")[2][:2], 16))
 
     def talk(self, ms: int = 10, count: int = 1) -> list[Feedback]:
-        """Let a line leave and its answer return `ms` later, `count` times."""
+        """Send a line and receive its answer `ms` later, `count` times."""
         heard = []
         for _ in range(count):
             line = self.line()
@@ -90,7 +90,7 @@ class Bench:
         return self.session.update(self.now, self.port_open, self.opened, received)
 
     def happen(self, port: str, ms: float, data: bytes) -> None:
-        """Open or close the port if the word says so, let time pass, and read these bytes."""
+        """Open or close the port if `port` says so, let time pass, and read these bytes."""
         if port:
             self.open() if port == "open" else self.close()
         self.wait(ms, *([data] if data else []))
@@ -226,7 +226,10 @@ def test_a_new_session_is_silent_even_if_the_old_one_received_lines() -> None:
 
 
 def sampled(bench: Bench, age_ns: int) -> Instant:
-    """Return the time of a line that was complete `age_ns` ago, less the wire time of its bytes."""
+    """Return the sample time of a line that the host finished reading `age_ns` ago.
+
+    The sample is older by the wire time of the line.
+    """
     made_ns = bench.now_ns - age_ns - wire_ns(len(GOOD), 115200)
     return Instant(made_ns, made_ns + WALL_NS)
 
@@ -389,7 +392,10 @@ def test_a_session_restarts_with_the_port_and_after_a_long_gap(case: str) -> Non
 
 @pytest.mark.parametrize("begins", ["board", "port"])
 def test_a_new_session_with_a_late_first_line_restarts_again_at_that_line(begins: str) -> None:
-    """A zero that was sent while the board was silent must not arm its sender."""
+    """The restart is reported again at the first line, because the board may have been silent.
+
+    A zero that was sent while the board was silent must not arm its sender.
+    """
     bench = Bench().up()
     if begins == "port":
         bench.open().wait(10)
@@ -604,7 +610,7 @@ def test_the_note_after_a_reason_names_the_check_in_force() -> None:
 
 
 def test_the_first_stop_of_a_silence_is_sent_without_delay() -> None:
-    """The last line to the MCU, one period ago, commanded motion."""
+    """The daemon sends the stop although it sent a line with a speed one period before."""
     bench = Bench().up()
     while not bench.session.silent(bench.now_ns):
         assert bench.line() == b"ap01.00,bp01.00,cp01.00,dp01.00\r\n"
@@ -620,7 +626,10 @@ def test_an_mcu_that_restarted_gets_a_stop_without_delay() -> None:
 
 
 def test_a_board_that_reports_by_its_own_clock_gets_no_more_time_behind_a_late_step() -> None:
-    """Its lines wait for the late step, so a step without a line shows that it is silent."""
+    """The lines of a free-running board wait in the kernel until the late step reads them.
+
+    A late step that finds no line therefore proves that the board is silent.
+    """
     bench = Bench(McuConfig(reply_period=0.02)).up()
     bench.wait(150)
     assert bench.link() == "stale"
@@ -643,7 +652,7 @@ def test_zero_speeds_are_sent_as_the_stop_line() -> None:
 
 
 def disbelieved() -> Bench:
-    """Return a bench with configured counts that the speeds of the board contradict."""
+    """Return a bench whose configured counts disagree with the speeds that the board reports."""
     bench, dice = Bench(McuConfig(encoder_counts=20)).up(), random.Random(1)
     for _ in range(100):
         line = ",".join(f"{motor}p{dice.uniform(20, 60):05.2f}" for motor in "abcd")
@@ -679,9 +688,9 @@ def test_the_bad_lines_of_an_update_make_one_event_for_each_reason(reads: int) -
 
 
 def driven_ms(bench: Bench, *lines: tuple[WheelSpeeds, float]) -> float:
-    """Write these lines, each followed by this silence in ms, and then receive a good line.
+    """Write these lines, let the given time in ms pass after each, and then receive a good line.
 
-    Return the time in ms from the sample before the first line to the command to rest.
+    Returns the time from the last sample before these lines to the command to rest, ms.
     """
     for speeds, ms in lines:
         bench.line(speeds)
@@ -743,14 +752,14 @@ def test_a_checked_line_of_zeros_commands_rest() -> None:
 
 
 def update(bench: Bench, *, left: bool, ms: float = 10, read: bytes = GOOD) -> None:
-    """Let time pass after a line that left or did not leave, then update the session."""
+    """Let time pass, then update the session. `left` says whether the port sent the last line."""
     bench.now_ns += int(ms * MS)
     received = (Received(bench.now, read),) if read else ()
     bench.session.update(bench.now, bench.port_open, bench.opened, received, unsent=not left)
 
 
 def blocked(bench: Bench, ms: float) -> Bench:
-    """Return the session after no line left for this long while good lines kept arriving."""
+    """Return a session whose port sent no line for this time, although good lines arrived."""
     bench.line()
     update(bench, left=True)
     for _ in range(round(ms / 10)):

@@ -1,4 +1,7 @@
-"""Whole counts come out of the speeds of a line although its time is known to some ms only."""
+"""The daemon computes whole counts from the speeds of a line.
+
+This works although the daemon knows the time of the line only to a few ms.
+"""
 
 from __future__ import annotations
 
@@ -22,10 +25,10 @@ from tests.unit.core.link.counted import PERIOD, Array, angles, counted
 def lines(
     counts: int, jitter: float, seed: int = 1, nominal: bool = False
 ) -> Iterator[tuple[Motors, float, Array]]:
-    """Yield the speeds of each line, the host's estimate of its time, s, and the true counts.
+    """Yield the speeds of each line, the host's estimate of its duration, s, and the true counts.
 
-    Samples are up to `jitter` s late, which the host does not know. Firmware divides by the true
-    time between its samples, or by the `nominal` period.
+    Each sample is up to `jitter` s late, and the host does not know by how much. The firmware
+    divides by the true time between two samples, or by the `nominal` period.
     """
     dice, wheels = np.random.default_rng(seed), angles(np.random.default_rng(seed), 25.0)
     at = np.arange(len(wheels)) * PERIOD + dice.uniform(0.0, jitter, len(wheels))
@@ -38,7 +41,7 @@ def lines(
 
 
 def missed(counts: int, jitter: float, nominal: bool = False) -> Array:
-    """Return how many counts of each wheel are wrong in the end."""
+    """Return the final error of each wheel's angle in counts."""
     found, total = WholeCounts(counts), np.zeros(4)
     for speeds, own, number in lines(counts, jitter, nominal=nominal):
         turned = found.turned(speeds, own)
@@ -123,7 +126,10 @@ def test_slow_wheels_with_edge_timing_firmware_do_not_turn_a_count_in_each_line(
 
 @pytest.mark.parametrize("counts", [96, 400, 3200])
 def test_equal_lines_at_uneven_times_lose_no_time(counts: int) -> None:
-    """The host knows the times too badly for whole counts, and a short one is no repetition."""
+    """The host knows the durations too roughly to find whole counts.
+
+    It must not take a line after a short time for a repetition of the last line.
+    """
     found, dice, turned, seconds = WholeCounts(counts), random.Random(1), 0.0, 0.0
     for _ in range(1000):
         own = dice.uniform(0.004, 0.014)
@@ -148,7 +154,7 @@ def test_zero_speeds_give_zero_angles() -> None:
 
 
 def off_by(lost: str, counts: int, jitter: float) -> float:
-    """Return the relative error of the wheels' way if each third command or reply is lost."""
+    """Lose every third command or reply, and return the relative error of the wheels' distance."""
     dice, wheels = np.random.default_rng(3), angles(np.random.default_rng(3), 60.0)
     n = np.arange(len(wheels))
     at = n * PERIOD + dice.uniform(0.0, jitter, len(wheels))

@@ -1,4 +1,4 @@
-"""Outputs of one step in which every number is different, so that a swapped field shows."""
+"""The outputs of one step. All numbers differ, so that a test notices two swapped fields."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ SNAPSHOT = Snapshot(
 
 
 def at(instant: Instant, **changes: Any) -> Outputs:
-    """Return the outputs of a tick at another time, with one estimate of that time."""
+    """Return the outputs of a step at this time, with one odometry estimate of the same time."""
     estimate = replace(ESTIMATE, at=instant)
     return replace(OUTPUTS, now=instant, **({"estimates": (estimate,)} | changes))
 

@@ -1,7 +1,7 @@
-"""Structs and CDR: each rule of the format, and comparison with rosbags as an independent oracle.
+"""Tests of CDR encoding: each rule of the format, and comparison with the library rosbags.
 
-Padding is arbitrary on the wire. Both encoders write zeros, so that whole payloads can be compared.
-A separate test proves that padding is not read. Run the soak with `pytest -m soak -s
+CDR allows any padding bytes. Both encoders write zeros, so the tests can compare whole payloads. A
+separate test proves that the decoder ignores padding. Run the soak test with `pytest -m soak -s
 core/messages/test_cdr.py`.
 """
 
@@ -84,7 +84,7 @@ ROS_NAMES: dict[type[Struct], str] = {
 
 
 def built(value: Any, name: str) -> Any:
-    """Return a message as the oracle's class `name`, by the oracle's own list of fields."""
+    """Return a message of the class `name` of rosbags, built from rosbags' own list of fields."""
     fields = STORE.fielddefs[name][1]
     return STORE.types[name](**{f: built_field(getattr(value, f), desc) for f, desc in fields})
 
@@ -104,7 +104,7 @@ def built_field(value: Any, desc: Any) -> Any:
 
 
 def plain(value: Any) -> Any:
-    """Return the oracle's message as maps and lists."""
+    """Return a message of rosbags as dicts and lists."""
     if hasattr(value, "__msgtype__"):
         fields = STORE.fielddefs[value.__msgtype__][1]
         return {name: plain(getattr(value, name)) for name, _ in fields}
@@ -864,7 +864,7 @@ def test_a_payload_that_is_truncated_at_any_position_is_refused() -> None:
 
 
 def weight(value: object) -> int:
-    """Return the number of items and characters in the parts without a fixed length."""
+    """Return the total number of list items and characters in a message."""
     if isinstance(value, str):
         return len(value)
     if isinstance(value, list):
@@ -878,7 +878,7 @@ LENGTHS = (0, 1, 2, 5, 255, 2**16, 2**31 - 1, 2**31, 2**32 - 1)
 
 
 def damaged(payload: bytes, dice: random.Random) -> bytes:
-    """Return a valid payload after one to three accidents."""
+    """Return a valid payload with one to three random kinds of damage."""
     for _ in range(dice.randint(1, 3)):
         at = dice.randrange(len(payload) + 1)
         end = min(len(payload), at + dice.randint(0, 9))

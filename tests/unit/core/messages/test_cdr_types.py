@@ -1,4 +1,4 @@
-"""A struct type is split into its leaves, in order, and put together again."""
+"""A struct type can be split into its primitive fields, in order, and rebuilt from them."""
 
 from __future__ import annotations
 

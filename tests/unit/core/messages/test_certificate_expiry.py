@@ -1,4 +1,4 @@
-"""The end of a certificate is reported in time, and an unreadable end is reported as well."""
+"""The daemon reports in time that a certificate expires. It also reports an unreadable date."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def test_the_certificate_that_expires_first_is_named_unless_it_is_the_robot_s_ow
 
 
 def test_an_authority_that_expires_together_with_its_gateway_certificate_is_named() -> None:
-    """The gateway reports the earlier end of its own certificate and of its authority's."""
+    """The gateway's report is the earlier expiry of its own certificate and of its authority's."""
     ends = {"": NOW_NS + 10 * DAY_NS, "the authority": NOW_NS + 10 * DAY_NS}
     assert expiry(ends, NOW_NS) == (1, "expires in 10 days (certificate of the authority)")
 

@@ -194,9 +194,9 @@ def test_a_battery_has_a_row_once_it_is_reported_or_has_thresholds() -> None:
 
 
 def test_a_router_has_a_row_before_the_first_check_of_its_connection() -> None:
-    """The row must be there before the first look at the routers.
+    """The first check of the routers takes half a second.
 
-    That look takes half a second, and the monitor would otherwise see a row appear.
+    Without a row from the start, a new row would appear in the monitor after this time.
     """
     config = replace(CONFIG, bus=BusConfig(connect=("tcp/a:7447",)))
     one = row("router", config)

@@ -1,6 +1,6 @@
-"""msgpack, JSON and CDR are recognized by name and by first bytes.
+"""The daemon recognizes msgpack, JSON and CDR by their names or by the first bytes.
 
-Any bad input raises only `DecodeError`.
+Bad input raises `DecodeError` and no other error.
 """
 
 from __future__ import annotations

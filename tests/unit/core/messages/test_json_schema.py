@@ -1,4 +1,4 @@
-"""The JSON Schemas hold in a third-party validator."""
+"""Tests of the JSON Schemas with a third-party validator."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ OUTGOING = set(SCHEMAS) - INCOMING
 
 
 def parts(name: str) -> list[dict[str, Any]]:
-    """Return all objects of a schema that have fields of their own, itself included."""
+    """Return the schema and all its nested schemas that have fields."""
     schema = SCHEMAS[name]
     return [one for one in (schema, *schema["$defs"].values()) if "properties" in one]
 
@@ -78,7 +78,10 @@ def test_incoming_messages_may_omit_defaults_but_not_add_fields(name: str) -> No
 
 
 def test_the_incoming_and_outgoing_schemas_are_those_of_the_topic_table() -> None:
-    """Types appear by name, with `In` added if the same name is also published."""
+    """Each type has a schema of its name.
+
+    An incoming type gets the suffix `In` if it is published too.
+    """
     said = {topic.direction: set[str]() for topic in TOPICS}
     for topic in TOPICS:
         said[topic.direction] |= {name for name in topic.type.split(" or ") if name in MESSAGES}

@@ -1,4 +1,4 @@
-"""The table has every key of the design exactly once, and the form of a full key."""
+"""The table of keys has every key of the design exactly once, and full keys have the right form."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of the messages due after a step: their stamps, frames and covariance cells."""
+"""Tests of the messages that are published after a step: stamps, frames and covariances."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def never() -> Snapshot:
 
 
 def published(outputs: Outputs = OUTPUTS, config: Config = CONFIG) -> dict[str, Any]:
-    """Return all messages due after these outputs if they are the first, by key."""
+    """Return the messages, keyed by key, that a new daemon publishes after these outputs."""
     return dict(Report(config, START).due(outputs, ALL, look))
 
 
@@ -259,7 +259,7 @@ angle = st.floats(-math.pi, math.pi)
 
 
 def rotated(q: Quaternion, v: tuple[float, float, float]) -> tuple[float, float, float]:
-    """Return q v q*, computed as t = 2 u x v, v' = v + w t + u x t."""
+    """Return the vector v rotated by the quaternion (w, u): v + w t + u x t, with t = 2 u x v."""
     (a, b, c), u = v, (q.x, q.y, q.z)
     t = tuple(
         2 * component

@@ -1,4 +1,4 @@
-"""A message on one line says the same as its JSON, without the parts meant for programs."""
+"""A message as one line of text contains the same facts as its JSON, except those for programs."""
 
 from __future__ import annotations
 

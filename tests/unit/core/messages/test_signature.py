@@ -1,4 +1,4 @@
-"""The sender of a command is read from the project's own attachment, if there is one."""
+"""The daemon reads the sender of a command from acsard's attachment, if the message has one."""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ LOW = Source("low", 10)
 
 
 class Bench:
-    """An arbiter with its own time. The senders' clocks are ahead by `offset_ns`."""
+    """An arbiter with a simulated time. The senders' clocks are ahead by `offset_ns`."""
 
     def __init__(
         self,
@@ -70,7 +70,7 @@ class Bench:
         )
 
     def known(self, source: Source, clock: str = "", sender: str = "") -> Bench:
-        """Send zeros until the arbiter knows the clock that stamps them."""
+        """Send zeros until the arbiter accepts the stamps of this sender's clock."""
         for _ in range(60):
             self.wait(50).stamped(source, 0.0, clock, REST, sender)
         assert self.stamped(source, 0.0, clock, REST, sender) == ""

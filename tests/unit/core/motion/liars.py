@@ -1,9 +1,9 @@
-"""Simulated drives as four encoders report them, of which one may fail, for `wheel_faults.py`.
+"""Simulated drives of four encoders, of which one may fail, for the tests of `wheel_faults.py`.
 
-Each wheel has its own motor lag, tyre and load, and starts anywhere within one count of its
-encoder. A line reports counts over its period in two decimals. The module
-`core/motion/wheel_faults.py` is judged by these drives, so this one uses only numpy and
-shares no code with it. The seed determines everything that a robot does.
+Each wheel has its own motor lag, tyre and load, and starts at a random position within one count. A
+line reports counts divided by its period in two decimals. These drives test the module
+`core/motion/wheel_faults.py`, so this module uses only numpy and shares no code with it. The seed
+determines everything that a robot does.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ SIDES = (1, -1, -1, 1)
 class Robot(Struct, frozen=True):
     """How the wheels of one robot differ.
 
-    `lag` is the mean motor lag in s. `lags` and `tyres` are standard deviations, as shares of the
-    lag and of the distance.
+    `lag` is the mean motor lag, s. `lags` and `tyres` are standard deviations, relative to the lag
+    and to the rolled distance.
     """
 
     counts: int = 3200
@@ -138,7 +138,7 @@ def fold(robot: Odometry, line: Feedback, commanded: WheelSpeeds) -> tuple[Estim
 
 
 def apart(a: Pose, b: Pose) -> tuple[float, float]:
-    """Return the distance in m and the angle in rad between two poses."""
+    """Return the distance, m, and the heading difference, rad, between two poses."""
     return math.dist((a.x, a.y), (b.x, b.y)), abs(math.remainder(a.yaw - b.yaw, math.tau))
 
 

@@ -1,9 +1,9 @@
-"""Simulated drives and true end poses of robots with the declared errors: the truth for NEES.
+"""Simulated drives and true end poses of robots whose errors have the declared statistics.
 
-This module implements only the declared model (`acsard.toml`, the docstring of
-`core/motion/error_model.py`), in numpy, for many robots at once. It shares no code with the module
-that it judges. The encoders report exactly the commanded speeds; the ground and the robot's true
-size change the actual motion.
+The tests compute NEES from them. This module implements only the declared error model
+(`acsard.toml`, the docstring of `core/motion/error_model.py`) in numpy, for many robots at once. It
+shares no code with the module that it tests. The encoders report exactly the commanded speeds. The
+ground and the robot's true size change the actual motion.
 
 NEES is e' P^-1 e, with e = log(estimate^-1 truth) and P the published covariance rotated by -yaw.
 If P is right, the mean of NEES over many runs is 3, and 95 % of its values are below 7.815.
@@ -154,7 +154,7 @@ def fold(lines: Iterable[Feedback], model: Model, counts: int = 0) -> tuple[Arra
 
 
 def plain(drive: Array) -> list[Feedback]:
-    """Return the feedback lines of a drive."""
+    """Return the speeds of a drive as feedback lines."""
     return [Feedback(AT, WheelSpeeds(r, le, le, r), PERIOD) for le, r in drive.tolist()]
 
 
@@ -187,7 +187,7 @@ def study(
 ) -> Array:
     """Return the NEES of `runs` robots, spread over `drives` drives.
 
-    Odometry receives every line, or only the lines that `heard` returns.
+    Odometry receives every line. If `heard` is given, odometry receives the lines that it returns.
     """
     rng = np.random.default_rng(seed)
     paths = [reports(scenario(rng)) for _ in range(drives)]

@@ -1,4 +1,4 @@
-"""Tests of the arbiter: priority, timeouts, order of arrival, and waiting sources."""
+"""Tests of the arbiter: priorities, timeouts, the order of senders, and waiting sources."""
 
 from __future__ import annotations
 
@@ -259,7 +259,10 @@ def test_a_command_that_arrived_before_neutral_was_required_arms_no_sender(
 
 
 def test_a_requirement_of_a_zero_with_an_earlier_time_does_not_replace_a_later_one() -> None:
-    """As if the board restarts, and a clear from before the restart is obeyed in the same step."""
+    """In one step the board restarts, and a `clear` from before the restart also requires a zero.
+
+    The later time counts.
+    """
     bench = Bench(HIGH, armed=False)
     bench.arbiter.require_neutral(bench.now_ns + 100 * MS)
     bench.arbiter.require_neutral(bench.now_ns)
@@ -332,7 +335,7 @@ def test_the_followed_sender_keeps_the_robot_while_its_stamps_are_in_doubt(
 
 @each("other", [HIGH, LEFT, RIGHT])
 def test_a_waiting_sender_with_stamps_in_doubt_does_not_block_another_sender(other: Source) -> None:
-    """The senders c, a and b came in this order, and c falls silent."""
+    """Senders c, a and b send in this order, and c falls silent. Sender a has doubtful stamps."""
     own = LEFT if other is RIGHT else other
     bench = Bench(HIGH, LEFT, RIGHT, armed=False).known(own, "clock", "a")
     bench.wait(300).send(own, REST, "c")
@@ -439,7 +442,10 @@ def test_a_stall_of_the_daemon_does_not_change_the_followed_sender(other: Source
 def test_a_risen_delay_is_forgiven_within_the_budget_despite_a_longer_timeout_elsewhere(
     most_ms: float, heals: bool
 ) -> None:
-    """A rise by 1.1 s exceeds the budget, so only the source with the long timeout goes on."""
+    """A rise of 1.1 s exceeds the budget of the source with the short timeout.
+
+    The arbiter then follows only the source with the long timeout.
+    """
     long = Source("long", 10, timeout=2.0)
     bench = Bench(HIGH, long, armed=False).known(HIGH, "clock", "a").known(long, "clock", "a")
     for at in range(130):
@@ -555,7 +561,7 @@ def test_many_senders_of_one_source_do_not_displace_a_sender_of_another_source()
 
 
 def held(bench: Bench, source: Source, seconds: float, twist: Twist = REST) -> Wait:
-    """Send this twist ten times a second for this time and return the reported wait."""
+    """Send this twist ten times a second for this time, and return why the robot waits."""
     for _ in range(round(10 * seconds)):
         bench.wait(100).send(source, twist)
     return bench.choice().wait

@@ -1,4 +1,4 @@
-"""Tests of the battery: its levels, their hysteresis, the mean, and a board that falls silent."""
+"""Tests of the battery: levels, hysteresis, averaged voltage, and a board that falls silent."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ ORDER = ("ok", "warning", "return", "stop")
 
 
 class Pack:
-    """A battery with its time. The first step is at 10 s."""
+    """A battery monitor with a simulated time. The first step is at 10 s."""
 
     def __init__(self, config: BatteryConfig = CONFIG) -> None:
         self.battery = Battery(config)
@@ -37,7 +37,7 @@ class Pack:
         self.stops = 0
 
     def step(self, *lines: BoardStatus, ms: int = 100) -> BatteryLevel | None:
-        """Take these status lines `ms` after the step before, and return the level."""
+        """Process these status lines `ms` after the last step, and return the level."""
         self.now_ms += ms
         told = [(self.now_ms * MS, line) for line in lines]
         found = self.battery.look(told, self.now_ms * MS)
@@ -51,7 +51,7 @@ class Pack:
         return [self.step(BoardStatus(volts=volts), ms=ms) for _ in range(count)][-1]
 
     def quiet(self, seconds: float) -> BatteryLevel | None:
-        """Take steps without a report for this time."""
+        """Run steps without a report of the board for this time."""
         return [self.step() for _ in range(round(seconds * 10))][-1]
 
     @property
@@ -187,7 +187,10 @@ def test_an_exchanged_battery_ends_the_stop_within_seconds() -> None:
 @each("start_ms", range(0, 1000, 50))
 @each("ms", [20, 100, 250])
 def test_a_motor_start_does_not_change_the_level(start_ms: int, ms: int) -> None:
-    """The start takes 0.3 s and lowers the voltage by 2 V. The battery is 0.1 V above the stop."""
+    """The voltage is 0.1 V above the level that stops the robot.
+
+    A motor lowers it by 2 V for 0.3 s.
+    """
     pack = Pack()
     pack.at(21.1, 30.0, ms=ms)
     assert pack.status.level == "return"
@@ -207,7 +210,7 @@ def test_a_motor_start_does_not_change_the_level(start_ms: int, ms: int) -> None
 def test_a_motor_start_in_the_first_reports_does_not_change_the_level(
     lost_s: float, ms: int, before: int
 ) -> None:
-    """The battery is 0.3 V above the stop, and one report shows the drop of 2 V."""
+    """The voltage is 0.3 V above the level that stops the robot, and one report is 2 V lower."""
     pack = Pack()
     for _ in range(before):
         pack.at(21.3, ms / 1000, ms=ms)

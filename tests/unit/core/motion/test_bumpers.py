@@ -1,4 +1,4 @@
-"""Tests of the bumpers: their states, their words, and the motion that each of them allows."""
+"""Tests of the bumpers: their states, their texts, and the motion that each of them allows."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ FOUR: tuple[Place, ...] = ("front", "rear", "left", "right")
 
 
 class Pins:
-    """Bumpers with their time. The first step is at 10 s."""
+    """Bumper inputs with a simulated time. The first step is at 10 s."""
 
     def __init__(self, safety: SafetyConfig) -> None:
         self.bumpers = Bumpers(safety)
@@ -33,7 +33,7 @@ class Pins:
         self.events: list[Event] = []
 
     def step(self, *reports: str, ms: int = 10) -> str:
-        """Take status lines with these bumpers ("" for none) after `ms`, and return the state."""
+        """Process status lines with these bumpers ("" for none) after `ms`. Return the state."""
         self.now_ms += ms
         statuses = [
             (self.now_ms * MS, BoardStatus(bumpers=tuple(mark == "X" for mark in marks) or None))
@@ -43,7 +43,7 @@ class Pins:
         return self.bumpers.state
 
     def quiet(self, ms: int) -> str:
-        """Take steps without a report for this time."""
+        """Run steps without a report of the board for this time."""
         for _ in range(ms // 10):
             self.step()
         return self.bumpers.state

@@ -1,6 +1,7 @@
-"""The limits of `Freshness`, to the nanosecond: what it accepts at a limit, and refuses beyond it.
+"""Tests of the limits of `Freshness` to the nanosecond.
 
-A sender sends at 20 Hz to a source with a timeout of 250 ms, unless a test says something else.
+It accepts a command exactly at a limit and refuses it 1 ns beyond. A sender sends at 20 Hz to a
+source with a timeout of 250 ms, unless a test says something else.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ Step = tuple[int, int]
 
 
 class Sender:
-    """A sender at a `Freshness` of its own. Times are in ns, and its delay is 0 at first."""
+    """A sender and the `Freshness` that checks its commands. Times are in ns."""
 
     def __init__(self, known: bool = True, steady: bool = False, timeout: int = TIMEOUT) -> None:
         self.freshness, self.steady, self.timeout = Freshness(), steady, timeout
@@ -168,7 +169,10 @@ def test_the_proof_of_a_clock_that_was_set_lasts_over_a_silence_of_a_long_timeou
 
 
 def test_a_proof_lasts_over_the_longest_timeout_of_the_sources_of_a_sender() -> None:
-    """The sender commands two sources every 3 s, and one of them has a short timeout."""
+    """The sender commands two sources by turns every 3 s.
+
+    The longer timeout of the two decides whether a pause interrupts the proof.
+    """
     sender, verdicts = Sender(known=False), list[Verdict]()
     for _ in range(4):
         for sender.timeout in (PATIENT, TIMEOUT):
@@ -231,7 +235,7 @@ def test_a_command_that_ends_a_proof_counts_only_if_it_is_not_late_itself(
 def test_a_late_command_at_the_end_of_a_proof_delays_the_proof_by_a_half(
     beyond: int, verdict: Verdict
 ) -> None:
-    """An earlier version looked again 4.5 s later."""
+    """The proof then ends half a proof later. An earlier version took 4.5 s more."""
     sender, late = Sender(), 600 * MS
     assert sender.sends(NS_PER_S, late) == "stale"
     assert set(sender.steadily(late, 29)) == {"stale"}
@@ -274,7 +278,10 @@ def test_a_delay_that_creeps_may_go_on_by_a_twentieth_of_the_proof_time(
 
 
 def test_the_part_of_a_delay_that_no_adjustment_shows_is_counted() -> None:
-    """The clock was set back by 500 ms, and then the network takes 100 ms more."""
+    """The sender's clock is set back by 500 ms. Then the network delays commands by 100 ms more.
+
+    The 100 ms count as a delay, and the 500 ms do not.
+    """
     sender = Sender()
     begun_ns = sender.at_ns
     sender.each([(PERIOD, 500 * MS), (150 * MS, 600 * MS)])
@@ -285,7 +292,7 @@ def test_the_part_of_a_delay_that_no_adjustment_shows_is_counted() -> None:
 
 
 def test_a_delay_from_before_an_adjustment_is_counted() -> None:
-    """The network took 200 ms when the clock was set back by 3 s, and takes less since."""
+    """The network delays commands by 200 ms when the clock is set back by 3 s, and less later."""
     sender = Sender()
     begun_ns = sender.at_ns
     assert sender.sends(300 * MS, 200 * MS) == "fresh"
@@ -302,7 +309,7 @@ def test_a_clock_that_was_set_forward_uses_none_of_the_forgiven_delay() -> None:
 
 
 def test_an_adjustment_that_shows_forgives_no_delay_of_the_network() -> None:
-    """The clock is set back by 500 ms, and the network holds everything back for 8 s."""
+    """The clock is set back by 500 ms, and the network delays all commands by 8 s."""
     sender = Sender()
     sender.sends(PERIOD, 500 * MS)
     sender.sends(PERIOD + 8 * NS_PER_S, 8500 * MS)
@@ -363,7 +370,10 @@ def test_stamps_that_leap_within_a_long_timeout_show_no_pause() -> None:
 
 
 def test_stamps_that_leap_in_commands_that_came_together_show_no_pause() -> None:
-    """The daemon drops commands when too many come at once, as after a suspend of its computer."""
+    """After a suspend many commands arrive at once, and the daemon drops some of them.
+
+    The stamps of the others therefore leap, although the sender did not pause.
+    """
     sender, late = Sender(), 8 * NS_PER_S
     assert sender.sends(5 * NS_PER_S, 4900 * MS) == "stale"
     sender.sends(0, 1900 * MS)
@@ -409,7 +419,10 @@ The clock is set back by `BACK` before number 101 is sent at period 1."""
 
 
 class Numbered(Sender):
-    """A sender with numbers. Number 100 is the last one before its clock is set back."""
+    """A sender whose commands have sequence numbers.
+
+    Number 100 is the last command before its clock is set back.
+    """
 
     def __init__(self) -> None:
         super().__init__(known=False)
@@ -418,7 +431,10 @@ class Numbered(Sender):
         assert verdicts[-1] == "fresh"
 
     def numbered(self, number: int, sent: float, arrived: float, back: int = 0) -> Verdict:
-        """Send by the true time in periods, with a clock that was set back by `back`."""
+        """Send a command whose clock was set back by `back` ns.
+
+        `sent` and `arrived` are true times in periods.
+        """
         at_ns = self.begun_ns + round((100 + arrived) * PERIOD)
         stamp_ns = self.begun_ns + round((100 + sent) * PERIOD) - back
         command = Command("high", GO, at_ns, stamp_ns, "a", sequence=number)
@@ -448,7 +464,7 @@ def test_a_clock_is_set_back_while_most_commands_are_lost(every: int) -> None:
 
 @pytest.mark.parametrize("later", [0.05, 0.95, 1.5, 20.0])
 def test_a_clock_is_set_back_while_every_command_comes_twice(later: float) -> None:
-    """The second copy arrives `later`, in periods."""
+    """The second copy of each command arrives `later` periods after the first copy."""
     sender, verdicts, again = Numbered(), list[Verdict](), set[Verdict]()
     for arrived, n in sorted((n + late, n) for n in range(-20, 41) for late in (0.0, later)):
         if arrived > 0.0:
@@ -479,7 +495,10 @@ def test_a_clock_is_set_back_while_every_command_comes_twice(later: float) -> No
 def test_a_repeated_command_changes_nothing_until_the_sender_pauses(
     known: bool, number: int | None, older: int, after: int, changes: bool
 ) -> None:
-    """The stamp is `older` than that of number 9, ns, and the command comes `after` it, ns."""
+    """The repeated stamp is `older` ns before the stamp of number 9.
+
+    The repeated command arrives `after` ns after number 9.
+    """
     sender = Sender(known=False)
     verdicts = [sender.sends(PERIOD, 0, max(0, n)) for n in range(-20 if known else 6, 10)]
     assert verdicts[-1] == ("fresh" if known else "unproven")
@@ -490,7 +509,10 @@ def test_a_repeated_command_changes_nothing_until_the_sender_pauses(
 
 @each("older", [0, 1, -1])
 def test_a_repeated_command_of_a_clock_that_was_set_back_changes_nothing(older: int) -> None:
-    """Its stamp is near that of the last accepted command, and later than that of the last one."""
+    """The repeated command is from before the adjustment.
+
+    Its stamp is later than the newest one.
+    """
     sender = Numbered()
     sender.numbered(101, 1, 1, BACK)
     before = pickle.dumps(sender.freshness)
@@ -517,13 +539,13 @@ def test_a_clock_is_set_back_while_commands_are_swapped(swap: str) -> None:
 
 
 def test_lost_commands_excuse_no_delay_beside_an_adjustment() -> None:
-    """The clock is set back, commands are lost, and all later ones are 5 s old."""
+    """The clock is set back and commands are lost. All later commands are 5 s late."""
     sender = Numbered()
     assert set(sender.after(110, 100, late=100.0)) == {"stale"}
 
 
 def test_an_adjustment_counts_once_however_many_commands_are_lost_after_it() -> None:
-    """After the adjustment every second command is lost, and then all are 5 s old."""
+    """After the adjustment every second command is lost. Then all commands are 5 s late."""
     sender = Numbered()
     for n in range(2, 20, 2):
         assert sender.numbered(100 + n, n, n, BACK) == "stale"
@@ -543,7 +565,7 @@ def test_one_wrong_stamp_after_lost_commands_shows_no_adjustment() -> None:
 
 
 def test_commands_that_are_replayed_show_no_adjustment_and_never_count() -> None:
-    """All later commands are 5 s old, and between them come old ones once more."""
+    """All later commands are 5 s late, and old commands arrive again between them."""
     sender = Numbered()
     for n in range(1, 100):
         assert sender.numbered(100 + n, n, n + 100) == "stale"
@@ -552,7 +574,7 @@ def test_commands_that_are_replayed_show_no_adjustment_and_never_count() -> None
 
 
 def test_commands_from_before_an_adjustment_show_no_second_one_when_they_are_replayed() -> None:
-    """The old stamps are later than those of the clock that was set back."""
+    """The stamps of the replayed commands are later than the stamps after the adjustment."""
     sender = Numbered()
     assert sender.after(101)[-1] == "fresh"
     for number in (98, 99):
@@ -561,7 +583,10 @@ def test_commands_from_before_an_adjustment_show_no_second_one_when_they_are_rep
 
 
 def test_a_late_command_from_before_an_adjustment_hides_no_part_of_it() -> None:
-    """The clock is set back by 450 ms. Only the next two commands are earlier than the last one."""
+    """The clock is set back by 450 ms.
+
+    Only two later commands have a stamp before the newest one.
+    """
     sender, back = Numbered(), 9 * PERIOD
     sender.numbered(102, 2, 2, back)
     assert sender.numbered(101, 0.5, 8) == "stale"
@@ -570,7 +595,7 @@ def test_a_late_command_from_before_an_adjustment_hides_no_part_of_it() -> None:
 
 
 def test_a_delay_from_before_an_adjustment_is_counted_although_commands_were_lost() -> None:
-    """The network took 500 ms until the clock was set back."""
+    """The network delays commands by 500 ms until the clock is set back."""
     sender = Numbered()
     assert sender.numbered(101, 1, 11) == "stale"
     sender.numbered(103, 3, 13, BACK)
@@ -683,7 +708,10 @@ def test_the_proof_of_a_slow_sender_among_others_lasts_over_a_silence_of_its_tim
 
 
 def test_new_clocks_that_are_silent_for_over_2_s_are_forgotten_before_known_ones() -> None:
-    """A known sender is silent for 9 s, while a hundred new ones a second send to a slow source."""
+    """One known sender is silent for 9 s.
+
+    Meanwhile 200 new senders a second command a slow source.
+    """
     sender = Sender()
     sender.timeout = 2 * PATIENT
     for number in range(1800):
@@ -731,7 +759,7 @@ def test_the_numbers_of_1024_senders_without_stamps_are_remembered(
 
 
 def test_bursts_of_a_backlog_never_count_although_one_burst_ends_a_half_of_a_proof() -> None:
-    """The oldest command of a burst has the delay of the burst before."""
+    """The oldest command of each burst has the same delay as the commands of the previous burst."""
     freshness, start = Freshness(), 15 * NS_PER_S
     backlog, number, last, accepted = 5 * NS_PER_S, 0, 0, []
     for burst in range(34):

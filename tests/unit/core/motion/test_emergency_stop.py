@@ -1,4 +1,4 @@
-"""Tests of the emergency-stop input: its states, its silence, and a computer that was late."""
+"""Tests of the emergency-stop input: its states, missing reports, and delays of this computer."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ DRAWN = """
 
 
 class Input:
-    """An input with its time. The first step is at 10 s."""
+    """An emergency-stop input with a simulated time. The first step is at 10 s."""
 
     def __init__(self, use: EstopUse = "auto") -> None:
         self.estop = EmergencyStop(use)
@@ -42,14 +42,14 @@ class Input:
         self.events: list[str] = []
 
     def step(self, *reports: bool | None, ms: int = 10) -> str:
-        """Take these reports `ms` after the step before, and return the state."""
+        """Process these reports `ms` after the last step, and return the state."""
         self.now_ms += ms
         told = [(self.now_ms * MS, BoardStatus(estop=pressed)) for pressed in reports]
         self.events += [event.name for event in self.estop.look(told, self.now_ms * MS)]
         return self.estop.state
 
     def quiet(self, ms: int) -> str:
-        """Take steps without a report for this time."""
+        """Run steps without a report of the board for this time."""
         for _ in range(ms // 10):
             self.step()
         return self.estop.state

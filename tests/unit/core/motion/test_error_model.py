@@ -1,4 +1,4 @@
-"""The error model claims the noise, the parameters' effects and the twist variances of a step."""
+"""Tests of the error model: noise, effects of the parameters, and twist variances of a step."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def test_no_setting_makes_a_variance_negative(
 
 
 def step(drive: DriveConfig, left: float, right: float) -> tuple[float, float]:
-    """Return d and dyaw for wheel angles by equations (4) to (7)."""
+    """Return the distance and the turn for wheel angles, by equations (4) to (7)."""
     dl = drive.wheel_radius * drive.left_wheel_radius_multiplier * left
     dr = drive.wheel_radius * drive.right_wheel_radius_multiplier * right
     track = drive.wheel_separation * drive.wheel_separation_multiplier
@@ -235,7 +235,10 @@ def test_the_lateral_variance_is_the_configured_one_except_at_rest() -> None:
 
 
 def test_the_ratio_s_error_makes_one_side_larger_and_the_other_smaller() -> None:
-    """It turns the robot like both radii together, and leaves the distance straight ahead."""
+    """An error of the ratio turns the robot as opposite errors of both radii do.
+
+    It does not change the distance straight ahead.
+    """
     ratio = columns(OdometryConfig(wheel_radius_ratio_std=0.01), Kinematics(DriveConfig()))
     both = columns(
         OdometryConfig(

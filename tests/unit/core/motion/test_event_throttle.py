@@ -1,4 +1,4 @@
-"""The log gets few lines per second: the first event immediately, the rest as a count."""
+"""The throttle limits log lines: it logs the first event at once, and later ones as a count."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def mode(change: str = "ready -> driving") -> Event:
 
 
 def told(events: list[Event], seconds: float, every_ms: int = 10) -> list[Event]:
-    """Return the lines after these events every `every_ms` for this many seconds."""
+    """Repeat these events every `every_ms` for this many seconds, and return the logged lines."""
     tally = EventThrottle()
     lines: list[Event] = []
     for step in range(round(seconds * 1000 / every_ms)):

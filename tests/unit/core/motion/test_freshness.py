@@ -1,4 +1,4 @@
-"""A command counts only when its delay is known to be short, whatever the clocks show."""
+"""A command drives the robot only if its delay is known to be short, even with wrong clocks."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tests.unit.core.motion.commanders import GO, HIGH, HOUR_NS, LOW, MS, SLOW, 
 
 
 class Clock:
-    """A sender's clock as `Freshness` sees it. Times are in ms."""
+    """A sender with a clock, and the `Freshness` that checks its commands. Times are in ms."""
 
     def __init__(self, known: bool = True, steady: bool = False) -> None:
         self.freshness, self.steady = Freshness(), steady
@@ -80,9 +80,9 @@ def test_a_new_clock_with_jitter_counts_within_three_seconds(jitter: float) -> N
 def test_first_contact_through_jitter_of_60_ms_takes_2_s_in_the_median_and_mostly_under_5_s(
     hz: float,
 ) -> None:
-    """The jitter is exponential and no command overtakes another, as on TCP.
+    """The jitter is exponential, and the commands stay in order, as on TCP.
 
-    An earlier version took 4 s, and 14 s at worst.
+    An earlier version took 4 s in the median, and 14 s in the worst case.
     """
     took = []
     for seed in range(100):
@@ -448,9 +448,9 @@ def test_the_budget_of_forgiven_delay_never_exceeds_its_limit() -> None:
 
 
 def test_a_minimum_that_fell_for_a_moment_still_bounds_a_steady_clock() -> None:
-    """An earlier version accepted a plateau of 30 s in this case.
+    """The delay falls to 5 ms for three commands after a first contact at 70 ms, then is 30 s.
 
-    It followed first contact at 70 ms and three commands at 5 ms.
+    An earlier version accepted the delay of 30 s.
     """
     clock = Clock(known=False, steady=True)
     clock.steadily(70.0, 1000)

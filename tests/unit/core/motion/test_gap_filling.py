@@ -1,4 +1,4 @@
-"""Tests of gap filling: a line gives the wheel angles since the last accepted line."""
+"""Tests of gap filling, which computes the wheel angles since the last accepted line."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def near(*values: float) -> Any:
 
 
 def total(rolled: Rolled) -> float:
-    """Return the angle of the first wheel, rad."""
+    """Return the angle that the first wheel has turned in the line and its gap, rad."""
     return rolled.turned[0] + sum(piece[0] for piece in rolled.pieces)
 
 
@@ -76,7 +76,10 @@ def test_a_silence_continues_the_speed_before_it_until_rest_is_commanded() -> No
 def test_a_late_command_to_rest_is_used_and_an_early_one_leaves_time_to_slow_down(
     driven: float, on: float, doubtful: float
 ) -> None:
-    """`on` is the time at the speed before the gap. Without rest in the gap, it is half of it."""
+    """`on` is how long the wheels are assumed to go on at the speed before the gap, s.
+
+    If no command to rest was sent in the gap, `on` is half of the gap.
+    """
     line = Feedback(AT, STILL, 0.8, bridged=0.7, driven=driven)
     stood = Rolling(quiet=0.1).take(line, FOUR)
     assert total(stood) == pytest.approx(4.0 * on)
@@ -85,7 +88,10 @@ def test_a_late_command_to_rest_is_used_and_an_early_one_leaves_time_to_slow_dow
 
 @pytest.mark.parametrize(("after", "angle"), [(1.5, 1.05), (1.0, 1.3), (-0.5, 0.55), (4.0, 2.8)])
 def test_speeds_that_are_large_enough_are_means_over_the_gap(after: float, angle: float) -> None:
-    """Until rest was commanded, the wheels rolled 0.8 rad at 4 rad/s; 1.14 rad/s are this mean."""
+    """The line's speed is the mean over the gap if it is at least 1.14 rad/s.
+
+    The wheels rolled 0.8 rad at 4 rad/s before the command to rest, and 0.8 rad give this mean.
+    """
     line = Feedback(AT, WheelSpeeds(after, after, after, after), 0.7, bridged=0.7, driven=0.2)
     assert total(Rolling(quiet=0.1).take(line, FOUR)) == pytest.approx(angle)
     mirrored = Feedback(AT, WheelSpeeds(*(-after,) * 4), 0.7, bridged=0.7, driven=0.2)
@@ -102,7 +108,10 @@ def test_in_a_short_gap_no_command_to_rest_is_doubtful() -> None:
 def test_the_command_to_rest_may_come_in_the_gap_behind_an_implausible_line(
     late: float, on: float
 ) -> None:
-    """`late` is the time from the implausible line to the command; the gap before it has 0.1 s."""
+    """`late` is the time from the implausible line to the command to rest, s.
+
+    Another gap of 0.1 s comes before the implausible line.
+    """
     rolling = Rolling(quiet=0.1)
     rolling.skip(Feedback(AT, FOUR, 0.11, bridged=0.1, driven=0.4))
     stood = rolling.take(Feedback(AT, STILL, 0.7, bridged=0.6, driven=late), FOUR)
@@ -127,7 +136,7 @@ def test_counts_take_precedence_over_the_speed() -> None:
 
 
 def test_counts_of_a_skipped_line_after_a_long_silence_are_added_once() -> None:
-    """The line has no duration of its own, because the silence before it covers that time."""
+    """The skipped line covers no time, because the silence before it covers all of it."""
     rolling, turned = Rolling(), (0.06, 0.06, 0.06, 0.06)
     rolling.skip(Feedback(AT, FOUR, 0.0, gap=0.5, turned=turned))
     first = rolling.take(Feedback(AT, FOUR, 0.01, turned=turned), TWO)
@@ -213,14 +222,14 @@ def one(index: int, speed: float, others: float = 4.0) -> WheelSpeeds:
 
 
 class Doubtful:
-    """A `Confirmation` after one line at 100 Hz, with the numbers of the lines that it returns."""
+    """A `Confirmation` that has received one line at 100 Hz, and a count of its lines."""
 
     def __init__(self, before: WheelSpeeds = FOUR) -> None:
         self.confirmation, self.before, self.lines = Confirmation(FeedbackConfig()), before, 0
         self.hear(before, 0.01)
 
     def hear(self, speeds: WheelSpeeds, dt: float, **more: Any) -> tuple[list[int], list[int]]:
-        """Return the numbers of the lines to use and to drop after a further line."""
+        """Receive a further line, and return the numbers of the lines to use and to drop."""
         self.lines += 1
         line = Feedback(Instant(self.lines, 0), speeds, dt, **more)
         used, dropped = self.confirmation.look(line, self.skipped, self.before, self.believed)
@@ -297,7 +306,7 @@ def test_a_line_with_counts_is_used_immediately() -> None:
 def test_the_line_that_differs_much_from_two_others_is_dropped(
     speeds: tuple[float, ...], used: list[int], dropped: list[int]
 ) -> None:
-    """A wheel changes alone, because the encoder of the other one is dead."""
+    """Only one wheel of the side changes, because the encoder of the other wheel is dead."""
     doubtful = Doubtful(STILL)
     said = [doubtful.hear(one(3, speed, 0.0), 0.01 + gap, bridged=gap)
             for speed, gap in zip(speeds, (0.5, 0.0, 0.0), strict=True)]  # fmt: skip
@@ -389,7 +398,10 @@ def test_a_line_between_two_gaps_makes_their_errors_independent() -> None:
 
 
 def test_a_command_to_rest_that_may_be_lost_makes_the_motion_uncertain() -> None:
-    """The robot is assumed to have stood for 0.2 s, but it moved on with the probability 1/2."""
+    """Gap filling assumes that the robot stood for the last 0.2 s.
+
+    The robot moved on with a probability of 1/2, because the command to rest may be lost.
+    """
     before, after = Twist(0.5, 1.0), Twist(0.1, -1.0)
     sure = Gaps().fill(0.5, before, after, REST)
     unsure = Gaps().fill(0.5, before, after, REST, doubtful=0.2)
@@ -405,9 +417,10 @@ def rounding(
     gaps: tuple[int, ...] = (),
     largest: float = math.inf,
 ) -> float:
-    """Return the step around a gap after lines with these speeds of all wheels, rad/s.
+    """Return the quantization step that applies to a gap after lines with these speeds, rad/s.
 
-    The lines with the indices `gaps` follow a gap that is not filled.
+    All wheels have the same speed. The lines with the indices `gaps` follow a gap that is not
+    filled.
     """
     rounded, still = Rounding(), 0.0
     for number, speed in enumerate(speeds):

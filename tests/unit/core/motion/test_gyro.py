@@ -1,4 +1,4 @@
-"""Tests of the turn of each feedback line, which the gyro samples give if they can."""
+"""Tests of the turn in each feedback line, which comes from the gyro if it has good samples."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ def stirring(t: float) -> float:
 
 
 def over_a_gap(bench: Bench, seconds: float, rate: float) -> Turn | None:
-    """Turn for this time without a line, then return the turn of a line that covers none of it."""
+    """Turn for this time without a line. Return the turn of a next line that covers no time."""
     for _ in range(round(seconds / DT)):
         bench.now_ns += LINE_NS
         bench.true += rate * DT
@@ -448,7 +448,7 @@ def test_the_deviation_of_the_learned_track_is_a_share_of_the_track() -> None:
 
 
 def proved(noise: float = 0.0, sample_ms: int = 10) -> Bench:
-    """Return a robot without slip whose gyro is proven, and which has stood still since then."""
+    """Return a robot without slip whose gyro has proved itself. The robot stands still."""
     bench = Bench(skid=1.0, noise=noise, sample_ms=sample_ms)
     bench.run(REST_FIRST)
     for rate in (1.0, -1.0):
@@ -541,7 +541,7 @@ def test_a_jump_counts_in_the_line_of_the_sample_after_it() -> None:
 
 
 def frozen(bench: Bench) -> None:
-    """Let the gyro repeat its next rate forever."""
+    """Let the gyro report one value from now on."""
     kept: list[float] = []
 
     def repeated(rate: float) -> float:
@@ -759,7 +759,7 @@ def test_a_new_pose_ends_the_doubt_of_a_contradiction() -> None:
 def test_a_slow_gyro_that_waits_for_the_confirmation_of_a_jump_is_not_silent(
     sample_ms: int,
 ) -> None:
-    """The robot stops from 4 rad/s within a third of a second, between two samples."""
+    """The robot stops from 4 rad/s so quickly that two samples of a slow gyro differ by a jump."""
     bench = Bench(skid=1.0, sample_ms=sample_ms)
     bench.run(REST_FIRST + 1.0)
     for rate in (1.0, -1.0):
@@ -834,7 +834,7 @@ def test_an_ordinary_slip_does_not_widen_the_variance() -> None:
 
 @pytest.mark.slow
 def test_the_variance_of_the_turn_is_that_of_its_errors() -> None:
-    """Heading errors divided by their claimed deviations are about normal."""
+    """The heading errors, divided by their published standard deviations, are about normal."""
     squares = []
     for seed in range(60):
         bench = Bench(noise=0.02, bias=0.01, first=10_000 * seed)

@@ -1,4 +1,4 @@
-"""The bias is the mean at rest. A new mean gets more weight the older the last one is."""
+"""The gyro's bias is its mean rate at rest. A new mean gets more weight if the last one is old."""
 
 from __future__ import annotations
 

@@ -163,7 +163,7 @@ def test_the_spread_is_the_variation_of_the_ratio_between_turns() -> None:
 
 
 def test_a_changing_delay_of_the_gyro_does_not_make_the_ratio_less_certain() -> None:
-    """The samples are up to 50 ms late, with a delay that changes each time."""
+    """The samples are up to 50 ms late, each by a different time."""
     match, told, true = Match(), 0.0, 0.0
     for n in range(6000):
         late = (n * 7 % 11) * 0.005

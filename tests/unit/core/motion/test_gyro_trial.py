@@ -13,9 +13,9 @@ DT = 0.01
 
 
 def turned(trial: Trial, rate: float, share: float, seconds: float, late_s: float = 0.0) -> Verdict:
-    """Return the verdict after a turn.
+    """Return the verdict on the gyro after a turn.
 
-    The wheels report `rate` in rad/s, and the gyro reports `share` of that.
+    The wheels report `rate`, rad/s, and the gyro reports `share` times this rate.
     """
     for line in range(round(seconds / DT)):
         told = rate * share if line * DT >= late_s else 0.0
@@ -77,9 +77,10 @@ def test_very_slow_turns_and_short_turns_to_and_fro_give_no_verdict() -> None:
     [(0.08, 0.6, "good"), (0.08, -0.6, "reversed"), (0.12, 0.0, "dead"), (0.08, 0.0, "none yet")],
 )
 def test_slow_lines_add_up_to_a_verdict(rate: float, share: float, verdict: Verdict) -> None:
-    """A silent gyro at 0.08 rad/s gives no verdict.
+    """A silent gyro during a turn at 0.08 rad/s gives no verdict.
 
-    Wheels with unequal tyres report that rate on a straight, where a good gyro reports nothing.
+    Wheels with unequal tyres also report 0.08 rad/s on a straight drive, where a good gyro is
+    silent.
     """
     assert turned(Trial(), rate, share, 6.0) == verdict
 
@@ -109,7 +110,10 @@ def test_a_straight_between_two_turns_restarts_the_trial() -> None:
 
 
 def test_time_at_rest_does_not_count_as_turning() -> None:
-    """A late gyro has reported nothing yet, no matter how long the robot stood before."""
+    """A late gyro reports nothing when the turn begins, even after a long rest.
+
+    It must not be found faulty for this.
+    """
     trial = Trial()
     turned(trial, 1.0, 0.0, 0.05)
     turned(trial, 0.0, 0.0, 0.4)

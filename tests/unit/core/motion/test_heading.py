@@ -1,6 +1,6 @@
 """Tests of odometry with a gyro.
 
-Each part of the wheels' turn is compared and corrected exactly once.
+Odometry compares each turn that the wheels report with the gyro, and corrects it, exactly once.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ PERIOD_NS = NS_PER_S // 100
 
 
 class Listening(Gyro):
-    """A gyro that records the wheels' turn and never corrects it."""
+    """A gyro that records the turns that the wheels report, and never corrects them."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -44,7 +44,7 @@ class Listening(Gyro):
 
 
 class One(Struct):
-    """One feedback line: its speeds, its missing time, and whether it is skipped."""
+    """A feedback line: its speeds, its missing time, and whether it is skipped."""
 
     left: float
     right: float
@@ -115,7 +115,7 @@ class Turning:
     """A robot with an accurate gyro that rests for a second and then moves as commanded."""
 
     def __init__(self, scale: float = 1.0) -> None:
-        """The gyro reports `scale` times the true turn."""
+        """Start at rest. The gyro reports `scale` times the true turn."""
         self.scale = scale
         self.gyro, self.robot = Gyro(), Odometry(OdometryConfig(), KINEMATICS, 3200)
         self.robot.checks.gyro = self.gyro
@@ -126,10 +126,10 @@ class Turning:
         self.run(1.0, Twist())
 
     def run(self, seconds: float, twist: Twist, dead: bool = False, gap: bool = False) -> None:
-        """Move at this twist; `dead` stops the front left wheel.
+        """Move at this twist. With `dead` the front left wheel reports 0.
 
-        With `gap` no line arrives until the robot has reached the twist, and the last line reports
-        it.
+        With `gap` no line arrives until the robot has reached the twist. The next line reports this
+        motion.
         """
         told = KINEMATICS.wheel_speeds(twist)
         speeds = told if not dead else WheelSpeeds(told.front_right, 0.0, *told.as_tuple()[2:])
@@ -196,7 +196,7 @@ def test_a_wheel_fault_during_the_gyro_trial_is_corrected_only_once(
 
 
 def proved(scale: float) -> Turning:
-    """Return a robot whose gyro is proven and supplies the turns from now on."""
+    """Return a robot whose gyro has proved itself, so that odometry uses it from now on."""
     bench = Turning(scale)
     bench.run(0.5, Twist(0.0, 1.0))
     bench.run(1.0, Twist())

@@ -1,6 +1,6 @@
-"""Tests of the conversion between twist and wheel speeds.
+"""Tests of the conversion between twist and wheel speeds by equations (1) to (3).
 
-They cover equations (1) to (3), and saturation that keeps the curvature.
+They also test saturation, which lowers all wheel speeds and keeps the curvature.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
-"""Tests of the effective track in use.
+"""Tests of the effective track that odometry uses.
 
-It is the configured one until another is learned, and it stays within bounds.
+Odometry uses the configured track until it has learned a track from the gyro. The learned track
+stays within bounds.
 """
 
 from __future__ import annotations
@@ -79,9 +80,9 @@ def test_a_learned_track_too_far_from_the_configured_one_is_reported_and_not_use
 def test_a_learned_track_at_a_bound_is_not_switched_on_and_off(
     bound: float, inwards: float
 ) -> None:
-    """A learned track in use stays in use up to the bounds.
+    """Odometry uses a learned track until it leaves the bounds.
 
-    One not in use must come a little further inside first.
+    To be used again, the learned track must come back a little further inside the bounds.
     """
     within, beyond = (Track(bound * (1.0 + inwards * off), SURE) for off in (0.001, -0.001))
     track = LearnedTrack(1.0)

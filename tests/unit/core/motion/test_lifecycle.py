@@ -1,4 +1,4 @@
-"""Tests of latches and mode: single sequences, and a model check of every reachable state."""
+"""Tests of latches and modes: chosen sequences of events, and a check of all reachable states."""
 
 from __future__ import annotations
 
@@ -62,7 +62,10 @@ def number(life: Lifecycle) -> int:
 
 
 def mode(life: Lifecycle) -> Mode:
-    """Return the mode; a type checker would merge two asserts on the attribute."""
+    """Return the mode.
+
+    A type checker would assume that the attribute cannot change between asserts.
+    """
     return life.mode
 
 
@@ -168,7 +171,7 @@ def test_a_number_is_not_used_again_after_its_latch_is_released() -> None:
 
 
 def test_a_number_is_not_used_again_after_a_restart_with_a_wall_clock_that_went_back() -> None:
-    """The latch file has only the latch that is still in force."""
+    """The latch file contains only latches in force, and no numbers of released latches."""
     first = Lifecycle(active=True, latches=Latches(inactive=OFF))
     numbers = []
     for seconds in (1.0, 1.5):
@@ -313,7 +316,7 @@ def test_every_cause_survives_restarts() -> None:
 
 
 class Held(NamedTuple):
-    """How a robot is stopped or switched off by a client, and how another client releases it."""
+    """How one client stops or deactivates a robot, and how another client releases it."""
 
     said: str
     mode: Mode
@@ -411,7 +414,11 @@ def test_a_step_of_the_wall_clock_does_not_end_the_two_seconds() -> None:
 def test_the_two_seconds_of_a_stop_from_the_start_count_from_the_first_step(
     kept: bool, wall_s: float
 ) -> None:
-    """The clock of a booting computer may be years away from the time of the stop."""
+    """A `clear` without a number releases a latch only after two seconds.
+
+    For a latch from the file they begin with the first step, because a booting computer's clock may
+    be wrong by years.
+    """
     stop_at_start = Latch(7, WALL_NS, "ann", "stopped by ann", kept)
     life = Lifecycle(active=True, latches=Latches(stop=stop_at_start))
     for step_s in (10.0, 10.01, 11.5):
@@ -452,7 +459,7 @@ def both() -> Lifecycle:
 
 
 def test_each_cause_of_a_fault_is_latched_once_with_a_new_number() -> None:
-    """The texts of one cause differ in their measured values only."""
+    """Two faults have the same cause if their texts differ only in measured values."""
     life = ready()
     assert life.fault("the left wheel is slow (3 %)", at(1.0))
     first = life.latches.fault
@@ -827,7 +834,10 @@ class Edge(NamedTuple):
 
 @cache
 def explore() -> list[Edge]:
-    """Return every edge of the machine: each trigger, soon and late, in each reachable state."""
+    """Return every edge of the state machine.
+
+    These are all triggers, each early and late, in each reachable state.
+    """
     edges: list[Edge] = []
     seen: set[tuple[State, tuple[bool, ...]]] = set()
     queue = deque((Lifecycle(active), 10.0) for active in (True, False))

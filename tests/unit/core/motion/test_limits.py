@@ -1,6 +1,6 @@
 """Tests of the limits that turn a requested twist into a safe one.
 
-They are speed, acceleration, deceleration, jerk, coasting and the cut.
+The limits are speed, acceleration, deceleration, jerk, coasting, and the cut to zero.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def limiter(limits: LimitsConfig = FREE) -> Limiter:
 
 
 def moving(linear: float, angular: float = 0.0, limits: LimitsConfig = FREE) -> Limiter:
-    """Return a limiter that has reached this twist with plenty of time and holds it."""
+    """Return a limiter that has reached this twist and holds it."""
     found = limiter(limits)
     followed(found, Twist(linear, angular), 2, dt=1000.0)
     assert found.twist == Twist(linear, angular)
@@ -391,7 +391,7 @@ def slopes(speeds: list[float]) -> list[float]:
 
 
 def rising(speeds: list[float]) -> list[tuple[float, float]]:
-    """Return the slope of each accelerating step and the change to its next slope."""
+    """Return, for each step that speeds up, its slope and the slope of the next step."""
     found = []
     for (a, b), (_, c) in pairwise(pairwise([speeds[0], *speeds])):
         if abs(c) > abs(b):

@@ -1,4 +1,4 @@
-"""Tests of the neutral-first rule: a zero arms a sender, and nothing else does."""
+"""Tests of the neutral-first rule: only a zero arms a sender."""
 
 from __future__ import annotations
 
@@ -89,9 +89,9 @@ def test_a_pause_without_a_zero_does_not_arm_however_long(pause_ms: int) -> None
 def test_a_possible_speed_of_a_shared_identity_ends_the_wait_of_each_shared_zero(
     name: str, other: str
 ) -> None:
-    """The samples of one program may have the stamps of a router at one time and none at another.
+    """One program's samples may have a router's stamps at one time and no stamps at another.
 
-    So the daemon cannot know that the other identity is another program.
+    The daemon therefore cannot know whether the other shared identity is another program.
     """
     bench = Bench(HIGH, armed=False)
     for _ in range(60):
@@ -321,7 +321,7 @@ def test_a_zero_whose_stamp_is_in_doubt_ends_an_earlier_speed_but_refreshes_no_t
 def test_a_speed_that_a_zero_in_doubt_overtook_is_not_followed_again(
     ahead_ms: int, clock: str, twist: Twist
 ) -> None:
-    """A stamp that is ahead by more than the timeout of 250 ms is wrong."""
+    """A stamp that is ahead by more than the timeout of 250 ms is doubtful."""
     one, stamp_ns = sender(), 5000 * MS
     one.take(replace(sent(GO, 10), stamp_ns=stamp_ns - MS, clock="a"), 0)
     one.refuse(replace(sent(REST, 20), stamp_ns=stamp_ns + ahead_ms * MS, clock="a"), "stale")
@@ -643,7 +643,10 @@ def test_no_twist_of_a_sender_that_no_zero_has_armed_is_followed(
 def test_a_numbered_speed_of_another_clock_that_a_zero_overtook_does_not_move_the_robot(
     verdict: Verdict, number: int | None, clock: str, after_ms: int, twist: Twist
 ) -> None:
-    """Clock "a" stamps the zero, as for `TwistStamped()` of a ROS node that stamps its speeds."""
+    """A ROS node stamps its speeds, and sends `TwistStamped()` without a stamp as its zero.
+
+    The zero then has the stamp of clock "a", another clock than that of the speeds.
+    """
 
     def sent_by(clock: str, number: int | None, twist: Twist, at_ms: int) -> Command:
         at_ns = at_ms * MS
@@ -673,7 +676,7 @@ def test_a_speed_that_the_first_zero_of_a_sender_overtook_does_not_move_the_robo
 
 
 def test_the_first_zero_after_a_demand_for_zeros_ends_older_speeds_whatever_came_before() -> None:
-    """A program has restarted with a new clock and lower numbers."""
+    """A program has restarted with a new clock and lower sequence numbers."""
     one = sender()
     one.take(Command("high", REST, 0, 0, "b", "node", sequence=500), 0)
     one.require_neutral()

@@ -1,4 +1,4 @@
-"""Tests that integrate wheel speeds into pose, wheel angles and their uncertainty."""
+"""Tests of odometry: it integrates wheel speeds to pose, wheel angles and their uncertainty."""
 
 from __future__ import annotations
 
@@ -324,9 +324,9 @@ def test_standing_adds_no_uncertainty() -> None:
 
 
 def gone(gap: float, linear: float, angular: float) -> PoseCovariance:
-    """Return the covariance after a gap that ended at this twist.
+    """Return the covariance after a gap of this length, s.
 
-    The gap began at 0.3 m/s and 0.5 rad/s.
+    The twist is 0.3 m/s and 0.5 rad/s before the gap, and `linear` and `angular` after it.
     """
     robot = odometry()
     robot.fold(feedback(4.5, 7.5, 0.0))
@@ -372,7 +372,7 @@ def test_a_robot_commanded_to_move_in_a_gap_may_have_moved_between_two_rests() -
 
 
 def test_only_the_commands_since_the_line_before_a_gap_count_in_it() -> None:
-    """The command before that line counts too, because the robot may still follow it."""
+    """One command before this line counts too, because the robot may still follow it."""
     robot = odometry()
     robot.command(Twist(0.4, 0.0))
     robot.fold(feedback(0.0, 0.0, 0.01))
@@ -390,7 +390,7 @@ def test_a_gap_between_speeds_of_single_counts_is_in_the_covariance(
 ) -> None:
     """With 96 counts per turn, a line of a slow wheel contains one count or none.
 
-    If the gap is not filled (negative `seconds`), the pose lacks its whole motion.
+    If the gap is not filled (negative `seconds`), the pose contains no motion for the gap.
     """
     dice, count = np.random.default_rng(5), math.tau / 96
     kinematics, errors = Kinematics(DriveConfig()), []
@@ -453,7 +453,7 @@ def test_a_damaged_line_of_fine_encoders_is_not_taken_for_coarse_encoders() -> N
 
 
 def test_the_time_of_a_filled_gap_is_no_rest() -> None:
-    """The wheels of a slow robot stood in the line after the gap, but may have turned in it."""
+    """The wheels of a slow robot stand in the line after a gap, but may have turned in the gap."""
     robot, steps = odometry(), (6.5,) * 4
     for speed in (6.5, 0.0, 0.0, 6.5, 0.0, 0.0):
         robot.fold(replace(feedback(speed, speed, 0.01), steps=steps))
@@ -500,7 +500,10 @@ def test_a_time_that_counts_bridge_adds_no_uncertainty() -> None:
 
 
 def fold_all(robot: Odometry, path: list[tuple[float, float, float]]) -> list[Estimate]:
-    """Fold each (left, right, dt); a dt above 0.09 s is a gap ten times as long."""
+    """Pass each (left, right, dt) to odometry.
+
+    A `dt` above 0.09 s gives a gap of ten times `dt`.
+    """
     return [
         robot.fold(
             feedback(left, right, 0.0, gap=dt * 10) if dt > 0.09 else feedback(left, right, dt)
@@ -587,7 +590,7 @@ def test_the_covariance_stays_finite_for_years(gap: float) -> None:
 
 
 def counted(*turned: float, dt: float = 0.01, gap: float = 0.0, speed: float = 0.0) -> Feedback:
-    """Return a line whose wheels turned by these angles, rad; one number applies to all wheels."""
+    """Return a line whose wheels turned by these angles, rad. A single number is for all wheels."""
     a, b, c, d = turned if len(turned) == 4 else turned * 4
     return Feedback(AT, WheelSpeeds(*(speed,) * 4), dt, gap, (a, b, c, d))
 
@@ -632,7 +635,7 @@ def test_a_skipped_line_leaves_its_time_to_the_next() -> None:
 def test_a_damaged_line_that_covers_a_long_time_leaves_this_time_to_the_next(
     bridged: float,
 ) -> None:
-    """That time lies between the speeds before it and after it, as in a gap."""
+    """Odometry interpolates this time between the speeds before and after it, as in a gap."""
     robot = odometry()
     robot.fold(feedback(10.0, 10.0, 0.01))
     assert robot.confirmed(feedback(20.0, 20.0, 0.01)) == ([feedback(20.0, 20.0, 0.01)], 0)
@@ -903,7 +906,10 @@ def test_an_enabled_learned_track_changes_nothing_until_it_is_known() -> None:
 
 
 def test_a_corrected_turn_is_computed_with_the_track_at_the_time_of_that_turn() -> None:
-    """The front left wheel is dead, and the learned track changes before that is found."""
+    """The front left wheel is dead.
+
+    The learned track changes before the daemon finds this wheel.
+    """
     asked = OdometryConfig(learned_track=True)
     liar, honest = (Odometry(asked, Kinematics(DriveConfig()), 3200) for _ in range(2))
     told = Kinematics(DriveConfig()).wheel_speeds(Twist(0.5, 0.8))
@@ -921,9 +927,9 @@ def test_a_corrected_turn_is_computed_with_the_track_at_the_time_of_that_turn() 
 
 @pytest.mark.parametrize("share", [0.5, 1.6])
 def test_a_learned_track_makes_the_estimate_as_uncertain_as_a_configured_one(share: float) -> None:
-    """A learned track affects more than its own error.
+    """A learned track changes more than its own contribution to the covariance.
 
-    Wheel noise, counts and their play depend on it as well.
+    The contributions of wheel noise and of encoder counts depend on the track as well.
     """
     asked = Odometry(OdometryConfig(learned_track=True), Kinematics(DriveConfig()), 400)
     asked.use_track(Track(share, 0.02))

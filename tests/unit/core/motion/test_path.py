@@ -1,4 +1,4 @@
-"""The end of a chain of arcs agrees with exact arithmetic."""
+"""The computed end of a chain of arcs agrees with exact arithmetic."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def test_a_sum_and_its_rounding_error_together_are_exact(a: float, b: float) -> 
 
 
 def long_double_end(distances: list[float], turns: list[float]) -> tuple[float, float, float]:
-    """Return the end of the path with 64 bits of mantissa, and 2 pi to as many.
+    """Return the end of the path, computed with a mantissa of 64 bits and a 2 pi of this precision.
 
     The yaw is within half a turn.
     """

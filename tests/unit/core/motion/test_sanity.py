@@ -1,4 +1,4 @@
-"""Impossible feedback is named, rejected, and soon a fault."""
+"""The daemon rejects impossible feedback with a reason. Repeated rejection leads to a fault."""
 
 from __future__ import annotations
 
@@ -123,7 +123,7 @@ SPIKE = only(2, 79.0)
 
 
 def verdicts(sanity: Sanity, *lines: Feedback) -> list[bool]:
-    """Return for each line whether it is possible, and check that none makes a fault."""
+    """Return for each line whether it is possible. Check that the lines cause no fault."""
     possible = []
     for each in lines:
         possible.append(sanity.impossible(each) == "")
@@ -227,7 +227,10 @@ def test_a_speed_of_the_limit_and_one_proven_count_is_possible() -> None:
 
 @pytest.mark.parametrize("number", [1, 2])
 def test_one_count_is_never_too_fast_and_two_in_its_time_are(number: int) -> None:
-    """A host that catches up asks again after 4 ms: one count of 16 is then 98 rad/s."""
+    """A host that catches up after a stall may ask again after 4 ms.
+
+    One count of 16 in this time is then 98 rad/s.
+    """
     sanity, count = Sanity(FeedbackConfig(wheel_speed=50.0)), math.tau / 16
     speed, angle = number * count / 0.004, number * count
     for sampled in (True, False):
@@ -249,7 +252,11 @@ def test_a_speed_of_the_limit_and_one_learned_step_is_possible(wheel: int, sign:
 
 
 def test_a_learned_step_excuses_fast_lines_only_as_long_as_their_mean_may_be_possible() -> None:
-    """A speed of 5.4 rad/s is reported as one or no step of 6.54 rad/s, a lasting one as steps."""
+    """The limit is 5.5 rad/s, and the quantization step is 6.54 rad/s.
+
+    A wheel at 5.4 rad/s reports one step in most lines and 0 in the others. Lines that always
+    report a step or more have a mean above the limit.
+    """
     sanity = Sanity(FeedbackConfig(wheel_speed=5.5))
     steps = [stepping(only(1, speed), 6.54) for speed in (*(6.54,) * 5, 0.0)]
     assert verdicts(sanity, *steps * 20) == [True] * 120
@@ -304,15 +311,16 @@ def test_no_wheel_within_its_limit_is_too_fast_before_its_step_is_known(
 
 
 def unknown(*speeds: float, dt: float = DT, count: float = 0.0) -> list[Feedback]:
-    """Return lines with these speeds of one wheel, before the quantization steps are known."""
+    """Return lines with these speeds of one wheel, whose quantization step is not known yet."""
     steps = (math.inf,) * 4
     return [Feedback(AT, only(1, v, 4.0), dt, steps=steps, count=count) for v in speeds]
 
 
 def test_an_unknown_step_excuses_only_one_count_of_a_fast_time() -> None:
-    """A board that repeats each count once reports two lines per count, and one count is excused.
+    """The step may be one count that the board reports in two lines.
 
-    So 5 of 7 lines at 30 rad/s are certain, a mean of 21.4 rad/s. Of 8 lines it is 22.5 rad/s.
+    Of seven lines at 30 rad/s only five then prove a speed: a mean of 21.4 rad/s, below the limit
+    of 22. Of eight lines six prove one, with a mean of 22.5 rad/s.
     """
     sanity = Sanity(FeedbackConfig(wheel_speed=22.0))
     found = [bool(sanity.impossible(line)) for line in unknown(*[30.0] * 10)]
@@ -352,14 +360,17 @@ def test_forgetting_ends_the_fast_time() -> None:
 
 
 def test_no_unknown_step_is_larger_than_one_count_of_sixteen() -> None:
-    """A damaged digit is found at once. One count of 16 in 10 ms is 39.27 rad/s."""
+    """A higher speed comes from a damaged digit, and is rejected at once.
+
+    One count of 16 in 10 ms is 39.27 rad/s.
+    """
     for speed, possible in ((39.26, True), (39.28, False), (90.0, False)):
         sanity = Sanity(FeedbackConfig(wheel_speed=10.0))
         assert verdicts(sanity, *unknown(speed, 4.0)) == [possible, True]
 
 
 def test_a_learned_step_excuses_no_speed_above_one_count_of_sixteen() -> None:
-    """Damaged lines of all wheels look like the steps of coarse encoders."""
+    """Damaged lines of all wheels could otherwise be taken for coarse encoders."""
     sanity = Sanity(FeedbackConfig())
     assert "rear_left" in sanity.impossible(stepping(only(2, 95.0), 90.0))
 
@@ -370,7 +381,7 @@ def test_a_learned_step_excuses_no_speed_above_one_count_of_sixteen() -> None:
 def test_an_unknown_step_is_one_count_in_the_time_of_the_line_or_in_5_ms(
     dt: float, fastest: float
 ) -> None:
-    """A line without a known time moves nothing, so nothing in it is excused."""
+    """In a line without a known time no speed is excused, because this line adds no motion."""
     for speed, possible in ((fastest, True), (fastest + 0.02, False)):
         sanity, steps = Sanity(FeedbackConfig(wheel_speed=10.0)), (math.inf,) * 4
         line = Feedback(AT, only(1, speed), dt, steps=steps)
@@ -414,7 +425,7 @@ WINDOW, MOST = 1000, 10
 
 
 def warned(sanity: Sanity, bad: int, lines: int = WINDOW) -> list[Event]:
-    """Return the warnings of a window whose first `bad` lines are impossible."""
+    """Return the warnings after a window of lines whose first `bad` lines are impossible."""
     warnings = []
     for i in range(lines):
         sanity.impossible(line(WheelSpeeds(*[200.0 if i < bad else 10.0] * 4)))

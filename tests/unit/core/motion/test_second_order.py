@@ -1,4 +1,7 @@
-"""Tests of the second-order terms, against errors that are composed one by one."""
+"""Tests of the second-order terms of the covariance.
+
+The tests compare them with errors that are composed step by step.
+"""
 
 from __future__ import annotations
 
@@ -17,9 +20,9 @@ def heading(variance: float) -> PoseCovariance:
 
 
 def straight(metres: int, yaw: float, column: float) -> tuple[SecondOrder, PoseCovariance]:
-    """Return the covariance after stretches of 0.1 m.
+    """Return the covariance after stretches of 0.1 m straight ahead.
 
-    Each stretch has this yaw variance and parameter column.
+    Each stretch adds this yaw variance and this effect of a parameter on yaw.
     """
     second, p = SecondOrder(1), NONE
     j = (0.0, 0.0, 0.0)
@@ -34,7 +37,7 @@ def straight(metres: int, yaw: float, column: float) -> tuple[SecondOrder, PoseC
 
 
 def sampled(metres: int, yaw: float, column: float) -> float:
-    """Return the mean square of the bracket terms along the path over 20,000 such paths."""
+    """Return the mean square of the bracket terms along 20,000 random paths like in `straight`."""
     rng = np.random.default_rng(1)
     n = 20_000
     p = rng.standard_normal(n)

@@ -1,4 +1,4 @@
-"""Tests of the signs that a wheel's encoder is faulty, and of the signs against it."""
+"""Tests of the evidence that a wheel's encoder is faulty, and of the evidence against it."""
 
 from __future__ import annotations
 
@@ -136,10 +136,10 @@ SLOW_S = 0.25
 
 
 def after(acceleration: float, other: float = 1.0, same: bool = True, count: float = FINE) -> float:
-    """Return the time until a wheel that still reports 10 rad/s is found stuck, s.
+    """Return the time until the check finds a wheel that is stuck at 10 rad/s, s.
 
-    The time starts when the command leaves 10 rad/s. The other wheel follows the change by the
-    share `other`. The result is inf if one second is not enough.
+    The time starts when the command changes from 10 rad/s. The other wheel follows `other` times
+    this change. The result is inf if one second is not enough.
     """
     stuck, slow, command, turned = Stuck(), 10.0, 10.0, 10.0
     for line in range(200):

@@ -1,7 +1,7 @@
-"""NEES of the published covariance over many robots whose wheels err as declared.
+"""NEES of the published covariance over many robots whose wheels have the configured errors.
 
-If the true mean is 3, the mean of 1000 runs is within 2.85 to 3.15 nineteen times in twenty. Here
-the seeds are fixed. `-m soak -s` prints all figures.
+If the true mean is 3, the mean of 1000 runs is within 2.85 to 3.15 nineteen times in twenty. The
+tests use fixed seeds. `-m soak -s` prints all figures.
 """
 
 from __future__ import annotations
@@ -99,9 +99,9 @@ def test_the_covariance_of_a_short_drive_matches_the_pose_errors(
 
 
 def bursts(a_minute: float) -> Heard:
-    """Return a function that loses 0.1 to 0.5 s of lines this many times a minute.
+    """Return a function that removes bursts of 0.1 to 0.5 s of lines, this many a minute.
 
-    Values between the neighbouring lines replace the lost ones.
+    It fills them with values between the neighbouring lines.
     """
 
     def heard(drive: Array, rng: np.random.Generator) -> list[Feedback]:
@@ -154,9 +154,9 @@ def test_the_covariance_matches_the_pose_errors_after_fifty_gaps_at_cruise() -> 
 
 
 def counting(counts: int) -> Heard:
-    """Return a function that makes lines from wheel counters.
+    """Return a function that makes lines with the whole counts of wheel counters.
 
-    Each counter starts anywhere within a count.
+    Each counter starts at a random fraction of a count.
     """
 
     def heard(drive: Array, rng: np.random.Generator) -> list[Feedback]:

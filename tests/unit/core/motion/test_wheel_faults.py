@@ -1,4 +1,7 @@
-"""The wheels of each side check each other: a faulty one leaves the pose, and slip is reported."""
+"""The wheels of each side check each other.
+
+Odometry excludes a faulty wheel, and the daemon reports slip.
+"""
 
 from __future__ import annotations
 
@@ -59,9 +62,9 @@ class Bench:
         seconds: float = 1.0,
         turn: float | None = None,
     ) -> float:
-        """Return the time until a wheel was found faulty, s, or inf.
+        """Feed lines for this time. Return when the check found a faulty wheel, s, or inf.
 
-        `turn` is the gyro's rate in rad/s.
+        `turn` is the gyro's rate, rad/s.
         """
         found = math.inf
         for line in range(round(seconds / PERIOD)):
@@ -88,7 +91,10 @@ def driven(told: WheelSpeeds = TEN, counts: int = 3200) -> Bench:
 
 
 def test_a_board_that_stopped_during_a_stall_has_no_dead_wheels_afterwards() -> None:
-    """Lines of 50 ms waited meanwhile, and the first command reaches the board 60 ms late."""
+    """Lines of 50 ms each wait during the stall, and the host reads them after it.
+
+    The first command after the stall reaches the board 60 ms late.
+    """
     faults = WheelFaults(Kinematics(DriveConfig()), 3200, FeedbackConfig(fault_time=0.1))
     for _ in range(40):
         assert not faults.watch(all_at(6.9), all_at(6.9), 0.05)
@@ -101,7 +107,10 @@ def test_a_board_that_stopped_during_a_stall_has_no_dead_wheels_afterwards() -> 
 
 @each("own", [-4.0, -10.0])
 def test_wheels_that_run_backwards_are_found_although_stalls_repeat(own: float) -> None:
-    """The board goes on, because its driver ignores it. Each stall makes six lines wait."""
+    """The wheels drive on in each stall, because the motor driver ignores the board.
+
+    Each stall makes six lines wait.
+    """
     faults, found = WheelFaults(Kinematics(DriveConfig()), 3200, FeedbackConfig()), ""
     for _ in range(6):
         for line in range(60):
@@ -217,7 +226,10 @@ def test_a_pose_that_was_set_after_the_fault_began_is_not_corrected() -> None:
 def test_a_push_by_hand_without_a_command_leaves_no_wheel_out(
     pushed: float, in_the_air: int
 ) -> None:
-    """Either three wheels roll while one hangs in the air, or only the one in the air turns."""
+    """Either three wheels roll and one hangs in the air, or only the wheel in the air turns.
+
+    Odometry excludes no wheel.
+    """
     for says in (only(in_the_air, 0.0, pushed), only(in_the_air, pushed, 0.0)):
         bench = Bench()
         for line in range(500):
@@ -285,7 +297,7 @@ def test_wheels_that_a_gyro_contradicts_have_a_hundred_times_larger_variances() 
 
 
 class Fall:
-    """One drive with one failure: the pose errors with and without the check."""
+    """One drive with one failure. It has the pose errors with and without the check."""
 
     def __init__(self, kind: str, seed: int, counts: int) -> None:
         rng = np.random.default_rng(seed)
@@ -372,9 +384,9 @@ def steady(counts: int, speed: float, rng: np.random.Generator) -> tuple[Array, 
 
 
 def out_after(kind: str, counts: int, speed: float, seed: int) -> float:
-    """Return the time until the faulty wheel is left out on a straight drive, s.
+    """Return the time until odometry excludes the faulty wheel on a straight drive, s.
 
-    The test fails if another wheel is left out.
+    The test fails if it excludes another wheel.
     """
     rng = np.random.default_rng(seed)
     told, angles = steady(counts, speed, rng)
@@ -402,7 +414,7 @@ def out_after(kind: str, counts: int, speed: float, seed: int) -> float:
 def test_the_time_to_find_a_wrong_wheel_depends_on_counts_and_speed(
     kind: str, counts: int, speed: float, within: float
 ) -> None:
-    """Speeds are those of the wheels in rad/s; 20 rad/s are 1 m/s."""
+    """The speeds are wheel speeds in rad/s: 20 rad/s are 1 m/s."""
     found = max(out_after(kind, counts, speed, seed) for seed in range(3))
     print(f"\n{kind}, {counts} counts, {speed:g} rad/s: {found:.2f} s")
     assert found <= within + 1e-9
@@ -411,11 +423,10 @@ def test_the_time_to_find_a_wrong_wheel_depends_on_counts_and_speed(
 def healthy(
     seed: int, seconds: float, counts: int, before: tuple[WheelSpeeds, ...] = ()
 ) -> tuple[int, bool]:
-    """Return how often slip is reported on a clean drive, and whether the pose stays exact.
+    """Return how often slip is reported on a clean drive, and whether the pose is exact.
 
-    The pose must equal the plain mean's bit for bit.
-
-    The lines of `before` precede the drive.
+    It is exact if it equals the pose from the plain mean of the wheels bit for bit. The lines of
+    `before` come before the drive.
     """
     rng = np.random.default_rng(10_000 + seed)
     told = commands(rng, seconds)
@@ -459,9 +470,9 @@ def test_an_hour_of_clean_driving_raises_one_false_alarm_at_most(counts: int, se
 
 
 def slipping(rng: np.random.Generator, counts: int, speed: float = 0.0) -> float:
-    """Return the time until an error of a tenth on one wheel is reported on a steady drive, s.
+    """Return the time until the check reports a wheel whose speed is wrong by 10 %, s.
 
-    With `speed` 0 the speed is random.
+    The drive is steady. Its speed is random if `speed` is 0.
     """
     speed = rng.choice((-1, 1)) * (speed or rng.uniform(6.0, 18.0))
     steps = np.concatenate([np.linspace(0.0, 1.0, 90), np.ones(410)])
@@ -504,7 +515,7 @@ def test_slip_of_a_tenth_is_reported_within_a_fifth_of_a_second(
 def test_the_time_to_report_slip_depends_on_counts_and_speed(
     counts: int, speed: float, within: float
 ) -> None:
-    """Speeds are those of the wheels in rad/s."""
+    """The speeds are wheel speeds in rad/s."""
     rng = np.random.default_rng(7)
     found = sorted(slipping(rng, counts, speed) for _ in range(5))
     print(f"\n{counts} counts, {speed:g} rad/s: median {found[2]:.2f} s, at most {found[-1]:.2f}")

@@ -1,6 +1,6 @@
-"""Tests of the front-rear difference of one side.
+"""Tests of the difference between the front and the rear wheel of one side.
 
-It comes from slip, or from a count, a tyre or a slower motor.
+Its causes are slip, encoder counts, unequal tyres, and a slower motor.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ FINE = math.tau / 3200
 def rolled(
     residual: Residual, front: float, rear: float, seconds: float, count: float = FINE
 ) -> list[bool]:
-    """Return for each line whether the front and rear wheels agreed at these speeds, rad/s."""
+    """Feed lines with these speeds, rad/s. Return for each whether front and rear wheel agree."""
     lines = round(seconds / DT)
     return [residual.add(front * DT, rear * DT, KEEP, DT, count) for _ in range(lines)]
 

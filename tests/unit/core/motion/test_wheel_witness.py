@@ -1,4 +1,4 @@
-"""A wheel that contradicts its command soon becomes a fault, and one that is pushed never does."""
+"""A wheel that contradicts its command soon causes a fault. A pushed wheel never does."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def only(wheel: int, speed: float, others: float = 0.0) -> WheelSpeeds:
 
 
 def both(wheel: int, speed: float) -> WheelSpeeds:
-    """Return the speeds of a robot of which only this wheel's side turns, rad/s."""
+    """Return the speeds of a robot on which only the side of this wheel turns, rad/s."""
     side = LEFT if wheel in LEFT else RIGHT
     return WheelSpeeds(*(speed if i in side else 0.0 for i in range(4)))
 
@@ -261,7 +261,10 @@ def test_a_wheel_that_slows_down_slowly_a_second_time_is_no_fault() -> None:
 
 
 def test_a_slow_wheel_that_sped_up_during_a_stall_and_now_slows_down_is_no_fault() -> None:
-    """The line after the stall is the first that is too fast, and shows a much higher speed."""
+    """The line after the stall is the first one with a speed above the command.
+
+    This speed is much higher than the speed before the stall.
+    """
     robot = watching()
     lines = [(9.29, 0.23, 0.1), (17.52, 1.41, 0.1), (17.95, 4.47, 0.1), (17.95, 7.86, 0.1)]
     lines += [(0.0, 11.83, 0.25), (1.21, 13.48, 0.02), (4.18, 12.63, 0.03)]
@@ -346,7 +349,7 @@ def test_a_wheel_faster_than_its_configured_response_time_is_no_fault(sign: floa
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_a_wheel_that_slows_to_a_creep_before_its_response_time_is_not_dead(sign: float) -> None:
-    """A coarse encoder reports a speed below one count per line as zero."""
+    """A coarse encoder reports 0 if the wheel turns by less than one count per line."""
     robot = watching(FeedbackConfig(response_time=2.0))
     for told, reported in ((sign * 20.0, sign * 20.0), (sign * 0.6, 0.0)):
         for step in range(1000):
@@ -355,7 +358,7 @@ def test_a_wheel_that_slows_to_a_creep_before_its_response_time_is_not_dead(sign
 
 
 def test_a_wheel_that_reaches_its_command_before_its_response_time_is_not_stuck() -> None:
-    """A coarse encoder reports one and the same speed for several lines."""
+    """A coarse encoder reports the same speed in several lines."""
     robot = watching(FeedbackConfig(response_time=2.0))
     for _ in range(1000):
         assert robot.watch(WheelSpeeds(*[13.7] * 4), WheelSpeeds(*[13.7] * 4), DT) == ""
@@ -499,7 +502,7 @@ def test_a_wheel_that_slows_down_before_it_turns_round_is_not_reversed(sign: flo
 
 
 def slow(robot: WheelFaults, share: float, seconds: float, wheel: int = 0) -> list[str]:
-    """Return the events of wheel speeds while this wheel reaches this share of 10 rad/s."""
+    """Return the logged events while this wheel turns at `share` times the commanded 10 rad/s."""
     events = []
     for step in range(round(seconds / DT)):
         seen = noisy(only(wheel, 10.0 * share, 10.0), step)

@@ -1,4 +1,4 @@
-"""The 33 bytes of rmw_zenoh are packed and unpacked exactly, and anything else is refused."""
+"""acsard packs and unpacks rmw_zenoh's attachment of 33 bytes exactly, and refuses other bytes."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Each channel's payload matches its definition.
+"""The payload of each channel matches the channel's message definition.
 
-A program that knows only the definition reads it.
+A program that knows only the definition can decode the payload.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ def filled(cls: type[Struct]) -> Any:
 
 
 def same(ours: Any, theirs: Any) -> bool:
-    """Return whether the fields of both are equal, by their order."""
+    """Return whether two messages have equal fields in the same order."""
     if isinstance(ours, Struct):
         fields = [getattr(ours, name) for name in ours.__struct_fields__]
         others = [v for k, v in vars(theirs).items() if k != "__msgtype__" and not k.isupper()]

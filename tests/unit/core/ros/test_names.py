@@ -217,9 +217,9 @@ def test_each_stored_type_hash_is_that_of_its_definition(type_name: str) -> None
 def test_the_hash_function_of_this_test_matches_the_published_hashes_of_ros(
     type_name: str, published: str
 ) -> None:
-    """The types come from ROS and not from this project.
+    """The expected hashes come from ROS and not from this project.
 
-    Both sides therefore cannot share an error.
+    The hash function of the test therefore cannot share an error with acsard.
     """
     assert rihs01(type_name) == published
 

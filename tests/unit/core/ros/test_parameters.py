@@ -1,7 +1,4 @@
-"""Tests of the configuration as ROS parameters.
-
-They cover list, read, describe, and the answer to a set request.
-"""
+"""Tests of the configuration as ROS parameters: listing, reading, describing and setting them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Each ROS name of the robot stands for a native key, in both trees."""
+"""Each ROS name of the robot stands for a native key, for both ROS transports."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def found(ros: RosConfig) -> list[Endpoint]:
 
 
 def keys(ros: RosConfig, transport: str) -> dict[str, str]:
-    """Return the key of each native name; twists appear only once."""
+    """Return the native key of each ROS name. The two types of twist count as one."""
     return {e.native: e.key for e in found(ros) if e.transport == transport}
 
 

@@ -1,6 +1,4 @@
-"""Tests of the fake microcontroller's side of the protocol.
-
-They are exact to the byte and the nanosecond.
+"""Tests of the protocol of the fake microcontroller, exact to the byte and the nanosecond.
 
 `TRUE` has no motor lag and fine encoders, so that it reports exactly the commanded speeds.
 """
@@ -35,7 +33,7 @@ Heard = list[tuple[int, bytes]]
 
 
 def replies(mcu: FakeMcu, until_ns: int) -> Heard:
-    """Advance from one event to the next and return the received data with its times."""
+    """Advance the MCU from event to event, and return the data that it sent, with times."""
     found = []
     while (due := mcu.next_ns()) is not None and due <= until_ns:
         data = mcu.advance(due)
@@ -55,7 +53,7 @@ def drive(mcu: FakeMcu, start_ns: int, count: int, line: bytes = LINE) -> Heard:
 
 
 def told(line: bytes, config: Config = TRUE) -> FakeMcu:
-    """Return an MCU that received this line once and had time to act."""
+    """Return an MCU that received this line once, after enough time to act on it."""
     mcu = FakeMcu(config)
     mcu.receive(0, line)
     mcu.advance(100 * MS)
@@ -407,7 +405,7 @@ NAMED["frozen_encoder"] = methodcaller("frozen_encoder", 2)
 def story(mcu: FakeMcu, start_ns: int) -> tuple[Heard, list[float], list[float]]:
     """Drive for half a second, then send only one invalid line.
 
-    Return the answers with their times, the angles and the set points.
+    Return the MCU's replies with times, the wheel angles, and the motors' set points.
     """
     found = drive(mcu, start_ns, 40)
     found += drive(mcu, start_ns + 400 * MS, 10, SEALED)

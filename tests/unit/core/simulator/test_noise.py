@@ -1,4 +1,4 @@
-"""Tests of noise that is the same in every run."""
+"""Tests of the simulator's noise, which is the same in every run."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ END = b"\r\n"
 
 
 def closed(body: bytes) -> bytes:
-    """Return the body with its correct check and a line end."""
+    """Return the body with its correct checksum and a line end."""
     return b"%b*%04X\r\n" % (body, binascii.crc_hqx(body, 0))
 
 

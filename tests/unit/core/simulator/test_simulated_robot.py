@@ -1,4 +1,4 @@
-"""Tests of a simulated robot that shows its true pose and its gyro."""
+"""Tests of a simulated robot, which reports its true pose and its gyro's rate."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of the simulated base: motors with a lag, and the path that their wheels make."""
+"""Tests of the simulated base: motors with a lag, and the robot's path that follows from them."""
 
 from __future__ import annotations
 

@@ -64,7 +64,7 @@ class Access:
         return [self.rules[name] for policy in policies for name in policy["rules"]]
 
     def lets(self, who: str, message: str, key: str, flow: str = "ingress") -> bool:
-        """Return whether a rule allows the message and none denies it.
+        """Return whether one of the rules allows the message and no rule denies it.
 
         A rule applies to every key that its key expressions include.
         """
@@ -251,7 +251,7 @@ def test_an_unused_gyro_key_is_granted_to_no_role() -> None:
 
 
 def test_without_a_urdf_the_description_belongs_to_the_programs_of_ros() -> None:
-    """robot_state_publisher publishes the same topic, and the daemon must not keep it off."""
+    """ROS's robot_state_publisher publishes this topic, and the access rules must allow it."""
     without = Access()
     ros = [e.key for e in endpoints(RosConfig(), ZID) if e.native == "robot_description"]
     assert len(ros) == 2
@@ -325,10 +325,7 @@ def test_no_role_may_put_by_wildcard_or_on_what_the_robot_publishes(role: Role) 
 
 @pytest.mark.parametrize("role", ["viewer", "operator"])
 def test_no_wildcard_covers_a_service_for_less_than_a_maintainer(role: Role) -> None:
-    """A wildcard that matches a service is denied.
-
-    A wildcard that includes such a wildcard is therefore denied as well.
-    """
+    """No rule of a lower role allows a query on a wildcard that matches a service."""
     services = [DEFAULT.key(f"srv/{verb}") for verb in SERVICES] + [DEFAULT.key("config")]
     services += [e.key for e in endpoints(RosConfig(), ZID) if e.direction in ("query", "service")]
     for rule in TRUSTING.rules_of(role):

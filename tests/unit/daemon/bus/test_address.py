@@ -1,6 +1,6 @@
-"""Tests of the choice of the robot that a program uses.
+"""Tests of how a program chooses its robot.
 
-The program's own arguments decide first, then the file that ACSARD_CONFIG names.
+The program's arguments have precedence over the file that ACSARD_CONFIG names.
 """
 
 from __future__ import annotations

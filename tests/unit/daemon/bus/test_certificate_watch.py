@@ -1,4 +1,4 @@
-"""Renewed certificate files are noticed, and the daemon knows the ends of replaced certificates."""
+"""The daemon notices renewed certificate files, and knows when replaced certificates expire."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from acsard.machine.authority import Authority
 
 
 class Files:
-    """The files of a robot, looked at by a clock that each look advances."""
+    """The certificate files of a robot, and the watch. Each check advances its simulated clock."""
 
     def __init__(self, where: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         self.where, self._now_ns = where, 0

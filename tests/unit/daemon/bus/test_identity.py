@@ -1,6 +1,6 @@
-"""The role of a client is the highest role whose key answers, in any order of answers.
+"""A client's role is the highest role whose key answers, whatever the order of the answers.
 
-Without an answer there is no role.
+A client without an answer has no role.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""A step takes a bounded part of the inbox, and the replies go out in their order."""
+"""A step processes a limited number of inbox items, and the replies are sent in order."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from acsard.daemon.bus.inbox import COMMAND_BUFFER, MAX_OPEN_QUERIES, Inbox, Rep
 
 
 class Loop:
-    """A stand-in for the control loop that records what woke it."""
+    """A stand-in for the control loop that records each reason for a wake-up."""
 
     def __init__(self) -> None:
         self.woken: list[str] = []
@@ -107,7 +107,7 @@ def test_a_loop_that_wakes_up_finds_the_displaced_samples_counted() -> None:
 
 
 class Asked:
-    """A query without Zenoh. It records its replies and, at the end, that it was dropped."""
+    """A stand-in for a Zenoh query. It records its replies and whether the daemon dropped it."""
 
     def __init__(self, gone: bool = False, closed: bool = False) -> None:
         self.told: list[str] = []

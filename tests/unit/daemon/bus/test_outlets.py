@@ -1,6 +1,6 @@
-"""Tests of the outlets between the control loop and the bus.
+"""Tests of the outlets, through which the control loop publishes on the bus.
 
-The loop never waits, and the newest value is sent.
+The loop never waits, and an outlet sends only the newest value.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Publisher:
         self.sent.append(msgspec.msgpack.decode(payload, type=Twist).linear.x)
 
     def declare_publisher(self, key: str, **options: Any) -> Publisher:
-        """Act as the session, which declares this publisher for its only key."""
+        """Return this publisher, as a Zenoh session does for its only key."""
         return self
 
 

@@ -1,4 +1,4 @@
-"""Tests of the robots that `--id` selects, and of the reasons for the silence of a robot."""
+"""Tests of the robots that `--id` selects, and of the reasons why a robot is silent."""
 
 from __future__ import annotations
 

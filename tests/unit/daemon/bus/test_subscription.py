@@ -1,4 +1,4 @@
-"""A subscription returns the samples of its key in order and ends after a silence."""
+"""A subscription returns the samples of its key in order, and ends if none comes for a while."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Queue:
         return self.held.popleft() if self.held else None
 
     def wait(self, seconds: float | None) -> None:
-        """Return at once, because no further sample arrives."""
+        """Return at once, because the test sends no further sample."""
 
     def undeclare(self) -> None:
         self.open = False

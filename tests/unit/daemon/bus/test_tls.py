@@ -1,4 +1,4 @@
-"""Tests of the certificate files, and of the sentence for each way in which TLS fails."""
+"""Tests of the certificate files, and of the error message for each TLS failure."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Tests of the router configurations: those that are written, and those that Zenoh accepts.
+"""Tests of the router configurations that acsard writes and that Zenoh accepts.
 
-All others get an error.
+Any other configuration gets an error.
 """
 
 from __future__ import annotations

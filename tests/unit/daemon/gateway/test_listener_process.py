@@ -1,6 +1,6 @@
-"""Tests of the judgement of the gateway's own Zenoh session.
+"""Tests of how the gateway judges the incidents of its own Zenoh session.
 
-The judgement logs incidents and gives the reasons to restart the gateway.
+It logs them, and it restarts if necessary.
 """
 
 from __future__ import annotations

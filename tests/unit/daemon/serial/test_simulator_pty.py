@@ -1,6 +1,6 @@
 """Tests of the built-in simulator as a device.
 
-They show the effects of `[sim] faults` on its bytes.
+They show how `[sim] faults` changes the bytes that the simulator sends.
 """
 
 from __future__ import annotations
@@ -18,7 +18,10 @@ LINE = b"ap00.00,bp00.00,cp00.00,dp00.00\n"
 
 
 async def first_piece(faults: tuple[str, ...], enough: Callable[[bytes], bool]) -> bytes:
-    """Return the first piece from the device that is `enough`, sending one line per piece."""
+    """Send lines and read one piece of data after each, until `enough` accepts a piece.
+
+    Return it.
+    """
     found: asyncio.Future[bytes] = asyncio.get_running_loop().create_future()
     with Simulated(Config(sim=SimConfig(faults=faults))) as simulated:
         device = os.open(simulated.path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
