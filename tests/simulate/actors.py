@@ -106,6 +106,8 @@ class Run:
         self._order = 0
         self._calls: dict[int, tuple[dict[str, Any], int, Callable[[bytes], None]]] = {}
         """Calls without an answer: the event, its arrival and the function for the answer."""
+        self.longest_reason = 0
+        """Length of the longest reason that the daemon has given."""
         self._puts_ns: list[int] = []
         """Arrivals of stops that were put on the key, and that no step has read yet."""
         self._ticket = 0
@@ -698,6 +700,7 @@ class Run:
             # A stall in a step waits for a step that makes a line.
             self._stalled_ns = max(self._stalled_ns, true_ns)
         witness.read()
+        self.longest_reason = max(self.longest_reason, len(seen.reason))
         if self._puts_ns:
             self._puts_ns = [at_ns for at_ns in self._puts_ns if at_ns > seen.decided_ns + offset]
         if self.product.disk.full:

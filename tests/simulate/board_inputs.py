@@ -59,6 +59,9 @@ CLIENT = re.compile(r"\bstopped (?:by|when the daemon started)\b")
 NEVER_S = 1e6
 """Time after which a board without a fault of a motor driver would report one, s."""
 
+PRESSED = "emergency stop pressed at the robot"
+"""Reason of a stop that the emergency stop has caused."""
+
 LONGEST = 4096
 """Bytes of a line that are kept. A status line is much shorter."""
 
@@ -340,6 +343,8 @@ class Inputs:
         self._powered = True
         """Whether a fault of a motor driver certainly counts: no emergency stop was pressed since
         the robot was last released. This outlasts a restart of the daemon."""
+        self._estopped = False
+        """Whether a board has reported a pressed emergency stop. This outlasts a restart."""
         self._emptied = False
         """Whether an empty battery may have stopped the robot. This outlasts a restart."""
         measure = config.get("battery", {}).get("measure", "volts")
@@ -463,7 +468,7 @@ class Inputs:
         before, was_sure, was_silent = known.marks, known.sure, known.silent
         known.marks, known.sure, known.silent = marks, certain, ""
         if known is self.estop and marks != b".":
-            self._powered = False
+            self._powered, self._estopped = False, True
             if certain and self._cut_ns is None:
                 self._cut_ns = true_ns
         if not certain:
@@ -573,7 +578,7 @@ class Inputs:
             raise BrokenError("a press stops the robot, however short", true_ns, text)
         if self._fresh and moving:
             raise BrokenError("a press is a zero at once", true_ns, str(moving))
-        if not self._mode and "emergency stop" in seen.reason:
+        if not self._mode and self._estopped and PRESSED in seen.reason:
             # A new daemon knows a stop of the emergency stop from its latch file. Only `clear` ends
             # it, also if a full disk has lost the `clear` of the daemon before.
             self._powered = self._driver_faulted = False

@@ -8,6 +8,7 @@ constant for long enough.
 
 from __future__ import annotations
 
+from bisect import bisect_right, insort
 from typing import Any, NamedTuple
 
 from tests.simulate.ages import MARGIN_NS, Wish
@@ -115,8 +116,8 @@ class Followed:
         """The same for the commands since the last step, of which a full buffer may drop some."""
         self._rests_ns: dict[Who, int] = {}
         """Arrival of the newest zero of each sender, by the robot's clock."""
-        self._stamps_ns: dict[Who, int] = {}
-        """The latest stamp of a zero of each sender."""
+        self._stamps_ns: dict[Who, list[int]] = {}
+        """The stamps of the zeros of each sender, in ascending order."""
         self._latest: dict[Who, Command] = {}
         """The last command that arrived from each sender, without overtaken speeds."""
         self._slowest: tuple[float, float] | None = None
@@ -156,7 +157,7 @@ class Followed:
             self._latest[who] = found
         if not (wish.v or wish.w or message.junk):
             self._rests_ns[who] = at_ns
-            self._stamps_ns[who] = max(message.stamp_ns, self._stamps_ns.get(who, 0))
+            insort(self._stamps_ns.setdefault(who, []), message.stamp_ns)
             self._zero_ns[who] = max(message.sent_ns, self._zero_ns.get(who, 0))
         if self._keeper is not None:
             priority = self._witness.priority
@@ -263,10 +264,19 @@ class Followed:
             overtakes_ns = 2 * self._witness.timeout[holder.who[0]]
         if self._rests_ns.get(holder.who, -overtakes_ns - 1) > holder.arrived_ns - overtakes_ns:
             return None
-        later = self._stamps_ns.get(holder.who, 0) > holder.message.stamp_ns
-        if later and not stable(holder.sender):
+        if not stable(holder.sender) and self._has_later_zero(holder):
             return None
         return None if holder.overtaken else (holder.v, holder.w)
+
+    def _has_later_zero(self, found: Command) -> bool:
+        """Return whether a zero of the same sender has a stamp that is later by up to the timeout.
+
+        The daemon ignores a zero whose stamp is later by more than that.
+        """
+        stamps_ns, stamp_ns = self._stamps_ns.get(found.who, []), found.message.stamp_ns
+        place = bisect_right(stamps_ns, stamp_ns)
+        longest_ns = self._witness.timeout[found.who[0]]
+        return place < len(stamps_ns) and stamps_ns[place] - stamp_ns <= longest_ns
 
     @property
     def sender(self) -> dict[str, Any] | None:

@@ -32,9 +32,12 @@ LONGEST_BUFFER = 1024
 A board sends more than that in 3.5 s without an end of line.
 """
 
-LONGEST_TEXT = 8192
-"""Longest text that the daemon may hold: a reason with all causes of a fault, and when each of them
-was latched. There are 24 of them."""
+LONGEST_TEXT = 1024
+"""Longest text that the daemon may hold if it has given no long reason. A reason with several
+causes of a fault is longer, and other texts quote it."""
+
+LONGEST_REASON = 4096
+"""Longest reason that the daemon may give."""
 
 SETTLES_NS = 3 * NS
 """After the last event a lawful sender drives within this time."""
@@ -282,7 +285,8 @@ class Liveness:
             run.counts[f"largest {name}"] = max(run.counts[f"largest {name}"], length)
         if size > MOST_HELD:
             raise BrokenError("memory is bounded", run.true_ns, f"a {kind} of {size} entries")
-        if text > LONGEST_TEXT or buffer > LONGEST_BUFFER:
+        longest = LONGEST_TEXT + 2 * min(run.longest_reason, LONGEST_REASON)
+        if text > longest or buffer > LONGEST_BUFFER:
             found = f"a text of {text} letters, a buffer of {buffer} bytes"
             raise BrokenError("memory is bounded", run.true_ns, found)
 
