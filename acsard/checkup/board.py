@@ -276,8 +276,9 @@ class Board:
     def zeros(self) -> None:
         """Send zero speeds in two lines: one ends with a comma, and the other does not.
 
-        Some firmware obeys only one of the two endings. If `sealed` is true, also send a line with
-        a checksum.
+        Some firmware stops motor d only at lines with one of the two endings. A line end comes
+        first, so that a partial line does not spoil the two lines. If `sealed` is true, also send a
+        line with a checksum.
         """
         self._commanded = ZERO
         plain = self._codecs[True].stop + self._codecs[False].stop

@@ -94,7 +94,7 @@ class PoseCovariance(Struct, frozen=True, gc=False):
 
 
 class TwistVariances(Struct, frozen=True, gc=False):
-    """Variances of the velocity that the odometry computes from one feedback line.
+    """Variances of the velocity of the base frame that the odometry computes from a feedback line.
 
     `linear` and `lateral` are in m2/s2, and `angular` is in rad2/s2.
     """

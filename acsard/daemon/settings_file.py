@@ -1,7 +1,7 @@
 """Compares the configuration file with the settings in force, and writes settings to the file.
 
 A `set` request with the field `keep` changes the settings and the file, in two stages. First a
-thread checks that the file can be changed; otherwise nothing is set. Then the robot uses the
+thread checks that the file can be changed; otherwise no setting is changed. Then the robot uses the
 settings, and the thread changes the file. The control loop never waits for the disk.
 """
 

@@ -46,8 +46,8 @@ class EventDeduplicator:
     def of(self, events: Events) -> list[Log]:
         """Return a log message for each event that was in no earlier list.
 
-        After a restart of the daemon, all events are new. A list that is older than an earlier list
-        adds no messages.
+        After a restart of the daemon, all events are new. If the wall clock was also set back, some
+        of them may be left out. A list that is older than an earlier list adds no messages.
         """
         known, told, stamp_ns = self._total, self._told, events.stamp.to_ns()
         before_ns = self._stamp_ns

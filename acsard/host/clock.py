@@ -48,8 +48,8 @@ NS_PER_US = 1000
 def now() -> Instant:
     """Return the present time by the monotonic clock and by the wall clock.
 
-    The two clocks are read within 50 us of each other. If another process interrupts five attempts,
-    the last attempt is returned, and its two times may differ by more.
+    The two clocks are read within 50 us of each other. If five attempts take longer, the last one
+    is returned, and its two times may differ by more.
     """
     for _ in range(5):
         mono, wall = mono_ns(), time.time_ns()

@@ -52,6 +52,10 @@ from acsard.host.errors import MendableError, NoAnswerError
 from acsard.host.processes import name_of
 from acsard.machine.finding import LEVELS, Finding, Level
 
+MIN_JUDGED_LINES = 40
+"""Smallest number of lines from which the share of lost lines is judged. The share of fewer lines
+is not significant."""
+
 MAX_KEYS = 6
 """Maximum number of configuration keys that one finding of `compared` names."""
 
@@ -256,6 +260,11 @@ def link(running: Running) -> Iterator[Finding]:
                 "cannot check the lines to the board, because a free-running board "
                 "(mcu.reply_period is set) does not answer each line"
             )
+        elif passed.get("lines_sent", 0) < MIN_JUDGED_LINES:
+            text = (
+                "the link is up, but the daemon sends too few lines in a second for this tool to "
+                "check whether lines are lost"
+            )
         yield Finding("link", "ok", text)
     if state.wheel_fault:
         yield Finding("wheels", "warning", state.wheel_fault, mend)
@@ -324,8 +333,8 @@ def unanswered_lines(passed: Mapping[str, int], config: Config) -> Iterator[str]
     to its increase within about a second.
     """
     sent, came = passed.get("lines_sent", 0), passed.get("lines", 0)
-    # With fewer than 40 lines, the share of lost lines is not significant.
-    if config.mcu.reply_period or sent < 40 or came >= (1 - MAX_UNANSWERED_FRACTION) * sent - 1:
+    enough = came >= (1 - MAX_UNANSWERED_FRACTION) * sent - 1
+    if config.mcu.reply_period or sent < MIN_JUDGED_LINES or enough:
         return
     yield (
         f"the board answered only {came} of the {sent} lines that the daemon sent in a second: "

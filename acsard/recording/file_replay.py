@@ -290,8 +290,8 @@ class RecordedRun(_Source):
                 yield step
         if last is None:
             raise RecordingError(
-                f"{recording.path} has no readable steps: it ends within its first second, or its "
-                "steps are damaged. Choose another recording"
+                f"{recording.path} has no readable steps, because it ends within its first second "
+                "or its steps are damaged: choose another recording"
             )
         if self.number is None:
             raise RecordingError(

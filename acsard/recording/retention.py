@@ -1,8 +1,8 @@
 """Decides which recordings are deleted, and which are retained because of an incident.
 
 An incident, such as a fault, protects the recording in which it happened. It also protects
-recordings that ended or began less than a minute before or after it. If more than `MAX_KEPT_FILES`
-recordings contain an incident, only the newest of them stay protected.
+recordings that ended less than a minute before it, or began less than a minute after it. If more
+than `MAX_KEPT_FILES` recordings contain an incident, only the newest of them stay protected.
 
 - An unprotected recording is deleted when it is too old.
 - Recordings leave some free space to other programs (`Disk.spare`). If less space is free,

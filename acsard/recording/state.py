@@ -181,7 +181,10 @@ def adopt(robot: Robot, begun: Robot, other: Robot) -> None:
 
 
 class _Walk:
-    """Does the work of `adopt()`: visits each part of the recorded robot once, and changes it."""
+    """Does the work of `adopt()`: walks through its three robots at the same time.
+
+    It visits each part of the recorded robot once, and changes it.
+    """
 
     def __init__(self) -> None:
         self._visited: dict[int, Any] = {}

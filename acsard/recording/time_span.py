@@ -171,7 +171,11 @@ def resolve(begin: When | None, end: When | None, now_s: float) -> tuple[float, 
     """
     first, last = -math.inf, math.inf
     if isinstance(begin, TimeOfDay):
-        first = _last_occurrence(begin, min(now_s, end.end) if isinstance(end, Moment) else now_s)
+        before_s = now_s
+        if isinstance(end, Moment):
+            # A whole day ends at a midnight that belongs to the next day.
+            before_s = min(now_s, math.nextafter(end.end, 0.0) if end.end > end.begin else end.end)
+        first = _last_occurrence(begin, before_s)
     elif isinstance(begin, Moment):
         first = begin.begin
     if isinstance(end, Moment):

@@ -479,8 +479,8 @@ emergency stop or a battery stop. A wheel fault does not count as a fault."""
 def is_serious(text: str) -> bool:
     """Return whether the text of a summary mentions a stop, a bumper hit or a fault.
 
-    `text` is the result of `summary`. Emergency stops and battery stops are stops too, but a wheel
-    fault is not a fault.
+    `text` is the result of `summary`. Emergency stops and battery stops are stops too. A wheel
+    fault (`wheel_fault`) does not count.
     """
     # Ignore the names of the clients, because a name may look like a fault.
     return SERIOUS_SUMMARY.search(text.partition(" (stopped by ")[0]) is not None

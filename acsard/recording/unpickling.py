@@ -416,8 +416,8 @@ def _is_part(kind: Any) -> bool:
 def _made(kind: type, given: tuple[Any, ...]) -> object:
     """Return an object of the class `kind`, constructed with the arguments `given`.
 
-    Raises `ValueError` if the class is not allowed. Wrong arguments also raise `TypeError` or a
-    msgspec error.
+    Raises `ValueError` if the class is not allowed. Raises `TypeError` or a msgspec error if the
+    class does not accept the arguments.
     """
     match given:
         case (dict(),) if kind is Counter:

@@ -59,8 +59,8 @@ BURST_S = 0.2
 read from the terminal may not return all delayed keys."""
 
 RELEASE_REASON = (
-    "you held this key while the robot could not drive, so the key is ignored: press space, then "
-    "press the key again"
+    "the robot did not follow this program while you held the key, so the key is ignored: press "
+    "space, then press the key again"
 )
 """Text for the operator if a held key does not drive the robot although the robot could follow."""
 

@@ -70,7 +70,7 @@ def sources(state: RobotState, room: int, width: int) -> list[Text]:
         name = Text(clean(one.name))
         name.truncate(13, overflow="ellipsis", pad=True)
         said = [Text(f"{mark}{name.plain} {count(one.priority):>8}  {rough(one.age)}")]
-        said += folded(f"waits for: {waits(one, state)}", width, 4)
+        said += folded(f"status: {waits(one, state)}", width, 4)
         if len(lines) > 1 and len(lines) + len(said) > room:
             break
         lines += [*said]

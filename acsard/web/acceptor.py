@@ -135,10 +135,14 @@ class Acceptor:
             one.pool.prove(one, who.token)
 
     def tidy(self, valid: Collection[str]) -> None:
-        """Cut each connection whose token is missing in `valid` at this and the previous call.
+        """Close the connections whose token is not valid any more.
 
-        `valid` contains the digests of all valid tokens. Call this method once a second. Between
-        the first and the second call, a WebSocket client has time to receive the reason.
+        Call this method once a second. It closes a connection if `valid` lacks its token in two
+        calls in a row. In the second between them, the server can tell a WebSocket client why its
+        connection ends.
+
+        Args:
+            valid: the digests of all valid tokens.
         """
         before = self._ended
         self._ended = {one for pool in (self._here, self._away) for one in pool.ended(valid)}

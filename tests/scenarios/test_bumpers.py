@@ -52,10 +52,7 @@ class Lines:
 
     @property
     def first(self) -> tuple[int, bytes]:
-        """The first line after the press, and the time in ns from the press to this line.
-
-        The time comes first in the tuple.
-        """
+        """The time from the press to the first line after it, ns, and this line."""
         at_ns, line = self.world.port.sent[self._first]
         return at_ns - self.pressed_ns, line
 

@@ -342,7 +342,8 @@ def _make_odd(dice: random.Random, config: dict[str, Any], extras: dict[str, Any
 def _make_extreme(dice: random.Random, config: dict[str, Any]) -> None:
     """Draw rates, timeouts and pauses from their whole range, and one to six sources.
 
-    No rate above 349 Hz is legal, because a plain line takes 2.9 ms at the highest baud rate.
+    No rate is above 349 Hz, because the daemon refuses it: a plain line takes 2.9 ms at the highest
+    baud rate.
     """
     rate, period = dice.choice(
         ((10.0, 0.1), (200.0, 0.005), (300.0, 0.0034), ("auto", 0.01), (100.0, 0.01))

@@ -125,7 +125,7 @@ def judge_pose(
 
 
 def judge_counts(at_ns: int, state: dict[str, Any], expected: int) -> None:
-    """Check that each command that arrived is counted in exactly one counter.
+    """Check that the sum of the counters equals `expected`, the number of commands that arrived.
 
     `command_displaced` is left out, because it counts steps and not commands.
     """

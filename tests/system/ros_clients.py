@@ -352,7 +352,8 @@ class Called(NamedTuple):
 def released(ros: Client) -> None:
     """Call `clear` until the daemon executes it.
 
-    A Trigger cannot name a latch, so the daemon refuses it in the first 2 s after a stop.
+    A ROS `Trigger` request cannot contain the number of the latch. For 2 s after a stop, the daemon
+    refuses a `clear` without this number, because its sender may not have seen the stop.
     """
     until(lambda: ros.call("acsard/clear").trigger()[0], 5.0, "a plain clear is obeyed")
 

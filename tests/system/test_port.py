@@ -66,9 +66,9 @@ def line() -> Iterator[Line]:
 async def test_a_line_made_before_the_process_was_suspended_is_not_sent_after_it(
     line: Line,
 ) -> None:
-    """The port replaces a line that is older than one period, because the process was suspended.
+    """The process was suspended after a step had made a line.
 
-    It sends a stop of any age.
+    The port sends a stop instead if the line is older than one period. It sends a stop of any age.
     """
     async with line.port() as port:
         assert port.offer(STOP, clock.now()) == "sent"

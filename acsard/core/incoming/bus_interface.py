@@ -51,7 +51,7 @@ class Bus(Protocol):
 
     @property
     def wanted(self) -> AbstractSet[str]:
-        """The published keys that have a subscriber at present."""
+        """The native keys of the topics that are latched or have a subscriber at present."""
 
     def take(self, queries: int) -> BusInput:
         """Return the input from the bus since the last call.

@@ -380,7 +380,8 @@ def _slope(reads: list[Read], slots: list[int]) -> float:
 def _latest(reads: list[Read], slots: list[int], period: float) -> tuple[float, list[float]]:
     """Return the time of slot 0, ns, and the lateness of each read, in slots.
 
-    The time of slot 0 is chosen so that the earliest read has the lateness 0.
+    The time of slot 0 is the latest one for which no read comes before its slot. So the least late
+    read has the lateness 0.
     """
     offsets = [at - slot * period for (at, _), slot in zip(reads, slots, strict=True)]
     first = min(offsets)
@@ -740,6 +741,7 @@ class PromptedTimes:
         USB and the scheduler also change the delay, so the result is only a part of the difference
         from the usual delay. The result is 0 in these cases:
 
+        - The usual delay is unknown, or an adapter delivers several replies in one read.
         - USB and the scheduler explain the mean deviation from the usual delay.
         - The mean deviation is so large that an adapter must cause it.
         - A stall has probably delayed this reply.

@@ -210,10 +210,10 @@ class WholeCounts:
         return abs(number - expected_s * fastest / self.angle) <= MAX_COUNT_ERROR
 
     def _number(self, speeds: Motors, fastest: float, expected_s: float) -> tuple[int, bool | None]:
-        """Return the count n of the fastest wheel (0 if unknown), and whether the speeds prove n.
+        """Return the count n of the fastest wheel (0 if unknown), and whether speeds are counts.
 
-        The second value is True if the speeds prove that they are whole counts, False if they prove
-        that they are not, and None if they prove nothing. `fastest` is the largest absolute value
+        The second value is True if the speeds are certainly whole counts, False if they certainly
+        are not, and None if it is not certain. `fastest` is the largest absolute value
         in `speeds`, rad/s. `expected_s` is the host's estimate of the time between the two samples,
         corrected by the error in the previous line.
         """

@@ -67,7 +67,8 @@ def least_role(key: str) -> Role:
     The main permission is the first of these that the table of keys gives to at least one role: to
     put on the key, to query the key, to subscribe to the key. For example, the result for `imu` is
     "maintainer", because only a maintainer may put on this key, although a viewer may query it. If
-    no role has any of these permissions, the result is "maintainer".
+    no role has any of these permissions, the result is "maintainer". If the key ends with the name
+    of a role, the result is this role.
 
     Args:
         key: the part of the key after the robot's id, such as `state`. A `json/` in front of it is

@@ -82,7 +82,7 @@ class _Source:
             sender.use(self.timeout_ns, self.pause_ns)
 
     def add(self, name: str, now_ns: int) -> Sender | None:
-        """Add the sender `name` and return it, or return None if the source is full.
+        """Add the sender `name` and return it, or return None if no sender can make room for it.
 
         A source remembers at most `MAX_SENDERS` senders. A further sender replaces the sender with
         the lowest rank (`_account`). However, a sender that may keep control of the robot is never

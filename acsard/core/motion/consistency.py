@@ -109,8 +109,8 @@ class ConsistencyChecks:
         for which `on_trial` was true, because the gyro was not proven at that time.
 
         If the gyro is proven by now, the heading already agrees with the gyro. The change must
-        therefore be undone, and the result is `turn`. Otherwise the result is 0. If the gyro may
-        still be proven later, the method changes the pending correction of the heading by -`turn`.
+        therefore be undone, and the result is `turn`. Otherwise the result is 0. If the gyro has
+        no verdict yet, the method changes the pending correction of the heading by -`turn`.
         """
         return 0.0 if self.gyro is None else self.gyro.undo_recomputation(turn)
 

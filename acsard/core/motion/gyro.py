@@ -229,9 +229,9 @@ class Gyro:
     def add_samples(self, samples: tuple[GyroSample, ...]) -> None:
         """Store the `samples` that arrived since the last control step, in the order of arrival.
 
-        If `anew` is true, a sample is the first one of another gyro. The values that were learned
-        from the earlier gyro are then forgotten, except the effective track. The heading stays as
-        uncertain as before.
+        A sample whose field `anew` is true is the first one of another gyro. The values that were
+        learned from the earlier gyro are then forgotten, except the effective track. If that gyro
+        contradicted the wheels, the difference is added to the uncertainty of the heading.
         """
         for sample in samples:
             if sample.anew:

@@ -203,7 +203,8 @@ class Sender:
 
         That program may have sent the speed at `at_ns`, a monotonic time, ns. A canceled zero does
         not arm the sender. If `commands.neutral_pause` was already over at `at_ns`, the zero has
-        armed the sender, and the sender stays armed.
+        armed the sender, and the sender stays armed. The call has no effect on a sender with its
+        own identity.
         """
         self._settle(at_ns)
         self._zero_ns = self._proven_zero_ns = None

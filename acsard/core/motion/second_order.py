@@ -93,17 +93,21 @@ class SecondOrder:
     def compose(
         self, p: PoseCovariance, q: PoseCovariance, j: list[Vector], w: list[Vector]
     ) -> PoseCovariance:
-        """Add a stretch of the path, and return the covariance that the caller must add to p + q.
+        """Add a stretch of the path, and update `xx`, `xy` and `yy`.
 
-        The method also updates `xx`, `xy` and `yy`. The caller must first call `carry` with the
-        displacement of the stretch. All arguments must be expressed at the robot's position at the
-        end of the stretch (`se2.seen_from`).
+        The caller must first call `carry` with the displacement of the stretch. All arguments must
+        be expressed at the robot's position at the end of the stretch (`se2.seen_from`).
 
         Args:
             p: the covariance of the noise on the path before the stretch.
             q: the covariance of the noise on the stretch itself.
-            j: the effect of each parameter on the path before the stretch.
-            w: the effect of each parameter on the stretch itself.
+            j: the effect of each uncertain parameter, such as the track, on the path before the
+                stretch.
+            w: the effect of each of these parameters on the stretch itself.
+
+        Returns:
+            The second-order terms that the caller must add to the covariance of the noise on the
+            whole path, which is otherwise p + q.
         """
         xyaw, yyaw, yawyaw = p.xyaw, p.yyaw, p.yawyaw
         for x, y, yaw in j:

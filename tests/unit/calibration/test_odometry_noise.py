@@ -9,8 +9,8 @@ kind by these figures:
   states,
 - the error of the heading after 10 s, and the same error with the best track and radii, which a
   least-squares fit to the true motion finds,
-- z, the errors of the track and of the ratio of left to right, divided by their standard
-  deviations.
+- z: the error of the track, and the error of the ratio of the left to the right wheel radius,
+  each divided by its standard deviation.
 """
 
 from __future__ import annotations

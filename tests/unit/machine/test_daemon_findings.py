@@ -328,6 +328,10 @@ def test_a_sound_link_says_which_lines_were_judged(
     assert finding.level == "ok"
     assert ("almost all lines to and from the board arrive" in finding.text) is answers_are_counted
     assert ("cannot check the lines to the board" in finding.text) is not answers_are_counted
+    state = replace(STATE, counters={"lines": 44, "lines_sent": 939})
+    (finding,) = link(Running(INFO, config, before, state, 0))
+    assert finding.level == "ok"
+    assert ("sends too few lines in a second" in finding.text) is answers_are_counted
 
 
 @pytest.mark.parametrize("state", ["booting", "stale"])

@@ -215,7 +215,10 @@ def test_a_chunk_that_still_grew_keeps_all_its_seconds(
 def test_a_short_file_with_a_bad_sector_at_its_beginning_stays_and_is_reported(
     growing: bytes, at: str, room: bool, tmp_path: Path
 ) -> None:
-    """This version cannot read the seconds after the bad sector, and a later version may."""
+    """The file stays, because a later version of acsard may read the seconds after the bad sector.
+
+    This version cannot read them.
+    """
     part, whole, bad = tmp_path / "a.part", tmp_path / "a.mcap", bytearray(growing)
     begin = growing.index(GROWING_HEAD) + len(GROWING_HEAD) if at == "chunk" else 0
     bad[begin : begin + 512] = bytes(512)

@@ -74,6 +74,7 @@ def test_a_text_that_is_not_a_time_is_refused_with_examples(text: str, words: st
         ("15:00", "16:00", (at(23, 15), at(23, 16))),
         ("23:50", "00:10", (at(22, 23, 50), at(23, 0, 10))),
         ("16:00", "today", (at(22, 16), at(24))),
+        ("00:00", "yesterday", (at(22), at(23))),
         ("14:05", "yesterday 15:00", (at(22, 14, 5), at(22, 15))),
         ("yesterday 23:00", "01:00", (at(22, 23), at(23, 1))),
         ("yesterday", "yesterday", (at(22), at(23))),

@@ -1,4 +1,4 @@
-"""acsard shows values as short text that is correct and safe for a terminal."""
+"""acsard shows values as text that is correct, bounded in length and safe for a terminal."""
 
 from __future__ import annotations
 

@@ -135,7 +135,7 @@ def test_a_leg_without_wheel_speeds_for_a_minute_is_disturbed() -> None:
 
 
 class Laptop(NoPrompt):
-    """A computer that is suspended 2 s after the begin of a leg, and the robot that it drives."""
+    """A computer that drives a robot. The computer is suspended 2 s after a leg has begun."""
 
     sender, session, unreadable = US, None, 0
 

@@ -735,10 +735,10 @@ def test_numbers_without_stamps_begin_again_after_over_2_s(beyond: int, verdict:
 
 
 @pytest.mark.parametrize(("beyond", "verdict"), [(0, "stale"), (1, "fresh")])
-def test_numbers_without_stamps_begin_again_after_a_timeout_that_is_longer(
+def test_numbers_without_stamps_begin_again_after_the_timeout_if_it_is_over_2_s(
     beyond: int, verdict: Verdict
 ) -> None:
-    """Until then the robot may still follow the command with the higher number."""
+    """Before the timeout, the robot may still follow the command with the higher number."""
     freshness = Freshness()
     assert numbered(freshness, NS_PER_S, 6, timeout=PATIENT) == "fresh"
     assert numbered(freshness, NS_PER_S + PATIENT + beyond, 5, timeout=PATIENT) == verdict
