@@ -327,10 +327,13 @@ def browser_frozen(field: Field, number: int) -> Iterator[float]:
 
 
 @contextmanager
-def network_gone(field: Field, number: int) -> Iterator[float]:
+def network_gone(
+    field: Field, number: int, before_return: Callable[[], None] = lambda: None
+) -> Iterator[float]:
     """The network delivers nothing in either direction, and no program gets an error.
 
-    This lasts for between 1 s and `longest_s`.
+    This lasts for between 1 s and `longest_s`. `before_return` is called just before the network
+    returns.
     """
     length_s = 1.0 + (field.longest_s - 1.0) * ((number * GOLDEN) % 1.0)
     field.hosts.cut()
@@ -338,6 +341,7 @@ def network_gone(field: Field, number: int) -> Iterator[float]:
     try:
         yield gone
         wait_until(gone + length_s)
+        before_return()
     finally:
         field.hosts.heal()
 
@@ -459,6 +463,10 @@ class Program:
         self._ends.set()
         self._thread.join()
 
+    def turn(self, speed: float) -> None:
+        """Send this speed from now on."""
+        self.speed = speed
+
     def _there(self) -> None:
         with inside(self._field.hosts.stranger):
             run(self._story, 300.0)
@@ -480,11 +488,10 @@ def goes_on(field: Field, number: int) -> Round:
     obey those speeds after the network has returned.
     """
     with Program(field) as program:
-        with network_gone(field, number) as gone:
-            program.speed = -SPEED
+        # After the network has returned, the program must not send a backward speed any more.
+        with network_gone(field, number, lambda: program.turn(SPEED)) as gone:
+            program.turn(-SPEED)
             took, allowed = field.braking(gone)
-            # After the network has returned, the program must not send a backward speed any more.
-            program.speed = SPEED
         # There is one connection, so messages sent without a network arrive before later ones. They
         # need at most as long again as the network was cut.
         wait_until(2 * time.monotonic() - gone + 1.0)

@@ -163,6 +163,6 @@ def test_a_router_without_its_key_ends_with_78_and_one_sentence(where: Path) -> 
     with watched_router(where, free_tls_endpoint()) as router:
         assert router.ended(10.0) == 78
         assert [
-            line for line in router.err if "private key" in line and "provide the files" in line
+            line for line in router.err if "private key" in line and "this user can read" in line
         ]
         assert "gateway" not in router.stderr

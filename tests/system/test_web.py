@@ -345,7 +345,9 @@ def test_a_daemon_in_a_terminal_serves_its_page_at_a_free_port_and_restarts_it(
         )
         with Terminal(tmp_path, "--config", str(config), "--record", "box") as daemon:
             daemon.shows(rf"page +http://127.0.0.1:{port}, for a browser")
-            url = daemon.shows(rf"page +(http://127.0.0.1:\d+/) +\(http://127.0.0.1:{port}/ is")[1]
+            url = daemon.shows(
+                rf"page +(http://127.0.0.1:\d+/) +\(instead of http://127.0.0.1:{port}/, at which"
+            )[1]
             assert json.loads(asyncio.run(text(f"{url}api/whoami")))["role"] == "maintainer"
 
             def listed() -> bool:
