@@ -21,9 +21,8 @@ class MinimumDelay:
         """Start before the first event.
 
         `drift` is the largest relative drift between the two clocks. `most` limits the excess of a
-        delay over the least delay, in the caller's unit of time. If the delay of
-        an event exceeds the least delay by more than `most`, the least delay rises until the excess
-        is `most`.
+        delay over the least delay, in the caller's unit of time. If the delay of an event exceeds
+        the least delay by more than `most`, the least delay rises until the excess is `most`.
         """
         self._drift, self._most = drift, most
         self.late = 0.0

@@ -470,7 +470,7 @@ class PromptedTimes:
 
     Replies come in the order of the commands. If a reply seems later than usual by more than half
     of the time to the next command, then it answers the next command, and the reply to the earlier
-    command was lost. The comments in this class also call a command a line.
+    command was lost.
     """
 
     def __init__(self, soonest_ns: int) -> None:
@@ -607,16 +607,16 @@ class PromptedTimes:
         if not left:
             self._last = None
             return None
-        line = left.popleft()
-        placed = self._answered(line)
+        command = left.popleft()
+        placed = self._answered(command)
         if second:
-            self._shorten(line)
+            self._shorten(command)
         return placed
 
-    def _answered(self, line: int) -> Placed:
+    def _answered(self, command: int) -> Placed:
         last, before = self._last, self._passed
-        lost, self._passed, self._line = before > self._line, line, line
-        at = line + (self._shift(line) if self._alone else 0)
+        lost, self._passed, self._line = before > self._line, command, command
+        at = command + (self._shift(command) if self._alone else 0)
         self._last = at if last is None or at > last else last
         due_ns = at + int(self._delay or self._soonest)
         if last is None:
@@ -643,12 +643,12 @@ class PromptedTimes:
         self._delay = self._least = self._soon = float(delay_ns)
         self._support = 0
 
-    def _shorten(self, line: int) -> None:
+    def _shorten(self, command: int) -> None:
         """Correct the usual delay if it was measured on a reply that a stall had delayed."""
         # After a stall, the delay of the second reply is much shorter than the usual delay. Without
         # the correction, the usual delay would fall by only 5 % of the difference per reply. Until
         # then the delay would seem to vary much, which would hide lost replies.
-        own = self._at - line
+        own = self._at - command
         self._first = own < (self._delay or 0) - self._apart / 2
         if self._first and self._alone and not self._batched:
             self._start(own)
@@ -676,11 +676,11 @@ class PromptedTimes:
         # The first part of a reply can come sooner than a complete reply.
         earliest = self._soonest // 2 if cut else self._soonest
         while given and (len(left) < began or at - left[began - 1] < earliest):
-            left.appendleft(given.pop())  # too soon: the replies answer lines that were given up
+            left.appendleft(given.pop())  # too soon: the replies answer commands that were given up
             again = True
         if len(left) < lines or self._delay is None:
             return
-        if at - left[lines - 1] < self._soonest:  # too soon: the reply answers the previous line
+        if at - left[lines - 1] < self._soonest:  # too soon: the reply answers the previous command
             left.appendleft(self._passed)
             self._base = float(at - left[lines - 1])
         lost = 0
@@ -691,8 +691,8 @@ class PromptedTimes:
             self._passed, lost = left.popleft(), lost + 1
             self._given.append(self._passed)
         self._losses += LOSS_GAIN * (lost / (lines + lost) - self._losses)
-        # If a line is given up too late, a reply looks late, but nothing makes a reply look early.
-        # So the base is the least delay, which rises slowly.
+        # If a command is given up too late, a reply looks late, but nothing makes a reply look
+        # early. So the base is the least delay, which rises slowly.
         self._base = min(self._base + DELAY_RISE_NS, at - left[lines - 1])
         self._delay = self._base
 
@@ -707,14 +707,14 @@ class PromptedTimes:
         lost, self._lost = self._lost, False
         self._missing -= LOSS_GAIN * self._missing
         # No reply comes sooner than the least delay. A reply that seems to come sooner is a late
-        # reply to the previous line.
+        # reply to the previous command.
         soonest = max(float(self._soonest), self._least)
         if left:
             most = MAX_RISE_PERIODS * self._apart
             rise = LEAST_DELAY_RISE * min(max(self._since, self._apart), most)
             self._soon = min(self._soon + rise, at - left[0])
             if self._soon - soonest > LOST_REPLY_PERIODS * self._apart:
-                # All of the last replies are late by more than the time between two lines. So
+                # All of the last replies are late by more than the time between two commands. So
                 # replies were lost, but the large spread of the delay had hidden the loss.
                 delay = self._delay = self._soon = soonest
                 wide = self._spread = 0.0
@@ -723,8 +723,8 @@ class PromptedTimes:
             apart = left[1] - left[0]
             if at - left[0] - delay <= max(apart / 2, wide) or at - left[1] < soonest:
                 break
-            # After a host stall, two lines are written in quick succession. The reply to the first
-            # line is late, but not so late that the reply to the second line should have come too.
+            # After a host stall, two commands are written in quick succession. The reply to the
+            # first one is late, but not so late that the reply to the second one should have come.
             overdue = at - left[1] - delay > max(self._apart / 2, wide)
             close = apart < self._apart / 2 and not overdue
             if close and self._missing < RARE_LOSS_FRACTION:
@@ -735,7 +735,7 @@ class PromptedTimes:
             return lost
         return at - left[0] - delay <= -max((left[0] - self._passed) / 2, wide)
 
-    def _shift(self, line: int) -> int:
+    def _shift(self, command: int) -> int:
         """Return an estimate of the extra time that the board took for the present reply, ns.
 
         USB and the scheduler also change the delay, so the result is only a part of the difference
@@ -746,13 +746,13 @@ class PromptedTimes:
         - The mean deviation is so large that an adapter must cause it.
         - A stall has probably delayed this reply.
 
-        `line` is the time at which the answered command was written, ns. The present reply must be
-        the only reply in its read of the port.
+        `command` is the time at which the answered command was written, ns. The present reply must
+        be the only reply in its read of the port.
         """
         delay, spread = self._delay, self._spread
         if delay is None or self._batched:
             return 0
-        error = self._at - line - delay
+        error = self._at - command - delay
         size = abs(error)
         if size < delay or size < 4 * spread:
             self._support = min(self._support + 1, MAX_SUPPORT)

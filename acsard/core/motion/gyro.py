@@ -498,6 +498,11 @@ class Gyro:
             lost: whether samples of the gyro are missing. A contradiction between gyro and wheels
                 then does not end with this line, so it is not added to the uncertainty yet.
         """
+        if dt <= 0.0:
+            # This line gives no turn, so a correction for a gyro that hangs waits for the next one.
+            if not lost and not self._frozen:
+                self._end_contradiction()
+            return None
         angle = 0.0
         if self._frozen:
             # The wheels give the turn since the gyro hangs, except in a gap of the feedback.
@@ -507,7 +512,7 @@ class Gyro:
             self._forget_repeated()
         if not lost:
             self._end_contradiction()
-        if dt <= 0.0 or (angle == 0.0 and self._doubt == 0.0):
+        if angle == 0.0 and self._doubt == 0.0:
             return None
         variance, self._doubt = self._doubt, 0.0
         return Turn(wheels + angle, variance, wheels / dt, noise)

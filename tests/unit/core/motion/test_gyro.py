@@ -575,9 +575,10 @@ def test_the_turn_of_a_gyro_that_repeats_one_rate_is_taken_back_at_rest(
     assert bench.says() == "used"
 
 
-def test_a_turn_is_taken_back_only_in_a_line_that_covers_a_known_time() -> None:
-    bench = proved()
-    bench.distort = lambda _: 0.5
+def test_the_turn_of_a_gyro_that_hangs_in_a_gap_is_taken_back_in_the_line_after_it() -> None:
+    bench = proved(0.002)
+    frozen(bench)
+    bench.run(0.05, 1.0)
     bench.run(0.9)
     for _ in range(20):
         bench.now_ns += LINE_NS
@@ -587,7 +588,8 @@ def test_a_turn_is_taken_back_only_in_a_line_that_covers_a_known_time() -> None:
     assert bench.gyro.turn(bench.now_ns, 0.0, 0.0, still=True) is None
     assert bench.says() == "not believed"
     bench.run(DT)
-    assert bench.told == pytest.approx(0.0, abs=1e-6)
+    assert bench.told == pytest.approx(bench.true, abs=0.02)
+    assert bench.variance == pytest.approx(0.005**2, rel=0.1)
 
 
 def test_the_rate_of_a_gyro_that_hangs_does_not_become_its_bias() -> None:
