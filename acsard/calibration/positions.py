@@ -306,7 +306,7 @@ def evidence(
 
 
 def spread(segments: Sequence[Segment], paths: Paths, parameters: Floats) -> float:
-    """Return the RMS distance of the positions from the paths computed from the wheels, m.
+    """Return the RMS distance between the measured positions and the paths of the wheels, m.
 
     Each path is first shifted and rotated so that it fits the positions best. Outliers have smaller
     weights.

@@ -99,7 +99,7 @@ class _Topic:
         self.kind = TYPES[type_]
         self.arrivals, self.stamps, self.values = array("q"), array("q"), array("d")
         self.wheels: tuple[str, ...] = ()
-        """Columns of the log that the joints of a `JointState` fill; () for other types."""
+        """Log columns that get the speeds of the joints of a `JointState`; () for other types."""
         self.joints: set[str] = set()
         self.unreadable, self.why = 0, ""
 

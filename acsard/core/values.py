@@ -545,7 +545,7 @@ class Inputs(Struct, frozen=True):
     superseded: bool = False
     """True if the line of the previous step was not written to the port."""
     missed: int = 0
-    """Number of control periods since the previous step in which no step ran."""
+    """Number of control periods without a step since the previous step."""
     events: tuple[Event, ...] = ()
     """Events of other parts of the daemon, to be logged together with the robot's events."""
     at_once: bool = False

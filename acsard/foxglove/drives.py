@@ -30,9 +30,8 @@ from acsard.foxglove.notices import Notices
 from acsard.host import clock
 
 SLOW_NS, SLOW_TIMES = 5 * NS_PER_S // 2, 3
-"""Limits that decide whether a panel publishes too rarely. It does if the silence before each of
-`SLOW_TIMES` consecutive messages is longer than `commander.BRAKING_AFTER_NS` (0.3 s) and at most
-`SLOW_NS` (2.5 s)."""
+"""A panel publishes too rarely if each of `SLOW_TIMES` consecutive messages follows a pause between
+0.3 s (`commander.BRAKING_AFTER_NS`) and `SLOW_NS`."""
 
 MAX_CHANNELS = 64
 """Largest number of channels of one viewer that are registered at the same time."""

@@ -182,7 +182,7 @@ def keys(config: Config, directory: Path) -> dict[str, object]:
 def port(config: Config) -> str:
     """Return the TCP port of the first TLS endpoint in `config`, or `PORT` if it has none.
 
-    If the robot uses the values that `keys` returns, it listens on this port.
+    The settings that `keys` returns let the robot listen on this port.
     """
     ports = [at.rpartition(":")[2] for at in config.bus.listen if at.startswith("tls/")]
     return ports[0] if ports else str(PORT)

@@ -168,12 +168,12 @@ PLAIN_TYPES = (bool, int, float, str, bytes, type(None))
 def adopt(robot: Robot, begun: Robot, other: Robot) -> None:
     """Change the configuration of a recorded robot, in place.
 
-    An attribute that the recorded run has changed keeps its value. Such an attribute differs
-    between `robot` and `begun`. Every other attribute gets its value from `other`.
+    The recorded run has changed an attribute if its values in `robot` and `begun` differ. Such an
+    attribute keeps its value. Every other attribute gets its value from `other`.
 
     Args:
         robot: the recorded robot, which is changed.
-        begun: a new robot with the recorded configuration.
+        begun: a new robot with the recorded configuration, as `robot` was before the run.
         other: a new robot with the new configuration. Do not use it later, because `robot` may
             share objects with it.
     """

@@ -96,8 +96,8 @@ class EchoDetector:
     def forget(self) -> None:
         """Forget all lines and reports, because the port has been opened."""
         self._sent: deque[bytes] = deque(maxlen=COMPARED_LINES + 1)
-        """The last `COMPARED_LINES` sent lines, and one older line, so that a run that ends with
-        the older line can continue."""
+        """The last `COMPARED_LINES` sent lines, and the line before them. A run in `_runs` may end
+        with that line, and the next reply may make the run longer."""
         self._runs: deque[_Run | None] = deque(maxlen=COMPARED_LINES + 1)
         """For each line in `_sent`, the run that ends with this line: the series of successive sent
         lines that came back. None if this line did not come back."""

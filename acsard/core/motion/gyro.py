@@ -130,8 +130,7 @@ class Turn(Struct, frozen=True, gc=False):
     angle: float
     variance: float
     rate: float
-    """Turn rate according to the last sample of the gyro, rad/s. Unlike this rate, `angle` may
-    include samples that arrived late."""
+    """Turn rate according to the last sample of the gyro, rad/s."""
     rate_variance: float
     wheels: float | None = None
     """Turn that wheels without a fault would report, rad. It is `angle` divided by the learned

@@ -1,9 +1,9 @@
 """Tests in the first turn whether a gyro measures rad/s about an axis that points up.
 
-A gyro that is mounted upside down, reads degrees or is disconnected reports a turn that differs
-from that of the wheels. If the wheels slip, a good gyro also reports a different turn. Therefore a
-gyro is not used until it has agreed with the wheels in a turn once. The bounds for this agreement
-are wide, because skidding wheels roll further than the robot turns.
+A gyro that is mounted upside down, reads degrees or is disconnected disagrees with the wheels in
+every turn. A good gyro disagrees with them only in a turn in which the wheels slip. So a gyro is
+used after it has agreed with the wheels in one turn. The bounds for this agreement are wide,
+because skidding wheels roll further than the robot turns.
 """
 
 from __future__ import annotations

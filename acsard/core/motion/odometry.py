@@ -377,10 +377,10 @@ class Odometry:
         return variances
 
     def _rounded(self, seconds: float) -> tuple[float, float]:
-        """Return the variances that encoder counts cause in a gap of `seconds` s.
+        """Return the variances that rounding to encoder counts causes in a gap of the feedback.
 
-        The result is a pair: the variances of the distance (m2) and the turn (rad2). The latter is
-        0 if a gyro provides the turn.
+        The gap takes `seconds` s. The result is the pair of the variances of the distance (m2) and
+        of the turn (rad2). The second one is 0 if a gyro provides the turn.
         """
         linear, angular = self._twist_uncertainty.rounding(self._rounding.square)
         square = seconds * seconds

@@ -33,8 +33,8 @@ MIN_WINDOW_NS = 4 * MS
 computation is more recent, a reply repeats the speeds of that computation."""
 
 OUTPUT_BYTES = 255
-"""Size of the board's output buffer, bytes. If a line does not fit into the buffer, the board drops
-the line, as the firmware in `deploy/firmware` does."""
+"""Size of the board's output buffer, bytes. The board drops a line that does not fit into the
+buffer. The firmware in `deploy/firmware` does the same."""
 
 STATUS_NS = NS_PER_S // 10
 """Time between two status lines, ns."""
