@@ -116,14 +116,14 @@ def _all_but_some_are_slow(items: list[pytest.Item]) -> None:
 
     A normal run then tries only a few variations. The nightly job tries all of them.
     """
-    seen, left = Counter[str](), Counter[str]()
+    counts, left = Counter[str](), Counter[str]()
     for item in items:
         one_in = item.get_closest_marker("variations")
         if one_in is None:
             continue
         test = item.nodeid.partition("[")[0]
-        seen[test] += 1
-        if (seen[test] - 1) % one_in.args[0] == 0:
+        counts[test] += 1
+        if (counts[test] - 1) % one_in.args[0] == 0:
             continue
         item.add_marker(pytest.mark.slow)
         if item.get_closest_marker("soak") or item.get_closest_marker("nightly"):

@@ -25,7 +25,7 @@ def _judge(schema: dict[str, Any]) -> Draft202012Validator:
 
 
 def _judges(kinds: Iterable[dict[str, Any]]) -> dict[str, Draft202012Validator]:
-    return {one["$ref"].rpartition("/")[2]: _judge(one) for one in kinds}
+    return {kind["$ref"].rpartition("/")[2]: _judge(kind) for kind in kinds}
 
 
 FRAMES = _judges(SCHEMAS[FROM_ROBOT]["oneOf"])
@@ -46,20 +46,20 @@ def answers(path: str, method: str, status: int, media: str, body: Any) -> bool:
 
 def kinds(frames: Iterable[Any]) -> set[str]:
     """Return the kinds of these frames. Fails unless exactly one description matches each frame."""
-    found = set()
+    names = set()
     for frame in frames:
         (kind,) = [name for name, judge in FRAMES.items() if judge.is_valid(frame)] or [frame]
         assert _FRAME.is_valid(frame), frame
-        found.add(kind)
+        names.add(kind)
         if kind == GUIDED_PREFIX:
             (line,) = [name for name, judge in GUIDES.items() if judge.is_valid(frame["guide"])]
-            found.add(line)
-    return found
+            names.add(line)
+    return names
 
 
 def spoilt(frame: dict[str, Any]) -> list[dict[str, Any]]:
     """Return invalid copies of the frame: each lacks one field or has a wrong value in it."""
-    without = [{key: one for key, one in frame.items() if key != name} for name in frame]
+    without = [{key: value for key, value in frame.items() if key != name} for name in frame]
     return without + [frame | {name: NO_VALUE} for name in frame]
 
 

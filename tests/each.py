@@ -45,14 +45,14 @@ def each(names: str | tuple[str, ...], sets: Iterable[Any]) -> Callable[[Any], A
     not keep state.
     """
     every = list(sets)
-    given = (names,) if isinstance(names, str) else names
+    keys = (names,) if isinstance(names, str) else names
 
     def decorate(test: Callable[..., Any]) -> Callable[..., None]:
         @functools.wraps(test)
         def all_of_them(**fixtures: Any) -> None:
             assert every, "there is nothing to test"
             for values in every:
-                chosen = dict(zip(given, (values,) if len(given) == 1 else values, strict=True))
+                chosen = dict(zip(keys, (values,) if len(keys) == 1 else values, strict=True))
                 try:
                     story = test(**fixtures, **chosen)
                     if inspect.iscoroutine(story):
@@ -62,7 +62,7 @@ def each(names: str | tuple[str, ...], sets: Iterable[Any]) -> Callable[[Any], A
                     raise
 
         signature = inspect.signature(test)
-        left = [one for name, one in signature.parameters.items() if name not in given]
+        left = [parameter for name, parameter in signature.parameters.items() if name not in keys]
         all_of_them.__signature__ = signature.replace(parameters=left)  # type: ignore[attr-defined]
         return all_of_them
 

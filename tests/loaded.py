@@ -76,8 +76,8 @@ def unattended() -> None:
 
 def environment(home: Path) -> dict[str, str]:
     """Return a minimal environment in which all writable directories are below `home`."""
-    kept = {key: os.environ[key] for key in ("PATH", "VIRTUAL_ENV") if key in os.environ}
-    return kept | {
+    variables = {key: os.environ[key] for key in ("PATH", "VIRTUAL_ENV") if key in os.environ}
+    return variables | {
         "HOME": str(home),
         "TMPDIR": str(home),
         "LC_ALL": "C",
@@ -119,18 +119,18 @@ def main() -> int:
             home = Path(path)
             if plain_user():
                 os.chown(home, NOBODY, NOBODY)
-            one = run(home, asked.words, asked.within)
-        done.append(one)
-        *_, last = one.said.strip().splitlines() or ["said nothing"]
-        ended = "out of time" if one.code is None else f"exit {one.code}"
-        print(f"run {number}: {one.seconds:.0f} s, {ended}: {last.strip('= ')}", flush=True)
-        for line in one.again + one.failed:
+            result = run(home, asked.words, asked.within)
+        done.append(result)
+        *_, last = result.said.strip().splitlines() or ["said nothing"]
+        ended = "out of time" if result.code is None else f"exit {result.code}"
+        print(f"run {number}: {result.seconds:.0f} s, {ended}: {last.strip('= ')}", flush=True)
+        for line in result.again + result.failed:
             print(f"    {line}", flush=True)
-        if one.code != 0:
+        if result.code != 0:
             log = Path(tempfile.gettempdir(), f"acsard-loaded-{number}.log")
-            log.write_text(one.said)
+            log.write_text(result.said)
             print(f"    all of it: {log}", flush=True)
-    good = sum(one.code == 0 for one in done)
+    good = sum(result.code == 0 for result in done)
     print(f"{good} of {len(done)} runs without a failure, beside {asked.loops} busy loops")
     return 0 if good == len(done) else 1
 

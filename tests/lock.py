@@ -52,31 +52,31 @@ def wanted() -> list[str]:
     return sorted(asked.union(*(project["optional-dependencies"][name] for name in EXTRAS)))
 
 
-def resolved(python: str, machine: str, held: dict[str, str]) -> dict[str, tuple[str, str]]:
+def resolved(python: str, machine: str, versions: dict[str, str]) -> dict[str, tuple[str, str]]:
     """Return the version and hash of each distribution that pip would install on this platform.
 
-    `held` maps distributions to versions that pip must use.
+    `versions` maps distributions to versions that pip must use.
     """
     platforms = [f"manylinux_2_{minor}_{machine}" for minor in range(GLIBC, 4, -1)]
     platforms += [f"manylinux2014_{machine}"]
     with tempfile.TemporaryDirectory() as path:
         constraints = Path(path, "held")
-        constraints.write_text("".join(f"{name}=={one}\n" for name, one in held.items()))
+        constraints.write_text("".join(f"{name}=={item}\n" for name, item in versions.items()))
         words = [sys.executable, "-m", "pip", "install", "--quiet", "--dry-run", "--report", "-"]
         words += ["--ignore-installed", "--only-binary", ":all:", "--target", path]
         words += ["--implementation", "cp", "--python-version", python]
-        words += [word for one in platforms for word in ("--platform", one)]
+        words += [word for item in platforms for word in ("--platform", item)]
         done = subprocess.run(
             [*words, "--constraint", str(constraints), *wanted()],
             stdout=subprocess.PIPE, text=True, check=True,
         )  # fmt: skip
-    found: list[Any] = json.loads(done.stdout)["install"]
+    packages: list[Any] = json.loads(done.stdout)["install"]
     return {
-        one["metadata"]["name"].lower().replace("_", "-"): (
-            one["metadata"]["version"],
-            one["download_info"]["archive_info"]["hashes"]["sha256"],
+        item["metadata"]["name"].lower().replace("_", "-"): (
+            item["metadata"]["version"],
+            item["download_info"]["archive_info"]["hashes"]["sha256"],
         )
-        for one in found
+        for item in packages
     }
 
 
@@ -91,7 +91,7 @@ def lock() -> str:
             hashes[name].add(digest)
     lines = [HEAD]
     for name in sorted(versions):
-        digests = "".join(f" \\\n    --hash=sha256:{one}" for one in sorted(hashes[name]))
+        digests = "".join(f" \\\n    --hash=sha256:{checksum}" for checksum in sorted(hashes[name]))
         lines.append(f"{name}=={versions[name]}{digests}\n")
     return "".join(lines)
 

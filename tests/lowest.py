@@ -20,14 +20,14 @@ def lowest() -> dict[str, str]:
     """Return the lowest version of each distribution."""
     pyproject = tomllib.loads(PYPROJECT.read_text())
     project, builder = pyproject["project"], pyproject["build-system"]["requires"]
-    found: dict[str, str] = {}
+    versions: dict[str, str] = {}
     extras = project["optional-dependencies"].values()
-    for one in chain(builder, project["dependencies"], *extras):
-        bound = BOUND.match(one)
-        assert bound is not None, f"{one} has no lower bound"
+    for requirement in chain(builder, project["dependencies"], *extras):
+        bound = BOUND.match(requirement)
+        assert bound is not None, f"{requirement} has no lower bound"
         name, version = bound.groups()
-        assert found.setdefault(name, version) == version, f"{name} has two lower bounds"
-    return found
+        assert versions.setdefault(name, version) == version, f"{name} has two lower bounds"
+    return versions
 
 
 if __name__ == "__main__":

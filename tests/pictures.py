@@ -225,17 +225,17 @@ class _States:
             self.look("no-board", "NO BOARD")
 
 
-def states(seen: Callable[[Browser, str], None]) -> None:
-    """Call `seen(browser, name)` for each state of the view *Drive* on a phone.
+def states(on_state: Callable[[Browser, str], None]) -> None:
+    """Call `on_state(browser, name)` for each state of the view *Drive* on a phone.
 
-    The robot and the page stay in the state until `seen` returns.
+    The robot and the page stay in the state until `on_state` returns.
     """
     with tempfile.TemporaryDirectory() as place, browsing(options=TRUSTING) as browser:
         browser.size(*PHONE)
-        shown = _States(Path(place), browser, seen)
-        shown.look_at_a_board()
-        shown.look_as_others()
-        shown.look_at_no_board()
+        screen = _States(Path(place), browser, on_state)
+        screen.look_at_a_board()
+        screen.look_as_others()
+        screen.look_at_no_board()
 
 
 DRAWN = "document.querySelectorAll('.picture.js-plotly-plot .main-svg').length"

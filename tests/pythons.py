@@ -87,10 +87,10 @@ def replays(python: str, paths: Sequence[Path], expected: re.Pattern[str] = VERD
     """Replay the files with this Python and print a line for each. Return whether all are right."""
     version, same = run(python, "-V"), True
     for path in paths:
-        said = run(python, "-m", "acsard", "recording", "replay", str(path))
-        print(f"{version:14} {path.name:20} {said}", flush=True)
+        output = run(python, "-m", "acsard", "recording", "replay", str(path))
+        print(f"{version:14} {path.name:20} {output}", flush=True)
         # the lines after the verdict list the items that were compared
-        verdict, *_ = said.splitlines() or [""]
+        verdict, *_ = output.splitlines() or [""]
         same = same and expected.match(verdict) is not None
     return same
 
@@ -113,7 +113,7 @@ def main() -> int:
             other, theirs = installed(python, where / f"venv-{number}"), where / str(number)
             same = replays(other, short, EXCEPT_WORDS) and replays(other, mine) and same
             theirs.mkdir()
-            said = run(
+            output = run(
                 other,
                 "-m",
                 "tests.pythons",
@@ -122,7 +122,7 @@ def main() -> int:
                 "--seconds",
                 str(asked.seconds),
             )
-            print(said, end="")
+            print(output, end="")
             same = replays(sys.executable, sorted(theirs.glob("*.mcap"))) and same
     return 0 if same else 1
 

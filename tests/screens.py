@@ -41,11 +41,11 @@ def screens(width: int) -> dict[str, list[str]]:
     """Return the lines of each screen, by the name of the command."""
     states = {"robot2": WAITING, "robot3": WARNED}
     robots = [
-        replace(test_fleet_table.ROW, robot_id=name, state=one) for name, one in states.items()
+        replace(test_fleet_table.ROW, robot_id=name, state=item) for name, item in states.items()
     ]
     return {
         "drive": [
-            one.plain for one in lines(replace(test_drive_screen.SEEN, state=WAITING), width)
+            item.plain for item in lines(replace(test_drive_screen.SEEN, state=WAITING), width)
         ],
         "top": lines_of(replace(SEEN, state=WARNED, before=BEFORE), width),
         "fleet": table([test_fleet_table.ROW, *robots], width),

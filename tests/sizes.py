@@ -37,7 +37,7 @@ def main() -> None:
     for path, length in Counter(lengths).most_common(SHOWN):
         print(f"{length:4} lines  {path.relative_to(PACKAGE.parent)}")
     print()
-    longest = sorted((one for path in modules for one in functions(path)), reverse=True)
+    longest = sorted((entry for path in modules for entry in functions(path)), reverse=True)
     for length, where in longest[:SHOWN]:
         print(f"{length:4} lines  {where}")
 

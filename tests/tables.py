@@ -106,8 +106,8 @@ def router_file(text: str) -> str:
             text,
         )
     for role in ROLES:
-        held = [rule for (least, _), rule in RULES.items() if has(role, least)]
-        names = " ".join(f'"{rule}-{EXAMPLE_ROBOT}",' for rule in dict.fromkeys(held))
+        rules = [rule for (least, _), rule in RULES.items() if has(role, least)]
+        names = " ".join(f'"{rule}-{EXAMPLE_ROBOT}",' for rule in dict.fromkeys(rules))
         text = _replaced(
             rf'(^ *subjects: \["{role}s"\],\n *rules: \[\n.*\n *// ROBOT\n).*\n',
             f"          {names}\n",
@@ -118,24 +118,24 @@ def router_file(text: str) -> str:
 
 def _rule_keys() -> dict[str, list[str]]:
     followed = [key for topic in PUBLISHED for key in (topic.key, json_key(topic.key))]
-    found = {"hear": [full_key("*", key) for key in followed]}
+    rules = {"hear": [full_key("*", key) for key in followed]}
     # The samples of a gyro go from a client to its robot only, never to other clients.
-    given = [row for row in TOPICS if row.direction != "in"]
+    rows = [row for row in TOPICS if row.direction != "in"]
     for role in ROLES:
         for use in USES:
-            keys = keys_for(role, use, TOPICS if use == "publish" else given)
+            keys = keys_for(role, use, TOPICS if use == "publish" else rows)
             if keys:
-                rule = found.setdefault(f"{RULES[role, use]}-{EXAMPLE_ROBOT}", [])
+                rule = rules.setdefault(f"{RULES[role, use]}-{EXAMPLE_ROBOT}", [])
                 rule += [full_key(EXAMPLE_ROBOT, key) for key in keys]
     own = [row.pattern for row in TOPICS if not row.local and "<key>" not in row.key]
     own += [json_key(topic.key) for topic in PUBLISHED]
-    found[f"own-{EXAMPLE_ROBOT}"] = [full_key(EXAMPLE_ROBOT, key) for key in own]
+    rules[f"own-{EXAMPLE_ROBOT}"] = [full_key(EXAMPLE_ROBOT, key) for key in own]
     sources = [source.name for source in Config().commands.sources]
     for role in ROLES:
         if has(role, COMMAND_ROLE):
             keys = source_keys(sources, role)
-            found[f"commands of {role}"] = [full_key(EXAMPLE_ROBOT, key) for key in keys]
-    return {rule: list(dict.fromkeys(keys)) for rule, keys in found.items()}
+            rules[f"commands of {role}"] = [full_key(EXAMPLE_ROBOT, key) for key in keys]
+    return {rule: list(dict.fromkeys(keys)) for rule, keys in rules.items()}
 
 
 # all files
@@ -148,7 +148,7 @@ def _marked(mark: str, table: str) -> Callable[[str], str]:
 
 def _replaced(pattern: str, part: str, text: str) -> str:
     """Replace the only match of the pattern by its first group followed by `part`."""
-    changed, count = re.subn(pattern, lambda found: found[1] + part, text, flags=re.M)
+    changed, count = re.subn(pattern, lambda match: match[1] + part, text, flags=re.M)
     assert count == 1, f"{count} places match {pattern}"
     return changed
 

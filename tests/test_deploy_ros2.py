@@ -45,9 +45,9 @@ def urdf() -> ET.Element:
 
 
 def one(element: ET.Element, path: str) -> ET.Element:
-    found = element.findall(path)
-    assert len(found) == 1, path
-    return found[0]
+    elements = element.findall(path)
+    assert len(elements) == 1, path
+    return elements[0]
 
 
 def numbers(text: str | None) -> list[float]:
@@ -72,8 +72,8 @@ def yaml(name: str) -> Any:
 
 
 def ros_parameters(name: str, node: str) -> dict[str, Any]:
-    found: dict[str, Any] = yaml(name)[node]["ros__parameters"]
-    return found
+    parameters: dict[str, Any] = yaml(name)[node]["ros__parameters"]
+    return parameters
 
 
 def bridge() -> zenoh.Config:
@@ -128,10 +128,10 @@ def test_lidar_and_footprint_frames_agree_with_the_configuration() -> None:
         ),
         (footprint.footprint_frame, [0, 0, footprint.footprint_z_offset], [0, 0, 0]),
     ):
-        found = joint_to(link)
-        assert one(found, "parent").get("link") == CONFIG.odometry.base_frame
-        assert numbers(one(found, "origin").get("xyz")) == xyz
-        assert numbers(one(found, "origin").get("rpy")) == rpy
+        fixed_joint = joint_to(link)
+        assert one(fixed_joint, "parent").get("link") == CONFIG.odometry.base_frame
+        assert numbers(one(fixed_joint, "origin").get("xyz")) == xyz
+        assert numbers(one(fixed_joint, "origin").get("rpy")) == rpy
 
 
 def test_only_the_base_frame_has_no_parent() -> None:
@@ -173,7 +173,7 @@ def test_ros2_control_has_what_the_topic_hardware_needs() -> None:
 
 
 def test_the_controller_has_the_dimensions_and_limits_of_the_robot() -> None:
-    found = ros_parameters("controllers.yaml", "/**/diff_drive_controller")
+    parameters = ros_parameters("controllers.yaml", "/**/diff_drive_controller")
     joints, drive, limits = CONFIG.joints, CONFIG.drive, CONFIG.limits
     wanted = {
         "left_wheel_names": [joints.front_left, joints.rear_left],
@@ -199,15 +199,17 @@ def test_the_controller_has_the_dimensions_and_limits_of_the_robot() -> None:
         "angular.z.max_acceleration_reverse": -limits.angular_acceleration,
         "angular.z.max_deceleration_reverse": limits.angular_deceleration,
     }
-    assert {key: found.get(key) for key in wanted} == wanted
-    assert {found["cmd_vel_timeout"]} == TIMEOUTS
+    assert {key: parameters.get(key) for key in wanted} == wanted
+    assert {parameters["cmd_vel_timeout"]} == TIMEOUTS
 
 
 def test_the_manager_runs_one_controller_fast_enough() -> None:
-    found = ros_parameters("controllers.yaml", "/**/controller_manager")
-    controllers = {key: value["type"] for key, value in found.items() if isinstance(value, dict)}
+    parameters = ros_parameters("controllers.yaml", "/**/controller_manager")
+    controllers = {
+        key: value["type"] for key, value in parameters.items() if isinstance(value, dict)
+    }
     assert controllers == {"diff_drive_controller": "diff_drive_controller/DiffDriveController"}
-    assert found["update_rate"] * min(TIMEOUTS) > 10
+    assert parameters["update_rate"] * min(TIMEOUTS) > 10
 
 
 # nav2_params.yaml
@@ -250,12 +252,12 @@ def test_nav2_knows_the_frames_and_topics() -> None:
         "base_frame_id": {footprint},
         "odom_topic": {"odom"},
     }
-    seen = set()
+    keys = set()
     for key, value in leaves(yaml("nav2_params.yaml")):
         if key in allowed:
             assert value in allowed[key], key
-            seen.add(key)
-    assert seen == set(allowed)
+            keys.add(key)
+    assert keys == set(allowed)
 
 
 def test_nav2s_chain_ends_at_cmd_vel_in_one_type() -> None:
@@ -289,10 +291,10 @@ def test_nav2s_footprint_has_the_wheels_inside() -> None:
 
 
 def leaves(tree: dict[str, Any]) -> list[tuple[str, Any]]:
-    found: list[tuple[str, Any]] = []
+    pairs: list[tuple[str, Any]] = []
     for key, value in tree.items():
-        found += leaves(value) if isinstance(value, dict) else [(key, value)]
-    return found
+        pairs += leaves(value) if isinstance(value, dict) else [(key, value)]
+    return pairs
 
 
 # acsar.launch.py
@@ -476,12 +478,12 @@ def test_each_row_of_diagnostics_falls_into_exactly_one_group_of_the_aggregator(
     names = row_names()
     assert len(set(names)) == 12
     for name in names:
-        found = [
+        matches = [
             group
             for group, analyzer in groups().items()
             if any(name.find(start) == 0 for start in analyzer["startswith"])
         ]
-        assert len(found) == 1, name
+        assert len(matches) == 1, name
     for analyzer in groups().values():
         for start in analyzer["startswith"]:
             assert any(name.startswith(start) for name in names), start

@@ -10,7 +10,7 @@ from tests.each import each
 
 
 def test_all_combinations_are_run_and_fixtures_are_left_to_pytest() -> None:
-    seen: list[tuple[int, str, int]] = []
+    calls: list[tuple[int, str, int]] = []
 
     @each("first", [1, 2])
     @each(("second", "third"), [("a", 3), ("b", 4)])
@@ -18,8 +18,8 @@ def test_all_combinations_are_run_and_fixtures_are_left_to_pytest() -> None:
         fixture.append((first, second, third))
 
     assert list(inspect.signature(test).parameters) == ["fixture"]
-    test(fixture=seen)
-    assert seen == [(1, "a", 3), (1, "b", 4), (2, "a", 3), (2, "b", 4)]
+    test(fixture=calls)
+    assert calls == [(1, "a", 3), (1, "b", 4), (2, "a", 3), (2, "b", 4)]
 
 
 def test_a_failure_names_its_parameter_set() -> None:

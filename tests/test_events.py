@@ -17,7 +17,7 @@ NAMES = get_args(EventName)
 
 def named() -> set[str]:
     """Return the name of each event and log line in the code of acsard."""
-    found = set()
+    names = set()
     for path in (ROOT / "acsard").rglob("*.py"):
         code = path.read_text(encoding="utf-8")
         if "Event(" not in code and "log.info(" not in code:
@@ -30,15 +30,15 @@ def named() -> set[str]:
                 last = node.func.attr if isinstance(node.func, ast.Attribute) else ""
                 called = ast.unparse(node.func) if last in ("", "info") else last
                 if called == "Event" or called.endswith("log.info"):
-                    found.add(first.value)
-    return found
+                    names.add(first.value)
+    return names
 
 
 @pytest.mark.slow
 def test_each_event_name_in_the_code_is_in_the_set() -> None:
-    found = named()
-    assert len(found) > 15
-    assert found <= set(NAMES)
+    names = named()
+    assert len(names) > 15
+    assert names <= set(NAMES)
 
 
 def test_each_event_name_of_the_set_is_in_the_code() -> None:

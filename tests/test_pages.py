@@ -85,10 +85,10 @@ def test_the_test_named_for_a_command_exists(how: Elsewhere) -> None:
 
 
 def test_ci_runs_the_commands_that_the_list_assigns_to_it() -> None:
-    told = (ROOT / ".ci/run").read_text(encoding="utf-8")
+    script = (ROOT / ".ci/run").read_text(encoding="utf-8")
     words = {how.words for how in COMMANDS.values() if isinstance(how, InCi)}
     assert words
-    assert not {one for one in words if one not in told}
+    assert not {line for line in words if line not in script}
 
 
 @each("block", blocks())
@@ -115,12 +115,12 @@ def calls(command: str) -> Iterator[list[str]]:
     words = shlex.split(command)
     while words:
         end = words.index("&&") if "&&" in words else len(words)
-        one, words = words[:end], words[end + 1 :]
-        one = one[1:] if one[0] == "sudo" else one
-        if one[:2] == ["sh", "-c"]:
-            yield from calls(one[2])
-        elif Path(one[0]).name == "acsard":
-            yield one[1 : one.index(">") if ">" in one else None]
+        call, words = words[:end], words[end + 1 :]
+        call = call[1:] if call[0] == "sudo" else call
+        if call[:2] == ["sh", "-c"]:
+            yield from calls(call[2])
+        elif Path(call[0]).name == "acsard":
+            yield call[1 : call.index(">") if ">" in call else None]
 
 
 @each("command", [text for text in COMMANDS if "acsard" in text])
@@ -146,8 +146,8 @@ def test_a_verb_in_the_text_has_the_options_named_with_it(
     with pytest.raises(SystemExit) as end:
         parser().parse_args([*path, "--help"])
     assert end.value.code == 0, f"{page}: acsard {' '.join(words)}"
-    told = capsys.readouterr().out
-    assert not [word for word in words if word.startswith("-") and word not in told]
+    usage = capsys.readouterr().out
+    assert not [word for word in words if word.startswith("-") and word not in usage]
 
 
 # extras
@@ -157,12 +157,12 @@ EXTRA = re.compile(r"pip install (?:-e )?\s*'(\S*)\[([\w,]+)\]'")
 
 def test_an_extra_is_installed_from_a_clone_since_no_index_has_acsard() -> None:
     texts = [text_of(page) for page in PAGES]
-    found = [one for text in texts for one in EXTRA.findall(text)]
-    told = {(place, extra) for place, extras in found for extra in extras.split(",")}
+    matches = [match for text in texts for match in EXTRA.findall(text)]
+    pairs = {(place, extra) for place, extras in matches for extra in extras.split(",")}
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     known = {(".", extra) for extra in project["optional-dependencies"]}
-    assert told
-    assert told <= known
+    assert pairs
+    assert pairs <= known
     assert {(".", extra) for extra in get_args(Extra)} <= known
 
 
@@ -253,9 +253,9 @@ def test_every_link_leads_somewhere(page: str) -> None:
 
 def files_in(text: str) -> set[str]:
     """Return the words that are names of files or directories."""
-    found = re.findall(r"(?<![\w/.<>-])((?:\.{1,2}/)?[\w.-]+/(?:[\w./-]*\w)?/?|[\w-]+\.\w+)", text)
+    names = re.findall(r"(?<![\w/.<>-])((?:\.{1,2}/)?[\w.-]+/(?:[\w./-]*\w)?/?|[\w-]+\.\w+)", text)
     kinds = (".py", ".js", ".html", ".toml", ".json5", ".yaml", ".c", ".md")
-    return {name for name in found if name.endswith((*kinds, "/", "acsard-stop"))}
+    return {name for name in names if name.endswith((*kinds, "/", "acsard-stop"))}
 
 
 def exists(name: str, *, below: Path) -> bool:
@@ -281,8 +281,8 @@ def files_with(pattern: str, *rooms: str) -> set[str]:
     """
     files = [file for room in rooms for file in (ROOT / room).rglob("*") if file.is_file()]
     texts = [(file, file.read_bytes()) for file in files if file.suffix != ".pyc"]
-    found = [file for file, text in texts if re.search(pattern.encode(), text)]
-    names = {str(file.relative_to(ROOT)).removeprefix("acsard/") for file in found}
+    matches = [file for file, text in texts if re.search(pattern.encode(), text)]
+    names = {str(file.relative_to(ROOT)).removeprefix("acsard/") for file in matches}
     return names - {"README.md"}  # the recipes themselves
 
 

@@ -43,8 +43,8 @@ def clone(tmp_path: Path) -> Path:
 def run(place: Path, *words: str) -> None:
     """Run a command without the project's tools on PATH and without a git identity."""
     env = {"PATH": os.defpath, "HOME": str(place.parent), "PRE_COMMIT_HOME": str(place.parent)}
-    for who in ("AUTHOR", "COMMITTER"):
-        env |= {f"GIT_{who}_NAME": "a", f"GIT_{who}_EMAIL": "a@example.org"}
+    for role in ("AUTHOR", "COMMITTER"):
+        env |= {f"GIT_{role}_NAME": "a", f"GIT_{role}_EMAIL": "a@example.org"}
     done = subprocess.run(
         words, cwd=place, env=env, capture_output=True, text=True, timeout=60.0, check=False
     )
@@ -62,7 +62,7 @@ def test_a_commit_of_code_or_of_the_contract_runs_every_check(clone: Path, name:
 
 
 def test_these_are_the_checks_that_a_change_must_pass() -> None:
-    told = (ROOT / ".ci/run").read_text(encoding="utf-8")
+    script = (ROOT / ".ci/run").read_text(encoding="utf-8")
     pattern = r"^ *\.venv/bin/((?:ruff|mypy|lint-imports)[^|\n]*?)(?: \|\|.*)?$"
-    found = re.findall(pattern, told, re.M)
-    assert set(found) == set(CHECKS)
+    commands = re.findall(pattern, script, re.M)
+    assert set(commands) == set(CHECKS)

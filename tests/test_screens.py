@@ -24,9 +24,9 @@ def printed() -> dict[tuple[str, int], list[str]]:
     for line in done.stdout.splitlines():
         if line.startswith("--- acsard "):
             verb, _, width = line.removeprefix("--- acsard ").partition(", ")
-            shown = screens[verb, int(width.split()[0])] = []
+            lines = screens[verb, int(width.split()[0])] = []
         else:
-            shown.append(line)
+            lines.append(line)
     return screens
 
 
@@ -42,5 +42,5 @@ def test_each_screen_fits_its_width_and_shows_the_whole_reason() -> None:
         wide = [line for line in lines if cell_len(line) > width and verb != LINE_BY_LINE]
         assert not wide, f"{verb} at {width} columns"
     for verb, width in ((verb, width) for verb in ("drive", "top") for width in WIDTHS):
-        shown = " ".join(" ".join(screens[verb, width]).split())
-        assert WAITING.reason.partition(": ")[2] in shown, f"{verb} at {width} columns"
+        text = " ".join(" ".join(screens[verb, width]).split())
+        assert WAITING.reason.partition(": ")[2] in text, f"{verb} at {width} columns"

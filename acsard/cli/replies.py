@@ -24,8 +24,8 @@ def of_robot(whose: str, line: str) -> str:
     The line has the form `{"robot": "robot1", "message": ...}`. `whose` is the id, and `line` is
     the message as JSON.
     """
-    told = {"robot": whose, "message": msgspec.Raw(line.encode())}
-    return formatting.json_line(msgspec.json.encode(told).decode())
+    record = {"robot": whose, "message": msgspec.Raw(line.encode())}
+    return formatting.json_line(msgspec.json.encode(record).decode())
 
 
 def json_line(encoding: str, payload: bytes) -> str:
@@ -65,9 +65,9 @@ def of_each(
         running_robots(robot.session, ids, robot.where.endpoint) if ALL_ROBOTS in ids else list(ids)
     )
 
-    def called(one: str) -> ServiceReply | AcsardError:
+    def called(robot_id: str) -> ServiceReply | AcsardError:
         try:
-            return call(robot.sibling(one))
+            return call(robot.sibling(robot_id))
         except AcsardError as error:  # the robot did not answer, or its answer cannot be decoded
             return error
 
@@ -90,11 +90,11 @@ def print_each(
         silence: text for a robot that did not answer. `{error}` in it stands for the reason.
         as_json: whether to print each reply as JSON instead of text.
     """
-    for one, reply in replies.items():
+    for robot_id, reply in replies.items():
         if isinstance(reply, AcsardError):
             reply = ServiceReply(False, silence.format(error=reply))
         line = encode(reply, "json").decode()
-        print(of_robot(one, line) if as_json else printable(f"{one}: {reply.message}"))
+        print(of_robot(robot_id, line) if as_json else printable(f"{robot_id}: {reply.message}"))
     if ALL_ROBOTS in ids:
         print(f"acsard: {count_text(robot.where.endpoint, len(replies))}", file=sys.stderr)
     if any(isinstance(reply, AcsardError) for reply in replies.values()):

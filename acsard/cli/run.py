@@ -98,8 +98,10 @@ def main(args: argparse.Namespace) -> int:
         if "INVOCATION_ID" not in os.environ:
             # Do not use print, because a full pipe that no program reads would block the control
             # loop.
-            told = banner(config, where, device, trouble, reach(args), served=served is not None)
-            screen.write(told + "\n")
+            banner_text = banner(
+                config, where, device, trouble, reach(args), served=served is not None
+            )
+            screen.write(banner_text + "\n")
         log.info(
             "started",
             version=version(),
@@ -142,7 +144,7 @@ def main(args: argparse.Namespace) -> int:
     return 0
 
 
-def settings_file(where: str, config: Config, given: dict[str, object]) -> SettingsFile:
+def settings_file(where: str, config: Config, cli_values: dict[str, object]) -> SettingsFile:
     """Return the `SettingsFile` with which the daemon changes its own configuration file.
 
     The `SettingsFile` parses the file as the daemon would after a restart.
@@ -152,7 +154,7 @@ def settings_file(where: str, config: Config, given: dict[str, object]) -> Setti
         config: the present configuration.
         given: maps dotted keys to values from the command line, which replace those of the file.
     """
-    overrides = tables(given, by_environment())
+    overrides = tables(cli_values, by_environment())
     file = Path(where).absolute() if Path(where).is_file() else None
     return SettingsFile(file, lambda text: with_record_directory(parse(text, overrides)), config)
 
@@ -192,8 +194,8 @@ def reach(args: argparse.Namespace) -> str:
     The result is text for a command line, such as " --id robot2", or "" if no option is needed.
     """
     listens = args.listen and reachable(args.listen)
-    given = (("--config", args.config), ("--connect", listens), ("--id", args.id))
-    return "".join([f" {option} {shlex.quote(value)}" for option, value in given if value])
+    pairs = (("--config", args.config), ("--connect", listens), ("--id", args.id))
+    return "".join([f" {option} {shlex.quote(value)}" for option, value in pairs if value])
 
 
 def banner(

@@ -103,9 +103,9 @@ def pairs(words: Sequence[str]) -> dict[str, Plain]:
     """
     if len(words) % 2:
         raise UsageError("give pairs of KEY VALUE, for example acsard set limits.linear_speed 0.8")
-    given = list(zip(words[::2], words[1::2], strict=True))
-    settings = {key: _value(word) for key, word in given}
-    for key, word in given:
+    assignments = list(zip(words[::2], words[1::2], strict=True))
+    settings = {key: _value(word) for key, word in assignments}
+    for key, word in assignments:
         if not finite(settings[key]):
             raise UsageError(f"{key} = {word}: a number must be finite; write one like 0.8")
     return settings
@@ -113,12 +113,12 @@ def pairs(words: Sequence[str]) -> dict[str, Plain]:
 
 def _value(word: str) -> Plain:
     try:
-        found = tomllib.loads(f"value = {word}")
+        document = tomllib.loads(f"value = {word}")
     except (tomllib.TOMLDecodeError, ValueError, RecursionError):
         return word
-    value: Plain = found["value"]
-    one = len(found) == 1 and isinstance(value, bool | int | float | str | list)
-    return value if one else word
+    value: Plain = document["value"]
+    is_plain = len(document) == 1 and isinstance(value, bool | int | float | str | list)
+    return value if is_plain else word
 
 
 def _require_for_many(args: argparse.Namespace, settings: dict[str, Plain]) -> None:
@@ -146,16 +146,16 @@ def _duration_of_changes(message: str) -> str:
         return ""
     limits = {key: pair for key, pair in changes.items() if survives_restart(key)}
     try:
-        kept = lowered(_limits(limits, 1), _limits(limits, 0))
+        lower_limits = lowered(_limits(limits, 1), _limits(limits, 0))
     except (TypeError, ValueError):  # a daemon of another version may have other limits
-        kept = {}
-    if not kept:
+        lower_limits = {}
+    if not lower_limits:
         return "in force until the daemon's next start"
-    if len(kept) == len(changes):
+    if len(lower_limits) == len(changes):
         return "a lowered limit survives a restart of the daemon, except on the simulator"
     return (
-        f"in force until the daemon's next start, except {', '.join(kept)}: a lowered limit "
-        "survives a restart. On the simulator, no setting survives a restart"
+        f"in force until the daemon's next start, except {', '.join(lower_limits)}: a lowered "
+        "limit survives a restart. On the simulator, no setting survives a restart"
     )
 
 
@@ -173,8 +173,8 @@ def _limits(pairs: Mapping[str, Sequence[str]], at: int) -> LimitsConfig:
 def _set_all(
     robot: Client, ids: tuple[str, ...], settings: dict[str, Plain], *, keep: bool, as_json: bool
 ) -> int:
-    def change_one(one: Client) -> ServiceReply:
-        reply = one.set(settings, keep=keep)
+    def change_one(client: Client) -> ServiceReply:
+        reply = client.set(settings, keep=keep)
         if as_json or keep or not reply.success:
             return reply
         return ServiceReply(True, _with_duration(reply.message))
@@ -202,6 +202,7 @@ def _tell(config: object, as_json: bool) -> None:
         print(msgspec.json.encode(now).decode())
         return
     for key, value in now.items():
-        said = described(key, 1)
-        told = f"{key} = {show(value)}\n    {said.description}\n    {said.additional_constraints}"
-        print(lines(told))
+        setting = described(key, 1)
+        rows = f"{key} = {show(value)}", setting.description, setting.additional_constraints
+        text = "\n    ".join(rows)
+        print(lines(text))

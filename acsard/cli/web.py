@@ -115,11 +115,11 @@ def _serve(args: argparse.Namespace, config: Config) -> int:
     from acsard.web import server, tokens
     from acsard.web.listen import page_urls
 
-    def announce(found: Sequence[Listen]) -> None:
-        for one, wished in zip(found, listen, strict=True):
+    def announce(addresses: Sequence[Listen]) -> None:
+        for address, wished in zip(addresses, listen, strict=True):
             instead = f"  (instead of {wished.url}, at which acsard cannot listen)"
-            note = "" if one == wished else instead
-            for url in page_urls(one, tls):
+            note = "" if address == wished else instead
+            for url in page_urls(address, tls):
                 print(f"  page    {url}{note}", flush=True)
 
     tls = args.tls or config.bus.tls
@@ -196,7 +196,7 @@ def _list(vault: Vault) -> int:
         return f"until {_clock(ends)}, {left}"
 
     if tokens:
-        show(table((one.name, one.role, until(one.ends)) for one in tokens))
+        show(table((token.name, token.role, until(token.ends)) for token in tokens))
     else:
         print(
             f"no tokens for the robot {vault.robot} are in {vault.path}; `acsard web --invite "

@@ -284,9 +284,9 @@ def objection(state: RobotState, source: str, sender: str) -> str:
     """
     if state.mode in NEVER_DRIVING_MODES:
         return state.reason
-    ours = next((one for one in state.sources if one.name == source), None)
+    ours = next((entry for entry in state.sources if entry.name == source), None)
     if ours is None:
-        names = ", ".join(one.name for one in state.sources)
+        names = ", ".join(entry.name for entry in state.sources)
         return (
             f"{source} is not one of commands.sources: {names}; use one of these sources, or add "
             f"{source} to commands.sources in the robot's acsard.toml and restart the daemon"
@@ -323,7 +323,7 @@ def must_release_key(state: RobotState, source: str) -> bool:
     `NEVER_DRIVING_MODES`, or "waiting"), or if `source` must first send a zero. When the robot can
     drive again, an operator who still holds the key may not expect the robot to move.
     """
-    ours = next((one for one in state.sources if one.name == source), None)
+    ours = next((entry for entry in state.sources if entry.name == source), None)
     zero_first = ours is not None and "must send a zero" in ours.waits_for
     return state.mode in NEVER_DRIVING_MODES or state.mode == "waiting" or zero_first
 
@@ -333,7 +333,7 @@ def receives_commands(state: RobotState, source: str) -> bool:
 
     Late commands count too.
     """
-    return any(one.name == source and one.waits_for != "a command" for one in state.sources)
+    return any(entry.name == source and entry.waits_for != "a command" for entry in state.sources)
 
 
 def refuses_for_good(state: RobotState, source: str) -> bool:
@@ -342,4 +342,4 @@ def refuses_for_good(state: RobotState, source: str) -> bool:
     If so, waiting cannot help: no command moves the robot in its present mode, or the source is not
     configured.
     """
-    return state.mode in NEVER_DRIVING_MODES or all(one.name != source for one in state.sources)
+    return state.mode in NEVER_DRIVING_MODES or all(entry.name != source for entry in state.sources)

@@ -83,13 +83,13 @@ class Fleet:
         self._lock = Lock()
         self.left_out = False
         """Whether a robot was left out because there were already `most` robots."""
-        self._known = {one: _Known() for one in ids if one != ALL_ROBOTS}
+        self._known = {robot_id: _Known() for robot_id in ids if robot_id != ALL_ROBOTS}
         self._states, self._infos = Decoder(RobotState), Decoder(Info)
         self._declared: list[Any] = []
         session, liveliness = robot.session, robot.session.liveliness()
         try:
-            for one in ids:
-                states, tokens = full_key(one, "state"), full_key(one, "alive")
+            for robot_id in ids:
+                states, tokens = full_key(robot_id, "state"), full_key(robot_id, "alive")
                 self._declared += [
                     session.declare_subscriber(states, self._state),
                     liveliness.declare_subscriber(tokens, self._token, history=True),
@@ -105,12 +105,12 @@ class Fleet:
         """
         now = clock.steady_s()
         with self._lock:
-            for name, one in list(self._known.items()):
-                self._take(one)
-                seen = max(one.since, one.follower.last_seen)
-                if not one.here and name not in self._ids and now - seen > self._forget_s:
+            for name, robot in list(self._known.items()):
+                self._take(robot)
+                last_active = max(robot.since, robot.follower.last_seen)
+                if not robot.here and name not in self._ids and now - last_active > self._forget_s:
                     del self._known[name]
-            return [self._row(name, one, now) for name, one in self._known.items()]
+            return [self._row(name, robot, now) for name, robot in self._known.items()]
 
     def due(self) -> list[tuple[str, str]]:
         """Return the queries that are due now, as pairs of robot id and key. Pass them to `ask()`.
@@ -119,12 +119,12 @@ class Fleet:
         """
         now, due = clock.steady_s(), []
         with self._lock:
-            for name, one in self._known.items():
-                self._take(one)
-                if one.follower.query_is_due(now):
+            for name, robot in self._known.items():
+                self._take(robot)
+                if robot.follower.query_is_due(now):
                     due.append((name, "state"))
-                if one.here and not one.version and now >= one.info_due:
-                    one.info_due = now + FLEET_QUERY_PERIOD_S
+                if robot.here and not robot.version and now >= robot.info_due:
+                    robot.info_due = now + FLEET_QUERY_PERIOD_S
                     due.append((name, "info"))
         return due
 
@@ -135,27 +135,27 @@ class Fleet:
 
     def is_present(self, robot_id: str) -> bool:
         """Return whether the liveliness token of this robot's daemon is present."""
-        one = self._known.get(robot_id)
-        return one is not None and bool(one.here)
+        robot = self._known.get(robot_id)
+        return robot is not None and bool(robot.here)
 
     def end(self) -> None:
         """Unsubscribe from all robots. This may wait for the bus. Raises `ZError`."""
-        for one in self._declared:
-            one.undeclare()
+        for subscriber in self._declared:
+            subscriber.undeclare()
 
-    def _row(self, name: str, one: _Known, now: float) -> Row:
-        follower, state = one.follower, one.follower.state
+    def _row(self, name: str, robot: _Known, now: float) -> Row:
+        follower, state = robot.follower, robot.follower.state
         silent = follower.silent(now)
-        if one.here and not follower.is_confirmed and not silent:
+        if robot.here and not follower.is_confirmed and not silent:
             # A storage on a router may have sent this old state. Wait for the daemon's own answer.
             state = None
         age = follower.age(now) if follower.is_confirmed else math.inf
-        return Row(name, one.here, state, age, one.version, silent)
+        return Row(name, robot.here, state, age, robot.version, silent)
 
-    def _take(self, one: _Known) -> None:
-        for sample, at in one.newest.take():
+    def _take(self, robot: _Known) -> None:
+        for sample, at in robot.newest.take():
             try:
-                one.follower.published(self._states.decode(*encoded(sample)), at)
+                robot.follower.published(self._states.decode(*encoded(sample)), at)
             except DecodeError:
                 pass  # a daemon of another version: the robot is shown as silent
 
@@ -174,42 +174,42 @@ class Fleet:
             return self._known.get(name)
 
     def _forget_one(self) -> None:
-        gone = [(one.since, name) for name, one in self._known.items() if not one.here]
-        for _, name in sorted(one for one in gone if one[1] not in self._ids)[:1]:
+        candidates = [(entry.since, name) for name, entry in self._known.items() if not entry.here]
+        for _, name in sorted(entry for entry in candidates if entry[1] not in self._ids)[:1]:
             del self._known[name]
 
     def _token(self, sample: zenoh.Sample) -> None:
-        one = self._of(sample)
-        if one is not None:
-            appeared, one.here = not one.here, sample.kind == zenoh.SampleKind.PUT
-            if not one.here:
+        robot = self._of(sample)
+        if robot is not None:
+            appeared, robot.here = not robot.here, sample.kind == zenoh.SampleKind.PUT
+            if not robot.here:
                 # Query the version again later, because the daemon may restart with another one.
-                one.since, one.version = clock.steady_s(), ""
+                robot.since, robot.version = clock.steady_s(), ""
             elif appeared:
-                one.begin()
+                robot.begin()
 
     def _state(self, sample: zenoh.Sample) -> None:
-        one = self._of(sample)
-        if one is not None:
-            one.newest.put((sample, clock.steady_s()))
+        robot = self._of(sample)
+        if robot is not None:
+            robot.newest.put((sample, clock.steady_s()))
 
     def _answer(self, sample: zenoh.Sample) -> None:
-        one = self._of(sample)
-        if one is None:
+        robot = self._of(sample)
+        if robot is None:
             return
         try:
             state = self._states.decode(*encoded(sample))
         except DecodeError:
             return
         with self._lock:
-            self._take(one)
-            one.follower.answered(state, clock.steady_s())
+            self._take(robot)
+            robot.follower.answered(state, clock.steady_s())
 
     def _info(self, sample: zenoh.Sample) -> None:
-        one = self._of(sample)
+        robot = self._of(sample)
         try:
             version = self._infos.decode(*encoded(sample)).version
         except DecodeError:
             version = "?"
-        if one is not None:
-            one.version = version
+        if robot is not None:
+            robot.version = version

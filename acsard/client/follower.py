@@ -88,13 +88,15 @@ class Follower:
         """
         # The previous answer is compared too, because the robot's clock may have been set back
         # since `self.state`.
-        held, before, self._answer = self.state, self._answer, state
-        known = [one for one in (held, before) if one is not None]
-        repeated = held is not None and held.stamp == state.stamp
-        if not repeated and any(state.stamp.to_ns() > one.stamp.to_ns() for one in known):
+        current, before, self._answer = self.state, self._answer, state
+        known = [old_state for old_state in (current, before) if old_state is not None]
+        repeated = current is not None and current.stamp == state.stamp
+        if not repeated and any(
+            state.stamp.to_ns() > old_state.stamp.to_ns() for old_state in known
+        ):
             self.published(state, now)
             return True
-        if held is None:
+        if current is None:
             # A storage may have sent this first answer. Query again immediately to find out.
             self.state, self.due = state, now
         return False

@@ -112,4 +112,8 @@ class Outbox:
     def _due(self) -> list[tuple[Commander, Put]]:
         now_ns = clock.steady_ns()
         known = [(commander.due_ns(), commander, put) for commander, put in self._senders.items()]
-        return [(one, put) for due_ns, one, put in known if due_ns is not None and due_ns <= now_ns]
+        return [
+            (sender, put)
+            for due_ns, sender, put in known
+            if due_ns is not None and due_ns <= now_ns
+        ]

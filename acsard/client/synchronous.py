@@ -235,7 +235,7 @@ class Client:
         begun_s = clock.steady_s()
         # When the longest timeout has passed, a zero would only stop the next sender that drives.
         known = list(self._spacing.moving.items())
-        moving = [one for one, at_s in known if begun_s - at_s < MAX_SOURCE_TIMEOUT_S]
+        moving = [robot for robot, at_s in known if begun_s - at_s < MAX_SOURCE_TIMEOUT_S]
         try:
             for pause_s in (REPEAT_ZERO_S, 0.0) if moving else ():
                 for client in moving:
@@ -482,8 +482,8 @@ class Client:
             if why := us.lacks(key):
                 return NotPermittedError(why)
         where = self.where
-        seen = presence(self.session, where.robot_id, where.endpoint)
-        if seen is None or seen.here or not where.endpoint:
+        visibility = presence(self.session, where.robot_id, where.endpoint)
+        if visibility is None or visibility.here or not where.endpoint:
             if key == "battery":
                 return NoAnswerError(f"{no_answer}: {NO_BATTERY}")
             return NoAnswerError(
@@ -491,7 +491,7 @@ class Client:
                 "this key (`acsard topics`), and may you query it (`acsard whoami`)?"
             )
         return NoAnswerError(
-            f"{no_answer}: {explain_silence(key, where.robot_id, where.endpoint, seen)}"
+            f"{no_answer}: {explain_silence(key, where.robot_id, where.endpoint, visibility)}"
         )
 
     def explain_error(self, error: UnheardError | NoAnswerError) -> MendableError:

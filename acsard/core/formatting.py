@@ -32,11 +32,11 @@ def printable_bytes(data: bytes, most: int, last: bool = False) -> str:
     If the text is too long, it shows the first bytes, or the last bytes if `last` is true. The "…"
     is an additional character. An unprintable byte is written as an escape such as `\x00`.
     """
-    shown = [repr(bytes([byte]))[2:-1] for byte in (reversed(data) if last else data)]
-    ends = accumulate(map(len, shown))
-    kept = [text for text, end in zip(shown, ends, strict=True) if end <= most]
-    cut = "…" if len(kept) < len(shown) else ""
-    return cut + "".join(reversed(kept)) if last else "".join(kept) + cut
+    texts = [repr(bytes([byte]))[2:-1] for byte in (reversed(data) if last else data)]
+    ends = accumulate(map(len, texts))
+    selection = [text for text, end in zip(texts, ends, strict=True) if end <= most]
+    cut = "…" if len(selection) < len(texts) else ""
+    return cut + "".join(reversed(selection)) if last else "".join(selection) + cut
 
 
 _ABOVE_ASCII = re.compile(r"[^\x00-\x7e]")
@@ -51,14 +51,14 @@ def json_line(text: str) -> str:
     )
 
 
-def many(count: int, one: str, more: str = "") -> str:
+def many(count: int, singular: str, more: str = "") -> str:
     """Return a count with its noun, such as `no lines`, `1 line` or `2 changes of mode`.
 
-    `one` is the noun in the singular, such as `line` or `change of mode`. `more` is the plural.
-    Leave it out if the plural only adds an "s".
+    `singular` is the noun in the singular, such as `line` or `change of mode`. `more` is the
+    plural. Leave it out if the plural only adds an "s".
     """
-    noun, of, rest = one.partition(" of ")
-    return f"{count or 'no'} {one if count == 1 else more or f'{noun}s{of}{rest}'}"
+    noun, of, rest = singular.partition(" of ")
+    return f"{count or 'no'} {singular if count == 1 else more or f'{noun}s{of}{rest}'}"
 
 
 def listed(items: Sequence[str], most: int, joint: str = ", ") -> str:

@@ -160,7 +160,7 @@ class Robot:
         self._refused_ns: int | None = None
         self._sanity = Sanity(config.feedback)
         latched = [latch for latch in (latches.fault, latches.stop) if latch is not None]
-        causes = [one.why for latch in latched for one in latch.causes if not one.by]
+        causes = [cause.why for latch in latched for cause in latch.causes if not cause.by]
         self._estop = EmergencyStop(config.safety.estop, PRESSED_REASON in causes)
         self._bumpers = Bumpers(config.safety)
         self._battery = Battery(config.battery, any(why.startswith(EMPTY_REASON) for why in causes))
@@ -317,9 +317,9 @@ class Robot:
             inputs.now, inputs.port_open, inputs.opened, inputs.received, unsent, inputs.late_ns
         )
         link = session.link
-        told = self._answered.look(self.counters["lines_sent"], session.good_lines, link == "up")
-        if told is not None:
-            events.append(told)
+        warning = self._answered.look(self.counters["lines_sent"], session.good_lines, link == "up")
+        if warning is not None:
+            events.append(warning)
         if before == "up" != link:
             self.counters["link_lost"] += 1
             if session.lateness.late_s:
@@ -336,8 +336,8 @@ class Robot:
             for part in (self._estop, self._bumpers, self._battery):
                 part.reopen()
         known = self._estop.state or self._bumpers.state or self._battery.status
-        kept = self._unreported or self._battery.held
-        if session.statuses or known or kept or session.forgot:
+        is_blocked = self._unreported or self._battery.held
+        if session.statuses or known or is_blocked or session.forgot:
             self._watch_inputs(inputs.now, events)
         if link != "up":
             # Without a link the daemon cannot ramp, so set the speeds to zero at once. When the
@@ -400,16 +400,16 @@ class Robot:
             for part in (estop, bumpers, battery):
                 part.forget()
             self._unreported = {}
-        held = self._awaited_report() if self._unreported else ("", "")
+        refusal = self._awaited_report() if self._unreported else ("", "")
         if estop.why:
-            held = estop.why, estop.mend
+            refusal = estop.why, estop.mend
         elif bumpers.held:
-            held = bumpers.held, bumpers.mend
+            refusal = bumpers.held, bumpers.mend
         elif self.session.status.driver_fault:
-            held = DRIVER_FAULT_REASON, DRIVER_FAULT_ADVICE
+            refusal = DRIVER_FAULT_REASON, DRIVER_FAULT_ADVICE
         elif battery.held:
-            held = battery.why, battery.mend
-        self._life.hold(*held, now.mono_ns)
+            refusal = battery.why, battery.mend
+        self._life.hold(*refusal, now.mono_ns)
 
     def _awaited_report(self) -> tuple[str, str]:
         """Return the cause of a latch from an earlier run of the daemon, and advice about it.
@@ -567,8 +567,8 @@ class Robot:
     def _set(self, settings: dict[str, Plain], now_ns: int) -> str:
         # The robot is at rest only if two lines are zero: the last one that was written to the
         # port, which the wheels follow, and the last one that was computed.
-        said, made = self._said[0].twist, self._limiter.twist
-        before, at_rest = self.config, self._speeds == STILL and said == made == REST
+        sent_twist, made = self._said[0].twist, self._limiter.twist
+        before, at_rest = self.config, self._speeds == STILL and sent_twist == made == REST
         try:
             self.config, news = changed(before, settings, at_rest)
         except ConfigError as error:
@@ -590,24 +590,26 @@ class Robot:
 
     def _accept_commands(self, inputs: Inputs, events: list[Event]) -> None:
         now_ns = inputs.now.mono_ns
-        heard: Sequence[Command | Refusal] = inputs.commands
+        messages: Sequence[Command | Refusal] = inputs.commands
         if inputs.refusals:
             # Process commands and refusals in the order of arrival. An unreadable message may have
             # commanded motion, so it cancels the zeros that arrived before it, and only those. The
             # refusal of a lost message has the arrival time 0, so it is processed first.
-            heard = sorted([*heard, *inputs.refusals], key=lambda one: one.arrived_ns)
-        for one in heard:
-            if isinstance(one, Refusal):
-                self._refuse(one, now_ns, events)
-                if one.source:
-                    self._arbiter.notice(one.source, one.sender, one.arrived_ns, one.shared)
+            messages = sorted([*messages, *inputs.refusals], key=lambda message: message.arrived_ns)
+        for message in messages:
+            if isinstance(message, Refusal):
+                self._refuse(message, now_ns, events)
+                if message.source:
+                    self._arbiter.notice(
+                        message.source, message.sender, message.arrived_ns, message.shared
+                    )
                 continue
-            if one.stamp_replaced:
+            if message.stamp_replaced:
                 self.counters["stamps_replaced"] += 1
-            reason = self._arbiter.accept(one)
+            reason = self._arbiter.accept(message)
             if reason:
-                text = f"source {one.source}: {REFUSED[reason]}"
-                self._refuse(Refusal(reason, text, one.source, one.sender), now_ns, events)
+                text = f"source {message.source}: {REFUSED[reason]}"
+                self._refuse(Refusal(reason, text, message.source, message.sender), now_ns, events)
             else:
                 self.counters["commands"] += 1
 
@@ -657,8 +659,8 @@ class Robot:
             case Mode.DRIVING:
                 limits = self.config.limits
                 moves = limits.linear_speed or limits.angular_speed
-                held = "" if moves else CANNOT_MOVE
-                return f"driving: {chosen(self._choice)}{held}{self.session.note}"
+                suffix = "" if moves else CANNOT_MOVE
+                return f"driving: {chosen(self._choice)}{suffix}{self.session.note}"
             case Mode.READY:
                 return f"{chosen(self._choice)}{self.session.note}"
             case Mode.WAITING:

@@ -74,28 +74,28 @@ class Curve:
 
     def points(self) -> list[Point]:
         """Return the points to draw, in order. A point with the value NaN marks a gap."""
-        found: list[Point] = []
+        points: list[Point] = []
         for _, low, high, breaks in self._bins:
-            found += [low] if low == high else sorted((low, high))
+            points += [low] if low == high else sorted((low, high))
             if breaks:
-                found.append(Point(found[-1].t, math.nan))
-        return found
+                points.append(Point(points[-1].t, math.nan))
+        return points
 
 
-def _merged(one: _Bin, other: _Bin) -> _Bin:
+def _merged(first: _Bin, other: _Bin) -> _Bin:
     """Return one bin with the lowest and the highest value of two neighboring bins.
 
     A gap between the two bins is dropped, because it would be too short to see.
     """
-    low = other.low if other.low.value < one.low.value else one.low
-    high = other.high if other.high.value > one.high.value else one.high
-    return _Bin(one.number, low, high, other.breaks)
+    low = other.low if other.low.value < first.low.value else first.low
+    high = other.high if other.high.value > first.high.value else first.high
+    return _Bin(first.number, low, high, other.breaks)
 
 
 def _halved(bins: list[_Bin]) -> Iterator[_Bin]:
     last: _Bin | None = None
-    for one in bins:
-        wide = one._replace(number=one.number // 2)
+    for current in bins:
+        wide = current._replace(number=current.number // 2)
         if last is not None and last.number != wide.number:
             yield last
             last = wide
@@ -159,16 +159,16 @@ class Band:
         return [span for span in self._spans if span.kind]
 
     def _wider(self, spans: list[Span]) -> list[Span]:
-        found: list[Span] = []
+        wide_spans: list[Span] = []
         for span in spans[:-1]:
-            last = found[-1] if found else None
+            last = wide_spans[-1] if wide_spans else None
             short = last is not None and last.end - last.begin < self._least
             if last is not None and (short or span.end - span.begin < self._least):
-                worse = min(last, span, key=lambda one: self._rank.get(one.kind, len(self._rank)))
-                found[-1] = worse._replace(begin=last.begin, end=span.end)
+                worse = min(last, span, key=lambda item: self._rank.get(item.kind, len(self._rank)))
+                wide_spans[-1] = worse._replace(begin=last.begin, end=span.end)
             else:
-                found.append(span)
-        return [*found, spans[-1]]
+                wide_spans.append(span)
+        return [*wide_spans, spans[-1]]
 
 
 class Place(NamedTuple):
@@ -216,18 +216,18 @@ class Track:
         self._last: Place | None = None
 
     def add(self, place: Place) -> None:
-        kept, last = self._kept, self._last
+        places, last = self._kept, self._last
         self._last = place
         if last is not None and _apart(last, place) > self._jump:
-            kept.clear()
-        while kept and place.t - kept[0].t > self._lasts:
-            kept.popleft()
-        if kept and not place.new and _apart(kept[-1], place) < self.stride:
+            places.clear()
+        while places and place.t - places[0].t > self._lasts:
+            places.popleft()
+        if places and not place.new and _apart(places[-1], place) < self.stride:
             return
-        kept.append(place)
-        while len(kept) > self._most:
+        places.append(place)
+        while len(places) > self._most:
             self.stride *= 2
-            self._kept = kept = self._wider(kept)
+            self._kept = places = self._wider(places)
 
     def places(self) -> list[Place]:
         """Return the kept places in the order of time. The newest place is always included."""
@@ -235,14 +235,14 @@ class Track:
         return [*self._kept, *([last] if last and last != self._kept[-1] else [])]
 
     def _wider(self, places: deque[Place]) -> deque[Place]:
-        found, broken = deque([places[0]]), False
+        new_places, broken = deque([places[0]]), False
         for place in islice(places, 1, None):
             broken = broken or place.new
-            if _apart(found[-1], place) >= self.stride:
-                found.append(place._replace(new=broken))
+            if _apart(new_places[-1], place) >= self.stride:
+                new_places.append(place._replace(new=broken))
                 broken = False
-        return found
+        return new_places
 
 
-def _apart(one: Place, other: Place) -> float:
-    return math.hypot(one.x - other.x, one.y - other.y)
+def _apart(place: Place, other: Place) -> float:
+    return math.hypot(place.x - other.x, place.y - other.y)

@@ -274,11 +274,11 @@ class ControlLoop:
         if inputs.gyro:
             self._turn_rates.clear()
         before = self._config
-        outputs, went = self._decided(inputs)
+        outputs, was_written = self._decided(inputs)
         if refused_sets:
             self._step_answers = (*refused_sets, *self._step_answers)
-        heard = bool(commands or refusals or requests)
-        pace.record_step(inputs.tick, outputs.due, went, outputs.news, heard)
+        has_input = bool(commands or refusals or requests)
+        pace.record_step(inputs.tick, outputs.due, was_written, outputs.news, has_input)
         self._publish(outputs)
         # `adopted` may change the log's level, so call it after logging this step's events.
         if self._config is not before and self._adopted:
@@ -301,14 +301,14 @@ class ControlLoop:
             self._handover.take(self._to_keep(outputs.latches))
             if self.robot.config is not self._config:
                 self._adopt(self.robot.config)
-            went = self._send(outputs, inputs.now, inputs.tick)
+            line = self._send(outputs, inputs.now, inputs.tick)
         except Exception:
             if self._recorder is not None:
                 self._recorder.died(inputs)
             raise
         if self._recorder is not None:
-            self._recorder.step(inputs, outputs, went, self.robot, self._guard)
-        return outputs, went is not None
+            self._recorder.step(inputs, outputs, line, self.robot, self._guard)
+        return outputs, line is not None
 
     def _to_keep(self, latches: Latches) -> Latches:
         """Return `latches` in the form that the keeper must store for the next start of the daemon.
@@ -321,11 +321,13 @@ class ControlLoop:
         if file is not None:
             latches = file.latches(latches, now)
         if self._speed.lowers:
-            limits, kept = self._started if file is None else file.limits, self._kept
-            if kept is None or not (kept[0] is latches and kept[1] is now and kept[2] is limits):
+            limits, cache = self._started if file is None else file.limits, self._kept
+            if cache is None or not (
+                cache[0] is latches and cache[1] is now and cache[2] is limits
+            ):
                 without = replace(latches, lowered=lowered(limits, now))
-                kept = self._kept = latches, now, limits, without
-            latches = kept[3]
+                cache = self._kept = latches, now, limits, without
+            latches = cache[3]
         last = self._handover.latches
         # Return the last object if nothing has changed, because the keeper writes its file again
         # for each new object, even for one with equal content.
@@ -355,23 +357,23 @@ class ControlLoop:
     ) -> tuple[tuple[Command, ...], tuple[Refusal, ...], tuple[Request, ...]]:
         # Before the first step there are no outputs with which to answer queries. The bus then
         # returns at most one slow query, whose answer needs no outputs.
-        got = self._got = self._bus.take(QUERIES_PER_STEP if self.outputs else 0)
-        if got is NO_INPUT:
+        batch = self._got = self._bus.take(QUERIES_PER_STEP if self.outputs else 0)
+        if batch is NO_INPUT:
             return (), (), ()
         commands: list[Command] = []
         refusals: list[Refusal] = []
         requests: list[Request] = []
-        self._note(got)
-        for arrival in got.arrivals:
+        self._note(batch)
+        for arrival in batch.arrivals:
             if arrival.key == GATEWAY:
                 ends_ns = self._gateway.receive(arrival, self.robot.counters)
                 if ends_ns:
                     self.report.certificate_ends[""] = ends_ns
                 continue
             if arrival.key == IMU:
-                heard = self._imu.receive(arrival, self.robot.counters, self._others)
-                if heard is not None:
-                    self._turn_rates.append(heard)
+                sample = self._imu.receive(arrival, self.robot.counters, self._others)
+                if sample is not None:
+                    self._turn_rates.append(sample)
                 continue
             if arrival.key == SPEED_LIMIT:
                 file = self._settings_file
@@ -388,36 +390,36 @@ class ControlLoop:
             try:
                 commands.append(self._receiver.command(arrival))
             except DecodeError as error:
-                who = claimed_identity(arrival)
+                identity = claimed_identity(arrival)
                 refusals.append(
                     Refusal(
                         error.reason,
                         f"{arrival.key}: {error}",
                         parts(arrival.key)[1],
-                        who.sender,
+                        identity.sender,
                         arrival.arrived_ns,
-                        who.shared,
+                        identity.shared,
                     )
                 )
         if superseded := count_superseded(commands):
             self.robot.counters["commands_superseded"] += superseded
-        for source in got.overrun_sources:
+        for source in batch.overrun_sources:
             text = f"source {source}: too many commands came at once, and the oldest were dropped"
             refusals.append(Refusal("displaced", text, source))
-        for query in got.queries:
+        for query in batch.queries:
             served = self._served(query, now, refusals)
             if served is not None:
                 requests.append(served)
         return tuple(commands), tuple(refusals), tuple(requests)
 
-    def _note(self, got: BusInput) -> None:
-        if got.overrun:
-            self.robot.counters["bus_overrun"] += got.overrun
-        if got.dropped:
-            self.robot.counters["bus_dropped"] += got.dropped
-        if got.routers is not None:
-            self._routers.receive(got.routers, self.robot.counters, self._others)
-        if got.stuck:
+    def _note(self, batch: BusInput) -> None:
+        if batch.overrun:
+            self.robot.counters["bus_overrun"] += batch.overrun
+        if batch.dropped:
+            self.robot.counters["bus_dropped"] += batch.dropped
+        if batch.routers is not None:
+            self._routers.receive(batch.routers, self.robot.counters, self._others)
+        if batch.stuck:
             self.robot.counters["bus_stuck"] += 1
             self._others.append(BUS_STUCK)
 
@@ -521,9 +523,9 @@ class ControlLoop:
         Unless `last` is true, an answer waits until the latches are stored, but at most for
         `MAX_ANSWER_DELAY_NS`.
         """
-        held, before_ns = self._handover.held, now.mono_ns - MAX_ANSWER_DELAY_NS
-        trouble = "" if held else self._handover.trouble or NOT_STORED
-        while self._answers and (held or last or self._answers[0][0] < before_ns):
+        is_stored, before_ns = self._handover.held, now.mono_ns - MAX_ANSWER_DELAY_NS
+        trouble = "" if is_stored else self._handover.trouble or NOT_STORED
+        while self._answers and (is_stored or last or self._answers[0][0] < before_ns):
             _, answer = self._answers.popleft()
             if trouble and answer.success:
                 answer = replace(answer, message=f"{answer.message}; {trouble}")
@@ -552,8 +554,8 @@ class ControlLoop:
         )
 
 
-def _stops(got: BusInput) -> list[str]:
-    puts = [one for one in got.arrivals if one.key == "stop" and one.put]
-    calls = [query for query in got.queries if query.topic == "srv/stop"]
+def _stops(batch: BusInput) -> list[str]:
+    puts = [arrival for arrival in batch.arrivals if arrival.key == "stop" and arrival.put]
+    calls = [query for query in batch.queries if query.topic == "srv/stop"]
     names = [caller_name(put.via, put.attachment, put.sender) for put in puts]
     return names + [caller_name(call.via, call.attachment) for call in calls]

@@ -166,12 +166,14 @@ class LatchFile:
             self._abandoned = True
             why = str(error) if isinstance(error, NoThreadError) else DISK_HANGS
             self._fail(why)
-            found = self._found
-            if found is None:
+            file_latches = self._found
+            if file_latches is None:
                 self._blind = True
                 latches = stopped(Latches(), unreadable(self.where, why), now)
             else:
-                latches = after_failed_write(found, at_start(unwritable(self.where, why)), now)
+                latches = after_failed_write(
+                    file_latches, at_start(unwritable(self.where, why)), now
+                )
             self.keep(latches)
         threads = (
             threading.Thread(target=self._work, args=(now,), name="latches", daemon=True),
@@ -305,8 +307,8 @@ class LatchFile:
             return False
         # A write does not matter if the file already contains the newest latches.
         busy_ns = None if self._written_latches is self._newest_latches else self._busy_ns
-        begun_ns = [one for one in (busy_ns, self._syncing_ns) if one is not None]
-        return any(clock.mono_ns() - one > HANG_TIMEOUT_S * NS_PER_S for one in begun_ns)
+        begun_ns = [start_ns for start_ns in (busy_ns, self._syncing_ns) if start_ns is not None]
+        return any(clock.mono_ns() - start_ns > HANG_TIMEOUT_S * NS_PER_S for start_ns in begun_ns)
 
     @property
     def _again(self) -> Event:

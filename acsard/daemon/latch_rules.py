@@ -88,15 +88,15 @@ def decode(robot: str, data: bytes) -> Latches:
         raise LatchFileError(f"it is damaged ({error})") from None
     if content.robot != robot:
         raise LatchFileError(f"it belongs to the robot {_safe(content.robot)!r:.60}")
-    found = content.latches
-    for latch in (found.stop, found.fault, found.inactive):
+    latches = content.latches
+    for latch in (latches.stop, latches.fault, latches.inactive):
         if latch is not None and any(cause.earlier for cause in latch.earlier):
             # No daemon writes such a file, and the code below cannot process causes that are nested
             # more deeply.
             raise LatchFileError("it is damaged (an earlier cause has causes of its own)")
     if _plain(content) != raw:
         raise LatchFileError("it is damaged (a field name is missing or unknown)")
-    return found.after_restart()
+    return latches.after_restart()
 
 
 def at_start(why: str) -> str:
@@ -157,11 +157,11 @@ def after_failed_write(latches: Latches, why: str, now: Instant) -> Latches:
         why: the reason of the stop that is added if `latches` contains no stop, in words.
         now: the time of the start.
     """
-    found = latches.fault, latches.inactive, latches.stop
-    kept = max((latch.number for latch in found if latch), default=-1)
-    number = number_after_restart(kept, now)
+    old_latches = latches.fault, latches.inactive, latches.stop
+    last_number = max((latch.number for latch in old_latches if latch), default=-1)
+    number = number_after_restart(last_number, now)
     fault, inactive, stop = (
-        latch and replace(latch, number=number + place) for place, latch in enumerate(found)
+        latch and replace(latch, number=number + place) for place, latch in enumerate(old_latches)
     )
     return stopped(Latches(stop, fault, inactive, latches.lowered), why, now)
 

@@ -257,9 +257,9 @@ def causes(late: Lateness) -> tuple[tuple[str, ...], str]:
 
     Both results are empty if the counters show no cause.
     """
-    found = [(cause, clause) for cause in CAUSES if (clause := cause.rule(late))]
-    clauses = [f"{clause} ({cause.advice})" for cause, clause in found]
-    return tuple([cause.name for cause, _ in found]), ", and ".join(clauses)
+    pairs = [(cause, clause) for cause in CAUSES if (clause := cause.rule(late))]
+    clauses = [f"{clause} ({cause.advice})" for cause, clause in pairs]
+    return tuple([cause.name for cause, _ in pairs]), ", and ".join(clauses)
 
 
 BECAUSE = ", because "
@@ -307,7 +307,7 @@ def present(before: Reading, after: Reading, within_ns: int) -> list[tuple[str, 
         "governor": clock_text(now),
         "steal": host if stolen_ns > STOLEN_FRACTION * within_ns else "",
     }
-    return [(clauses[one.name], one.advice) for one in CAUSES if clauses.get(one.name)]
+    return [(clauses[cause.name], cause.advice) for cause in CAUSES if clauses.get(cause.name)]
 
 
 def _seconds(duration_ns: int) -> str:

@@ -178,7 +178,7 @@ class LateWatch:
                 self._keep(kernel.read(conditions))
                 continue
             time.sleep(max(SETTLE_S, (free_ns - clock.mono_ns()) / NS_PER_S))
-            late = max(self._box.take(), key=lambda one: one.late_ns, default=None)
+            late = max(self._box.take(), key=lambda period: period.late_ns, default=None)
             before = None if late is None else self._before(late.now_ns - late.late_ns)
             after = kernel.read()
             conditions, looked_ns = after.conditions, clock.mono_ns()

@@ -218,27 +218,27 @@ class SettingsFile:
         """
         if not self._pending:
             return []
-        found: list[Request | Answer] = []
-        for one in self._results.take():
-            number = one.id if isinstance(one, Answer) else one.request.id
+        results: list[Request | Answer] = []
+        for result in self._results.take():
+            number = result.id if isinstance(result, Answer) else result.request.id
             pending = self._pending.get(number)
             if pending is None:
                 continue  # the request was overdue and has been answered
-            if isinstance(one, _Checked):
+            if isinstance(result, _Checked):
                 if now_ns > pending.due_ns:
                     continue  # the request is overdue: the code below answers it
-                pending.edit = one.edit
-                found.append(one.request)
+                pending.edit = result.edit
+                results.append(result.request)
                 continue
             if not pending.overdue:
-                found.append(one)
+                results.append(result)
             del self._pending[number]
             keys, by = ", ".join(pending.request.settings), pending.request.by
             # The log puts the kind in front of the text: `written: KEY to FILE`.
-            if one.success:
+            if result.success:
                 events.append(Event("set", f"{keys} to {self._file}", by=by, kind="written"))
             elif pending.overdue:
-                text = f"{keys} to {self._file}: {one.message}"
+                text = f"{keys} to {self._file}: {result.message}"
                 events.append(Event("set", text, "warning", by=by, kind="not written"))
         # Skip a request that the robot is deciding about. The robot may use its settings, so the
         # answer must not say that no setting was changed.
@@ -253,7 +253,7 @@ class SettingsFile:
             waits.overdue = True
             if waits.answer is None:
                 del self._pending[waits.request.id]
-        return [*found, *map(_overdue, overdue)]
+        return [*results, *map(_overdue, overdue)]
 
     @property
     def limits(self) -> LimitsConfig:
@@ -281,13 +281,13 @@ class SettingsFile:
         file = self._limits
         if file is self._started:
             return latches
-        kept = self._kept
+        cache = self._kept
         # Return the same object for the same arguments, because the latch file is written again for
         # each new object.
-        if kept is None or not (kept[0] is latches and kept[1] is now and kept[2] is file):
+        if cache is None or not (cache[0] is latches and cache[1] is now and cache[2] is file):
             result = replace(latches, lowered=lowered(file, now))
-            kept = self._kept = latches, now, file, result
-        return kept[3]
+            cache = self._kept = latches, now, file, result
+        return cache[3]
 
     def close(self) -> None:
         """Let the thread end. Do not wait for it."""
@@ -322,12 +322,12 @@ class SettingsFile:
             return Answer(request.id, False, f"no setting was changed: {error}")
 
     def _written_answer(self, edit: Edit, answer: Answer) -> Answer:
-        told = answer.message
+        text = answer.message
         try:
             apply_edit(edit)
         except MendableError as error:
             return Answer(
-                answer.id, False, f"{told}, but only until the daemon's next start, because {error}"
+                answer.id, False, f"{text}, but only until the daemon's next start, because {error}"
             )
         limits = {
             key.removeprefix(LIMITS_PREFIX): float(value)  # type: ignore[arg-type]
@@ -336,7 +336,7 @@ class SettingsFile:
         }
         if limits:
             self._limits = replace(self._limits, **limits)
-        return Answer(answer.id, True, f"{told}; written to {edit.file}")
+        return Answer(answer.id, True, f"{text}; written to {edit.file}")
 
     def _difference(self) -> str:
         try:
@@ -350,9 +350,9 @@ class SettingsFile:
                 "the daemon could not start with the present content of its file: "
                 f"{error.problems[0]}"
             )
-        found = differences(self._in_force, self._written)
-        told = [one.words(key) for key, one in found.items()]
-        return listed(told, MAX_NAMED)
+        changes = differences(self._in_force, self._written)
+        texts = [change.words(key) for key, change in changes.items()]
+        return listed(texts, MAX_NAMED)
 
     def _read(self) -> None:
         if self._file is None:

@@ -144,9 +144,9 @@ class Bridge:
             self._went()
         self._was_here = here
         driving = self._drives.driving()
-        shown, fresh = self._shown.take()
-        self._relay.follow(shown, fresh)
-        if self._commands_hidden_reason and not shown.isdisjoint(self._relay.commanders):
+        topics, fresh = self._shown.take()
+        self._relay.follow(topics, fresh)
+        if self._commands_hidden_reason and not topics.isdisjoint(self._relay.commanders):
             self._notices.say(
                 "warning", "commands", self._commands_hidden_reason, status_id="commands"
             )
@@ -184,7 +184,8 @@ class Bridge:
     def _timeout_s(self, facts: Facts) -> float:
         sources = facts.config.commands.sources
         return next(
-            (one.timeout for one in sources if one.name == self._robot.source), MAX_SOURCE_TIMEOUT_S
+            (source.timeout for source in sources if source.name == self._robot.source),
+            MAX_SOURCE_TIMEOUT_S,
         )
 
     def _follow(self, driving: bool) -> None:

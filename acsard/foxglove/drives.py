@@ -78,8 +78,8 @@ def wish(encoding: str, payload: bytes) -> Wish:
 
     `encoding` is Zenoh's name of the encoding.
     """
-    found = _receiver.command(Arrival("cmd/app", True, payload, encoding, 0, None, ""))
-    return Wish(found.twist, found.stamp_ns)
+    command = _receiver.command(Arrival("cmd/app", True, payload, encoding, 0, None, ""))
+    return Wish(command.twist, command.stamp_ns)
 
 
 class Viewer:
@@ -139,12 +139,12 @@ class Drives:
             encoding: Foxglove's name of the encoding, "json" or "cdr".
             schema_name: ROS type of the messages, such as "geometry_msgs/Twist".
         """
-        found, problem = "", ""
+        zenoh_encoding, problem = "", ""
         if topic != self.topic:
             problem = f"no program listens on {topic}: send commands to {self.topic} instead"
         else:
             try:
-                found = encoding_of(encoding, schema_name)
+                zenoh_encoding = encoding_of(encoding, schema_name)
             except DecodeError as error:
                 problem = f"{topic}: {error}"
         with self._lock:
@@ -152,7 +152,7 @@ class Drives:
             if viewer is None:
                 viewer = self._viewers[client] = Viewer(self._robot_of(client))
             if len(viewer.channels) < MAX_CHANNELS:
-                viewer.channels[channel] = found, problem
+                viewer.channels[channel] = zenoh_encoding, problem
 
     def received(self, client: int, channel: int, data: bytes) -> None:
         """Queue the command in a viewer's message. If it is refused, tell the viewers why.
@@ -212,7 +212,7 @@ class Drives:
         now_ns = clock.steady_ns()
         with self._lock:
             viewers = self._viewers.items()
-            return {one: it.robot for one, it in viewers if it.commander.is_driving(now_ns)}
+            return {client: it.robot for client, it in viewers if it.commander.is_driving(now_ns)}
 
     def end(self) -> None:
         """Send a zero command for each viewer that may be driving, then stop the sending thread."""

@@ -84,21 +84,23 @@ class Notices:
                 visible.
         """
         if newcomers:
-            for one in self._staying.values():
-                server.publish_status(one.text, STATUS_LEVELS[one.level], one.status_id)
-        for one in self._waiting.take():
-            if not one.text:
-                if self._staying.pop(one.status_id, None):
-                    server.remove_status([one.status_id])
+            for notice in self._staying.values():
+                server.publish_status(notice.text, STATUS_LEVELS[notice.level], notice.status_id)
+        for notice in self._waiting.take():
+            if not notice.text:
+                if self._staying.pop(notice.status_id, None):
+                    server.remove_status([notice.status_id])
                 continue
-            if one.status_id:
-                if self._staying.get(one.status_id) == one:
+            if notice.status_id:
+                if self._staying.get(notice.status_id) == notice:
                     continue  # the viewers show it already
-                self._staying[one.status_id] = one
-            server.publish_status(one.text, STATUS_LEVELS[one.level], one.status_id or None)
+                self._staying[notice.status_id] = notice
+            server.publish_status(
+                notice.text, STATUS_LEVELS[notice.level], notice.status_id or None
+            )
             stamp = Time.from_ns(clock.now().wall_ns)
-            log(Log(stamp, LEVELS[one.level], f"foxglove.{one.name}", one.text))
-            self._tell(one.text)
+            log(Log(stamp, LEVELS[notice.level], f"foxglove.{notice.name}", notice.text))
+            self._tell(notice.text)
 
 
 class Objections:

@@ -49,12 +49,12 @@ class EventDeduplicator:
         After a restart of the daemon, all events are new. If the wall clock was also set back, some
         of them may be left out. A list that is older than an earlier list adds no messages.
         """
-        known, told, stamp_ns = self._total, self._told, events.stamp.to_ns()
+        known, previous, stamp_ns = self._total, self._told, events.stamp.to_ns()
         before_ns = self._stamp_ns
         if events.total < known:
             if stamp_ns <= self._stamp_ns:
                 return []  # an older answer that arrived after a published list
-            known, told = 0, []  # the daemon was restarted
+            known, previous = 0, []  # the daemon was restarted
         self._total, self._stamp_ns, self._told = events.total, stamp_ns, events.events
         first = len(events.events) - min(events.total - known, len(events.events))
         # The number of new events is wrong if the daemon was restarted and has logged at least as
@@ -62,9 +62,9 @@ class EventDeduplicator:
         # clock may be set back. An event that lasts counts several times in the total but appears
         # once in the list.
         return [
-            log(one, one.stamp)
-            for place, one in enumerate(events.events)
-            if (place >= first or one.stamp.to_ns() > before_ns) and one not in told
+            log(event, event.stamp)
+            for place, event in enumerate(events.events)
+            if (place >= first or event.stamp.to_ns() > before_ns) and event not in previous
         ]
 
 
@@ -102,11 +102,13 @@ def command_forms(
         source: the name of the command source.
     """
     native = source_keys([source])
-    found = {key_of(key): CommandForm(key) for key in (*native, *source_keys([source], "*"))}
-    for one in endpoints(ros, "*"):
-        if one.native in native:
-            found[one.key] = CommandForm(one.native, one.encoding, one.transport)
-    return found
+    forms = {key_of(key): CommandForm(key) for key in (*native, *source_keys([source], "*"))}
+    for endpoint in endpoints(ros, "*"):
+        if endpoint.native in native:
+            forms[endpoint.key] = CommandForm(
+                endpoint.native, endpoint.encoding, endpoint.transport
+            )
+    return forms
 
 
 class Reader:
@@ -169,8 +171,8 @@ class Commanders:
 
     def take(self) -> Iterator[tuple[str, TwistStamped]]:
         """Yield a pair (topic, command) for each valid command since the last call."""
-        for topic, heard in self._heard.items():
-            for arrival, wall_ns in heard.take():
+        for topic, subscription in self._heard.items():
+            for arrival, wall_ns in subscription.take():
                 try:
                     yield topic, self._reader.read(arrival, wall_ns)
                 except DecodeError:
@@ -217,9 +219,9 @@ class _Heard:
         return self._box.take()
 
     def undeclare(self) -> None:
-        for one in self._declared:
+        for subscriber in self._declared:
             try:
-                one.undeclare()
+                subscriber.undeclare()
             except zenoh.ZError:
                 pass  # the session is closed, and the subscription with it
 
@@ -270,12 +272,12 @@ class Relay:
             # A viewer that opens the log receives the last events too.
             self._deduplicator = EventDeduplicator()
         self._commanders.follow(topics)
-        shown = [
+        outputs = [
             out
             for topic, out in self._outs.items()
             if topic in topics and topic not in self._commanders.topics
         ]
-        keys = {out.key for out in shown}
+        keys = {out.key for out in outputs}
         for key in self._followed.keys() - keys:
             self._followed.pop(key).undeclare()
         for topic in fresh:
@@ -321,17 +323,17 @@ class Relay:
 
     def _messages(self, key: str, samples: Subscription) -> list[msgspec.Struct]:
         # A round forwards at most the newest 100 messages of a key, one second's worth at 100 Hz.
-        held: deque[zenoh.Sample] = deque(maxlen=100)
+        backlog: deque[zenoh.Sample] = deque(maxlen=100)
         try:
             while (sample := samples.try_recv()) is not None:
-                held.append(sample)
+                backlog.append(sample)
         except zenoh.ZError:
             pass  # the session is closed: the program is ending
-        found: list[msgspec.Struct] = []
+        messages: list[msgspec.Struct] = []
         reader = decoder(key)
-        for sample in held:
+        for sample in backlog:
             try:
-                found.append(reader.decode(*encoded(sample)))
+                messages.append(reader.decode(*encoded(sample)))
             except DecodeError:
                 self.unreadable += 1
-        return found
+        return messages

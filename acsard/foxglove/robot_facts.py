@@ -39,11 +39,11 @@ class Facts(Struct, frozen=True):
         `CMD_VEL_IN` appears once for each command source. For every other topic, the command source
         is "".
         """
-        found = []
+        pairs = []
         for row in published_channels(left_out(self.config)):
             names = self.sources if row is CMD_VEL_IN else ("",)
-            found += [(row, name) for name in names]
-        return found
+            pairs += [(row, name) for name in names]
+        return pairs
 
 
 def key_of(row: Channel, source: str) -> str:
@@ -75,7 +75,7 @@ def learn(robot: Client) -> Facts:
         role = us.role
         forbidden = "" if has(role, COMMAND_ROLE) else us.words()
     try:
-        sources = tuple(one.name for one in robot.get("state").sources)
+        sources = tuple(source.name for source in robot.get("state").sources)
         tables = robot.get("config") if has(role, least_role("config")) else None
         config = Config() if tables is None else from_builtins(tables)
     except (DecodeError, msgspec.ValidationError) as error:

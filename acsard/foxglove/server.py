@@ -155,12 +155,12 @@ class Settings:
             if any(value is None for value in wishes.values()):
                 raise AcsardError("a setting cannot be removed, only changed")
             reply = self._robot.set(wishes)
-            said, done = reply.message, reply.success
+            text, done = reply.message, reply.success
             if self._readable:
                 news = self.learn(self._robot.get("config"))
         except AcsardError as error:
-            said, done = str(error), False
-        self._notices.say("info" if done else "error", "set", said if done else f"not set: {said}")
+            text, done = str(error), False
+        self._notices.say("info" if done else "error", "set", text if done else f"not set: {text}")
         with self._lock:
             return news | (asked(self._known, wishes.keys()) if wishes else {})
 
@@ -195,8 +195,8 @@ def live_settings(config: object) -> dict[str, Any]:
 
     `config` is the configuration as nested dicts. Tuples become lists.
     """
-    found = ((key, value) for key, value in flat(config) if live(key))
-    return {key: list(value) if isinstance(value, tuple) else value for key, value in found}
+    items = ((key, value) for key, value in flat(config) if live(key))
+    return {key: list(value) if isinstance(value, tuple) else value for key, value in items}
 
 
 def asked(known: Mapping[str, Any], names: Collection[str]) -> dict[str, Any]:
@@ -239,7 +239,7 @@ class Listener:
     def on_set_parameters(
         self, client: Client, parameters: list[foxglove.Parameter], request_id: str | None = None
     ) -> list[foxglove.Parameter]:
-        wishes = {one.name: one.get_value() for one in parameters}
+        wishes = {parameter.name: parameter.get_value() for parameter in parameters}
         return as_parameters(self._settings.set(wishes))
 
     def on_parameters_subscribe(self, param_names: list[str]) -> None:

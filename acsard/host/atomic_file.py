@@ -36,11 +36,11 @@ def replace(
             cut then leaves the complete old or new file. If false, a power cut may leave a part of
             the new file until the caller has called `sync`.
     """
-    kept = owner
+    owner_ids = owner
     if file.exists():
         before = file.stat()
         mode = stat.S_IMODE(before.st_mode) if mode is None else mode
-        kept = owner or (before.st_uid, before.st_gid)
+        owner_ids = owner or (before.st_uid, before.st_gid)
     handle, name = tempfile.mkstemp(dir=file.parent, prefix=f".{file.name}.")
     try:
         with os.fdopen(handle, "wb") as new:
@@ -48,15 +48,15 @@ def replace(
             new.flush()
             os.fchmod(new.fileno(), NEW_MODE if mode is None else mode)
             try:
-                if kept:
-                    os.fchown(new.fileno(), *kept)
+                if owner_ids:
+                    os.fchown(new.fileno(), *owner_ids)
             except PermissionError:
                 # This process may not give a file to another user, so its own user owns the new
                 # file. The file keeps its group if this user is a member of the group.
-                if owner or kept is None:
+                if owner or owner_ids is None:
                     raise
                 with suppress(PermissionError):
-                    os.fchown(new.fileno(), -1, kept[1])
+                    os.fchown(new.fileno(), -1, owner_ids[1])
             if synced:
                 os.fsync(new.fileno())
         os.replace(name, file)

@@ -215,9 +215,9 @@ def change(file: Path, keys: Keys | Callable[[Config], Keys], *, new: bool = Fal
     changed, raise `MendableError` and leave it unchanged.
     """
     try:
-        place, text, given = _changed(file, keys, new)
+        place, text, changes = _changed(file, keys, new)
         replace(place, text.encode())
-        return given
+        return changes
     except (OSError, ValueError, ConfigError) as error:
         raise _not_changed(file, error) from None
 
@@ -243,8 +243,8 @@ def _changed(
     place = file.resolve(strict=not new)
     # `read_text` would lose CRLF line ends.
     text = "" if new and not place.exists() else place.read_bytes().decode()
-    given = keys(parse(text.encode())) if callable(keys) else keys
-    return place, edited(text, given), given
+    changes = keys(parse(text.encode())) if callable(keys) else keys
+    return place, edited(text, changes), changes
 
 
 def _not_changed(file: Path, error: Exception) -> MendableError:

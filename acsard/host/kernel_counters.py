@@ -203,14 +203,14 @@ def busiest(
     # A process whose nice value is higher by 9 can still delay the thread noticeably. At a
     # difference of 10, the kernel gives the process only a tenth of the thread's weight.
     least = priority + 9 if priority >= 0 else priority
-    ran = {(one.pid, one.name): one.ran_ns for one in before}
+    ran = {(process.pid, process.name): process.ran_ns for process in before}
     grown = [
-        replace(one, ran_ns=one.ran_ns - ran[one.pid, one.name])
-        for one in after
-        if (one.pid, one.name) in ran and one.priority <= least
+        replace(process, ran_ns=process.ran_ns - ran[process.pid, process.name])
+        for process in after
+        if (process.pid, process.name) in ran and process.priority <= least
     ]
-    found = max(grown, key=lambda one: one.ran_ns, default=None)
-    return found if found is not None and found.ran_ns * 4 >= within_ns else None
+    candidate = max(grown, key=lambda process: process.ran_ns, default=None)
+    return candidate if candidate is not None and candidate.ran_ns * 4 >= within_ns else None
 
 
 def slow_clock(policy: Mapping[str, str]) -> SlowClock | None:
@@ -292,7 +292,7 @@ class Kernel:
             # At a low voltage the firmware also sets the other bits, so they do not prove heat.
             cooled or (bool(bits & THROTTLED_BITS) and not low),
             sum(map(_number, self._throttle_counts)),
-            next((one for one in slow if one is not None), None),
+            next((limit for limit in slow if limit is not None), None),
         )
 
     def busiest(self, seconds: float) -> Program | None:

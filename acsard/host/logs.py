@@ -43,10 +43,10 @@ def is_journal(stream: TextIO, environ: Mapping[str, str]) -> bool:
     the environment `environ`.
     """
     try:
-        found = os.fstat(stream.fileno())
+        status = os.fstat(stream.fileno())
     except (OSError, ValueError):
         return False
-    return environ.get("JOURNAL_STREAM") == f"{found.st_dev}:{found.st_ino}"
+    return environ.get("JOURNAL_STREAM") == f"{status.st_dev}:{status.st_ino}"
 
 
 def render(logger: object, method: str, line: MutableMapping[str, Any]) -> str:

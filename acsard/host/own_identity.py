@@ -46,9 +46,11 @@ def own_addresses() -> list[str]:
     The list is empty if the command `ip` fails.
     """
     try:
-        found = json.loads(run_command(("ip", "-json", "address"), 5.0).stdout or "[]")
+        links = json.loads(run_command(("ip", "-json", "address"), 5.0).stdout or "[]")
     except (OSError, ValueError, subprocess.TimeoutExpired):
         return []
-    told = [one["local"] for link in found for one in link.get("addr_info", ()) if "local" in one]
-    real = (ipaddress.ip_address(text) for text in told)
+    texts = [
+        entry["local"] for link in links for entry in link.get("addr_info", ()) if "local" in entry
+    ]
+    real = (ipaddress.ip_address(text) for text in texts)
     return [str(ip) for ip in real if not (ip.is_loopback or ip.is_link_local)]

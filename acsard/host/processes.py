@@ -47,7 +47,7 @@ class _Open(Struct, frozen=True):
 
 def holders(path: str) -> Iterator[Holder]:
     """Yield each process that has the device at `path` open."""
-    for process in dict.fromkeys(one.process for one in _having_open(path)):
+    for process in dict.fromkeys(descriptor.process for descriptor in _having_open(path)):
         try:
             yield _holder(process)
         except OSError:
@@ -60,17 +60,17 @@ def holder_of(path: str) -> Holder | None:
 
     If there are several, prefer a process that has locked the device.
     """
-    found = None
-    for one in _having_open(path):
+    holder = None
+    for descriptor in _having_open(path):
         try:
-            if one.process.name != str(os.getpid()):
-                found = _holder(one.process)
-                if any(line.startswith("lock:") for line in one.fdinfo()):
-                    return found
+            if descriptor.process.name != str(os.getpid()):
+                holder = _holder(descriptor.process)
+                if any(line.startswith("lock:") for line in descriptor.fdinfo()):
+                    return holder
         except OSError:
             # The process has ended.
             continue
-    return found
+    return holder
 
 
 def master_of(path: str) -> Holder | None:
@@ -82,10 +82,10 @@ def master_of(path: str) -> Holder | None:
     if os.major(wanted) not in PTY_MAJORS:
         return None
     index = f"tty-index:\t{os.minor(wanted) + 256 * (os.major(wanted) - PTY_MAJORS[0])}"
-    for one in _open_devices("/ptmx"):
+    for descriptor in _open_devices("/ptmx"):
         try:
-            if index in one.fdinfo():
-                return _holder(one.process)
+            if index in descriptor.fdinfo():
+                return _holder(descriptor.process)
         except OSError:
             # The process has ended.
             continue
@@ -148,10 +148,10 @@ def _open_devices(part: str) -> Iterator[_Open]:
 
 def _having_open(path: str) -> Iterator[_Open]:
     wanted = _number(path)
-    for one in _open_devices("") if wanted else ():
+    for descriptor in _open_devices("") if wanted else ():
         try:
-            if one.device() == wanted:
-                yield one
+            if descriptor.device() == wanted:
+                yield descriptor
         except OSError:
             # The process has closed the descriptor since.
             continue

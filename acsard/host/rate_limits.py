@@ -73,7 +73,9 @@ class Buckets:
         if name not in self._buckets:
             # Drop the full buckets, which equal new ones, so that many names do not fill the
             # memory.
-            self._buckets = {k: one for k, one in self._buckets.items() if not one.full(now_ns)}
+            self._buckets = {
+                k: bucket for k, bucket in self._buckets.items() if not bucket.full(now_ns)
+            }
         own = self._buckets.setdefault(name, Bucket(self._per_name))
         if self._shared is None:
             return own.take(now_ns)

@@ -33,7 +33,7 @@ async def in_thread(
     """
     loop = asyncio.get_running_loop()
     future: asyncio.Future[T] = loop.create_future()
-    taken, waits_no_longer = False, threading.Event()
+    delivered, waits_no_longer = False, threading.Event()
 
     def settle(result: T, error: BaseException | None) -> None:
         if future.done():
@@ -55,7 +55,7 @@ async def in_thread(
             # Call `late` in this thread: it could block the event loop, and another thread may fail
             # to start.
             waits_no_longer.wait()
-            if not taken:
+            if not delivered:
                 late(result)  # type: ignore[arg-type]
 
     thread = threading.Thread(target=work, name=getattr(call, "__name__", "call"), daemon=True)
@@ -67,7 +67,7 @@ async def in_thread(
         # Before Python 3.12 wait_for swallows a cancellation that coincides with the result.
         async with asyncio.timeout(timeout):
             result = await future
-        taken = True
+        delivered = True
         return result
     finally:
         waits_no_longer.set()

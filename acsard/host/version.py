@@ -44,7 +44,7 @@ def commit_of(clone: Path) -> str:
     name = head.removeprefix("ref: ")
     common = git / (_text(git / "commondir") or ".")
     packed = [line.partition(" ") for line in _text(common / "packed-refs").splitlines()]
-    return _text(common / name) or next((found for found, _, ref in packed if ref == name), "")
+    return _text(common / name) or next((commit for commit, _, ref in packed if ref == name), "")
 
 
 def _text(path: Path) -> str:

@@ -107,11 +107,11 @@ class Authority:
         except x509.ExtensionNotFound:
             return True
         kind, limits = type(_general_name(address)), constraints.value
-        permitted = [one for one in limits.permitted_subtrees or () if isinstance(one, kind)]
-        excluded = [one for one in limits.excluded_subtrees or () if isinstance(one, kind)]
-        if any(_within(address, one) for one in excluded):
+        permitted = [name for name in limits.permitted_subtrees or () if isinstance(name, kind)]
+        excluded = [name for name in limits.excluded_subtrees or () if isinstance(name, kind)]
+        if any(_within(address, name) for name in excluded):
             return False
-        return not permitted or any(_within(address, one) for one in permitted)
+        return not permitted or any(_within(address, name) for name in permitted)
 
     def names_in(self, directory: Path) -> list[str]:
         """Return the host names and IP addresses in the certificate in `directory`.
@@ -119,8 +119,10 @@ class Authority:
         Return [] if the certificate cannot be read or contains none.
         """
         try:
-            found = x509.load_pem_x509_certificate((directory / CERTIFICATE).read_bytes())
-            names = found.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+            certificate = x509.load_pem_x509_certificate((directory / CERTIFICATE).read_bytes())
+            names = certificate.extensions.get_extension_for_class(
+                x509.SubjectAlternativeName
+            ).value
         except (OSError, ValueError, x509.ExtensionNotFound):
             return []
         addresses = names.get_values_for_type(x509.IPAddress)
@@ -201,15 +203,15 @@ def _usage(signs: bool) -> x509.KeyUsage:
 
 
 def _constraints(addresses: Sequence[str]) -> x509.NameConstraints:
-    hosts, networks = list(LOCAL_NAMES), [ipaddress.ip_network(one) for one in PRIVATE_NETWORKS]
+    hosts, networks = list(LOCAL_NAMES), [ipaddress.ip_network(item) for item in PRIVATE_NETWORKS]
     for address in addresses:
         named = _general_name(address)
         if not isinstance(named, x509.IPAddress):
             hosts.append(address.lower())
-        elif not any(named.value in one for one in networks):
+        elif not any(named.value in item for item in networks):
             networks.append(_network_of(address))
     # A host name below another permitted name needs no separate entry.
-    own = [one for one in dict.fromkeys(hosts) if not any(one.endswith(f".{h}") for h in hosts)]
+    own = [item for item in dict.fromkeys(hosts) if not any(item.endswith(f".{h}") for h in hosts)]
     return x509.NameConstraints([*map(x509.DNSName, own), *map(x509.IPAddress, networks)], None)
 
 

@@ -59,11 +59,11 @@ def certificates(tls: str) -> Iterator[Finding]:
         text = f"Zenoh refuses {directory / CERTIFICATE} with the key {directory / KEY} ({why})"
         yield Finding("certificates", "failure", text, renewal(tls, ""))
         return
-    found = expiry_times(tls)
-    level, words = expiry(found, now().wall_ns)
+    expiries = expiry_times(tls)
+    level, words = expiry(expiries, now().wall_ns)
     mend = (
-        renewal(tls, first_expiry(found)[0])
-        if found
+        renewal(tls, first_expiry(expiries)[0])
+        if expiries
         else f"run `{install('tls')}`, which installs the library that reads certificates"
     )
     yield Finding("certificates", LEVELS[level], f"{tls}: {words}", mend if level else "")
@@ -122,12 +122,12 @@ def _mend_of_absent(directory: Path) -> str:
 def _command(action: str, directory: Path) -> str:
     places = (directory, *directory.absolute().parents)
     # In contrast to `Path.exists`, this raises no error if this user may not enter a directory.
-    there = next(one for one in places if os.path.exists(one))
+    there = next(place for place in places if os.path.exists(place))
     program = "acsard"
     if not os.access(there, os.W_OK):
         # sudo does not search this user's PATH, so the command contains the full path of acsard.
-        found = shutil.which("acsard")
-        program = f"sudo {found or f'{sys.executable} -m acsard'}"
+        path = shutil.which("acsard")
+        program = f"sudo {path or f'{sys.executable} -m acsard'}"
     return f"{program} tls {action} --directory {shlex.quote(str(directory))}"
 
 

@@ -90,7 +90,7 @@ def add(directory: Path, name: str, addresses: Sequence[str], days: int) -> Path
     if place.exists():
         raise MendableError(f"{place} exists; remove it, or choose another name")
     _require_permitted(authority, addresses)
-    named = [one for one in _names_of(name) if authority.permits(one)]
+    named = [host for host in _names_of(name) if authority.permits(host)]
     authority.issue(place, name, [*named, *addresses], days)
     return place
 
@@ -107,15 +107,15 @@ def renew_client(directory: Path, name: str, addresses: Sequence[str], days: int
     clients = directory / "clients"
     place = clients / name
     if not (place / CERTIFICATE).is_file():
-        there = sorted(one.parent.name for one in clients.glob(f"*/{CERTIFICATE}"))
+        there = sorted(entry.parent.name for entry in clients.glob(f"*/{CERTIFICATE}"))
         raise MendableError(
             f"{clients} has no certificate for {name}, only for: {', '.join(there) or 'nobody'}; "
             f"`acsard tls add {shlex.quote(name)} --directory {shlex.quote(str(directory))}` makes "
             "this certificate"
         )
     _require_permitted(authority, addresses)
-    kept = [one for one in authority.names_in(place) if authority.permits(one)]
-    authority.issue(place, name, [*kept, *addresses], days)
+    old_names = [entry for entry in authority.names_in(place) if authority.permits(entry)]
+    authority.issue(place, name, [*old_names, *addresses], days)
     return place
 
 
@@ -149,9 +149,9 @@ def _names_of(name: str) -> list[str]:
 
 
 def _require_permitted(authority: Authority, addresses: Sequence[str]) -> None:
-    barred = [one for one in addresses if not authority.permits(one)]
+    barred = [address for address in addresses if not authority.permits(address)]
     if barred:
-        named = " ".join(f"--address {one}" for one in barred)
+        named = " ".join(f"--address {address}" for address in barred)
         raise MendableError(
             f"the certificate authority may not sign a certificate for {', '.join(barred)}: the "
             "authority's own certificate permits only private networks, .local names, and the "

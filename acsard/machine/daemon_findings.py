@@ -174,12 +174,12 @@ def compared(running: Running, file: Config) -> Iterator[Finding]:
         )
         return
     for belongs, level, reason, mend in DIFFERENCE_REASONS:
-        differing = {key: one for key, one in others.items() if belongs(key)}
+        differing = {key: difference for key, difference in others.items() if belongs(key)}
         if not differing:
             continue
-        told = [one.words(key) for key, one in differing.items()]
+        texts = [difference.words(key) for key, difference in differing.items()]
         text = f"the running daemon ({daemon_name}) has other values than the file ({reason}): "
-        text += listed(told, MAX_KEYS, "; ")
+        text += listed(texts, MAX_KEYS, "; ")
         mend = mend.format(
             which="these values" if len(differing) > 1 else "this value", lines=_tables(differing)
         )
@@ -191,7 +191,7 @@ def _tables(differing: Mapping[str, Difference]) -> str:
 
     With these lines, the file contains the values that the running daemon has.
     """
-    parts = [(key.rpartition("."), write(one.its)) for key, one in differing.items()]
+    parts = [(key.rpartition("."), write(difference.its)) for key, difference in differing.items()]
     return "; ".join(f"[{table}] {name} = {value}" for (table, _, name), value in parts)
 
 
@@ -249,10 +249,10 @@ def link(running: Running) -> Iterator[Finding]:
     problems = [*unanswered_lines(passed, config), *(refused(passed) or refused(state.counters))]
     for text in problems:
         yield Finding("link", "warning", text, mend)
-    went = [] if config.mcu.simulated else link_losses(state.counters)
-    for times, text in went:
+    losses = [] if config.mcu.simulated else link_losses(state.counters)
+    for times, text in losses:
         yield Finding("link", "warning" if times > often else "ok", text, mend)
-    if not problems and not late and not went:
+    if not problems and not late and not losses:
         text = "the link is up, and almost all lines to and from the board arrive"
         if config.mcu.reply_period:
             text = (
@@ -332,12 +332,12 @@ def unanswered_lines(passed: Mapping[str, int], config: Config) -> Iterator[str]
     such a board does not answer each line. `passed` maps the name of each of the daemon's counters
     to its increase within about a second.
     """
-    sent, came = passed.get("lines_sent", 0), passed.get("lines", 0)
-    enough = came >= (1 - MAX_UNANSWERED_FRACTION) * sent - 1
+    sent, replies = passed.get("lines_sent", 0), passed.get("lines", 0)
+    enough = replies >= (1 - MAX_UNANSWERED_FRACTION) * sent - 1
     if config.mcu.reply_period or sent < MIN_JUDGED_LINES or enough:
         return
     yield (
-        f"the board answered only {came} of the {sent} lines that the daemon sent in a second: "
+        f"the board answered only {replies} of the {sent} lines that the daemon sent in a second: "
         "the serial line loses data, or the board is free-running and does not answer each line"
     )
 
@@ -355,8 +355,8 @@ def refused(counters: Mapping[str, int]) -> list[str]:
     }
     if sum(kinds.values()) <= MAX_UNANSWERED_FRACTION * max(1, counters.get("lines", 0)):
         return []
-    told = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in kinds.items())
-    return [f"the daemon rejected lines from the microcontroller, by reason: {told}"]
+    reasons = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in kinds.items())
+    return [f"the daemon rejected lines from the microcontroller, by reason: {reasons}"]
 
 
 def link_losses(counters: Mapping[str, int]) -> list[tuple[int, str]]:
@@ -572,10 +572,12 @@ def late(running: Running) -> Iterator[Finding]:
     """
     counters = running.state.counters
     missed, lines = counters.get("missed_periods", 0), counters.get("lines_sent", 0)
-    told = [row.message for row in running.rows if row.name == "acsard: control loop" and row.level]
+    messages = [
+        row.message for row in running.rows if row.name == "acsard: control loop" and row.level
+    ]
     if missed > 0.01 * max(1, lines):
-        told = [f"the daemon missed {missed} control periods"]
-    for text in told:
+        messages = [f"the daemon missed {missed} control periods"]
+    for text in messages:
         mend = (
             "`top` shows which other program uses the processor; a daemon that runs as the systemd "
             "service has real-time priority"
@@ -587,7 +589,7 @@ def late(running: Running) -> Iterator[Finding]:
         if event.name == "missed_periods" and (cause := cause_in(event.text))
     ]
     for event, cause in causes[-MAX_CAUSES:]:
-        level: Level = "warning" if told else "ok"
+        level: Level = "warning" if messages else "ok"
         at = utc(event.stamp.to_ns())
         text = f"the daemon missed control periods just before {at}: it was late {cause}"
         yield Finding("daemon", level, text, CAUSES_PAGE)
@@ -641,8 +643,8 @@ def gyro(does: str, counters: Mapping[str, int]) -> Iterator[Finding]:
         yield Finding("gyro", "warning" if mend else "ok", words, mend)
     refused = {n.removeprefix("imu_"): c for n, c in counters.items() if n.startswith("imu_") and c}
     if refused:
-        most = sorted(refused.items(), key=lambda one: -one[1])
-        told = ", ".join(f"{count} {reason.replace('_', ' ')}" for reason, count in most)
+        most = sorted(refused.items(), key=lambda item: -item[1])
+        reasons = ", ".join(f"{count} {reason.replace('_', ' ')}" for reason, count in most)
         mend = (
             "the event imu_refused in the log names the sender: let the sender send finite values "
             "in rad/s, from only one gyro, whose z axis points up"
@@ -650,7 +652,7 @@ def gyro(does: str, counters: Mapping[str, int]) -> Iterator[Finding]:
         yield Finding(
             "gyro",
             "warning",
-            f"the daemon rejected samples on the Zenoh key `imu`, by reason: {told}",
+            f"the daemon rejected samples on the Zenoh key `imu`, by reason: {reasons}",
             mend,
         )
 
@@ -664,7 +666,7 @@ def linked(rows: Mapping[str, DiagnosticStatus]) -> Iterator[Finding]:
     row = rows.get("acsard: router")
     if row is not None:
         mend = START_ROUTER_ADVICE if row.level else ""
-        if any(one.value == NO_ROUTER for one in row.values):
+        if any(pair.value == NO_ROUTER for pair in row.values):
             mend = PUT_ROUTER_ADVICE
         yield Finding("router", LEVELS[min(row.level, 2)], f"the daemon is {row.message}", mend)
 

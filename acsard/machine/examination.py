@@ -155,12 +155,12 @@ def serial_port(config: Config) -> Iterator[Finding]:
         )
         return
     if not os.path.exists(path):
-        seen = ", ".join(port.device for port in serial_devices()) or "none"
+        ports = ", ".join(port.device for port in serial_devices()) or "none"
         mend = (
             "plug the board in. The board's name in /dev/serial/by-id stays the same when you plug "
             "the board in again: it is the best value of mcu.port (`acsard ports` lists the names)"
         )
-        yield Finding("port", "failure", f"{path} does not exist; the ports are: {seen}", mend)
+        yield Finding("port", "failure", f"{path} does not exist; the ports are: {ports}", mend)
         return
     if not stat.S_ISCHR(os.stat(path).st_mode):
         mend = "`acsard ports` lists the serial devices: write one of them as mcu.port"
@@ -220,7 +220,7 @@ def _permission(path: str) -> Finding:
 def examine(
     where: str,
     text: bytes,
-    given: dict[str, dict[str, object]],
+    overrides: dict[str, dict[str, object]],
     find_address: Callable[[Config], Address] = address_of,
 ) -> Iterator[Finding]:
     """Yield all findings of the doctor.
@@ -235,7 +235,7 @@ def examine(
         UsageError: the daemon's address contains an invalid endpoint.
     """
     try:
-        config = parse(text, given)
+        config = parse(text, overrides)
     except ConfigError as error:
         for problem in error.problems:
             yield Finding("configuration", "failure", f"{where}: {problem}", "see acsard.toml")

@@ -47,11 +47,11 @@ class SerialDevice(Struct, frozen=True):
 def serial_devices() -> list[SerialDevice]:
     """Return the serial ports of this machine that have hardware, sorted by device name."""
     links = _links()
-    found = []
+    devices = []
     for port in sorted(list_ports.comports(), key=lambda p: str(p.device)):
         usb = port.vid is not None and port.pid is not None
         usb_id = f"{port.vid:04x}:{port.pid:04x}" if usb else ""
-        found.append(
+        devices.append(
             SerialDevice(
                 device=port.device,
                 names=links.get(os.path.realpath(port.device), []),
@@ -62,7 +62,7 @@ def serial_devices() -> list[SerialDevice]:
                 holders=list(holders(port.device)),
             )
         )
-    return found
+    return devices
 
 
 def _links() -> dict[str, list[str]]:

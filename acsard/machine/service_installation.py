@@ -176,12 +176,12 @@ class File(Struct, frozen=True):
         The result is "missing", "as installed", "changed", "wrong mode or owner" or "unreadable".
         """
         try:
-            found = self.found()
+            content = self.found()
         except MendableError:
             return "unreadable"
-        if found is None:
+        if content is None:
             return "missing"
-        if found != self.content:
+        if content != self.content:
             return "changed"
         return "as installed" if self.is_as_written() else WRONG_MODE
 
@@ -379,7 +379,7 @@ def admitting(directory: Path) -> Write | Keep | None:
     return admitted(file, file.found(), directory)
 
 
-def admitted(file: File, found: bytes | None, directory: Path) -> Write | Keep:
+def admitted(file: File, content: bytes | None, directory: Path) -> Write | Keep:
     """Return the step that writes the certificates' directory into a drop-in file.
 
     If the drop-in file already names the directory, return a `Keep` step.
@@ -394,9 +394,9 @@ def admitted(file: File, found: bytes | None, directory: Path) -> Write | Keep:
     text = re.sub(
         rb'(?m)^(LoadCredential=[\w.-]+:|ExecReload=.*cd ")[^"\n]*(/[^/"\n]+|" && .*)$',
         lambda match: match[1] + place + match[2],
-        file.content if found is None else found,
+        file.content if content is None else content,
     )
-    if text == found:
+    if text == content:
         return Keep(file.path, "it already names the directory of the certificates")
     return Write(File(file.path, text))
 
@@ -415,7 +415,7 @@ def wrong_modes(wanted: Iterable[File]) -> set[Path]:
 
 
 def installing(
-    wanted: Iterable[File], found: Found, wrong: Container[Path], *, force: bool
+    wanted: Iterable[File], contents: Found, wrong: Container[Path], *, force: bool
 ) -> list[Step]:
     """Return the steps that install the service.
 
@@ -433,7 +433,7 @@ def installing(
     steps: list[Step] = []
     changed: list[str] = []
     for file in wanted:
-        there = found[file.path]
+        there = contents[file.path]
         same = there == file.content
         if (same and file.path not in wrong) or (file.kept and there is not None):
             steps.append(Keep(file.path))
@@ -464,7 +464,7 @@ def foreign_entries(files: Iterable[File], places: Iterable[Path]) -> list[Path]
 
 def uninstalling(
     wanted: Iterable[File],
-    found: Found,
+    contents: Found,
     others: Iterable[Path] = (),
     *,
     force: bool,
@@ -491,12 +491,14 @@ def uninstalling(
     # Only systemd knows the real path of a state directory, and only while the unit is installed.
     # So if an earlier removal has kept the directory without its unit, install the unit again.
     again = [
-        file for file in wanted if purge and file.path.name in stateful and found[file.path] is None
+        file
+        for file in wanted
+        if purge and file.path.name in stateful and contents[file.path] is None
     ]
-    there = [file for file in wanted if found[file.path] is not None or file in again]
+    there = [file for file in wanted if contents[file.path] is not None or file in again]
     why: dict[Path, str] = {}
     for file in there:
-        if found[file.path] == file.content or purge:
+        if contents[file.path] == file.content or purge:
             continue
         if file.kept:
             why[file.path] = "it is your configuration; --purge removes it"

@@ -88,13 +88,13 @@ def listed(directory: Path) -> list[Path]:
 
     The result includes the file that is being written, and files that were cut off.
     """
-    found = [
+    paths = [
         path
         for path in directory.iterdir()
         # A pipe or a link with such a name is not a recording, and reading a pipe may never end.
         if _number(path) is not None and path.is_file() and not path.is_symlink()
     ]
-    return sorted(found, key=lambda path: (_number(path), path.name))
+    return sorted(paths, key=lambda path: (_number(path), path.name))
 
 
 def is_being_recorded(path: Path, now_s: float) -> bool:
@@ -242,7 +242,7 @@ class RecordingDirectory:
     def _recover(self) -> None:
         for part in [path for path in listed(self._directory) if path.name.endswith(PART_SUFFIX)]:
             try:
-                found, marked, disk = part.stat(), _marked(part), self._disk()
+                status, marked, disk = part.stat(), _marked(part), self._disk()
             except FileNotFoundError:
                 # Another process has just removed the file.
                 continue
@@ -250,7 +250,7 @@ class RecordingDirectory:
             kind, cut = (ours, "disk") if ours else marked or ("kept", "crash")
             whole = part.with_name(_stem(part) + SUFFIX_OF_KIND[kind])
             try:
-                message = recover(part, whole, cut, disk.free - found.st_size > disk.spare)
+                message = recover(part, whole, cut, disk.free - status.st_size > disk.spare)
             # Recording new steps is more important than finishing an old file.
             except OSError as error:
                 message = f"{part.name} cannot be completed: {error.strerror}"
@@ -258,8 +258,8 @@ class RecordingDirectory:
             if ours:
                 self._run.numbers.add(_number(part) or 0)
             elif whole.exists() and not marked:
-                self.cut_ns = found.st_mtime_ns
-                self._retain_before(part, found.st_mtime_ns)
+                self.cut_ns = status.st_mtime_ns
+                self._retain_before(part, status.st_mtime_ns)
 
     def _retain_before(self, part: Path, cut_ns: int) -> None:
         """Give the retention class `near` to files that ended within a minute of a crash.
@@ -361,9 +361,9 @@ class RecordingDirectory:
             if _number(path) in self._run.numbers:
                 # Another process may have just removed the file.
                 with suppress(FileNotFoundError):
-                    found = path.stat()
-                    at_ns = max(0, found.st_mtime_ns + jumped_ns)
-                    os.utime(path, ns=(found.st_atime_ns, at_ns))
+                    status = path.stat()
+                    at_ns = max(0, status.st_mtime_ns + jumped_ns)
+                    os.utime(path, ns=(status.st_atime_ns, at_ns))
 
     def trim(self, now: Instant | None, refused: bool = False) -> None:
         """Delete recordings to comply with the limits on total size, age and free disk space.
@@ -396,9 +396,9 @@ class RecordingDirectory:
                 continue
             # Another process may have just removed the file.
             with suppress(FileNotFoundError):
-                found, number = path.stat(), _number(path) or 0
+                status, number = path.stat(), _number(path) or 0
                 this_run = number in self._run.numbers
-                size, at_s = found.st_size, found.st_mtime
+                size, at_s = status.st_size, status.st_mtime
                 ended.append(FinishedFile(path.name, number, _kind(path), size, at_s, this_run))
         return ended
 

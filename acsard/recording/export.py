@@ -277,15 +277,15 @@ class _MessageWriter(_Writer):
         self._add(messages)
 
     def _add(self, messages: list[Published]) -> None:
-        for one in messages:
-            number = self._channels.get((one.channel.name, one.source))
+        for message in messages:
+            number = self._channels.get((message.channel.name, message.source))
             if number is None:
-                number = self._open(one.channel, one.source)
+                number = self._open(message.channel, message.source)
             # MCAP has no times before 1970.
-            wall_ns = max(0, one.wall_ns)
+            wall_ns = max(0, message.wall_ns)
             self._counts[number] += 1
             with self._run.state_errors():
-                data = one.channel.encode(one.message)
+                data = message.channel.encode(message.message)
             self._writer.add_message(number, wall_ns, data, wall_ns, self._counts[number])
             first, last = self.times if self.count else (wall_ns, wall_ns)
             self.times = (min(first, wall_ns), max(last, wall_ns))

@@ -537,11 +537,11 @@ class EventCopies:
         if self.difference or not recording.is_intact:
             return
         end = read_end(recording.path)
-        said = recording.compute_end_record().said
-        if end is not None and end.said != said:
+        summary = recording.compute_end_record().said
+        if end is not None and end.said != summary:
             self._differs(
                 f'the summary at the end of the file is "{end.said}", but the events in the file '
-                f'give the summary "{said}"'
+                f'give the summary "{summary}"'
             )
 
     def _compare(self, last: bool, follows: bool = True) -> None:

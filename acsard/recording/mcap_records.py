@@ -372,13 +372,13 @@ def walk(data: bytes) -> Iterator[FileItem]:
         opcode, length = RECORD_HEAD.unpack_from(data, at)
         claimed = at + RECORD_HEAD.size + length
         chunk = chunks.read(at)
-        found = _read(stream, at, opcode, claimed, len(data)) if chunk is None else None
+        item = _read(stream, at, opcode, claimed, len(data)) if chunk is None else None
         if chunk is not None and chunk.complete:
-            found = FileItem(None, chunk, chunk.end)
-        elif found is None and opcode in SKIPPED_RECORDS and claimed <= len(data):
+            item = FileItem(None, chunk, chunk.end)
+        elif item is None and opcode in SKIPPED_RECORDS and claimed <= len(data):
             at = claimed
             continue
-        if found is None:
+        if item is None:
             after = chunks.later(at + 1)
             if claimed < (after or len(data)):
                 following = chunks.read(claimed)
@@ -387,11 +387,11 @@ def walk(data: bytes) -> Iterator[FileItem]:
                     after = claimed
             cut = after is None and not chunks.spent and (not opcode or claimed > len(data))
             end = len(data) if cut or chunks.spent else after or claimed
-            found = FileItem(None, chunk, end, not cut)
-        yield found
-        if isinstance(found.record, Footer):
+            item = FileItem(None, chunk, end, not cut)
+        yield item
+        if isinstance(item.record, Footer):
             return
-        at = found.end
+        at = item.end
 
 
 def _read(stream: io.BytesIO, at: int, opcode: int, claimed: int, size: int) -> FileItem | None:

@@ -124,7 +124,7 @@ class Recorder:
         self._put(FinishedStep(inputs, outputs, sent), robot, guard)
         self._watch_disk(inputs.now.mono_ns)
 
-    def _put(self, taken: FinishedStep, robot: Robot, guard: Guard) -> None:
+    def _put(self, step: FinishedStep, robot: Robot, guard: Guard) -> None:
         queue = self._queue
         if self._full:
             self._lost += 1
@@ -140,7 +140,7 @@ class Recorder:
             self._report(Event("recording", text, "warning"))
             return
         else:
-            queue.append(taken)
+            queue.append(step)
         if self._wants_state:
             self._wants_state = False
             queue.append(StateBeforeStep(self._number, freeze(robot, guard.memory), robot.config))

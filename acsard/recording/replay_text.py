@@ -102,15 +102,19 @@ def describe_difference(difference: Difference, began_ns: int) -> list[str]:
     ]
 
 
-def _side(name: str, seen: RecordedOutputs) -> list[str]:
-    mode, reason, link, source = map(printable, seen.status)
-    line = "no line" if seen.line is None else printable(seen.line.decode(errors="replace").strip())
-    poses = [[f"{value / US_PER_S:.6f}" for value in pose] for pose in seen.poses]
+def _side(name: str, outputs: RecordedOutputs) -> list[str]:
+    mode, reason, link, source = map(printable, outputs.status)
+    line = (
+        "no line"
+        if outputs.line is None
+        else printable(outputs.line.decode(errors="replace").strip())
+    )
+    poses = [[f"{value / US_PER_S:.6f}" for value in pose] for pose in outputs.poses]
     return [
         f"  {name:8}  {line}",
         f"            mode {mode} ({reason}), link {link}, source {source or 'none'}",
         *[f"            pose x {x} y {y} yaw {yaw}" for x, y, yaw in poses],
-        *[f"            event {_event(event)}" for event in seen.events],
+        *[f"            event {_event(event)}" for event in outputs.events],
     ]
 
 

@@ -158,19 +158,19 @@ _decoder_of_first = msgspec.msgpack.Decoder(_First)
 # Encoding
 
 
-def encode(first: int, taken: Sequence[FinishedStep]) -> bytes:
+def encode(first: int, steps: Sequence[FinishedStep]) -> bytes:
     """Encode successive steps as a batch.
 
     Args:
         first: the number of the first step. It counts the steps since the daemon's start.
         taken: 1 to `MAX_ROWS` steps.
     """
-    start = taken[0].inputs.now
+    start = steps[0].inputs.now
     offset_ns = start.wall_ns - start.mono_ns
-    times = list(_times(taken, start.mono_ns, offset_ns))
+    times = list(_times(steps, start.mono_ns, offset_ns))
     unit = math.gcd(*chain.from_iterable(times)) or 1
-    rares, pose, rows = _rares(taken), (0, 0, 0), []
-    for (inputs, outputs, sent), ns, rare in zip(taken, times, rares, strict=True):
+    rares, pose, rows = _rares(steps), (0, 0, 0), []
+    for (inputs, outputs, sent), ns, rare in zip(steps, times, rares, strict=True):
         now, offset, *reads = [n // unit for n in ns]
         poses = []
         for estimate in outputs.estimates:
@@ -193,22 +193,22 @@ def encode(first: int, taken: Sequence[FinishedStep]) -> bytes:
                 rare=None if rare == NO_OCCASIONAL_FIELDS else rare,
             )
         )
-    crc = checksum([e for t in taken for e in t.outputs.estimates], 0)
+    crc = checksum([e for t in steps for e in t.outputs.estimates], 0)
     names = 0
-    for inputs, _, _ in taken:
+    for inputs, _, _ in steps:
         names = input_names(inputs, names)
     batch = Batch(first, start.mono_ns, offset_ns, unit, tuple(rows), crc, names)
     return msgspec.msgpack.encode(batch)
 
 
-def _times(taken: Sequence[FinishedStep], mono_ns: int, offset_ns: int) -> Iterator[list[int]]:
+def _times(steps: Sequence[FinishedStep], mono_ns: int, offset_ns: int) -> Iterator[list[int]]:
     """Yield one list of times for each step, ns.
 
     The list begins with the values of `Row.now` and `Row.offset`. For each read of the step, the
     list then contains two values: the time from the read to the step, and the offset of the read.
     """
     tick_ns = mono_ns
-    for inputs, _, _ in taken:
+    for inputs, _, _ in steps:
         now = inputs.now
         times = [now.mono_ns - tick_ns, now.wall_ns - now.mono_ns - offset_ns]
         for read in inputs.received:
@@ -219,11 +219,11 @@ def _times(taken: Sequence[FinishedStep], mono_ns: int, offset_ns: int) -> Itera
         yield times
 
 
-def _rares(taken: Sequence[FinishedStep]) -> Iterator[OccasionalFields]:
+def _rares(steps: Sequence[FinishedStep]) -> Iterator[OccasionalFields]:
     opened: int | None = None
     trouble: str | None = None
     status: Status | None = None
-    for inputs, outputs, _ in taken:
+    for inputs, outputs, _ in steps:
         now = status_of(outputs)
         yield OccasionalFields(
             opened=inputs.opened if inputs.opened != opened else None,

@@ -137,7 +137,9 @@ def search(files: Sequence[Path], first: float, last: float) -> Search:
             continue
         if contents is None:
             continue
-        pieces += [_CoveredRange(one.begin, one.end, path) for one in contents.stretches]
+        pieces += [
+            _CoveredRange(stretch.begin, stretch.end, path) for stretch in contents.stretches
+        ]
         if part_between(contents.stretches, first, last) is not None:
             chosen[number] = contents
     for group in _groups(files, chosen):
@@ -183,7 +185,7 @@ def _earlier(files: Sequence[Path], number: int, contents: Contents) -> list[int
     The file with the index `number` and the contents `contents` begins during this drive. If that
     file does not begin during a drive, the result is empty.
     """
-    found: list[int] = []
+    indices: list[int] = []
     while number > 0 and contents.first.recorded.status[0] == "driving":
         number -= 1
         try:
@@ -192,9 +194,9 @@ def _earlier(files: Sequence[Path], number: int, contents: Contents) -> list[int
             break
         if before is None or not _continues(before, contents):
             break
-        found.insert(0, number)
+        indices.insert(0, number)
         contents = before
-    return found
+    return indices
 
 
 def _continues(before: Contents, contents: Contents) -> bool:

@@ -156,10 +156,10 @@ def part_class(module: str, name: str) -> type:
     ours = module in PART_MODULES or any(
         r.endswith(".") and module.startswith(r) for r in PART_MODULES
     )
-    found = vars(sys.modules[module]).get(name) if ours and module in sys.modules else None
-    if not isinstance(found, type) or found.__module__ != module or found.__name__ != name:
+    part = vars(sys.modules[module]).get(name) if ours and module in sys.modules else None
+    if not isinstance(part, type) or part.__module__ != module or part.__name__ != name:
         raise ValueError(f"{module:.50}.{name:.50} is not a class of a robot's state")
-    return found
+    return part
 
 
 PLAIN_TYPES = (bool, int, float, str, bytes, type(None))

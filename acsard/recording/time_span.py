@@ -108,10 +108,10 @@ def parse_when(text: str, now_s: float) -> When:
 
 
 def _time_of_day(words: str, text: str) -> TimeOfDay:
-    found = _CLOCK.fullmatch(words)
-    if found is None:
+    match = _CLOCK.fullmatch(words)
+    if match is None:
         raise _unknown(text)
-    clock = TimeOfDay(int(found[1]), int(found[2]), float(found[3] or 0))
+    clock = TimeOfDay(int(match[1]), int(match[2]), float(match[3] or 0))
     if clock.hours > 23 or clock.minutes > 59 or clock.seconds >= 60:
         raise TimeError(
             f"{words} is not a time of day: a day goes from 00:00 to 23:59:59; write for example "
@@ -230,31 +230,31 @@ def span(recording: Recording, begin: When | None, end: When | None) -> Span:
     If `begin` or `end` is None, the part is not limited on that side.
     """
     by_clock = any(isinstance(when, TimeOfDay | Moment) for when in (begin, end))
-    found = stretches(recording) if by_clock else []
-    first = None if begin is None else _seconds(begin, found, end=False)
-    last = None if end is None else _seconds(end, found, end=True)
+    stretch_list = stretches(recording) if by_clock else []
+    first = None if begin is None else _seconds(begin, stretch_list, end=False)
+    last = None if end is None else _seconds(end, stretch_list, end=True)
     return Span(-math.inf if first is None else first, math.inf if last is None else last)
 
 
-def _seconds(when: When, found: list[Stretch], end: bool) -> float:
+def _seconds(when: When, stretch_list: list[Stretch], end: bool) -> float:
     if isinstance(when, Offset):
         return when.seconds
     away, at = math.inf, 0.0
-    for number, one in enumerate(found):
-        least = one.at if number else -math.inf
-        most = found[number + 1].at if number + 1 < len(found) else math.inf
+    for number, stretch in enumerate(stretch_list):
+        least = stretch.at if number else -math.inf
+        most = stretch_list[number + 1].at if number + 1 < len(stretch_list) else math.inf
         if isinstance(when, Moment):
             moments = [when.end if end else when.begin]
         else:
-            moments = [_on(one.begin, day, when) for day in (-1, 0, 1)]
+            moments = [_on(stretch.begin, day, when) for day in (-1, 0, 1)]
         for moment in moments:
-            far = max(one.begin - moment, moment - one.end, 0.0)
+            far = max(stretch.begin - moment, moment - stretch.end, 0.0)
             if far < away:
-                away, at = far, min(max(one.at + moment - one.begin, least), most)
+                away, at = far, min(max(stretch.at + moment - stretch.begin, least), most)
     return at
 
 
-def part_between(found: list[Stretch], first: float, last: float) -> Span | None:
+def part_between(stretch_list: list[Stretch], first: float, last: float) -> Span | None:
     """Return the part of a recording between two wall-clock times.
 
     If the range overlaps several stretches, the part includes all of them. Return None if the range
@@ -265,14 +265,14 @@ def part_between(found: list[Stretch], first: float, last: float) -> Span | None
         first: beginning of the range, s since 1970.
         last: end of the range, s since 1970.
     """
-    inside = [one for one in found if one.begin <= last and first <= one.end]
+    inside = [stretch for stretch in stretch_list if stretch.begin <= last and first <= stretch.end]
     if not inside:
         return None
-    begin = min(one.at + max(first, one.begin) - one.begin for one in inside)
-    end = max(one.at + min(last, one.end) - one.begin for one in inside)
+    begin = min(stretch.at + max(first, stretch.begin) - stretch.begin for stretch in inside)
+    end = max(stretch.at + min(last, stretch.end) - stretch.begin for stretch in inside)
     # A part that includes the last step must also include the end of the file.
-    whole_begin = inside[0] is found[0] and first <= found[0].begin
-    whole_end = inside[-1] is found[-1] and last >= found[-1].end
+    whole_begin = inside[0] is stretch_list[0] and first <= stretch_list[0].begin
+    whole_end = inside[-1] is stretch_list[-1] and last >= stretch_list[-1].end
     return Span(-math.inf if whole_begin else begin, math.inf if whole_end else end)
 
 
@@ -304,33 +304,33 @@ def read_contents(recording: Recording) -> Contents | None:
 
     A stretch is a part without an adjustment of the wall clock. Return None if no step is readable.
     """
-    found: list[Stretch] = []
+    stretch_list: list[Stretch] = []
     first: Step | None = None
     last_ns, before = 0, b""
     for topic, wall_ns, data in recording.messages():
         if topic != "steps":
             continue
         if first is not None and 0 <= wall_ns - last_ns < MIN_CLOCK_CHANGE_NS:
-            found[-1] = found[-1]._replace(end=wall_ns / NS_PER_S)
+            stretch_list[-1] = stretch_list[-1]._replace(end=wall_ns / NS_PER_S)
         else:
             batch = _steps(data)
             times = [step.inputs.now for step in (*_steps(before), *batch)]
             if first is None and batch:
                 first = batch[0]
-                found.append(_from(recording, first.inputs.now))
-            for one, other in pairwise(times):
-                ahead_ns = other.wall_ns - other.mono_ns - one.wall_ns + one.mono_ns
+                stretch_list.append(_from(recording, first.inputs.now))
+            for previous, other in pairwise(times):
+                ahead_ns = other.wall_ns - other.mono_ns - previous.wall_ns + previous.mono_ns
                 if abs(ahead_ns) >= MIN_CLOCK_CHANGE_NS:
-                    found[-1] = found[-1]._replace(end=one.wall_ns / NS_PER_S)
-                    found.append(_from(recording, other))
+                    stretch_list[-1] = stretch_list[-1]._replace(end=previous.wall_ns / NS_PER_S)
+                    stretch_list.append(_from(recording, other))
         last_ns, before = wall_ns, data
     if first is None:
         return None
     last = first
     if batch := _steps(before):
         last = batch[-1]
-        found[-1] = found[-1]._replace(end=last.inputs.now.wall_ns / NS_PER_S)
-    return Contents(found, first, last)
+        stretch_list[-1] = stretch_list[-1]._replace(end=last.inputs.now.wall_ns / NS_PER_S)
+    return Contents(stretch_list, first, last)
 
 
 def _from(recording: Recording, now: Instant) -> Stretch:

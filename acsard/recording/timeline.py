@@ -203,15 +203,15 @@ class BoardIdentity:
                 self._data = b""
                 continue
             self._data = data[begin:][-MAX_IDENTITY_BYTES:]
-            found = _IDENTITY.search(self._data)
-            if found is None:
+            match = _IDENTITY.search(self._data)
+            if match is None:
                 continue
-            self._data = self._data[found.end() :]
+            self._data = self._data[match.end() :]
             reported = any(event.name == "mcu_restarted" for event in step.recorded.events)
             if reported or now.mono_ns - self._reported_ns < MIN_REASON_NS:
                 continue
             self._reported_ns = now.mono_ns
-            words = printable_bytes(found[1], MAX_IDENTITY_BYTES)
+            words = printable_bytes(match[1], MAX_IDENTITY_BYTES)
             text = (
                 "the microcontroller sent its name, as it does after a restart and after a "
                 f"request: {words}"
@@ -282,8 +282,10 @@ class WaitingSenders:
     def _has_room(self, now: Instant) -> bool:
         if len(self._waiting) >= MAX_WAITING:
             oldest_ns = now.mono_ns - MIN_SILENCE_NS
-            kept = {key: one for key, one in self._waiting.items() if one.last_ns >= oldest_ns}
-            self._waiting = kept
+            recent = {
+                key: sender for key, sender in self._waiting.items() if sender.last_ns >= oldest_ns
+            }
+            self._waiting = recent
         return len(self._waiting) < MAX_WAITING
 
     def _known(self, source: str) -> bool:
@@ -300,10 +302,10 @@ class WaitingSenders:
         priority is unknown, or if `waiting` has the higher priority. In the second case the source
         does not wait, because the robot refuses its commands for another reason.
         """
-        one, other = self._priorities.get(waiting), self._priorities.get(followed)
-        if one is None or other is None or one > other:
+        priority, other = self._priorities.get(waiting), self._priorities.get(followed)
+        if priority is None or other is None or priority > other:
             return ""
-        return "which came first" if one == other else "which has the higher priority"
+        return "which came first" if priority == other else "which has the higher priority"
 
 
 def _named(source: str, sender: str) -> str:
@@ -421,8 +423,10 @@ class TimelineWriter:
         if mode == "driving":
             if self._began_ns is None:
                 self._began_ns, self._distance_m, self._sources = now_ns, 0.0, []
-                seen = self._number is not None or step.number == 0
-                self._since = "" if seen else ", counted from the beginning of this recording"
+                is_complete = self._number is not None or step.number == 0
+                self._since = (
+                    "" if is_complete else ", counted from the beginning of this recording"
+                )
             if source not in self._sources:
                 self._sources.append(source)
         elif self._began_ns is not None:

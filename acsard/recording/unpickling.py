@@ -227,15 +227,15 @@ class _Machine:
     def _top(self, count: int) -> list[_Entry]:
         if len(self._stack) < count:
             raise IndexError("an instruction takes more values than there are on the stack")
-        taken = self._stack[-count:]
+        entries = self._stack[-count:]
         del self._stack[-count:]
-        return taken
+        return entries
 
     def _marked(self) -> list[_Entry]:
         mark = self._marks.pop()
-        taken = self._stack[mark:]
+        entries = self._stack[mark:]
         del self._stack[mark:]
-        return taken
+        return entries
 
     def _copies(self, entry: _Entry) -> None:
         self._copied += entry.size
@@ -308,21 +308,21 @@ class _Machine:
         self._push(self._find(module, name))
 
     def construct(self) -> None:
-        kind, given = self._top(2)
-        if not isinstance(kind.value, type) or not isinstance(given.value, tuple):
+        kind, arguments = self._top(2)
+        if not isinstance(kind.value, type) or not isinstance(arguments.value, tuple):
             raise TypeError(
                 "an instruction calls an object that is not a class, or calls a class without a "
                 "tuple of arguments"
             )
         entry = _Entry(None)
-        entry.holds([given])
-        self._copies(given)
-        entry.value = _made(kind.value, given.value)
+        entry.holds([arguments])
+        self._copies(arguments)
+        entry.value = _made(kind.value, arguments.value)
         self._stack.append(entry)
 
     def make_bare(self) -> None:
-        kind, given = self._top(2)
-        if not isinstance(kind.value, type) or given.value != ():
+        kind, arguments = self._top(2)
+        if not isinstance(kind.value, type) or arguments.value != ():
             raise TypeError(
                 "an instruction makes an object of a value that is not a class, or makes an object "
                 "with arguments, which acsard never writes"
@@ -413,21 +413,21 @@ def _is_part(kind: Any) -> bool:
     return plain and kind.__module__ != "builtins" and not hasattr(kind, "__setstate__")
 
 
-def _made(kind: type, given: tuple[Any, ...]) -> object:
-    """Return an object of the class `kind`, constructed with the arguments `given`.
+def _made(kind: type, arguments: tuple[Any, ...]) -> object:
+    """Return an object of the class `kind`, constructed with the arguments `arguments`.
 
     Raises `ValueError` if the class is not allowed. Raises `TypeError` or a msgspec error if the
     class does not accept the arguments.
     """
-    match given:
+    match arguments:
         case (dict(),) if kind is Counter:
-            return Counter(*given)
+            return Counter(*arguments)
         case () | ((), None | int()) if kind is deque:
-            return deque(*given)
+            return deque(*arguments)
         case (str() | int() as value,) if issubclass(kind, Enum):
             return kind(value)
         case _ if issubclass(kind, Struct):
-            made = kind(*given)
+            made = kind(*arguments)
             # A constructor of a Struct does not check the types of its arguments. `convert` does.
             msgspec.convert({name: getattr(made, name) for name in kind.__struct_fields__}, kind)
             return made

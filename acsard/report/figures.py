@@ -261,8 +261,8 @@ def _places(name: str, places: list[Place], mode: str, **look: object) -> Trace:
 
 def _with_gaps(places: list[Place]) -> list[Place]:
     gap = Place(0.0, math.nan, math.nan, 0.0)
-    found = [item for place in places for item in ((gap, place) if place.new else (place,))]
-    return found[1:] if found and found[0] is gap else found
+    items = [item for place in places for item in ((gap, place) if place.new else (place,))]
+    return items[1:] if items and items[0] is gap else items
 
 
 def _spread(places: list[Place]) -> list[Place]:
@@ -274,12 +274,12 @@ def _spread(places: list[Place]) -> list[Place]:
     for before, after in pairwise(places):
         metres = 0.0 if after.new else math.hypot(after.x - before.x, after.y - before.y)
         distances.append(distances[-1] + metres)
-    spacing, found, due = distances[-1] / HEADING_ARROWS, list[Place](), 0.0
+    spacing, arrows, due = distances[-1] / HEADING_ARROWS, list[Place](), 0.0
     for place, distance in zip(places, distances, strict=True):
-        if distance >= due and (not found or distance > 0):
-            found.append(place)
+        if distance >= due and (not arrows or distance > 0):
+            arrows.append(place)
             due += max(spacing, distance - due)
-    return found
+    return arrows
 
 
 def _arrows(places: list[Place]) -> dict[str, Any]:
@@ -449,9 +449,9 @@ class TimeFigures:
 
     def events(self) -> Figure:
         """Return the picture of the events, with a row for each level."""
-        levels, kept = ("info", "warning", "error"), self._data.marks
+        levels, marks = ("info", "warning", "error"), self._data.marks
         traces = [
-            self._marks(level, at, [mark for mark in kept.all() if mark.level == level])
+            self._marks(level, at, [mark for mark in marks.all() if mark.level == level])
             for at, level in enumerate(levels)
         ]
         axes = self._timed() | {
@@ -540,6 +540,6 @@ class TimeFigures:
 
 
 def _hover(name: str, values: Sequence[float]) -> dict[str, Any]:
-    shown = "customdata" if values else "y"
-    text = f"{name} %{{{shown}:.3~f}}<br>%{{x|%H:%M:%S.%L}}<extra></extra>"
+    field = "customdata" if values else "y"
+    text = f"{name} %{{{field}:.3~f}}<br>%{{x|%H:%M:%S.%L}}<extra></extra>"
     return {"hovertemplate": text} | ({"customdata": numbers(values)} if values else {})

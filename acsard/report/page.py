@@ -287,9 +287,9 @@ def _events(data: ReportData, clock: Clock) -> str:
         else ""
     )
     table = _table(["time", "event", "what", "by"], cells)
-    shown = " open" if len(marks) <= MAX_UNFOLDED_EVENTS else ""
+    attribute = " open" if len(marks) <= MAX_UNFOLDED_EVENTS else ""
     heading = f"<summary><h2>All {len(marks)} events</h2></summary>"
-    return f"<details{shown}>{heading}{table}</details>{more}"
+    return f"<details{attribute}>{heading}{table}</details>{more}"
 
 
 def _settings(data: ReportData) -> str:

@@ -108,7 +108,9 @@ class Marks:
 
     def all(self) -> list[Mark]:
         """Return all events that are kept, in order."""
-        rows = [row for kept in (self._first, self._last) for rows in kept.values() for row in rows]
+        rows = [
+            row for groups in (self._first, self._last) for rows in groups.values() for row in rows
+        ]
         return [mark for _, mark in sorted(rows, key=lambda row: row[0])]
 
 

@@ -141,11 +141,11 @@ def reasons(data: ReportData) -> list[tuple[str, str, str, float]]:
                 alike = NUMBER.sub("#", span.words)
                 seconds = durations.setdefault((name, span.kind, alike), defaultdict(float))
                 seconds[span.words] += span.end - span.begin
-    found = [
+    table_rows = [
         (name, state, max(seconds, key=seconds.__getitem__), math.fsum(seconds.values()))
         for (name, state, _), seconds in durations.items()
     ]
-    return sorted(found, key=lambda row: -row[3])[:MAX_REASONS]
+    return sorted(table_rows, key=lambda row: -row[3])[:MAX_REASONS]
 
 
 def _first_of_each(marks: list[Mark], clock: Clock) -> str:
@@ -171,14 +171,14 @@ def notes(data: ReportData, origin: Origin) -> list[str]:
     These are the notes of `origin`, and notes about missing steps, about a change of the clock, and
     about the resolution of the pictures.
     """
-    found = list(origin.notes)
+    texts = list(origin.notes)
     if data.missing:
-        found.append(
+        texts.append(
             f"{many(data.missing, 'step is', 'steps are')} missing: after the missing steps, the "
             "commanded and limited speeds, and the reasons why sources wait, may be wrong."
         )
     if data.marks.counts["clock"]:
-        found.append(
+        texts.append(
             "The clock of the robot's computer was set during this recording. In the list of "
             "events, each time is the clock's time at that event. The time axes of the pictures "
             "begin with the clock's time and ignore the later change."
@@ -186,12 +186,12 @@ def notes(data: ReportData, origin: Origin) -> list[str]:
     curves = [*data.linear.values(), *data.angular.values()]
     width = max(curve.width for curve in curves)
     if width > MAX_POINT_S:
-        found.append(
+        texts.append(
             f"Each point of a picture covers up to {width:.2g} s, and shows the lowest and the "
             "highest value in that time. To see more detail, choose a shorter time with --from and "
             "--to."
         )
-    return found
+    return texts
 
 
 def rows(data: ReportData, origin: Origin, clock: Clock) -> Iterator[tuple[str, str]]:

@@ -264,12 +264,12 @@ class JsonPrompt:
                     # begins does not end it.
                     self._news.wait(POLL_S)
             try:
-                got = read(self._answer.value)
+                answer = read(self._answer.value)
             except ValueError as error:
                 wrong = str(error)
                 continue
             self._moves = True
-            return got
+            return answer
 
     # Input
 
@@ -286,14 +286,14 @@ class JsonPrompt:
         Return a reason to interrupt the subcommand if the input ends before, if a line is too long,
         or if no line arrives in time.
         """
-        held, heard_s = b"", time.monotonic()
+        buffer, heard_s = b"", time.monotonic()
         while not self._left:
             if self._readable(POLL_S):
                 read = os.read(self._input, 4096)
-                *whole, held = (held + read).split(b"\n")
+                *whole, buffer = (buffer + read).split(b"\n")
                 if not read:
                     return "the program that shows the questions to the operator has ended"
-                if len(held) > MAX_LINE_BYTES:
+                if len(buffer) > MAX_LINE_BYTES:
                     return f"a line on standard input has more than {MAX_LINE_BYTES} bytes"
                 for line in whole:
                     self._take(line)
@@ -314,17 +314,17 @@ class JsonPrompt:
 
     def _take(self, line: bytes) -> None:
         try:
-            said = self._lines.decode(line)
+            message = self._lines.decode(line)
         except (msgspec.MsgspecError, ValueError, RecursionError):
             # The line does not answer the question, which therefore stays open.
             return
         with self._news:
-            if said.key:
+            if message.key:
                 self._pressed = True
-            elif said.answer and said.answer == self._open:
+            elif message.answer and message.answer == self._open:
                 # Forget a key that was pressed before the answer. A later key press stops the
                 # drive.
-                self._open, self._answer, self._pressed = 0, said, False
+                self._open, self._answer, self._pressed = 0, message, False
             self._news.notify_all()
 
     def _end(self, why: str) -> None:

@@ -118,11 +118,11 @@ turning.
 
 
 @contextmanager
-def ended_by_signals(says: str = "", *, exits: bool = False) -> Iterator[None]:
+def ended_by_signals(notice: str = "", *, exits: bool = False) -> Iterator[None]:
     """Raise `KeyboardInterrupt` in the `with` block when one of `PROMPT_END_SIGNALS` arrives.
 
     Further signals are then ignored until the end of the block, so that its cleanup can send zero
-    speeds. `says` is printed when the signal arrives. If `exits` is true, a signal other than
+    speeds. `notice` is printed when the signal arrives. If `exits` is true, a signal other than
     SIGINT raises `SystemExit` instead, with 128 plus the number of the signal.
     """
     before = [signal.getsignal(number) for number in PROMPT_END_SIGNALS]
@@ -133,8 +133,8 @@ def ended_by_signals(says: str = "", *, exits: bool = False) -> Iterator[None]:
         # If the program that started this one is gone or does not read, printing would fail or
         # block. The zero speeds must not wait for that.
         with suppress(OSError, ValueError):
-            if says and select.select([], [sys.stderr], [], 0.0)[1]:
-                print(f"\n{says}", file=sys.stderr)
+            if notice and select.select([], [sys.stderr], [], 0.0)[1]:
+                print(f"\n{notice}", file=sys.stderr)
         if exits and number != signal.SIGINT:
             raise SystemExit(128 + number)
         raise KeyboardInterrupt

@@ -45,76 +45,76 @@ class Teleop(Struct, frozen=True):
     """True if no state has arrived for too long, so the shown data is old."""
 
 
-def lines(seen: Teleop, width: int, height: int | None = None) -> list[Text]:
+def lines(teleop: Teleop, width: int, height: int | None = None) -> list[Text]:
     """Return the lines of the screen of `acsard drive`.
 
     There are at most `height` lines, or any number if `height` is None. A line has at most `width`
     character cells. A `width` below 20 counts as 20.
     """
     width = max(20, width)
-    head = printable(f"{seen.robot_id} as {seen.source}  {seen.endpoint}")
-    shown = [Text(head, "bold")]
-    if seen.silent or seen.state is None:
-        shown += _wrapped(silence(seen), width, "bold red")
-    if seen.state is not None:
-        state = seen.state
+    head = printable(f"{teleop.robot_id} as {teleop.source}  {teleop.endpoint}")
+    rows = [Text(head, "bold")]
+    if teleop.silent or teleop.state is None:
+        rows += _wrapped(silence(teleop), width, "bold red")
+    if teleop.state is not None:
+        state = teleop.state
         mode = f" {printable(state.mode).upper()} "
-        told = _wrapped(f"{mode} {reason(state)}", width, "bold")
-        for first in told[:1]:
+        mode_lines = _wrapped(f"{mode} {reason(state)}", width, "bold")
+        for first in mode_lines[:1]:
             first.stylize(MODE_STYLES.get(state.mode, "reverse"), 0, len(mode))
-        shown += told
-        if seen.objection:
-            shown += _wrapped(refused(seen.objection), width, "bold red")
-        shown += flow(measured(state), width)
-    shown.append(Text(f"keys ask for {asked(seen)}"))
+        rows += mode_lines
+        if teleop.objection:
+            rows += _wrapped(refused(teleop.objection), width, "bold red")
+        rows += flow(measured(state), width)
+    rows.append(Text(f"keys ask for {asked(teleop)}"))
     below = [Text(line, "dim") for line in HELP]
-    if height is not None and len(shown) + len(below) >= height:
-        shown = [*shown[: max(1, height - len(below))], *below][:height]
+    if height is not None and len(rows) + len(below) >= height:
+        rows = [*rows[: max(1, height - len(below))], *below][:height]
     else:
-        shown += [Text(), *below]
-    for line in shown:
+        rows += [Text(), *below]
+    for line in rows:
         line.truncate(width, overflow="ellipsis")
-    return shown
+    return rows
 
 
-def report_lines(seen: Teleop, width: int) -> list[str]:
+def report_lines(teleop: Teleop, width: int) -> list[str]:
     """Return the lines of a report about the robot, for a terminal that cannot show a screen.
 
     The report has the content of the screen, but not the help about the keys. A line has at most
     `width` characters. A `width` below 20 counts as 20.
     """
-    told = [f"keys ask for {asked(seen)}"]
-    if seen.state is None or seen.silent:
-        return _words([silence(seen), *told], width)
-    if seen.objection:
-        told.insert(0, refused(seen.objection))
-    why = f"{printable(seen.state.mode)}: {reason(seen.state)}"
-    return _words([why, *told], width, measured(seen.state))
+    parts = [f"keys ask for {asked(teleop)}"]
+    if teleop.state is None or teleop.silent:
+        return _words([silence(teleop), *parts], width)
+    if teleop.objection:
+        parts.insert(0, refused(teleop.objection))
+    why = f"{printable(teleop.state.mode)}: {reason(teleop.state)}"
+    return _words([why, *parts], width, measured(teleop.state))
 
 
-def last_report_lines(seen: Teleop, width: int) -> list[str]:
+def last_report_lines(teleop: Teleop, width: int) -> list[str]:
     """Return the lines of the last report, which is printed when `acsard drive` ends.
 
     The report says whether the robot still moves, and contains its mode with the reason, its pose
     and its speeds. A line has at most `width` characters.
     """
-    if seen.state is None or seen.silent:
-        return _words([f"drive ended: {silence(seen)}"], width)
-    what = "still moves" if moves(seen.state) else "stands still"
-    if seen.state.linear is None:
+    if teleop.state is None or teleop.silent:
+        return _words([f"drive ended: {silence(teleop)}"], width)
+    what = "still moves" if moves(teleop.state) else "stands still"
+    if teleop.state.linear is None:
         what = "reports no speed"
-    why = f"{printable(seen.state.mode)}: {reason(seen.state)}"
-    return _words([f"drive ended: the robot {what}", why], width, measured(seen.state))
+    why = f"{printable(teleop.state.mode)}: {reason(teleop.state)}"
+    return _words([f"drive ended: the robot {what}", why], width, measured(teleop.state))
 
 
-def released(seen: Teleop) -> bool:
+def released(teleop: Teleop) -> bool:
     """Return whether the robot stands still and no longer follows this drive's command source.
 
     Return False if no state has arrived. A robot without a measured speed counts as standing still.
     """
-    if seen.state is None or moves(seen.state):
+    if teleop.state is None or moves(teleop.state):
         return False
-    return seen.state.mode != Mode.DRIVING or seen.state.source != seen.source
+    return teleop.state.mode != Mode.DRIVING or teleop.state.source != teleop.source
 
 
 def moves(state: RobotState) -> bool:
@@ -122,11 +122,11 @@ def moves(state: RobotState) -> bool:
     return any((state.linear, state.angular, *state.wheels))
 
 
-def silence(seen: Teleop) -> str:
+def silence(teleop: Teleop) -> str:
     """Return a sentence which says that the first state, or a new state, has not arrived."""
-    if seen.state is None and not seen.silent:
+    if teleop.state is None and not teleop.silent:
         return "waiting for the first state message of the daemon"
-    return f"nothing received from the daemon for {seen.age:.0f} s: is the daemon running?"
+    return f"nothing received from the daemon for {teleop.age:.0f} s: is the daemon running?"
 
 
 def reason(state: RobotState) -> str:
@@ -144,19 +144,19 @@ def refused(objection: str) -> str:
     return f"your keys do not drive the robot: {printable(objection)}{mend}"
 
 
-def asked(seen: Teleop) -> str:
-    return f"{seen.linear:.2f} m/s, {seen.angular:.2f} rad/s"
+def asked(teleop: Teleop) -> str:
+    return f"{teleop.linear:.2f} m/s, {teleop.angular:.2f} rad/s"
 
 
 def measured(state: RobotState) -> list[Text]:
     """Return the robot's pose and measured twist as short texts with units."""
-    told = [*place(state.x, state.y, state.yaw), *speeds(state.linear, state.angular)]
-    return [Text(one) for one in told]
+    texts = [*place(state.x, state.y, state.yaw), *speeds(state.linear, state.angular)]
+    return [Text(text) for text in texts]
 
 
-def _words(told: Sequence[str], width: int, figures: Sequence[Text] = ()) -> list[str]:
+def _words(parts: Sequence[str], width: int, figures: Sequence[Text] = ()) -> list[str]:
     width = max(20, width)
-    lines = wrap("; ".join(told), width, subsequent_indent="  ", break_on_hyphens=False)
+    lines = wrap("; ".join(parts), width, subsequent_indent="  ", break_on_hyphens=False)
     return [*lines, *(f"  {line}" for line in flow(figures, width - 2))]
 
 

@@ -38,8 +38,8 @@ class Feed:
             ) from None
         # First process the states that have arrived. One of them may be newer than the answer.
         self.poll()
-        held, now = self._watch.state, clock.steady_s()
-        if held is None or state.stamp.to_ns() > held.stamp.to_ns():
+        previous, now = self._watch.state, clock.steady_s()
+        if previous is None or state.stamp.to_ns() > previous.stamp.to_ns():
             self._watch.answered(state, now)
             self._take(state, now)
 

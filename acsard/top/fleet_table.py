@@ -47,17 +47,17 @@ def table(rows: Sequence[Row], width: int, height: int | None = None) -> list[st
     widest = [max(len(row[n]) for row in cells) for n in range(len(COLUMN_HEADS))]
     rooms = [min(room, most) for room, most in zip(widest, (*COLUMN_WIDTHS, WHY), strict=True)]
     powered = any(row[BATTERY_COLUMN] for row in cells[1:])
-    shown = [n for n in range(len(COLUMN_HEADS)) if n != BATTERY_COLUMN or powered]
+    columns = [n for n in range(len(COLUMN_HEADS)) if n != BATTERY_COLUMN or powered]
     # If the terminal is too narrow, these columns are left out one by one, in this order.
     for column in map(COLUMN_HEADS.index, ("VERSION", "PLACE", "LINK", "BATTERY")):
-        if column in shown and sum(rooms[n] + 2 for n in shown) - 2 > width:
-            shown.remove(column)
-    rest = sum(rooms[n] + 2 for n in shown[1:])
+        if column in columns and sum(rooms[n] + 2 for n in columns) - 2 > width:
+            columns.remove(column)
+    rest = sum(rooms[n] + 2 for n in columns[1:])
     rooms[0] = min(rooms[0], max(NAME, width - rest))
     lines = [
         "  ".join(
             [name.ljust(rooms[0])]
-            + [row[n][: rooms[n]].ljust(rooms[n]) for n in shown[1:-1]]
+            + [row[n][: rooms[n]].ljust(rooms[n]) for n in columns[1:-1]]
             + [row[-1]]
         ).rstrip()
         for name, row in zip(shortened([row[0] for row in cells], rooms[0]), cells, strict=True)
@@ -85,7 +85,7 @@ def shortened(names: Sequence[str], room: int) -> list[str]:
         ]
 
     from_the_middle = sorted(range(room), key=lambda head: abs(2 * head - room + 1))
-    return max(map(cut, from_the_middle), key=lambda found: len(set(found)))
+    return max(map(cut, from_the_middle), key=lambda variant: len(set(variant)))
 
 
 def row_cells(row: Row) -> tuple[str, ...]:
@@ -111,10 +111,10 @@ def row_cells(row: Row) -> tuple[str, ...]:
 
 def _why(state: RobotState) -> str:
     why = reason(state)
-    found, parts = [one for one in warnings(state) if one.brief not in why], [why]
-    if found:
-        parts.insert(1 if state.mode in URGENT else 0, brief(found))
-    details = [(one.what.replace("_", " "), one.text) for one in found]
+    problems, parts = [warning for warning in warnings(state) if warning.brief not in why], [why]
+    if problems:
+        parts.insert(1 if state.mode in URGENT else 0, brief(problems))
+    details = [(warning.what.replace("_", " "), warning.text) for warning in problems]
     details.append(("speed limit", state.speed_limit))
     return "; ".join(parts + [f"{what}: {printable(text)}" for what, text in details if text])
 
@@ -176,14 +176,14 @@ class Roster(Fleet):
             known = list(self._known.values())
         named = ALL_ROBOTS not in self._ids
         return named and all(
-            one.here and one.version and one.follower.is_confirmed for one in known
+            robot.here and robot.version and robot.follower.is_confirmed for robot in known
         )
 
     @property
     def seen(self) -> str:
         """A sentence with the number of robots that are present; "" if the user named them."""
         with self._lock:
-            here = sum(bool(one.here) for one in self._known.values())
+            here = sum(bool(robot.here) for robot in self._known.values())
         return count_text(self._robot.where.endpoint, here) if ALL_ROBOTS in self._ids else ""
 
     @property

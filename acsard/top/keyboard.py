@@ -148,11 +148,11 @@ class Keyboard:
         - No key seems to be held. Then the network may be delaying the repeats of a held key. If
           more than `MAX_BURST_KEYS` repeats arrive together later, ignore this key too.
         """
-        held = self._held(now)
-        if self._over or (held and now - self._begun <= SETTLED_S):
+        key_down = self._held(now)
+        if self._over or (key_down and now - self._begun <= SETTLED_S):
             return
         self._over = True
-        if held:
+        if key_down:
             self._stop(now)
 
     def ignores(self, now: float) -> bool:

@@ -40,18 +40,21 @@ BAR_WIDTH = 4
 
 def motion(state: RobotState, width: int) -> list[Text]:
     """Return lines with pose and twist, then lines with the speeds of the front and rear wheels."""
-    told = [
+    figures = [
         f"x {signed(state.x, 3, 8)} m",
         f"y {signed(state.y, 3, 8)} m",
         f"yaw {signed(math.degrees(state.yaw), 1, 6)}°",
         f"forward {signed(state.linear, 3, 7)} m/s",
         f"turn {signed(state.angular, 3, 7)} rad/s",
     ]
-    lines = [rule(width, [(0, "pose and twist")]), *flow([Text(one) for one in told], width, 0)]
+    lines = [
+        rule(width, [(0, "pose and twist")]),
+        *flow([Text(value) for value in figures], width, 0),
+    ]
     lines.append(Text("wheels rad/s", "cyan"))
     (right, left, rear_left, rear_right), scale = speeds(state)
-    for axle, one, other in (("front", left, right), ("rear", rear_left, rear_right)):
-        line = Text(f"  {axle:<6}", "dim").append_text(wheel(one, scale, BAR_WIDTH)).append(" ")
+    for axle, value, other in (("front", left, right), ("rear", rear_left, rear_right)):
+        line = Text(f"  {axle:<6}", "dim").append_text(wheel(value, scale, BAR_WIDTH)).append(" ")
         lines.append(line.append_text(wheel(other, scale, BAR_WIDTH)))
     return lines
 
@@ -65,38 +68,38 @@ def sources(state: RobotState, room: int, width: int) -> list[Text]:
     lines = [rule(width, [(0, "sources"), (16, "priority"), (26, "seen")])]
     left = list(state.sources)
     while left:
-        one = left[0]
-        mark = "▶ " if drives(one, state) else "  "
-        name = Text(clean(one.name))
+        source = left[0]
+        mark = "▶ " if drives(source, state) else "  "
+        name = Text(clean(source.name))
         name.truncate(13, overflow="ellipsis", pad=True)
-        said = [Text(f"{mark}{name.plain} {count(one.priority):>8}  {rough(one.age)}")]
-        said += folded(f"status: {waits(one, state)}", width, 4)
-        if len(lines) > 1 and len(lines) + len(said) > room:
+        rows = [Text(f"{mark}{name.plain} {count(source.priority):>8}  {rough(source.age)}")]
+        rows += folded(f"status: {waits(source, state)}", width, 4)
+        if len(lines) > 1 and len(lines) + len(rows) > room:
             break
-        lines += [*said]
+        lines += [*rows]
         left.pop(0)
     if left:
         lines.append(Text(hidden(left), "dim"))
     return lines if state.sources else [*lines, Text("  none", "dim")]
 
 
-def link(seen: ScreenData, state: RobotState, width: int) -> list[Text]:
+def link(data: ScreenData, state: RobotState, width: int) -> list[Text]:
     """Return the lines about the serial link, the commands and the rejected inputs.
 
-    `seen` contains the data of the screen, and `state` is the state to show. A line has at most
+    `data` contains the data of the screen, and `state` is the state to show. A line has at most
     `width` character cells.
     """
-    before = seen.before or state
-    lines = [rule(width, [(0, title(seen, state))])]
+    before = data.before or state
+    lines = [rule(width, [(0, title(data, state))])]
     if state.certificate_expiry:
         lines += flow([certificate(state)], width, 2)
-    counted = rates(seen, state, before)
-    told = [Text(f"{what} {counted(name)}") for what, name in COUNTER_LINES]
+    counted = rates(data, state, before)
+    figures = [Text(f"{what} {counted(name)}") for what, name in COUNTER_LINES]
     superseded = state.counters.get("lines_superseded", 0)
-    told += [Text(f"superseded {count(superseded)}"), missed(state, before), overrun(state)]
+    figures += [Text(f"superseded {count(superseded)}"), missed(state, before), overrun(state)]
     if met := state.counters.get("commands_of_new_senders", 0):
-        told.append(Text(f"commands of new senders {count(met)}"))
-    lines += flow([one for one in told if one], width, 0)
+        figures.append(Text(f"commands of new senders {count(met)}"))
+    lines += flow([figure for figure in figures if figure], width, 0)
     if state.gyro != "off":
         lines += folded(f"gyro {clean(state.gyro)}", width, 2)
     if state.effective_track:
@@ -120,8 +123,10 @@ def timing(state: RobotState, width: int) -> list[Text]:
     for since, last in (("last minute", True), ("since start", False)):
         lines.append(Text(f"{since:<16}{heads}", "dim"))
         for name in NAMES:
-            one = state.latencies.get(name)
-            figures = None if one is None else one.last_minute if last else one.since_start
+            latency = state.latencies.get(name)
+            figures = (
+                None if latency is None else latency.last_minute if last else latency.since_start
+            )
             lines.append(Text(f"{name:<16}").append_text(spread(figures)))
     return lines
 
@@ -132,6 +137,6 @@ def folded(text: str, width: int, inset: int) -> list[Text]:
     If the text begins with a label such as "gyro", its first line is not indented.
     """
     first = "" if text.startswith(("gyro ", "track ", "board ", "last one ")) else " " * inset
-    wide = max((cell_len(one) for one in text), default=1)  # a character may be two cells wide
+    wide = max((cell_len(piece) for piece in text), default=1)  # a character may be two cells wide
     room, rest = max(inset + 1, width // max(1, wide)), " " * inset
-    return [Text(one) for one in wrap(text, room, initial_indent=first, subsequent_indent=rest)]
+    return [Text(piece) for piece in wrap(text, room, initial_indent=first, subsequent_indent=rest)]

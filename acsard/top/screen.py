@@ -24,7 +24,7 @@ from acsard.top.wide_screen import MAX_COLUMNS
 MAX_SOURCES = 32
 
 
-def screen(seen: ScreenData, width: int, height: int | None = None) -> Group:
+def screen(data: ScreenData, width: int, height: int | None = None) -> Group:
     """Return the screen of `acsard top`.
 
     The screen has at most `height` lines, or any number if `height` is None. A line has at most
@@ -32,16 +32,16 @@ def screen(seen: ScreenData, width: int, height: int | None = None) -> Group:
     counts as `MAX_COLUMNS`.
     """
     width = max(20, min(MAX_COLUMNS, width))
-    head = [_header(seen, width), *(_no_news(seen, width) if seen.silent else _mode(seen, width))]
-    if seen.state is not None:
-        head += _warnings(seen.state, width)
+    head = [_header(data, width), *(_no_news(data, width) if data.silent else _mode(data, width))]
+    if data.state is not None:
+        head += _warnings(data.state, width)
     sections: list[list[Text]] = []
-    if seen.state is not None:
-        state = seen.state
+    if data.state is not None:
+        state = data.state
         parts = narrow_screen if width < narrow_screen.MIN_WIDE_COLUMNS else beside
         sections = [
             parts.motion(state if state.link == "up" else _unmeasured(state), width),
-            parts.link(seen, state, width),
+            parts.link(data, state, width),
             parts.timing(state, width),
         ]
         used = len(head) + sum(map(len, sections)) + 1
@@ -51,7 +51,7 @@ def screen(seen: ScreenData, width: int, height: int | None = None) -> Group:
     airy = height is None or height - used >= len(sections) - 1
     body = [line for part in sections for line in ([Text(), *part] if airy else part)]
     body = body[1:] if airy else body  # no empty line between the head and the first section
-    if seen.silent:
+    if data.silent:
         for line in body:
             line.stylize("dim")
     lines = [*head, *body][:height]
@@ -66,20 +66,20 @@ def _unmeasured(state: RobotState) -> RobotState:
     return replace(state, linear=math.nan, angular=math.nan, wheels=[])
 
 
-def _header(seen: ScreenData, width: int) -> Text:
-    left = Text.assemble((clean(seen.robot_id), "bold"), "  ", clean(seen.endpoint))
-    if seen.info is not None:
-        left.append(f"  acsard {clean(seen.info.version)}", "dim")
-    right = Text(f"seen {rough(seen.age)} ago" if seen.state is not None else "", "dim")
-    if seen.hint:
-        right.append(f"   {seen.hint}")
+def _header(data: ScreenData, width: int) -> Text:
+    left = Text.assemble((clean(data.robot_id), "bold"), "  ", clean(data.endpoint))
+    if data.info is not None:
+        left.append(f"  acsard {clean(data.info.version)}", "dim")
+    right = Text(f"seen {rough(data.age)} ago" if data.state is not None else "", "dim")
+    if data.hint:
+        right.append(f"   {data.hint}")
     return ends(left, right, width)
 
 
-def _mode(seen: ScreenData, width: int) -> list[Text]:
+def _mode(data: ScreenData, width: int) -> list[Text]:
     # On a wide screen, always return two lines. Otherwise, the lines below would move when the
     # reason becomes long.
-    state = seen.state
+    state = data.state
     if state is None:
         return [Text("waiting for the first state message of the daemon", "yellow")]
     badge = Text(f" {clean(state.mode).upper()[:12]} ", MODE_STYLES.get(state.mode, "reverse"))
@@ -92,8 +92,8 @@ def _mode(seen: ScreenData, width: int) -> list[Text]:
 
 
 def _warnings(state: RobotState, width: int) -> list[Text]:
-    found = warnings(state)
-    words = clean(f"{WARNING}: {found[0]}" if len(found) == 1 else brief(found))
+    problems = warnings(state)
+    words = clean(f"{WARNING}: {problems[0]}" if len(problems) == 1 else brief(problems))
     wide = width >= narrow_screen.MIN_WIDE_COLUMNS
     lines = [Text(words)] if wide and words else narrow_screen.folded(words, width, 2)
     for line in lines:
@@ -108,11 +108,11 @@ def _split(words: str, room: int) -> tuple[str, str]:
     return (words[:at], words[at + 1 :]) if at > 0 else (words[:room], words[room:])
 
 
-def _no_news(seen: ScreenData, width: int) -> list[Text]:
-    since = lasting(int(min(seen.age, 1e9)))
+def _no_news(data: ScreenData, width: int) -> list[Text]:
+    since = lasting(int(min(data.age, 1e9)))
     words = f"NOTHING RECEIVED FOR {since}: is the daemon running?"
-    if seen.undecodable:
+    if data.undecodable:
         words = f"NOTHING READABLE FOR {since}: is the daemon a different version?"
-    told = Text(words.center(width), "bold white on red")
+    banner = Text(words.center(width), "bold white on red")
     blank = Text(" " * width, "on red")
-    return [blank, told, blank.copy()]
+    return [blank, banner, blank.copy()]

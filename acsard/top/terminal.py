@@ -103,11 +103,11 @@ def print_last_report(ride: KeyboardDrive) -> None:
     left = clock.steady_s()
     while os.isatty(0) and os.isatty(1):
         ride.take()
-        seen, took = ride.seen(), clock.steady_s() - left
-        rests = seen.age < took and released(seen)
+        teleop, took = ride.seen(), clock.steady_s() - left
+        rests = teleop.age < took and released(teleop)
         # A robot usually stops within 2 s, by its own deceleration ramp.
         if rests or took > 2.0:
-            print("\n".join(last_report_lines(seen, output_size().columns)), flush=True)
+            print("\n".join(last_report_lines(teleop, output_size().columns)), flush=True)
             return
         time.sleep(KEY_POLL_S)
 
@@ -119,24 +119,24 @@ def roster(fleet: Roster) -> None:
     def draw() -> RenderableType:
         rows = fleet.rows()
         width, height = console.size
-        told = [Text(line, no_wrap=True) for line in table(rows, width, max(1, height - 2))]
-        told[0].stylize("bold cyan")
-        for line in told[1:]:
+        texts = [Text(line, no_wrap=True) for line in table(rows, width, max(1, height - 2))]
+        texts[0].stylize("bold cyan")
+        for line in texts[1:]:
             if "GONE" in line.plain or "SILENT" in line.plain:
                 line.stylize("bold red")
             elif WARNING in line.plain:
                 line.stylize("bold yellow")
         below = f"q quits   {fleet.left_out_text or fleet.seen}" if rows else fleet.hint()
         last = Text(below.rstrip(), "dim", no_wrap=bool(rows), overflow="ellipsis")
-        return Group(*told, Text(), last)
+        return Group(*texts, Text(), last)
 
     _hold(lambda suspend: _watch(draw, console, suspend))
 
 
 def _watch(draw: Callable[[], RenderableType], console: Console, suspend: list[bool]) -> bool:
-    with keys() as read, _screen(console) as shown:
+    with keys() as read, _screen(console) as display:
         while not suspend:
-            shown.update(draw(), refresh=True)
+            display.update(draw(), refresh=True)
             typed = read(DRAW_PERIOD_S)
             if typed is None or "q" in typed.lower():
                 return False
@@ -174,7 +174,7 @@ def _steer(ride: KeyboardDrive, console: Console, suspend: list[bool]) -> bool:
 
     Return True if the user pressed Ctrl-Z, and False at the end of the input.
     """
-    with keys() as read, _screen(console) as shown:
+    with keys() as read, _screen(console) as display:
         due = 0.0
         while not suspend:
             typed = read(KEY_POLL_S)
@@ -183,7 +183,7 @@ def _steer(ride: KeyboardDrive, console: Console, suspend: list[bool]) -> bool:
             ride.step(typed)
             if typed or time.monotonic() >= due:
                 due = time.monotonic() + DRAW_PERIOD_S
-                shown.update(Group(*lines(ride.seen(), *console.size)), refresh=True)
+                display.update(Group(*lines(ride.seen(), *console.size)), refresh=True)
     for letter in ("k", "", ""):
         ride.step(letter)  # stop the robot, because a suspended program sends no commands
     return True
@@ -258,10 +258,10 @@ def _drive_in_lines(ride: KeyboardDrive) -> None:
     with until_signal(), keys() as read:
         while (typed := read(KEY_POLL_S)) is not None:
             ride.step(typed)
-            seen = ride.seen()
-            if due.tell(seen, time.monotonic()):
+            teleop = ride.seen()
+            if due.tell(teleop, time.monotonic()):
                 width, height = output_size()
-                print("\n".join(page.with_help(report_lines(seen, width), height)), flush=True)
+                print("\n".join(page.with_help(report_lines(teleop, width), height)), flush=True)
 
 
 def output_size() -> os.terminal_size:
@@ -280,15 +280,15 @@ class ReportThrottle:
         self._shown: tuple[object, ...] = ()
         self._at = -RESTING_REPORT_S
 
-    def tell(self, seen: Teleop, now: float) -> bool:
+    def tell(self, teleop: Teleop, now: float) -> bool:
         """Return whether the caller must print a report now.
 
-        If the result is True, the report counts as printed. `seen` is the content of the report,
+        If the result is True, the report counts as printed. `teleop` is the content of the report,
         and `now` is the time on a monotonic clock, s.
         """
-        state = seen.state
+        state = teleop.state
         words = ("", "") if state is None else (state.mode, state.reason)
-        what = (*words, seen.objection, seen.linear, seen.angular, seen.silent)
+        what = (*words, teleop.objection, teleop.linear, teleop.angular, teleop.silent)
         moving = state is not None and moves(state)
         wait = MOVING_REPORT_S if moving else RESTING_REPORT_S
         if what != self._shown:
@@ -307,14 +307,14 @@ class Page:
         """Number of lines printed since the help was last printed, including the lines of the help.
         It is `NO_END` before the help is first printed."""
 
-    def with_help(self, told: list[str], height: int) -> list[str]:
+    def with_help(self, report: list[str], height: int) -> list[str]:
         """Return the lines of a report, with the help about the keys above them if necessary.
 
-        The help is necessary if the lines `told` would scroll the last printed help out of sight.
+        The help is necessary if the lines `report` would scroll the last printed help out of sight.
         `height` is the number of lines of the terminal.
         """
-        self._shown += len(told)
+        self._shown += len(report)
         if self._shown < height:
-            return told
-        self._shown = len(HELP) + len(told)
-        return [*HELP, *told]
+            return report
+        self._shown = len(HELP) + len(report)
+        return [*HELP, *report]

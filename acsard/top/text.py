@@ -100,8 +100,8 @@ def bar(value: float, scale: float, cells: int) -> str:
 # Lines.
 
 
-def row(label: str, told: str, style: str = "") -> Text:
-    return Text.assemble((f"{label:<12}", "dim"), (told, style))
+def row(label: str, value: str, style: str = "") -> Text:
+    return Text.assemble((f"{label:<12}", "dim"), (value, style))
 
 
 def ends(left: Text, right: Text, width: int) -> Text:

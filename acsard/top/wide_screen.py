@@ -65,10 +65,10 @@ def motion(state: RobotState, width: int) -> list[Text]:
     twist = f"forward {signed(state.linear, 3, 7)} m/s  turn {signed(state.angular, 3, 7)} rad/s"
     rows = ((place, "front", left, right), (twist, "rear", rear_left, rear_right))
     lines = [rule(width, at)]
-    for told, axle, one, other in rows:
-        line = Text(told.ljust(40))
+    for text, axle, speed, other in rows:
+        line = Text(text.ljust(40))
         line.append(axle.ljust(6), "dim")
-        line.append_text(wheel(one, scale, cells)).append("  ")
+        line.append_text(wheel(speed, scale, cells)).append("  ")
         lines.append(line.append_text(wheel(other, scale, cells)))
     return lines
 
@@ -109,10 +109,10 @@ def sources(state: RobotState, room: int, width: int) -> list[Text]:
     start = room_name + 3
     at = ((0, "sources"), (start, "priority"), (start + 10, "seen"), (start + 17, "waits for"))
     lines = [rule(width, at)]
-    shown = state.sources[: room if len(state.sources) <= room else room - 1]
-    lines += [_source(source, state, room_name) for source in shown]
-    if len(shown) < len(state.sources):
-        lines.append(Text(hidden(state.sources[len(shown) :]), "dim"))
+    top_sources = state.sources[: room if len(state.sources) <= room else room - 1]
+    lines += [_source(source, state, room_name) for source in top_sources]
+    if len(top_sources) < len(state.sources):
+        lines.append(Text(hidden(state.sources[len(top_sources) :]), "dim"))
     return lines if state.sources else [*lines, Text("  none", "dim")]
 
 
@@ -152,19 +152,19 @@ def _source(source: SourceState, state: RobotState, room: int) -> Text:
     return Text(f"{mark}{name.plain} {figures}{waits(source, state)}", style)
 
 
-def link(seen: ScreenData, state: RobotState, width: int) -> list[Text]:
+def link(data: ScreenData, state: RobotState, width: int) -> list[Text]:
     """Return the lines about the serial link, the commands and the rejected inputs.
 
     There are also lines about the gyro, the effective track and the board's inputs, if the robot
-    reports them. `seen` contains the data of the screen, and `state` is the state to show.
+    reports them. `data` contains the data of the screen, and `state` is the state to show.
     """
-    before = seen.before or state
-    head = title(seen, state)
+    before = data.before or state
+    head = title(data, state)
     titles: list[tuple[int, str | Text]] = [(0, head)]
     if state.certificate_expiry:
-        told = certificate(state)
-        titles.append((max(head.cell_len + 2, width - told.cell_len - 4), told))
-    counted = rates(seen, state, before)
+        expiry = certificate(state)
+        titles.append((max(head.cell_len + 2, width - expiry.cell_len - 4), expiry))
+    counted = rates(data, state, before)
     superseded = state.counters.get("lines_superseded", 0)
     lines = [
         rule(width, titles),
@@ -187,13 +187,15 @@ def link(seen: ScreenData, state: RobotState, width: int) -> list[Text]:
     return lines
 
 
-def title(seen: ScreenData, state: RobotState) -> Text:
+def title(data: ScreenData, state: RobotState) -> Text:
     """Return the heading of the lines about the serial link: the link's state and its port."""
-    told = Text.assemble("link ", (clean(state.link), f"bold {LINK_STYLES.get(state.link, 'red')}"))
-    if seen.info is not None:
-        sim = seen.info.simulated
-        told.append(" on ", "dim").append("the built-in SIMULATOR" if sim else _port(seen.info))
-    return told
+    heading = Text.assemble(
+        "link ", (clean(state.link), f"bold {LINK_STYLES.get(state.link, 'red')}")
+    )
+    if data.info is not None:
+        sim = data.info.simulated
+        heading.append(" on ", "dim").append("the built-in SIMULATOR" if sim else _port(data.info))
+    return heading
 
 
 def certificate(state: RobotState) -> Text:
@@ -201,7 +203,7 @@ def certificate(state: RobotState) -> Text:
     return Text(f"certificate {clean(state.certificate_expiry)}", style)
 
 
-def rates(seen: ScreenData, state: RobotState, before: RobotState) -> Callable[[str], str]:
+def rates(data: ScreenData, state: RobotState, before: RobotState) -> Callable[[str], str]:
     """Return a function that returns a text with the rate and the total of a counter.
 
     The function takes the name of the counter. The rate is the increase per second from the earlier
@@ -211,8 +213,8 @@ def rates(seen: ScreenData, state: RobotState, before: RobotState) -> Callable[[
     # (a network's delay) from the time between the arrivals of the states, the robot's clock was
     # set. In this case, use the time between the arrivals.
     seconds = (state.stamp.to_ns() - before.stamp.to_ns()) / NS_PER_S
-    if abs(seconds - seen.passed) > 0.2:
-        seconds = seen.passed
+    if abs(seconds - data.passed) > 0.2:
+        seconds = data.passed
 
     def counted(name: str) -> str:
         now, then = state.counters.get(name, 0), before.counters.get(name, 0)
@@ -227,12 +229,12 @@ def board(state: RobotState) -> str:
     The text leaves out everything that the board does not report. It is "" if the board reports
     nothing.
     """
-    told = [f"emergency stop {clean(state.emergency_stop)}"] if state.emergency_stop else []
+    parts = [f"emergency stop {clean(state.emergency_stop)}"] if state.emergency_stop else []
     if state.bumpers is not None:
-        told.append(f"bumpers {''.join('X' if one else '.' for one in state.bumpers)}")
+        parts.append(f"bumpers {''.join('X' if bumper else '.' for bumper in state.bumpers)}")
     if state.battery is not None:
-        told += ["battery", *power(state.battery)]
-    return "  ".join(told)
+        parts += ["battery", *power(state.battery)]
+    return "  ".join(parts)
 
 
 def overrun(state: RobotState) -> Text:
@@ -246,10 +248,10 @@ def overrun(state: RobotState) -> Text:
 
 def _gyro(does: str) -> Text:
     good = does in ("used", "waiting for rest", "waiting for turn")
-    told = next(
+    status = next(
         (f"{name}: {words}" for name, words in STATUS_TEXTS.items() if name == does), clean(does)
     )
-    return row("gyro", told, "" if good else "yellow")
+    return row("gyro", status, "" if good else "yellow")
 
 
 def _port(info: Info) -> str:
@@ -286,13 +288,13 @@ def refused(state: RobotState, before: RobotState) -> list[tuple[str, list[Text]
     """
     kinds = []
     for kind, prefix in (("lines", "line_"), ("commands", "command_"), ("gyro", "imu_")):
-        found = [(n, c) for n, c in state.counters.items() if n.startswith(prefix) and c]
-        found.sort(key=lambda one: -one[1])
+        counters = [(n, c) for n, c in state.counters.items() if n.startswith(prefix) and c]
+        counters.sort(key=lambda item: -item[1])
         parts = []
-        for name, number in found[:MOST_REASONS]:
+        for name, number in counters[:MOST_REASONS]:
             grows = number > before.counters.get(name, 0)
-            told = f"{clean(name.removeprefix(prefix)).replace('_', ' ')} {count(number)}"
-            parts.append(Text(told, "yellow" if grows else ""))
+            text = f"{clean(name.removeprefix(prefix)).replace('_', ' ')} {count(number)}"
+            parts.append(Text(text, "yellow" if grows else ""))
         if parts:
             kinds.append((kind, parts))
     return kinds
@@ -307,19 +309,21 @@ def timing(state: RobotState, width: int) -> list[Text]:
     lines = [rule(width, at), Text(f"{'':{start}}{heads}{heads}", "dim")]
     for name in NAMES:
         line = Text(f"{name:<16}").append(LATENCY_ROWS[name][long].ljust(room), "dim")
-        one = state.latencies.get(name)
-        for figures in (one.last_minute, one.since_start) if one else (None, None):
+        latency = state.latencies.get(name)
+        for figures in (latency.last_minute, latency.since_start) if latency else (None, None):
             line.append_text(spread(figures))
         lines.append(line)
     return lines
 
 
-def spread(found: Spread | None) -> Text:
+def spread(figures: Spread | None) -> Text:
     """Return median, 99th percentile and maximum of a latency, in three columns of 7 cells.
 
-    `found` is None if the latency is unknown. Each column then shows "-".
+    `figures` is None if the latency is unknown. Each column then shows "-".
     """
-    if found is None or found.count <= 0:
+    if figures is None or figures.count <= 0:
         return Text("-".rjust(7) * 3, "dim")
-    p50, p99, most = (rough(1e-6 * us, 1e-6).rjust(7) for us in (found.p50, found.p99, found.max))
+    p50, p99, most = (
+        rough(1e-6 * us, 1e-6).rjust(7) for us in (figures.p50, figures.p99, figures.max)
+    )
     return Text.assemble(p50, (p99, "bold"), (most, "dim"))

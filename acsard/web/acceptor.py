@@ -113,8 +113,8 @@ class Acceptor:
             opened.close()
         self._listeners.clear()
         for pool in (self._here, self._away):
-            for one in pool.strangers():
-                one.cut()
+            for connection in pool.strangers():
+                connection.cut()
 
     def spoke(self, transport: asyncio.BaseTransport | None, body: StreamReader) -> None:
         """Stop the timer that closes a connection whose client sends no complete request headers.
@@ -122,17 +122,17 @@ class Acceptor:
         Call this when the headers of a request have arrived. `transport` identifies the connection,
         and `body` is the stream from which the body of the request is read.
         """
-        if (one := _connection(transport)) is not None:
-            one.spoke(body)
+        if (connection := _connection(transport)) is not None:
+            connection.spoke(body)
 
-    def admitted(self, transport: asyncio.BaseTransport | None, who: Identity) -> None:
-        """Record that the client of a connection has been identified as `who`.
+    def admitted(self, transport: asyncio.BaseTransport | None, identity: Identity) -> None:
+        """Record that the client of a connection has been identified as `identity`.
 
         If the server must close connections to make room, it first closes connections whose client
         is not identified. `transport` identifies the connection.
         """
-        if (one := _connection(transport)) is not None:
-            one.pool.prove(one, who.token)
+        if (connection := _connection(transport)) is not None:
+            connection.pool.prove(connection, identity.token)
 
     def tidy(self, valid: Collection[str]) -> None:
         """Close the connections whose token is not valid any more.
@@ -145,9 +145,11 @@ class Acceptor:
             valid: the digests of all valid tokens.
         """
         before = self._ended
-        self._ended = {one for pool in (self._here, self._away) for one in pool.ended(valid)}
-        for one in self._ended & before:
-            one.cut()
+        self._ended = {
+            connection for pool in (self._here, self._away) for connection in pool.ended(valid)
+        }
+        for connection in self._ended & before:
+            connection.cut()
 
     def _resume(self, opened: socket.socket, secure: ssl.SSLContext | None, make: Factory) -> None:
         if opened in self._listeners:
@@ -178,43 +180,43 @@ class Acceptor:
         loop = asyncio.get_running_loop()
         loop.remove_reader(opened)
         loop.call_later(NO_FILES_PAUSE_S, self._resume, opened, secure, make)
-        if (gone := self._away.displaced() or self._here.displaced()) is not None:
-            self.crowded(gone)
+        if (victim := self._away.displaced() or self._here.displaced()) is not None:
+            self.crowded(victim)
 
     # The connections call the methods below.
 
-    def crowded(self, one: _Connection) -> None:
+    def crowded(self, connection: _Connection) -> None:
         """Cut a connection and count the refusal under the reason `crowded`.
 
         Call this if there is no room for the connection, or if its request headers are too long.
         """
-        self._counts.refuse("crowded", one.peer)
-        one.cut()
+        self._counts.refuse("crowded", connection.peer)
+        connection.cut()
 
-    def slow(self, one: _Connection) -> None:
+    def slow(self, connection: _Connection) -> None:
         """Cut a connection that exceeds a time limit, and count the refusal as `slow`."""
-        self._counts.refuse("slow", one.peer)
-        one.cut()
+        self._counts.refuse("slow", connection.peer)
+        connection.cut()
 
-    def wait(self, one: _Connection) -> None:
+    def wait(self, connection: _Connection) -> None:
         """Queue a connection. Its TLS handshake starts as soon as the limits allow it."""
-        self._waiting.setdefault(one.network, {})[one] = None
+        self._waiting.setdefault(connection.network, {})[connection] = None
         if self._again is None:
             self._next()
 
-    def give_up(self, one: _Connection) -> None:
+    def give_up(self, connection: _Connection) -> None:
         """Remove a connection from the queue of connections that wait for their TLS handshake."""
-        same = self._waiting.get(one.network, {})
-        same.pop(one, None)
+        same = self._waiting.get(connection.network, {})
+        same.pop(connection, None)
         if not same:
-            self._waiting.pop(one.network, None)
+            self._waiting.pop(connection.network, None)
 
-    def started(self, one: _Connection) -> None:
-        """Record that the TLS handshake of the connection `one` has succeeded or failed.
+    def started(self, connection: _Connection) -> None:
+        """Record that the TLS handshake of the connection `connection` has succeeded or failed.
 
         If another handshake is waiting and the limits allow it, start that handshake.
         """
-        self._starting.pop(one, None)
+        self._starting.pop(connection, None)
         if self._again is None:
             self._next()
 
@@ -222,19 +224,22 @@ class Acceptor:
         loop, self._again = asyncio.get_running_loop(), None
         if not self._waiting:
             return
-        now_ns, begun = clock.mono_ns(), Counter(one.network for one in self._starting)
+        now_ns, begun = (
+            clock.mono_ns(),
+            Counter(connection.network for connection in self._starting),
+        )
         # A network with many handshakes must not delay the handshakes of other networks.
         ready = [name for name in self._waiting if self._handshakes.room(name, now_ns)]
         if ready and self._has_room(loop.time()):
             network = min(ready, key=lambda name: begun[name])
             self._handshakes.take(network, now_ns)
             same = self._waiting.pop(network)
-            one = next(iter(same))
-            del same[one]
+            connection = next(iter(same))
+            del same[connection]
             if same:
                 self._waiting[network] = same  # after all other networks
-            self._starting[one] = loop.time()
-            one.start()
+            self._starting[connection] = loop.time()
+            connection.start()
         # A handshake occupies the event loop for 1 to 2 ms. The pause between the handshakes lets
         # the server send a stop before the next one.
         self._again = loop.call_later(0.005, self._next)
@@ -250,7 +255,7 @@ class Acceptor:
             return True
         # Only the network with the most handshakes loses one. So a slow client in another network
         # can finish its handshake.
-        networks = Counter(one.network for one in self._starting)
+        networks = Counter(connection.network for connection in self._starting)
         most = max(networks.values())
         oldest, begun = next(
             item for item in self._starting.items() if networks[item[0].network] == most
@@ -287,12 +292,12 @@ class _Connection(asyncio.Protocol):
         self._inner: Reader | None = None
 
     def enter(self) -> None:
-        gone = self.pool.enter(self.network, self)
-        if gone is self:
+        victim = self.pool.enter(self.network, self)
+        if victim is self:
             self._acceptor.crowded(self)
             return
-        if gone is not None:
-            self._acceptor.crowded(gone)
+        if victim is not None:
+            self._acceptor.crowded(victim)
         self._socket.setblocking(False)
         option, unread_ms = socket.TCP_USER_TIMEOUT, round(1000 * UNREAD_TIMEOUT_S)
         self._socket.setsockopt(socket.IPPROTO_TCP, option, unread_ms)

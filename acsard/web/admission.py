@@ -136,22 +136,22 @@ class Admission:
                 self._rows[added] = row
         return app
 
-    async def owner(self, peer: str, shown: Sequence[str]) -> Identity:
+    async def owner(self, peer: str, texts: Sequence[str]) -> Identity:
         """Return the owner of the first valid token in a request.
 
-        `peer` is the client's IP address, and `shown` contains the tokens in the request. Raises
+        `peer` is the client's IP address, and `texts` contains the tokens in the request. Raises
         `RefusedError` if no token is valid, and `TimeoutError` if the disk does not answer.
         """
-        if not any(shown):
+        if not any(texts):
             raise RefusedError(
                 "no_token", "a token is missing: run `acsard web --invite ROLE` on the robot"
             )
         tokens = await self._lookups.read()
-        who = next(filter(None, (owner_in(tokens, text) for text in shown)), None)
+        identity = next(filter(None, (owner_in(tokens, text) for text in texts)), None)
         # A valid token is accepted even if too many wrong tokens have arrived. So the guesses of
         # one client cannot lock out another client.
-        if who is not None:
-            return replace(who, address=peer)
+        if identity is not None:
+            return replace(identity, address=peer)
         if not self._guesses.take(network_of(peer), clock.mono_ns()):
             raise RefusedError("too_fast", "too many wrong tokens: wait a minute")
         raise RefusedError(
@@ -215,31 +215,31 @@ class Admission:
         refused. Raises `RefusedError` for a refused request, and if the client may not use the
         path.
         """
-        said = request_facts(request)
-        here = place(said, self._names | {own_address(request)}) == "here"
+        facts = request_facts(request)
+        here = place(facts, self._names | {own_address(request)}) == "here"
         is_open = row is not None and row.least is None
-        listed = by_listed_page(said, self._origins)
+        listed = by_listed_page(facts, self._origins)
         if request.method not in ("GET", "HEAD") if is_open else not listed:
-            require_own_origin(said)
+            require_own_origin(facts)
         if is_open:
             # A browser loads the files of the page over several connections before it requests a
             # path that needs a token. If such a request already contains a valid token, record the
             # client's identity, so that other clients cannot displace this connection.
-            shown = [] if here else tokens_shown(request, self._robot)
-            if who := next(filter(None, map(self._vault.known, shown)), None):
-                self._acceptor.admitted(request.transport, who)
+            tokens = [] if here else tokens_shown(request, self._robot)
+            if identity := next(filter(None, map(self._vault.known, tokens)), None):
+                self._acceptor.admitted(request.transport, identity)
             elif not here:
                 await self._pace_stranger(request)
             return False
-        who = replace(self._local, address=said.peer)
+        identity = replace(self._local, address=facts.peer)
         if not here:
             # Accept cookies only from the robot's own page. A page in `web.origins` must send a
             # token.
-            shown = tokens_sent(request) if listed else tokens_shown(request, self._robot)
-            who = await self.owner(said.peer, shown)
-        request[IDENTITY_KEY] = who
-        self._acceptor.admitted(request.transport, who)
-        fast = self._too_fast(who, row)
+            tokens = tokens_sent(request) if listed else tokens_shown(request, self._robot)
+            identity = await self.owner(facts.peer, tokens)
+        request[IDENTITY_KEY] = identity
+        self._acceptor.admitted(request.transport, identity)
+        fast = self._too_fast(identity, row)
         if fast and not (row and row.waits):
             text = (
                 f"more than {REQUEST_RATE.hz:g} requests a second with one token: use the "
@@ -247,14 +247,18 @@ class Admission:
             )
             raise RefusedError("too_fast", text)
         if row is not None and row.least is not None:
-            who.require(row.least, f"{row.method} {row.path}")
+            identity.require(row.least, f"{row.method} {row.path}")
         return fast
 
-    def _too_fast(self, who: Identity, row: Route | None) -> bool:
-        if not who.token:
+    def _too_fast(self, identity: Identity, row: Route | None) -> bool:
+        if not identity.token:
             return False  # clients on the robot itself have no rate limit
         rate = row.rate if row else REQUEST_RATE
-        name = f"{who.token} {network_of(who.address)}" if row and row.waits else who.token
+        name = (
+            f"{identity.token} {network_of(identity.address)}"
+            if row and row.waits
+            else identity.token
+        )
         return not self._paces.setdefault(rate, Buckets(rate)).take(name, clock.mono_ns())
 
     def _listed(self, request: web.Request) -> bool:
@@ -342,5 +346,5 @@ def _reached(request: web.Request) -> tuple[str, int]:
 
 
 def _origin(request: web.Request) -> str:
-    who = request.get(IDENTITY_KEY)
-    return peer_of(request) if who is None else who.origin
+    identity = request.get(IDENTITY_KEY)
+    return peer_of(request) if identity is None else identity.origin

@@ -247,12 +247,12 @@ class Files:
         kind = CONTENT_TYPES.get(Path(name).suffix)
         if kind is None or "/" in name or name.startswith("."):
             return None
-        paths = [self._directory / one for one in (name, *INLINED.get(name, ()))]
+        paths = [self._directory / entry for entry in (name, *INLINED.get(name, ()))]
         try:
             if any(path.is_symlink() or not path.is_file() for path in paths):
                 return None
-            seen = [path.stat() for path in paths]
-            stamp = tuple((one.st_mtime_ns, one.st_size) for one in seen)
+            stats = [path.stat() for path in paths]
+            stamp = tuple((entry.st_mtime_ns, entry.st_size) for entry in stats)
             known = self._files.get(name)
             if known is None or known.stamp != stamp:
                 known = self._files[name] = _read(paths, kind, stamp)

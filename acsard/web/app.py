@@ -194,17 +194,17 @@ class Page:
         form = await _token_posted(request)
         if not request.secure:
             raise RefusedError("plain", "over plain http, no token is needed: connect without one")
-        who = await self._admission.owner(peer_of(request), [form.token])
+        identity = await self._admission.owner(peer_of(request), [form.token])
         cookie = cookie_name(self._robots.id, own_port(request))
-        shown = "" if form.replace else request.cookies.get(cookie, "")
-        present = self._vault.known(shown)
-        if present is not None and not who.may(present.role):
+        old_token = "" if form.replace else request.cookies.get(cookie, "")
+        present = self._vault.known(old_token)
+        if present is not None and not identity.may(present.role):
             raise TroubleError(
                 409,
                 f"this browser is already signed in as {present.name} ({present.role}); the link "
-                f"would sign it in as {who.name} ({who.role}), with fewer permissions",
+                f"would sign it in as {identity.name} ({identity.role}), with fewer permissions",
             )
-        left_s = await in_thread(lambda: self._vault.left_s(who.token), READ_TIMEOUT_S)
+        left_s = await in_thread(lambda: self._vault.left_s(identity.token), READ_TIMEOUT_S)
         response = web.Response(status=303, headers={"Location": "/"})
         response.set_cookie(
             cookie, form.token, max_age=left_s, path="/", secure=True, httponly=True,
@@ -213,7 +213,7 @@ class Page:
         return response
 
     async def socket(self, request: web.Request) -> web.StreamResponse:
-        who, peer = request[IDENTITY_KEY], peer_of(request)
+        identity, peer = request[IDENTITY_KEY], peer_of(request)
         offered = request.headers.get("Sec-WebSocket-Protocol", "")
         if tokens_offered(offered) and PROTOCOL not in map(str.strip, offered.split(",")):
             # If aiohttp knew none of the offered names, it would log all of them, and so the token.
@@ -221,7 +221,7 @@ class Page:
                 "malformed",
                 f"the WebSocket must offer the subprotocol {PROTOCOL} besides the token",
             )
-        if full := self._websocket_limits.enter(peer, who.token):
+        if full := self._websocket_limits.enter(peer, identity.token):
             raise RefusedError("too_many", full)
         try:
             served = web.WebSocketResponse(
@@ -233,14 +233,14 @@ class Page:
             )
             await served.prepare(request)
             _limit_buffer(request)
-            viewer = Viewer(served, request, who, self._parts, camera=self._has_camera)
+            viewer = Viewer(served, request, identity, self._parts, camera=self._has_camera)
             self._viewers.add(viewer)
             try:
                 await viewer.run()
             finally:
                 self._viewers.discard(viewer)
         finally:
-            self._websocket_limits.leave(peer, who.token)
+            self._websocket_limits.leave(peer, identity.token)
         return served
 
     # The interface for programs.
@@ -257,11 +257,11 @@ class Page:
         return web.Response(body=body.encode(), headers={"Content-Type": metrics.CONTENT_TYPE})
 
     async def whoami(self, request: web.Request) -> web.StreamResponse:
-        who = request[IDENTITY_KEY]
+        identity = request[IDENTITY_KEY]
         # A browser does not report to its page why a WebSocket was refused, so `full` reports it
         # here.
-        full = self._websocket_limits.refusal(peer_of(request), who.token)
-        return reply(Caller(who.role, who.name, full))
+        full = self._websocket_limits.refusal(peer_of(request), identity.token)
+        return reply(Caller(identity.role, identity.name, full))
 
     async def value(self, request: web.Request) -> web.StreamResponse:
         return reply(msgspec.Raw(await self._value(request.path.removeprefix("/api/"))))
@@ -283,10 +283,10 @@ class Page:
         """
         body = await _body_of(request)
         try:
-            given = msgspec.json.decode(body, type=dict[str, Any]) if body.strip() else {}
+            arguments = msgspec.json.decode(body, type=dict[str, Any]) if body.strip() else {}
         except (msgspec.MsgspecError, ValueError, RecursionError) as error:
             raise RefusedError("malformed", f"the body must be a JSON object: {error}") from None
-        robot = given.pop("robot", "")
+        robot = arguments.pop("robot", "")
         if not isinstance(robot, str):
             text = (
                 "`robot` must be the id of a robot as a JSON string; for robots other than its "
@@ -294,7 +294,7 @@ class Page:
             )
             raise RefusedError("malformed", text)
         verb = request.path.removeprefix("/api/srv/")
-        answer = await self._parts.calls.call(request[IDENTITY_KEY], verb, given, robot)
+        answer = await self._parts.calls.call(request[IDENTITY_KEY], verb, arguments, robot)
         return reply(answer, 200 if answer.success else 409)
 
     async def picture(self, request: web.Request) -> web.StreamResponse:
@@ -303,9 +303,9 @@ class Page:
         The client names its last picture in the header `If-None-Match`. If no other picture arrives
         in time, return an answer with the status 304.
         """
-        seen = request.headers.get("If-None-Match", "").strip('"')
+        etag = request.headers.get("If-None-Match", "").strip('"')
         begun_ns = clock.steady_ns()
-        number = int(seen) if seen.isdecimal() and len(seen) < 16 else 0
+        number = int(etag) if etag.isdecimal() and len(etag) < 16 else 0
         picture = await self._camera.after(number)
         if picture is None:
             return web.Response(status=304)
@@ -380,7 +380,7 @@ def _allowed(key: str) -> dict[str, Any]:
         case inspect.FloatType(ge=float(low), le=float(high)):
             return {"low": low, "high": high}
         case inspect.LiteralType(values=choices):
-            return {"choices": [str(one) for one in choices]}
+            return {"choices": [str(choice) for choice in choices]}
     return {}
 
 

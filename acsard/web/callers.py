@@ -175,8 +175,8 @@ def tokens_offered(protocols: str) -> list[str]:
 
     A script in a browser can set no other header when it opens a WebSocket.
     """
-    offered = (one.strip() for one in protocols.split(","))
-    return [one.removeprefix(TOKEN) for one in offered if one.startswith(TOKEN)][:MAX_TOKENS]
+    offered = (name.strip() for name in protocols.split(","))
+    return [name.removeprefix(TOKEN) for name in offered if name.startswith(TOKEN)][:MAX_TOKENS]
 
 
 def cookie_name(robot: str, port: int) -> str:

@@ -82,9 +82,9 @@ class Calls:
         self._elsewhere = Places(MAX_REMOTE_STOPS, MAX_REMOTE_STOPS)
 
     async def call(
-        self, who: Identity, verb: str, payload: Mapping[str, Any], robot: str = ""
+        self, identity: Identity, verb: str, payload: Mapping[str, Any], robot: str = ""
     ) -> ServiceReply:
-        """Call the service `verb` for the client `who`, and return the reply.
+        """Call the service `verb` for the client `identity`, and return the reply.
 
         A stop of the page's own robot also interrupts the running check or calibration.
 
@@ -99,41 +99,41 @@ class Calls:
             RefusedError: the client may not make this call, or sends too many stops to robots that
                 may not exist.
         """
-        require(who, verb)
+        require(identity, verb)
         other = "" if robot == self._robots.id else robot
         if other:
             _require_stop(verb, other)
         if verb != "stop" or other:
-            return await self._called(who, verb, payload, other)
+            return await self._called(identity, verb, payload, other)
         # A running check turns the wheels, and has opened the serial port in place of the daemon.
         # The daemon cannot stop the wheels then, so interrupt the check too.
         ending, reply = await asyncio.gather(
-            self._interrupt_guide(), self._called(who, verb, payload, other)
+            self._interrupt_guide(), self._called(identity, verb, payload, other)
         )
         if not ending.words:
             return reply
         return ServiceReply(reply.success and ending.ended, f"{ending.words}; {reply.message}")
 
     async def _called(
-        self, who: Identity, verb: str, payload: Mapping[str, Any], other: str
+        self, identity: Identity, verb: str, payload: Mapping[str, Any], other: str
     ) -> ServiceReply:
         client = self._robots.client
         if client is None:
             return ServiceReply(False, self._robots.gone)
 
         def request() -> ServiceReply:
-            return _named(client, other or self._robots.id, who).request(verb, payload)
+            return _named(client, other or self._robots.id, identity).request(verb, payload)
 
         async def stop() -> ServiceReply:
             if other:
-                return await self._stop(other, client, who, request)
+                return await self._stop(other, client, identity, request)
             return await self._stops.ask(request)
 
         if verb == "stop" and other and other not in self._answered and not self._is_known(other):
-            self._require_few(who)
+            self._require_few(identity)
         try:
             if verb == "stop":
-                reply = await self._merged.ask((who.token, other), stop)
+                reply = await self._merged.ask((identity.token, other), stop)
             else:
                 reply = await self._ask(request)
         except (MendableError, DecodeError, TimeoutError) as error:
@@ -155,7 +155,7 @@ class Calls:
         return await self._ask(lambda: client.sibling(robot).reply(f"{name}?fmt=json"))
 
     async def _stop(
-        self, robot: str, client: Client, who: Identity, request: Callable[[], ServiceReply]
+        self, robot: str, client: Client, identity: Identity, request: Callable[[], ServiceReply]
     ) -> ServiceReply:
         # A robot that does not exist never replies, so the number of waiting calls is limited.
         with self._elsewhere.place() as free:
@@ -166,7 +166,7 @@ class Calls:
                 return reply
         await in_thread(
             lambda: robot_discovery.stop(
-                client.session, [robot], _named(client, robot, who).caller
+                client.session, [robot], _named(client, robot, identity).caller
             ),
             ANSWER_TIMEOUT_S,
         )
@@ -177,12 +177,12 @@ class Calls:
             "robot has stopped",
         )
 
-    def _require_few(self, who: Identity) -> None:
+    def _require_few(self, identity: Identity) -> None:
         """Raise `RefusedError` if a client exceeds the limit `REMOTE_STOP_RATE`.
 
         Call this for each stop of a robot that may not exist.
         """
-        if not self._unknown.take(who.token or who.name, clock.mono_ns()):
+        if not self._unknown.take(identity.token or identity.name, clock.mono_ns()):
             rate = REMOTE_STOP_RATE
             raise RefusedError(
                 "too_fast",
@@ -273,13 +273,13 @@ class Stops:
             return await in_thread(call, ANSWER_TIMEOUT_S)
 
 
-def require(who: Identity, verb: str) -> None:
-    """Raise `RefusedError` unless the service `verb` exists and the client `who` may call it."""
+def require(caller: Identity, verb: str) -> None:
+    """Raise `RefusedError` unless the service `verb` exists and the client `caller` may call it."""
     if verb not in SERVICES:
         raise RefusedError(
             "malformed", f"{verb!r} is not a service; choose one of {', '.join(SERVICES)}"
         )
-    who.require(SERVICE_ROLES[verb], verb)
+    caller.require(SERVICE_ROLES[verb], verb)
 
 
 def _require_stop(verb: str, robot: str) -> None:
@@ -295,11 +295,11 @@ def _require_stop(verb: str, robot: str) -> None:
         )
 
 
-def _named(client: Client, robot: str, who: Identity) -> Client:
-    """Return a bus client for a robot, with a name that contains the name of `who`.
+def _named(client: Client, robot: str, identity: Identity) -> Client:
+    """Return a bus client for a robot, with a name that contains the name of `identity`.
 
     The robot's daemon logs the calls of the bus client under this name.
     """
     other = client.sibling(robot)
-    other.name = f"{who.name}@page"
+    other.name = f"{identity.name}@page"
     return other

@@ -86,8 +86,8 @@ class Parts:
                 )
             return None
         begin = head + 4
-        if found := _LENGTH.search(self._buffer, 0, head):
-            end = begin + int(found[1])
+        if match := _LENGTH.search(self._buffer, 0, head):
+            end = begin + int(match[1])
         else:
             end = self._buffer.find(self._end, begin)
         if max(end, len(self._buffer) if end < 0 else 0) - begin > MAX_PICTURE:

@@ -62,7 +62,7 @@ class Fleet:
         """
         self._look()
         rows = [] if self._tracked is None else self._tracked.rows()
-        return [_row(one) for one in sorted(rows, key=lambda one: one.robot_id)]
+        return [_row(row) for row in sorted(rows, key=lambda row: row.robot_id)]
 
     def sees(self, robot: str) -> bool:
         """Return whether this server has found the robot with the id `robot` on the bus.
@@ -121,20 +121,20 @@ async def _within_time(call: Callable[[], None]) -> None:
         await in_thread(call, DECLARE_TIMEOUT_S)
 
 
-def _row(one: fleet.Row) -> Row:
-    state = one.state if math.isfinite(one.age) else None
-    version = one.version[:40]
+def _row(entry: fleet.Row) -> Row:
+    state = entry.state if math.isfinite(entry.age) else None
+    version = entry.version[:40]
     if state is None:
-        mode, reason = ("gone", "its daemon has ended") if one.here is False else (None, "")
-        return Row(one.robot_id, mode, reason, None, "", None, version)
-    age = round(one.age, 3)
-    if one.here is False:
+        mode, reason = ("gone", "its daemon has ended") if entry.here is False else (None, "")
+        return Row(entry.robot_id, mode, reason, None, "", None, version)
+    age = round(entry.age, 3)
+    if entry.here is False:
         was = f"its daemon has ended; the robot was {state.mode}"
-        return Row(one.robot_id, "gone", was, None, "", age, version)
-    if one.silent:
-        return Row(one.robot_id, None, f"the robot was {state.mode}", None, "", age, version)
+        return Row(entry.robot_id, "gone", was, None, "", age, version)
+    if entry.silent:
+        return Row(entry.robot_id, None, f"the robot was {state.mode}", None, "", age, version)
     return Row(
-        one.robot_id, state.mode, state.reason, state.linear, state.link, age, version,
-        [str(one) for one in warnings(state)], [state.x, state.y, state.yaw],
+        entry.robot_id, state.mode, state.reason, state.linear, state.link, age, version,
+        [str(entry) for entry in warnings(state)], [state.x, state.y, state.yaw],
         charge(state.battery),
     )  # fmt: skip

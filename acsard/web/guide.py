@@ -118,10 +118,12 @@ class Guide:
         `simulated` says whether the page's robot is simulated. The recommended calibration method
         depends on it.
         """
-        found = await self._boards()
+        candidates = await self._boards()
         way, advice = SIMULATED if simulated else ("", "")
-        sees_one = any(board.port != SIMULATOR and board.what != ABSENT_PORT for board in found)
-        return Choices(NEEDS, way, advice, found, "" if sees_one else NO_DEVICE)
+        sees_one = any(
+            board.port != SIMULATOR and board.what != ABSENT_PORT for board in candidates
+        )
+        return Choices(NEEDS, way, advice, candidates, "" if sees_one else NO_DEVICE)
 
     def join(self, viewer: object, say: Say) -> None:
         """Add a viewer, and tell the viewer which check or calibration is running.
@@ -238,7 +240,7 @@ class Guide:
     async def _ports(self, asked: Begin) -> list[str]:
         if asked.begin != "check":
             return []
-        return [one.port for one in await self._boards()]
+        return [board.port for board in await self._boards()]
 
     async def _boards(self) -> list[Board]:
         return await in_thread(lambda: boards(self._configured), 5.0)
@@ -254,20 +256,20 @@ def boards(configured: str) -> list[Board]:
     `configured` is the port in the configuration. It comes first in the result, even if it does not
     exist now. Call this function in a thread, because it blocks.
     """
-    found: dict[str, str] = {}
+    texts: dict[str, str] = {}
     for device in serial_devices():
         name = device.names[0] if device.names else device.device
         own = configured in (device.device, *device.names)
         notes = [device.board or device.description, "configured" if own else ""]
         notes += [f"in use by {holder.name} (process {holder.pid})" for holder in device.holders]
-        found[configured if own else name] = ", ".join(filter(None, notes))
-    if configured != SIMULATOR and configured not in found:
-        found = {configured: "configured" if os.path.exists(configured) else ABSENT_PORT, **found}
-    found[SIMULATOR] = "the simulator: no real robot moves"
+        texts[configured if own else name] = ", ".join(filter(None, notes))
+    if configured != SIMULATOR and configured not in texts:
+        texts = {configured: "configured" if os.path.exists(configured) else ABSENT_PORT, **texts}
+    texts[SIMULATOR] = "the simulator: no real robot moves"
     # The wheels turn during a check, so the configured port comes first: an operator who does not
     # read the list must check the board of this robot.
-    ports = sorted(found, key=lambda port: port != configured)
-    return [Board(port, found[port]) for port in ports]
+    ports = sorted(texts, key=lambda port: port != configured)
+    return [Board(port, texts[port]) for port in ports]
 
 
 def arguments(begin: Begin, reach: Reach, ports: Collection[str]) -> list[str]:
@@ -287,10 +289,10 @@ def arguments(begin: Begin, reach: Reach, ports: Collection[str]) -> list[str]:
         return ["mcu", "check", "--json-lines", *config, f"--port={begin.port}"]
     if begin.port:
         raise FrameError("begin", "`port` is only for a check of the board, not for a calibration")
-    given = [f"--connect={reach.endpoint}", f"--id={reach.robot_id}"]
+    options = [f"--connect={reach.endpoint}", f"--id={reach.robot_id}"]
     if reach.tls:
-        given.append(f"--tls={reach.tls}")
-    return ["calibrate", "--json-lines", *config, *given, *_method(begin)]
+        options.append(f"--tls={reach.tls}")
+    return ["calibrate", "--json-lines", *config, *options, *_method(begin)]
 
 
 def _method(begin: Begin) -> list[str]:
@@ -330,15 +332,15 @@ class _Job:
     def about(self, viewer: object) -> Guided:
         return Guided(Running(self.name, self.by, viewer is self.viewer))
 
-    async def run(self, given: Sequence[str]) -> tuple[int, str]:
-        """Run `acsard` with the arguments `given`, and return the pair (exit code, error output).
+    async def run(self, options: Sequence[str]) -> tuple[int, str]:
+        """Run `acsard` with the arguments `options`, and return the pair (exit code, error output).
 
         If a signal ended the child, the exit code is 128 plus the number of the signal. Raises
         `OSError` if the child cannot be started.
         """
         if self.left:
             return int(Exit.FAILURE), ""
-        async with running(acsard(*given), stdin=PIPE, stdout=PIPE, stderr=PIPE) as process:
+        async with running(acsard(*options), stdin=PIPE, stdout=PIPE, stderr=PIPE) as process:
             self._process = process
             if self.left:
                 self._interrupt()
@@ -404,19 +406,19 @@ class _Job:
 
     def _take(self, line: bytes) -> None:
         try:
-            said = msgspec.json.decode(line, type=_Said)
+            message = msgspec.json.decode(line, type=_Said)
         except (msgspec.MsgspecError, ValueError):
             return  # not a protocol line: a library printed it
-        if said.question:
-            self._question, self._leg, self._drive_running = said.question, said.leg, False
-        if said.progress >= 1.0:
+        if message.question:
+            self._question, self._leg, self._drive_running = message.question, message.leg, False
+        if message.progress >= 1.0:
             self._drive_running = False
         self.say(Guided(msgspec.Raw(line)))
 
     async def _read_errors(self, process: Process) -> None:
         assert process.stderr is not None
-        while said := await process.stderr.read(4096):
-            self._last = last_part(self._last + said)
+        while chunk := await process.stderr.read(4096):
+            self._last = last_part(self._last + chunk)
 
     def _words(self) -> str:
         lines = self._last.decode(errors="replace").splitlines()
@@ -425,12 +427,12 @@ class _Job:
         return "\n".join(line.removeprefix("acsard: ") for line in lines).strip()
 
 
-def last_part(said: bytes) -> bytes:
-    """Return the last complete lines of `said`, with at most `MAX_ERROR_BYTES` in total.
+def last_part(output: bytes) -> bytes:
+    """Return the last complete lines of `output`, with at most `MAX_ERROR_BYTES` in total.
 
     If the last line alone is longer, return its last characters.
     """
-    kept = said[-MAX_ERROR_BYTES:]
-    if len(said) <= MAX_ERROR_BYTES:
-        return kept
-    return kept.partition(b"\n")[2] or kept.lstrip(CONTINUATION_BYTES)
+    tail = output[-MAX_ERROR_BYTES:]
+    if len(output) <= MAX_ERROR_BYTES:
+        return tail
+    return tail.partition(b"\n")[2] or tail.lstrip(CONTINUATION_BYTES)

@@ -92,7 +92,7 @@ class Minute:
         lateness = [late.p99 * MS, late.max * MS] if late else [None, None]
         volts = state.battery.volts if state.battery else None
         row = [*measured, *twist, *lateness, volts]
-        self._rows.append((at_ns, [None if one is None else round(one, 3) for one in row]))
+        self._rows.append((at_ns, [None if value is None else round(value, 3) for value in row]))
 
     def plotted(self, now_ns: int) -> Plotted:
         """Return the values of the last minute before `now_ns`, as columns."""

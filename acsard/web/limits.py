@@ -145,22 +145,22 @@ class Sockets(Generic[C]):
         `MAX_TCP_OF_TOKEN` is in this dict too."""
         self._tokens: Counter[str] = Counter()
 
-    def enter(self, network: str, one: C) -> C | None:
-        """Add the new connection `one`, and return the connection that the caller must close.
+    def enter(self, network: str, newcomer: C) -> C | None:
+        """Add the new connection `newcomer`, and return the connection that the caller must close.
 
         Return None if the caller need not close any connection. If the new connection is refused,
-        do not add it, and return `one` itself. `network` is the network of the client.
+        do not add it, and return `newcomer` itself. `network` is the network of the client.
         """
         own = self._strangers.get(network, {})
-        gone = None
+        victim = None
         if len(own) >= MAX_TCP_OF_NETWORK:
-            gone = next(iter(own))
-            self.leave(gone)
-        elif len(self._networks) >= self._most and (gone := self.displaced()) is None:
-            return one
-        self._strangers.setdefault(network, {})[one] = None
-        self._networks[one] = network
-        return gone
+            victim = next(iter(own))
+            self.leave(victim)
+        elif len(self._networks) >= self._most and (victim := self.displaced()) is None:
+            return newcomer
+        self._strangers.setdefault(network, {})[newcomer] = None
+        self._networks[newcomer] = network
+        return victim
 
     def displaced(self) -> C | None:
         """Remove the connection that must make room for a new connection, and return it.
@@ -170,43 +170,43 @@ class Sockets(Generic[C]):
         """
         if self._strangers:
             network = max(self._strangers, key=lambda name: len(self._strangers[name]))
-            gone = next(iter(self._strangers[network]))
+            victim = next(iter(self._strangers[network]))
         else:
             token, count = max(self._tokens.items(), key=lambda item: item[1], default=("", 0))
             if count <= RESERVED_TCP_OF_TOKEN:
                 return None
-            gone = next(one for one, its in self._known.items() if its == token)
-        self.leave(gone)
-        return gone
+            victim = next(connection for connection, its in self._known.items() if its == token)
+        self.leave(victim)
+        return victim
 
-    def prove(self, one: C, token: str) -> None:
-        """Record that the connection `one` has shown the valid token `token`.
+    def prove(self, connection: C, token: str) -> None:
+        """Record that the connection `connection` has shown the valid token `token`.
 
         `token` is "" for a client on the robot itself. A later token of the same connection
         replaces the earlier token, because a browser may get another token. If the later token has
         `MAX_TCP_OF_TOKEN` connections already, the connection still counts under the earlier token.
         """
-        network, before = self._networks.get(one), self._known.get(one)
+        network, before = self._networks.get(connection), self._known.get(connection)
         if network is None:
             return
-        self._shown[one] = token
+        self._shown[connection] = token
         if before == token or self._tokens[token] >= MAX_TCP_OF_TOKEN:
             return
         if before is None:
-            self._forget(network, one)
+            self._forget(network, connection)
         else:
             self._fewer(before)
-        self._known[one] = token
+        self._known[connection] = token
         self._tokens[token] += 1
 
-    def leave(self, one: C) -> None:
-        network = self._networks.pop(one, None)
-        self._shown.pop(one, None)
+    def leave(self, connection: C) -> None:
+        network = self._networks.pop(connection, None)
+        self._shown.pop(connection, None)
         if network is None:
             return
-        token = self._known.pop(one, None)
+        token = self._known.pop(connection, None)
         if token is None:
-            self._forget(network, one)
+            self._forget(network, connection)
             return
         self._fewer(token)
 
@@ -216,19 +216,21 @@ class Sockets(Generic[C]):
         `valid` contains all tokens that are valid now. If a connection has shown several tokens,
         the last of them counts.
         """
-        return [one for one, token in self._shown.items() if token and token not in valid]
+        return [
+            connection for connection, token in self._shown.items() if token and token not in valid
+        ]
 
     def strangers(self) -> list[C]:
         """Return the connections without a valid token, and those beyond `MAX_TCP_OF_TOKEN`."""
-        return [one for network in self._strangers.values() for one in network]
+        return [connection for network in self._strangers.values() for connection in network]
 
     def _fewer(self, token: str) -> None:
         self._tokens[token] -= 1
         if not self._tokens[token]:
             del self._tokens[token]
 
-    def _forget(self, network: str, one: C) -> None:
-        del self._strangers[network][one]
+    def _forget(self, network: str, connection: C) -> None:
+        del self._strangers[network][connection]
         if not self._strangers[network]:
             del self._strangers[network]
 

@@ -78,31 +78,31 @@ def invitations(listen: Sequence[Listen], tls: str) -> list[str]:
     HTTPS are used. `tls` is the directory of the robot's certificate. Call `require_certificate`
     first.
     """
-    found: list[str] = []
+    urls: list[str] = []
     ipv4_ports = _ipv4_ports(listen)
-    for one in listen:
-        if not one.secure:
+    for address in listen:
+        if not address.secure:
             continue
-        hosts = [one.host]
-        if one.everywhere:
+        hosts = [address.host]
+        if address.everywhere:
             certified = names_in(tls)
             own = [at for at in own_addresses() if at in certified]
             # Not every network has IPv6, so IPv4 addresses come first. A socket at `::` does not
             # accept IPv4 connections if another socket has the same port on IPv4.
-            both = one.host != EVERYWHERE_6 or one.port not in ipv4_ports
+            both = address.host != EVERYWHERE_6 or address.port not in ipv4_ports
             older = [at for at in own if ":" not in at and both]
-            newer = [at for at in own if ":" in at and one.host == EVERYWHERE_6]
+            newer = [at for at in own if ":" in at and address.host == EVERYWHERE_6]
             hosts = [*older, *newer, own_name()]
-        found += [one.url_at(host) for host in hosts]
-    return list(dict.fromkeys(found))
+        urls += [address.url_at(host) for host in hosts]
+    return list(dict.fromkeys(urls))
 
 
-def page_urls(one: Listen, tls: str) -> list[str]:
-    """Return the URLs of the page at the address `one`, the most reliable URL first.
+def page_urls(address: Listen, tls: str) -> list[str]:
+    """Return the URLs of the page at the address `address`, the most reliable URL first.
 
     `tls` is the directory of the robot's certificate.
     """
-    return invitations([one], tls) if one.secure else [one.url]
+    return invitations([address], tls) if address.secure else [address.url]
 
 
 def require_certificate(listen: Sequence[Listen], tls: str) -> None:
@@ -110,7 +110,7 @@ def require_certificate(listen: Sequence[Listen], tls: str) -> None:
 
     `tls` is the directory of the certificate, or "".
     """
-    away = [one for one in listen if one.secure]
+    away = [address for address in listen if address.secure]
     if away and not tls:
         raise CertificateError(
             f"{away[0].url} needs a certificate: run `acsard tls init` to make it; then set "
@@ -128,7 +128,7 @@ def open_sockets(listen: Sequence[Listen], next_port: bool) -> list[tuple[Listen
     opened at an address.
     """
     ipv4_ports = _ipv4_ports(listen)
-    return [_open_socket(one, next_port, one.port not in ipv4_ports) for one in listen]
+    return [_open_socket(address, next_port, address.port not in ipv4_ports) for address in listen]
 
 
 def _ipv4_ports(listen: Sequence[Listen]) -> set[int]:
@@ -137,30 +137,30 @@ def _ipv4_ports(listen: Sequence[Listen]) -> set[int]:
     Another socket accepts the IPv4 connections there. These are the ports of the addresses in
     `listen` whose host is an IPv4 address or a name.
     """
-    return {one.port for one in listen if ":" not in one.host}
+    return {address.port for address in listen if ":" not in address.host}
 
 
-def _open_socket(one: Listen, next_port: bool, both: bool) -> tuple[Listen, socket.socket]:
-    """Open a listening socket at the address `one`; return the used address and the socket.
+def _open_socket(addr: Listen, next_port: bool, both: bool) -> tuple[Listen, socket.socket]:
+    """Open a listening socket at the address `addr`; return the used address and the socket.
 
     `next_port` is explained at `open_sockets()`. If `both` is true, a socket at `::` accepts IPv4
     connections too.
     """
-    ports = range(one.port, min(65536, one.port + MAX_PORTS_TRIED)) if next_port else [one.port]
-    both = both and one.host == EVERYWHERE_6 and socket.has_dualstack_ipv6()
+    ports = range(addr.port, min(65536, addr.port + MAX_PORTS_TRIED)) if next_port else [addr.port]
+    both = both and addr.host == EVERYWHERE_6 and socket.has_dualstack_ipv6()
     trouble: OSError | None = None
     for port in ports:
         try:
-            found = socket.getaddrinfo(one.host, port, type=socket.SOCK_STREAM)[0]
+            info = socket.getaddrinfo(addr.host, port, type=socket.SOCK_STREAM)[0]
             opened = socket.create_server(
-                found[4][:2], family=found[0], backlog=128, dualstack_ipv6=both
+                info[4][:2], family=info[0], backlog=128, dualstack_ipv6=both
             )
         except OSError as error:
             trouble = error
             continue
         opened.setblocking(False)
-        return Listen(one.secure, one.host, port), opened
+        return Listen(addr.secure, addr.host, port), opened
     raise InUseError(
-        f"cannot listen at {one.url}: {trouble}; if another program uses this address, stop that "
+        f"cannot listen at {addr.url}: {trouble}; if another program uses this address, stop that "
         "program, or choose another address with --address or the setting web.address"
     ) from None

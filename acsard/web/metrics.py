@@ -81,7 +81,7 @@ def _of_robot(state: RobotState) -> Iterator[tuple[str, Kind, str, Iterable[Samp
         "1 for the present state of the link to the microcontroller, else 0",
         links,
     )
-    warned = {one.what for one in warnings(state)}
+    warned = {item.what for item in warnings(state)}
     subjects = [({"what": what}, float(what in warned)) for what in WARNING_KINDS]
     yield "warning", "gauge", "1 while the robot gives this warning, else 0", subjects
     if state.certificate_days is not None:
@@ -100,7 +100,7 @@ def _of_robot(state: RobotState) -> Iterator[tuple[str, Kind, str, Iterable[Samp
             "1 while the emergency stop counts as pressed, else 0",
             [({}, pressed)],
         )
-    bumpers = [({"bumper": str(n)}, float(one)) for n, one in enumerate(state.bumpers or (), 1)]
+    bumpers = [({"bumper": str(n)}, float(item)) for n, item in enumerate(state.bumpers or (), 1)]
     if bumpers:
         yield "bumper", "gauge", "1 while the bumper counts as pressed, else 0", bumpers
     battery = state.battery
@@ -202,10 +202,10 @@ class Counts:
             origins, self._origins = self._origins, Counter()
         if not new:
             return None
-        said = ", ".join(f"{count} {why.replace('_', ' ')}" for why, count in new.most_common())
+        reasons = ", ".join(f"{count} {why.replace('_', ' ')}" for why, count in new.most_common())
         named = origins.most_common(MAX_NAMED)
         whom = ", ".join(f"{count} from {origin}" for origin, count in named)
         if others := new.total() - sum(count for _, count in named):
             whom += f", {others} from others" if whom else ""
-        text = f"{said}; {whom}" if whom else said
+        text = f"{reasons}; {whom}" if whom else reasons
         return Event("page_refused", text, "warning", count=new.total())

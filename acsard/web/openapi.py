@@ -172,13 +172,13 @@ def _needed(kind: type | str) -> bool:
 def _messages() -> Described:
     # The types in `$defs` become schemas of their own, because most programs that read the document
     # cannot resolve `$defs`.
-    found: Described = {}
+    schemas: Described = {}
     for name, schema in SCHEMAS.items():
         whole = _flat(schema, f"{name}.")
         parts = whole.pop("$defs")
-        found[name] = {key: value for key, value in whole.items() if key[0] != "$"}
-        found |= {f"{name}.{part}": value for part, value in parts.items()}
-    return found
+        schemas[name] = {key: value for key, value in whole.items() if key[0] != "$"}
+        schemas |= {f"{name}.{part}": value for part, value in parts.items()}
+    return schemas
 
 
 def _flat(node: Any, before: str) -> Any:
@@ -187,7 +187,7 @@ def _flat(node: Any, before: str) -> Any:
     The name of each component is the old name with the prefix `before`.
     """
     if isinstance(node, list):
-        return [_flat(one, before) for one in node]
+        return [_flat(item, before) for item in node]
     if not isinstance(node, dict):
         return node
     if isinstance(ref := node.get("$ref"), str):
@@ -218,10 +218,10 @@ def _of_the_socket(refs: Refs) -> Described:
         [("guide", _raw({"oneOf": [refs[kind] for kind in GUIDE_MESSAGES]}))],
         namespace={"__doc__": socket_messages.Guided.__doc__},
     )
-    found, own = _components([guided])
+    components, own = _components([guided])
     from_robot = [*(refs[kind] for kind in (*SENT_MESSAGES, *VALUE_MESSAGES)), own[guided]]
     to_robot = [refs[kind] for kind in MESSAGE_TYPES.values()]
-    return found | {
+    return components | {
         TO_ROBOT: {"title": TO_ROBOT, "oneOf": to_robot},
         FROM_ROBOT: {"title": FROM_ROBOT, "oneOf": from_robot},
     }

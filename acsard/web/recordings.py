@@ -125,21 +125,23 @@ class BlackBox:
         def look() -> tuple[Path, tuple[int, int]] | None:
             path = next((path for path in _files(place) if path.name == name), None)
             try:
-                seen = path.stat() if path is not None else None
+                status = path.stat() if path is not None else None
             except FileNotFoundError:  # the daemon has just renamed or deleted the file
                 return None
             return (
-                None if path is None or seen is None else (path, (seen.st_mtime_ns, seen.st_size))
+                None
+                if path is None or status is None
+                else (path, (status.st_mtime_ns, status.st_size))
             )
 
         try:
-            found = await in_thread(look, READ_TIMEOUT_S)
+            entry = await in_thread(look, READ_TIMEOUT_S)
         except (OSError, TimeoutError) as error:
             raise _unread(place, error) from None
-        if found is None:
+        if entry is None:
             text = "this recording does not exist; GET /api/recordings lists them"
             raise RefusedError("path", text)
-        return found
+        return entry
 
     def _place(self) -> Path:
         host = self._robots.endpoint.partition("/")[2].rpartition(":")[0].strip("[]")
@@ -163,12 +165,12 @@ def rows(directory: Path) -> list[Recording]:
 
     If the directory does not exist, return [].
     """
-    found = []
+    recordings = []
     for path in _files(directory):
         # The daemon may rename or delete a file meanwhile.
         with suppress(FileNotFoundError):
-            found.append(_row(path))
-    return found
+            recordings.append(_row(path))
+    return recordings
 
 
 def _files(directory: Path) -> list[Path]:
@@ -274,25 +276,26 @@ class Reports:
         call draws the report again if the drawing failed, or if the recording has changed since.
         `path` and `stamp` are the results of `BlackBox.found()`.
         """
-        one, now_ns = self._one, clock.mono_ns()
-        if one is not None and not one.ended and one.path != path:
+        drawing, now_ns = self._one, clock.mono_ns()
+        if drawing is not None and not drawing.ended and drawing.path != path:
             return ReportState(
-                "busy", f"the report of {one.path.name} is being drawn: wait until it is finished"
+                "busy",
+                f"the report of {drawing.path.name} is being drawn: wait until it is finished",
             )
         if (
-            one is None
-            or one.path != path
-            or (one.result_delivered and (one.failed or one.stamp != stamp))
+            drawing is None
+            or drawing.path != path
+            or (drawing.result_delivered and (drawing.failed or drawing.stamp != stamp))
         ):
-            one = self._one = _Drawing(path, stamp)
-            self._work = asyncio.get_running_loop().create_task(self._draw(one))
-        one.asked_ns, one.result_delivered = now_ns, one.ended
-        if one.failed:
-            return ReportState("failed", one.failed)
-        if one.packed:
+            drawing = self._one = _Drawing(path, stamp)
+            self._work = asyncio.get_running_loop().create_task(self._draw(drawing))
+        drawing.asked_ns, drawing.result_delivered = now_ns, drawing.ended
+        if drawing.failed:
+            return ReportState("failed", drawing.failed)
+        if drawing.packed:
             return ReportState("ready", href=f"report/{path.name}")
-        seconds = (now_ns - one.begun_ns) / NS_PER_S
-        return ReportState("drawing", percent=one.percent, seconds=round(seconds, 1))
+        seconds = (now_ns - drawing.begun_ns) / NS_PER_S
+        return ReportState("drawing", percent=drawing.percent, seconds=round(seconds, 1))
 
     def drawn(self, name: str) -> bytes | None:
         """Return the report of the recording `name`, compressed by gzip.
@@ -300,11 +303,11 @@ class Reports:
         Return None if this report is not finished or not in memory. Each call restarts the time
         `KEEP_REPORT_NS` after which the report is discarded.
         """
-        one = self._one
-        if one is None or one.path.name != name or not one.packed:
+        drawing = self._one
+        if drawing is None or drawing.path.name != name or not drawing.packed:
             return None
-        one.asked_ns = clock.mono_ns()
-        return one.packed
+        drawing.asked_ns = clock.mono_ns()
+        return drawing.packed
 
     def tidy(self) -> None:
         """Discard the report if no client has requested it for some time.
@@ -312,11 +315,11 @@ class Reports:
         This time is `ABANDONED_NS` while the report is being drawn, and `KEEP_REPORT_NS` after
         that. Call this method once a second.
         """
-        one = self._one
-        if one is None:
+        drawing = self._one
+        if drawing is None:
             return
-        old_ns = clock.mono_ns() - one.asked_ns
-        if old_ns > (KEEP_REPORT_NS if one.ended else ABANDONED_NS):
+        old_ns = clock.mono_ns() - drawing.asked_ns
+        if old_ns > (KEEP_REPORT_NS if drawing.ended else ABANDONED_NS):
             self.end()
 
     def end(self) -> None:
@@ -325,25 +328,25 @@ class Reports:
             self._work.cancel()
         self._one = self._work = None
 
-    async def _draw(self, one: _Drawing) -> None:
+    async def _draw(self, drawing: _Drawing) -> None:
         try:
             async with asyncio.timeout(DRAW_TIMEOUT_S):
-                body = await self._drawn(one)
-                one.packed = await in_thread(lambda: gzip.compress(body, 6, mtime=0), None)
+                body = await self._drawn(drawing)
+                drawing.packed = await in_thread(lambda: gzip.compress(body, 6, mtime=0), None)
         except NoThreadError as error:
-            one.failed = str(error)
+            drawing.failed = str(error)
         except TimeoutError:
-            one.failed = TOO_LONG
+            drawing.failed = TOO_LONG
         # Python raises `RuntimeError` if it cannot start a thread for the child process.
         except (OSError, RuntimeError, _FailedError) as error:
-            one.failed = str(error)
+            drawing.failed = str(error)
 
-    async def _drawn(self, one: _Drawing) -> bytes:
-        command, limits = [*self._command, str(one.path)], Limits(CHILD_NICE, MAX_CHILD_MEMORY)
+    async def _drawn(self, drawing: _Drawing) -> bytes:
+        command, limits = [*self._command, str(drawing.path)], Limits(CHILD_NICE, MAX_CHILD_MEMORY)
         async with running(command, limits, stdout=PIPE, stderr=PIPE) as child:
-            listening = asyncio.create_task(_read_errors(child, one))
+            listening = asyncio.create_task(_read_errors(child, drawing))
             try:
-                body, said = await _body(child), await listening
+                body, error_text = await _body(child), await listening
             finally:
                 listening.cancel()
             code = await child.wait()
@@ -354,7 +357,7 @@ class Reports:
             )
         if code:
             raise _FailedError(
-                _why(said) or f"the program that draws the report {how_it_ended(code)}"
+                _why(error_text) or f"the program that draws the report {how_it_ended(code)}"
             )
         return body
 
@@ -363,11 +366,11 @@ class _FailedError(Exception):
     """A report could not be drawn. The text of this error is the reason."""
 
 
-def _why(said: str) -> str:
-    last = said.rpartition("\n")[2]
+def _why(error_text: str) -> str:
+    last = error_text.rpartition("\n")[2]
     if last.startswith("MemoryError"):
         return TOO_MUCH
-    return last if said.startswith("Traceback") else said
+    return last if error_text.startswith("Traceback") else error_text
 
 
 async def _body(child: Process) -> bytes:
@@ -380,19 +383,19 @@ async def _body(child: Process) -> bytes:
     return bytes(body)
 
 
-async def _read_errors(child: Process, one: _Drawing) -> str:
+async def _read_errors(child: Process, job: _Drawing) -> str:
     """Read the child's standard error to its end, and return the error text.
 
-    A line of digits is the progress in percent. It updates `one.percent`, and is not a part of the
+    A line of digits is the progress in percent. It updates `job.percent`, and is not a part of the
     error text.
     """
     assert child.stderr is not None
     # A read may end within a character, so the decoder keeps the first bytes of this character.
-    said, decoder = "", codecs.getincrementaldecoder("utf-8")(errors="replace")
+    text, decoder = "", codecs.getincrementaldecoder("utf-8")(errors="replace")
     while part := await child.stderr.read(1 << 12):
-        *lines, rest = (said + decoder.decode(part)).split("\n")
+        *lines, rest = (text + decoder.decode(part)).split("\n")
         words = [line for line in lines if not line.isdecimal()]
         numbers = [int(line) for line in lines if line.isdecimal() and len(line) <= 3]
-        one.percent = min(100, max([one.percent, *numbers]))
-        said = "\n".join([*words, rest])[-2000:]
-    return (said + decoder.decode(b"", final=True)).strip().removeprefix("acsard: ")
+        job.percent = min(100, max([job.percent, *numbers]))
+        text = "\n".join([*words, rest])[-2000:]
+    return (text + decoder.decode(b"", final=True)).strip().removeprefix("acsard: ")

@@ -96,7 +96,7 @@ class Route(Struct, frozen=True):
     def pattern(self) -> str:
         """Path in the notation of aiohttp's router, with a regular expression per parameter."""
         patterns = {name: PARAMETERS.get(name, "[^{}/]+") for name in self.parameters}
-        return _PARAMETER.sub(lambda found: f"{{{found[1]}:{patterns[found[1]]}}}", self.path)
+        return _PARAMETER.sub(lambda match: f"{{{match[1]}:{patterns[match[1]]}}}", self.path)
 
 
 def asked(topic: Topic) -> bool:

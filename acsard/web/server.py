@@ -103,11 +103,11 @@ async def serve(
         stack.push_async_callback(runner.cleanup)
         stack.push_async_callback(guide.close)
         places = open_sockets(options.listen, options.supervised)
-        for one, opened in places:
-            tls = secure if one.secure else None
+        for address, opened in places:
+            tls = secure if address.secure else None
             acceptor.listen(opened, tls, lambda: Reader(counts, runner.server))
         stack.callback(acceptor.close)
-        announce([one for one, _ in places])
+        announce([address for address, _ in places])
         stack.callback(asyncio.create_task(_report_refusals(counts, log)).cancel)
         if secure is not None:
             renewing = _renew(secure, names, files, options.tls, log)
@@ -188,7 +188,7 @@ def _about(options: ServerOptions) -> About:
         config.limits.angular_speed,
         config.rates.state,
         config.record.directory,
-        {one.name: one.timeout for one in config.commands.sources},
+        {source.name: source.timeout for source in config.commands.sources},
     )
 
 
@@ -198,7 +198,7 @@ def _certified(options: ServerOptions) -> tuple[ssl.SSLContext | None, set[str]]
     Return None and an empty set if no address uses HTTPS. Raises `MendableError` if the certificate
     is not usable.
     """
-    if not any(one.secure for one in options.listen):
+    if not any(address.secure for address in options.listen):
         return None, set()
     require_certificate(options.listen, options.tls)
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
@@ -213,7 +213,7 @@ def _load(context: ssl.SSLContext, directory: str) -> None:
 
 def _names(directory: str) -> set[str]:
     names = {socket.gethostname().lower(), own_name(), *map(str.lower, names_in(directory))}
-    return {one for one in names if one != "localhost" and not is_loopback(one)}
+    return {name for name in names if name != "localhost" and not is_loopback(name)}
 
 
 async def _renew(

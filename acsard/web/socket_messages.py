@@ -173,12 +173,12 @@ def decode(text: str) -> Frame:
     """Decode a message of a client from JSON. Raises `FrameError` if it is not valid."""
     about = "message"
     try:
-        meant = [name for name in _heads.decode(text) if name in MESSAGE_TYPES]
-        if len(meant) != 1:
+        fields = [name for name in _heads.decode(text) if name in MESSAGE_TYPES]
+        if len(fields) != 1:
             raise FrameError(
                 about, f"a message needs exactly one of the fields {', '.join(MESSAGE_TYPES)}"
             )
-        about = meant[0]
+        about = fields[0]
         frame = _decoders[about].decode(text)
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
         raise FrameError(about, str(error)) from None

@@ -101,7 +101,10 @@ class Outgoing:
                 self._news.clear()
                 await self._send_what_waits()
                 now = loop.time()
-                due = [await self._send_due(one, now) for one in list(self.following.values())]
+                due = [
+                    await self._send_due(subscription, now)
+                    for subscription in list(self.following.values())
+                ]
                 due.append(look_around(now))
                 timer = loop.call_at(min(due), self._news.set)
                 try:
@@ -122,9 +125,9 @@ class Outgoing:
         self._closing = True
         # Cut off a client that does not answer the close frame in time.
         asyncio.get_running_loop().call_later(1.0, cut, self._transport)
-        said = aiohttp.WSCloseCode.POLICY_VIOLATION.to_bytes(2, "big") + why.encode()
+        payload = aiohttp.WSCloseCode.POLICY_VIOLATION.to_bytes(2, "big") + why.encode()
         with suppress(ConnectionError):
-            await self._socket.send_frame(said, aiohttp.WSMsgType.CLOSE)
+            await self._socket.send_frame(payload, aiohttp.WSMsgType.CLOSE)
 
     def cut(self) -> None:
         """End the connection without telling the client the reason."""
@@ -151,27 +154,27 @@ class Outgoing:
         while self._out:
             await self._send(self._out.popleft())
 
-    async def _send_due(self, one: Following, now: float) -> float:
+    async def _send_due(self, subscription: Following, now: float) -> float:
         """Send the newest value of a key if the value is due and new.
 
         Return the time at which the next value is due, s on the event loop's clock. `now` is the
         present time on this clock.
         """
-        stream = one.stream
+        stream = subscription.stream
         if stream is None:
-            return now + one.period  # `Keys._join` wakes the task when the stream exists
-        if one.due > now:
-            return one.due
+            return now + subscription.period  # `Keys._join` wakes the task when the stream exists
+        if subscription.due > now:
+            return subscription.due
         # All keys share one time grid, so they wake the task together.
-        one.due = (now // one.period + 1) * one.period
-        if stream.number != one.sent:
+        subscription.due = (now // subscription.period + 1) * subscription.period
+        if stream.number != subscription.sent:
             if self._unread() > MAX_UNREAD_BYTES:
                 self._counts.add("frames_left_out")
             else:
-                one.sent, value, age = stream.value()
-                frame = b'%b%b,"age":%.1f}' % (one.head, value, age)
+                subscription.sent, value, age = stream.value()
+                frame = b'%b%b,"age":%.1f}' % (subscription.head, value, age)
                 await self._send(frame)
-        return one.due
+        return subscription.due
 
     def _unread(self) -> int:
         return 0 if self._transport is None else self._transport.get_write_buffer_size()
@@ -220,7 +223,11 @@ class Keys:
             self._out.refuse("subscribe", "malformed", text)
             return
         known = self._out.following.get((robot, key))
-        others = sum(1.0 / one.period for one in self._out.following.values() if one is not known)
+        others = sum(
+            1.0 / subscription.period
+            for subscription in self._out.following.values()
+            if subscription is not known
+        )
         if others + frame.rate > MAX_FRAMES_HZ:
             self._out.refuse(
                 "subscribe",
@@ -244,51 +251,51 @@ class Keys:
             )
             self._out.refuse("subscribe", "too_many", f"{text}: unsubscribe from some")
         else:
-            one = Following(robot, key, self._robots.id, 1.0 / frame.rate)
-            self._out.following[robot, key] = one
-            self._start(self._join(one))
+            subscription = Following(robot, key, self._robots.id, 1.0 / frame.rate)
+            self._out.following[robot, key] = subscription
+            self._start(self._join(subscription))
 
     def unsubscribe(self, frame: Unsubscribe) -> None:
         name = frame.robot or self._robots.id, frame.unsubscribe
         # Remove the key immediately, because the client's next message may subscribe to it again.
-        one = self._out.following.pop(name, None)
-        if one is not None:
-            self._leave(one)
+        subscription = self._out.following.pop(name, None)
+        if subscription is not None:
+            self._leave(subscription)
 
     def leave_all(self) -> None:
         followed, self._out.following = self._out.following, {}
-        for one in followed.values():
-            self._leave(one)
+        for subscription in followed.values():
+            self._leave(subscription)
 
     @property
     def _shares(self) -> Shares:
         return self._robots.streams.shares
 
-    def _leave(self, one: Following) -> None:
-        if one.robot != self._robots.id:
-            self._shares.leave(self._holder, (one.robot, one.name))
-        if one.stream is not None:
-            self._robots.streams.leave(one.robot, one.name)
+    def _leave(self, subscription: Following) -> None:
+        if subscription.robot != self._robots.id:
+            self._shares.leave(self._holder, (subscription.robot, subscription.name))
+        if subscription.stream is not None:
+            self._robots.streams.leave(subscription.robot, subscription.name)
 
-    async def _join(self, one: Following) -> None:
+    async def _join(self, subscription: Following) -> None:
         stream = None
-        while stream is None and self._is_followed(one):
-            stream = await self._found(one)
+        while stream is None and self._is_followed(subscription):
+            stream = await self._found(subscription)
         if stream is None:
             return
-        if not self._is_followed(one):  # the viewer unsubscribed during the wait
-            self._robots.streams.leave(one.robot, one.name)
+        if not self._is_followed(subscription):  # the viewer unsubscribed during the wait
+            self._robots.streams.leave(subscription.robot, subscription.name)
             return
-        one.stream = stream
+        subscription.stream = stream
         self._out.wake()
 
-    async def _found(self, one: Following) -> Stream | None:
+    async def _found(self, subscription: Following) -> Stream | None:
         client = self._robots.client
         if client is None:
             await asyncio.sleep(0.2)
             return None
         try:
-            return await self._robots.streams.follow(client, one.robot, one.name)
+            return await self._robots.streams.follow(client, subscription.robot, subscription.name)
         except NOT_READY_ERRORS:
             self._out.refuse(
                 "subscribe", "stuck", "the Zenoh bus is stuck; the page tries again by itself"
@@ -296,5 +303,5 @@ class Keys:
             await asyncio.sleep(RETRY_DELAY_S)
             return None
 
-    def _is_followed(self, one: Following) -> bool:
-        return self._out.following.get((one.robot, one.name)) is one
+    def _is_followed(self, subscription: Following) -> bool:
+        return self._out.following.get((subscription.robot, subscription.name)) is subscription

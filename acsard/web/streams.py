@@ -162,16 +162,16 @@ class Streams:
             return lambda sample: take(sample) if has_exact_key(client.key(key), sample) else None
 
         def declare() -> Any:
-            heard = client.listen(key, of_it(stream.take))
+            subscription = client.listen(key, of_it(stream.take))
             if not asks:
-                return heard
+                return subscription
             try:
                 # The query gives a first value soon, even if the key is published rarely.
                 client.ask(key, of_it(stream.answered))
             except zenoh.ZError:
-                heard.undeclare()
+                subscription.undeclare()
                 raise
-            return heard
+            return subscription
 
         return await in_thread(declare, DECLARE_TIMEOUT_S, late)
 

@@ -72,7 +72,7 @@ class Vault:
 
         Return 0 if the token has expired or is unknown.
         """
-        ends = [one.ends for one in self.all() if one.digest == digest]
+        ends = [token.ends for token in self.all() if token.digest == digest]
         return max(0, int(max(ends, default=0) - time.time()))
 
     def all(self) -> list[Token]:
@@ -83,12 +83,12 @@ class Vault:
         return self._own(self._shared())
 
     def _own(self, tokens: list[Token]) -> list[Token]:
-        return [one for one in tokens if one.robot == self.robot]
+        return [token for token in tokens if token.robot == self.robot]
 
     def _shared(self) -> list[Token]:
         try:
-            seen = self.path.stat()
-            stamp = seen.st_mtime_ns, seen.st_ino
+            status = self.path.stat()
+            stamp = status.st_mtime_ns, status.st_ino
             read = self._read
             if stamp != read[0]:
                 read = stamp, msgspec.json.decode(self.path.read_bytes(), type=list[Token])
@@ -102,7 +102,7 @@ class Vault:
     def valid_digests(self) -> frozenset[str]:
         """Return the digests of the tokens that are valid now."""
         now_s = time.time()
-        return frozenset(one.digest for one in self.all() if one.ends > now_s)
+        return frozenset(token.digest for token in self.all() if token.ends > now_s)
 
     def unknown_to(self, service: Path = SERVICE_DIRECTORY) -> str:
         """Return a warning if the service `acsard-web` of this machine ignores these tokens.
@@ -126,9 +126,9 @@ class Vault:
         """
         with self._changing() as tokens:
             now_s = int(time.time())
-            tokens[:] = [one for one in tokens if one.ends > now_s]
-            ours = [one for one in tokens if one.robot == self.robot]
-            if any(one.name == name for one in ours):
+            tokens[:] = [record for record in tokens if record.ends > now_s]
+            ours = [record for record in tokens if record.robot == self.robot]
+            if any(record.name == name for record in ours):
                 raise UsageError(
                     f"the token {name} exists already: either give another --name, or revoke the "
                     f"old token with --revoke {name}"
@@ -149,14 +149,16 @@ class Vault:
         Raises `UsageError` if the robot has no token with this name.
         """
         with self._changing() as tokens:
-            ours = [one for one in tokens if one.robot == self.robot]
-            if all(one.name != name for one in ours):
-                known = ", ".join(one.name for one in ours) or "none"
+            ours = [token for token in tokens if token.robot == self.robot]
+            if all(token.name != name for token in ours):
+                known = ", ".join(token.name for token in ours) or "none"
                 raise UsageError(
                     f"there is no token {name} of {self.robot} in {self.path}; the robot's tokens: "
                     f"{known}"
                 )
-            tokens[:] = [one for one in tokens if (one.name, one.robot) != (name, self.robot)]
+            tokens[:] = [
+                token for token in tokens if (token.name, token.robot) != (name, self.robot)
+            ]
 
     @contextmanager
     def _changing(self) -> Iterator[list[Token]]:
@@ -224,13 +226,13 @@ def owner_in(tokens: Sequence[Token], text: str) -> Identity | None:
     """
     if not text or len(text) > 200:
         return None
-    digest, found = _digest(text), None
+    digest, match = _digest(text), None
     for token in tokens:
         if hmac.compare_digest(token.digest, digest):
-            found = token
-    if found is None or found.ends <= time.time():
+            match = token
+    if match is None or match.ends <= time.time():
         return None
-    return Identity(found.role, found.name, found.digest)
+    return Identity(match.role, match.name, match.digest)
 
 
 def _digest(text: str) -> str:

@@ -99,11 +99,11 @@ async def run(config: dict[str, Any], port: serial.Serial) -> None:
         loop.robot.on_command(sample)
         events.call_soon_threadsafe(loop.write)
 
-    kept = session.declare_subscriber(f"{root}/cmd/{source}", direct(on_command))
+    subscriber = session.declare_subscriber(f"{root}/cmd/{source}", direct(on_command))
     await serial_asyncio.connection_for_serial(events, lambda: loop, port)
     gc.freeze()
     await asyncio.Event().wait()
-    del kept
+    del subscriber
 
 
 def main() -> None:

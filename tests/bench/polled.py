@@ -60,9 +60,9 @@ class Robot:
         if not end:
             return False
         self.buffer = rest
-        found = TOKEN.findall(line)
-        if len(found) == 4:
-            a, b, c, d = [float(size) * (1 if sign == b"p" else -1) for sign, size in found]
+        tokens = TOKEN.findall(line)
+        if len(tokens) == 4:
+            a, b, c, d = [float(size) * (1 if sign == b"p" else -1) for sign, size in tokens]
             right, left = RADIUS * (a + d) / 2, RADIUS * (b + c) / 2
             self.linear, self.angular = (right + left) / 2, (right - left) / SEPARATION
         return True
@@ -105,11 +105,11 @@ def main() -> None:
     robot = Robot()
     with serial.Serial(args.port, config["mcu"]["baud_rate"], timeout=0) as port:
         session, root, source = session_of(config)
-        kept = session.declare_subscriber(f"{root}/cmd/{source}", robot.on_command)
+        subscriber = session.declare_subscriber(f"{root}/cmd/{source}", robot.on_command)
         odometry = session.declare_publisher(f"{root}/odom")
         period = 1.0 / config["control"]["rate"]
         due = time.monotonic()
-        while kept:
+        while subscriber:
             robot.buffer += port.read(4096 if args.drain else max(0, 128 - len(robot.buffer)))
             while robot.read() and args.drain:
                 pass

@@ -47,15 +47,15 @@ def config(rate: float = 100.0, reply_period: float = 0.0) -> Config:
     return bench_config(wanted, simulated=True)
 
 
-def sibling(one: Config, number: int) -> Config:
+def sibling(settings: Config, number: int) -> Config:
     """Return a copy of the configuration with another robot id and another bus address."""
-    name, bus = RobotConfig(f"{one.robot.id}-{number}"), BusConfig(listen=(free_endpoint(),))
-    return replace(one, robot=name, bus=bus)
+    name, bus = RobotConfig(f"{settings.robot.id}-{number}"), BusConfig(listen=(free_endpoint(),))
+    return replace(settings, robot=name, bus=bus)
 
 
 @contextmanager
 def rig(
-    one: Config,
+    settings: Config,
     words: Sequence[str] = ACSARD,
     *,
     port: str = "",
@@ -64,9 +64,9 @@ def rig(
 ) -> Iterator[Rig]:
     """Start a program and a simulated board. The body runs when the link between them is up."""
     with TemporaryDirectory(prefix="acsard-bench-") as where:
-        file = write(one, Path(where))
+        file = write(settings, Path(where))
         with Rig(
-            one,
+            settings,
             file,
             command_line=words,
             port=port,
@@ -76,9 +76,9 @@ def rig(
             yield running
 
 
-def driven(one: Config, words: Sequence[str], seconds: float, seed: int) -> Record:
+def driven(settings: Config, words: Sequence[str], seconds: float, seed: int) -> Record:
     """Send commands to the program for this many seconds, and return the record of all messages."""
-    with rig(one, words) as running:
+    with rig(settings, words) as running:
         running.command(seconds, staircase, seed)
         return running.end()
 
@@ -88,12 +88,12 @@ def waits_us(record: Record) -> list[float]:
     return [wait / 1000 for wait in command_waits(record)]
 
 
-def delays_us(one: Config, record: Record) -> list[float]:
+def delays_us(settings: Config, record: Record) -> list[float]:
     """Return the time from each feedback line's last byte on the wire to its odometry, in us.
 
     The odometry counts when this process receives it from the bus.
     """
-    return [fed.delay_ns / 1000 for fed in feedback_fates(one, record)]
+    return [fed.delay_ns / 1000 for fed in feedback_fates(settings, record)]
 
 
 def share(values: Sequence[float], part: float) -> float:
@@ -107,7 +107,7 @@ def in_turns(ways: Mapping[str, Callable[[], float]], rounds: int) -> dict[str, 
     for _ in range(rounds):
         for name, measure in ways.items():
             values[name].append(measure())
-    return {name: median(found) for name, found in values.items()}
+    return {name: median(results) for name, results in values.items()}
 
 
 def schedule(pid: int, policy: int, priority: int = 0) -> None:

@@ -50,7 +50,7 @@ def ahead_of_all() -> Iterator[None]:
 
 
 @contextmanager
-def flooded(one: Config, wanted: bool) -> Iterator[None]:
+def flooded(settings: Config, wanted: bool) -> Iterator[None]:
     """Run a client that floods another command source with zeros while the body runs.
 
     If `wanted` is False, no client runs.
@@ -58,9 +58,9 @@ def flooded(one: Config, wanted: bool) -> Iterator[None]:
     if not wanted:
         yield
         return
-    text = FLOOD.replace("acsard/acsar/cmd/app", f"acsard/{one.robot.id}/cmd/nav")
+    text = FLOOD.replace("acsard/acsar/cmd/app", f"acsard/{settings.robot.id}/cmd/nav")
     flood = subprocess.Popen(
-        words(text, one.bus.listen[0], 0.0, 2 * SECONDS), stdout=subprocess.PIPE
+        words(text, settings.bus.listen[0], 0.0, 2 * SECONDS), stdout=subprocess.PIPE
     )
     try:
         yield
@@ -92,15 +92,22 @@ def test_a_busy_machine_beside_a_quiet_one(real_time: bool, tmp_path: Path) -> N
     print(f"{'':26}{'p50':>9}{'p99':>9}{'max':>9}   {'p50':>9}{'p99':>9}{'max':>9}")
     late = {}
     for name, (busy, flood, record_too) in CASES.items():
-        one = config()
+        settings = config()
         if record_too:
-            one = replace(one, record=replace(one.record, directory=str(tmp_path / name)))
-        one = replace(one, control=replace(one.control, real_time=real_time))
-        with rig(one) as running, all_cores_busy(busy), flooded(one, flood), ahead_of_all():
+            settings = replace(
+                settings, record=replace(settings.record, directory=str(tmp_path / name))
+            )
+        settings = replace(settings, control=replace(settings.control, real_time=real_time))
+        with (
+            rig(settings) as running,
+            all_cores_busy(busy),
+            flooded(settings, flood),
+            ahead_of_all(),
+        ):
             running.command(SECONDS, staircase, 1)
             record = running.end()
         assert any((tmp_path / name).glob("*.mcap*")) == record_too
-        waits, delays = waits_us(record), delays_us(one, record)
+        waits, delays = waits_us(record), delays_us(settings, record)
         cells = [f"{share(values, p):9.0f}" for values in (waits, delays) for p in (0.5, 0.99, 1.0)]
         print(f"{name:26}{''.join(cells[:3])}   {''.join(cells[3:])}", flush=True)
         late[name] = sum(wait > 10_000 for wait in waits) / len(waits)

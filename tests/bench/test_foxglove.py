@@ -55,23 +55,23 @@ def test_a_viewer_of_all_topics(tmp_path: Path) -> None:
             alone.append(cost(daemon, bridge, bus))
             with Viewer(bridge.port) as viewer:
                 looked = [viewer.show(topic) for topic in viewer.channels]
-                next(one for one in looked if one.channel["topic"] == "/odom").first(10)
-                before = sum(len(one.came) for one in looked)
+                next(item for item in looked if item.channel["topic"] == "/odom").first(10)
+                before = sum(len(item.came) for item in looked)
                 watched.append(cost(daemon, bridge, bus))
-                messages += sum(len(one.came) for one in looked) - before
+                messages += sum(len(item.came) for item in looked) - before
     rate = messages / ROUNDS / SPAN_S
-    bridge_s = sum(one.bridge for one in watched) / 100 * SPAN_S
+    bridge_s = sum(item.bridge for item in watched) / 100 * SPAN_S
     print(f"\n{rate:.0f} messages a second, {1e6 * bridge_s / messages:.0f} us each, all told")
     for name, costs in (("no viewer", alone), ("a viewer", watched)):
-        missed = sum(one.periods.missed for one in costs)
+        missed = sum(item.periods.missed for item in costs)
         print(
-            f"{name}: acsard foxglove {median(one.bridge for one in costs):.1f} % of a core, "
-            f"daemon {median(one.daemon for one in costs):.1f} %, missed periods {missed} of "
-            f"{sum(one.periods.elapsed for one in costs):.0f}, "
-            f"loop without a core {sum(one.waited_s for one in costs) * 1000:.0f} ms"
+            f"{name}: acsard foxglove {median(item.bridge for item in costs):.1f} % of a core, "
+            f"daemon {median(item.daemon for item in costs):.1f} %, missed periods {missed} of "
+            f"{sum(item.periods.elapsed for item in costs):.0f}, "
+            f"loop without a core {sum(item.waited_s for item in costs) * 1000:.0f} ms"
         )
     assert rate > 0.9 * 4 * 100
-    assert median(one.bridge for one in alone) < 0.2 * median(one.bridge for one in watched)
+    assert median(item.bridge for item in alone) < 0.2 * median(item.bridge for item in watched)
     # Each missed period is one in which the machine had no core for the loop.
-    missed, waited = sum(one.periods.missed for one in watched), sum(o.waited_s for o in watched)
-    assert missed <= sum(one.periods.missed for one in alone) + 2 + waited / 0.01
+    missed, waited = sum(item.periods.missed for item in watched), sum(o.waited_s for o in watched)
+    assert missed <= sum(item.periods.missed for item in alone) + 2 + waited / 0.01

@@ -115,9 +115,9 @@ def test_recording_makes_no_period_late(tmp_path: Path) -> None:
     off, on = costs[False], costs[True]
     print(f"\n{told('without', off)}\n{told('recording', on)}")
     # The bound is the difference between two equal daemons on this machine now.
-    noise = max(one.p99 for one in off) - min(one.p99 for one in off)
-    assert median(one.p99 for one in on) <= median(one.p99 for one in off) + noise
-    assert 0 < median(one.bytes_ for one in on) * 86_400 < DRIVING
+    noise = max(run.p99 for run in off) - min(run.p99 for run in off)
+    assert median(run.p99 for run in on) <= median(run.p99 for run in off) + noise
+    assert 0 < median(run.bytes_ for run in on) * 86_400 < DRIVING
 
 
 def test_recording_takes_little_of_the_processor(tmp_path: Path) -> None:

@@ -61,13 +61,13 @@ def line(name: str, values: list[float]) -> str:
     return f"{name:44}{len(values):7d}{p50:9.0f}{p90:9.0f}{p99:9.0f}{most:9.0f}"
 
 
-def times_as_long(what: str, one: list[list[float]], other: list[list[float]]) -> float:
-    """Print and return how many times longer `one` takes than `other`.
+def times_as_long(what: str, ratio: list[list[float]], other: list[list[float]]) -> float:
+    """Print and return how many times longer `ratio` takes than `other`.
 
     This is the median over the rounds of the ratio of the two medians.
     """
-    by_round = [median(a) / median(b) for a, b in zip(one, other, strict=True) if a and b]
-    rounds = ", ".join(f"{one:.1f}" for one in by_round)
+    by_round = [median(a) / median(b) for a, b in zip(ratio, other, strict=True) if a and b]
+    rounds = ", ".join(f"{ratio:.1f}" for ratio in by_round)
     print(f"{what}: {median(by_round):.2f} times as long at p50 (by round {rounds})")
     return median(by_round)
 
@@ -78,20 +78,20 @@ def test_commands_and_feedback_are_many_times_faster_than_polled() -> None:
     delays: Turns = {name: [] for name in ways}
     for number in range(ROUNDS):
         for name, words in ways.items():
-            one = config()
-            record = driven(one, words, SECONDS, seed=number)
+            settings = config()
+            record = driven(settings, words, SECONDS, seed=number)
             waits[name].append(waits_us(record))
-            delays[name].append(delays_us(one, record))
+            delays[name].append(delays_us(settings, record))
     head = f"{ROUNDS} turns of {SECONDS:g} s each, us"
     print(f"\n{head:44}  count      p50      p90      p99      max")
     slower = []
-    for what, found in (("command -> wire", waits), ("feedback -> odometry", delays)):
+    for what, turns in (("command -> wire", waits), ("feedback -> odometry", delays)):
         for name in ways:
-            print(line(f"{what}: {name}", [value for turn in found[name] for value in turn]))
+            print(line(f"{what}: {name}", [value for turn in turns[name] for value in turn]))
         for name in trees():
-            times_as_long(f"  {name} than by events", found[name], found["by events"])
-        times_as_long("  polled, draining than acsard", found["polled, draining"], found["acsard"])
-        slower.append(times_as_long("  polled than acsard", found["polled"], found["acsard"]))
+            times_as_long(f"  {name} than by events", turns[name], turns["by events"])
+        times_as_long("  polled, draining than acsard", turns["polled, draining"], turns["acsard"])
+        slower.append(times_as_long("  polled than acsard", turns["polled"], turns["acsard"]))
     if min(slower) < PROMISED:
         print(f"below the {PROMISED:g} times of a quiet machine")
     assert min(slower) >= ASSERTED
@@ -99,10 +99,10 @@ def test_commands_and_feedback_are_many_times_faster_than_polled() -> None:
 
 def shares_of_a_pair(words: Sequence[str], seed: int) -> tuple[float, float]:
     """Run a program and the polled program at the same time. Return the share of a core of each."""
-    one = config()
+    settings = config()
     with ExitStack() as stack:
-        ours = stack.enter_context(rig(one, words))
-        theirs = stack.enter_context(rig(sibling(one, 1), POLLED))
+        ours = stack.enter_context(rig(settings, words))
+        theirs = stack.enter_context(rig(sibling(settings, 1), POLLED))
         with ThreadPoolExecutor(2) as pool:
             shares = [pool.submit(each.command, PAIR_S, staircase, seed) for each in (ours, theirs)]
         return shares[0].result(), shares[1].result()
@@ -120,13 +120,13 @@ def test_what_a_commanded_robot_costs_at_the_same_time_as_polled() -> None:
             pairs[name].append(shares_of_a_pair(words, number))
     print(f"\none subscriber, {1 / SPACING_S[1]:.0f} to {1 / SPACING_S[0]:.0f} commands a second:")
     ratios = {}
-    for name, found in pairs.items():
-        by_pair = sorted(ours / theirs for ours, theirs in found)
+    for name, shares in pairs.items():
+        by_pair = sorted(ours / theirs for ours, theirs in shares)
         ratios[name] = median(by_pair)
-        ours, theirs = (100 * median(column) for column in zip(*found, strict=True))
+        ours, theirs = (100 * median(column) for column in zip(*shares, strict=True))
         print(
             f"  {name:10}{ours:5.1f} % of a core beside {theirs:.1f} %, {ratios[name]:.2f} times "
-            f"polled ({len(found)} pairs, from {by_pair[0]:.2f} to {by_pair[-1]:.2f})"
+            f"polled ({len(shares)} pairs, from {by_pair[0]:.2f} to {by_pair[-1]:.2f})"
         )
     # Even a driver without decisions needs the time of the wake-ups and of the hand-over.
     assert ratios["by events"] < ratios["acsard"] < 5.0
@@ -146,16 +146,16 @@ def test_a_faster_microcontroller_leaves_no_backlog_here_and_a_growing_one_there
     hz, seconds = 110.0, 20.0
     backlog: dict[str, list[int]] = {}
     for name, words in (("acsard", ACSARD), ("polled", POLLED)):
-        one = config(reply_period=1 / hz)
-        with rig(one, words, free_running=1 / hz) as running:
+        setup = config(reply_period=1 / hz)
+        with rig(setup, words, free_running=1 / hz) as running:
             running.follow(seconds)
             record = running.end()
-        fates = feedback_fates(one, record)
+        fates = feedback_fates(setup, record)
         waiting = [fed.waiting for fed in fates]
         backlog[name] = standing(waiting, 100)
         over = sum(count > 1 for count in waiting)
         print(
-            f"\n{name}: microcontroller at {hz:g} Hz, host at {one.rate_hz:g} Hz, {seconds:g} s: "
+            f"\n{name}: microcontroller at {hz:g} Hz, host at {setup.rate_hz:g} Hz, {seconds:g} s: "
             f"{len(record.feedback_lines)} lines, {len(fates)} told\n"
             f"  backlog by the second, lines: {' '.join(map(str, backlog[name]))}\n"
             f"  more than one newer line waiting: {over} of {len(fates)} samples; "

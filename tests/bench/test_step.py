@@ -69,10 +69,10 @@ class Timed:
         self.calls = self.ns = 0
         setattr(owner, name, self)
 
-    def __call__(self, *given: object) -> object:
+    def __call__(self, *arguments: object) -> object:
         began = thread_time_ns()
         try:
-            return self._call(*given)
+            return self._call(*arguments)
         finally:
             self.ns += thread_time_ns() - began
             self.calls += 1
@@ -175,13 +175,13 @@ def test_what_a_step_has_grown_by_is_told_beside_what_it_may() -> None:
     """
     run, rounds = Run(ALL), []
     for seed in range(ROUNDS):
-        found = run.drive(seed)
-        added = sum(found[name] for name in run.parts) - found["simplest"]
-        rounds.append(found | {"added": added, "share": added / (found["step"] - added)})
-    told = {name: median(one[name] for one in rounds) for name in rounds[0]}
+        times = run.drive(seed)
+        added = sum(times[name] for name in run.parts) - times["simplest"]
+        rounds.append(times | {"added": added, "share": added / (times["step"] - added)})
+    medians = {name: median(timing[name] for timing in rounds) for name in rounds[0]}
     assert run.world.state.gyro == "used"
     assert run.world.loop.robot.session.count_recovery.counts == (400,) * 4
-    share = told.pop("share")
-    print("\nus a line: " + ", ".join(f"{name} {value:.1f}" for name, value in told.items()))
+    share = medians.pop("share")
+    print("\nus a line: " + ", ".join(f"{name} {value:.1f}" for name, value in medians.items()))
     print(f"added is {share:.0%} of the rest of the step; it may be {ALLOWED / STEP:.0%}")
     assert share < ASSERTED

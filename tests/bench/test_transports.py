@@ -39,49 +39,49 @@ ON_THE_BRIDGE = ("odom", "tf", "joint_states")
 
 
 @contextmanager
-def listening(one: Config, keys: Sequence[str], sessions: int = 1) -> Iterator[None]:
+def listening(settings: Config, keys: Sequence[str], sessions: int = 1) -> Iterator[None]:
     """Run this number of clients that subscribe to all the keys, each with its own connection."""
     with ExitStack() as stack:
         for _ in range(sessions):
-            session = client_session(one.bus.listen[0])
+            session = client_session(settings.bus.listen[0])
             stack.callback(session.close)
             for key in keys:
                 session.declare_subscriber(key, direct(lambda _: None))
             # Messages on one link stay in order. An answer received now follows the subscription.
-            alive = session.liveliness().get(full_key(one.robot.id, "alive"), timeout=3.0)
+            alive = session.liveliness().get(full_key(settings.robot.id, "alive"), timeout=3.0)
             assert len(list(alive)) == 1
         yield
 
 
-def cycle_us(running: Rig, one: Config, seconds: float) -> float:
+def cycle_us(running: Rig, settings: Config, seconds: float) -> float:
     """Return the processor time of the daemon per control period."""
     pid = running.process.pid
     began_ns, used_ns = clock.mono_ns(), processor_ns(pid)
     time.sleep(seconds)
-    periods = (clock.mono_ns() - began_ns) / 1e9 * one.rate_hz
+    periods = (clock.mono_ns() - began_ns) / 1e9 * settings.rate_hz
     return (processor_ns(pid) - used_ns) / 1000 / periods
 
 
-def native(one: Config) -> tuple[str, ...]:
-    return tuple(full_key(one.robot.id, key) for key in FEEDBACK)
+def native(settings: Config) -> tuple[str, ...]:
+    return tuple(full_key(settings.robot.id, key) for key in FEEDBACK)
 
 
 @pytest.mark.bench
 @pytest.mark.timeout(300)
 def test_the_cost_of_each_transport() -> None:
-    one = config()
-    with rig(one) as running:
+    settings = config()
+    with rig(settings) as running:
         running.unsubscribe()
 
         def cost(keys: tuple[str, ...]) -> float:
-            with listening(one, keys, 1 if keys else 0):
-                return cycle_us(running, one, 3.0)
+            with listening(settings, keys, 1 if keys else 0):
+                return cycle_us(running, settings, 3.0)
 
         ways: dict[str, Callable[[], float]] = {
             "nobody": partial(cost, ()),
-            "native msgpack": partial(cost, native(one)),
+            "native msgpack": partial(cost, native(settings)),
             "bridge CDR": partial(cost, ON_THE_BRIDGE),
-            "both": partial(cost, (*native(one), *ON_THE_BRIDGE)),
+            "both": partial(cost, (*native(settings), *ON_THE_BRIDGE)),
         }
         costs = in_turns(ways, 4)
         running.end()
@@ -97,13 +97,13 @@ def test_the_cost_of_each_transport() -> None:
 @pytest.mark.bench
 @pytest.mark.timeout(300)
 def test_the_cost_of_more_subscribers() -> None:
-    one = config()
-    with rig(one) as running:
+    settings = config()
+    with rig(settings) as running:
         running.unsubscribe()
 
         def cost(sessions: int) -> float:
-            with listening(one, native(one)[:1], sessions):
-                return cycle_us(running, one, 3.0)
+            with listening(settings, native(settings)[:1], sessions):
+                return cycle_us(running, settings, 3.0)
 
         numbers = (0, 1, 4, 16)
         ways: dict[str, Callable[[], float]] = {str(n): partial(cost, n) for n in numbers}
@@ -131,13 +131,13 @@ def missed_and_due(running: Rig) -> tuple[int, float]:
 @pytest.mark.bench
 @pytest.mark.timeout(300)
 def test_the_cost_of_more_robots() -> None:
-    one, seconds = config(), 8.0
+    settings, seconds = config(), 8.0
     print("\nrobots on this machine, each with its simulator inside and one subscriber, 100 Hz")
     shares: dict[int, float] = {}
     for number in (1, 4, 16):
         with ExitStack() as stack:
             robots = [
-                stack.enter_context(rig(sibling(one, which), port=SIMULATOR))
+                stack.enter_context(rig(sibling(settings, which), port=SIMULATOR))
                 for which in range(number)
             ]
             before = [missed_and_due(robot) for robot in robots]
@@ -177,7 +177,7 @@ class Nobody:
 
 
 def encoded(
-    monkeypatch: pytest.MonkeyPatch, keys: Sequence[str], one: Config, count: int
+    monkeypatch: pytest.MonkeyPatch, keys: Sequence[str], settings: Config, count: int
 ) -> Counter[str]:
     """Publish `count` messages, and return how often the bus encoded them in each format.
 
@@ -192,8 +192,8 @@ def encoded(
     monkeypatch.setattr(outlets, "encode", counting)
 
     async def publish() -> None:
-        async with ZenohBus(one, Nobody()) as bus:
-            with listening(one, keys, 1 if keys else 0):
+        async with ZenohBus(settings, Nobody()) as bus:
+            with listening(settings, keys, 1 if keys else 0):
                 made.clear()  # messages kept for late subscribers
                 while len(made) < len(keys):  # Zenoh reports each subscriber in its own time
                     bus.publish("odom", odometry("odom", "base_link"))

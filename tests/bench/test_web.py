@@ -122,8 +122,8 @@ def test_twenty_viewers_cost_the_page_and_not_the_robot(tmp_path: Path) -> None:
     for count in (0, 20, 1, 0, 20):
         with Daemon(tmp_path) as daemon, Page(daemon, tmp_path) as page, Bus(daemon.endpoint) as b:
             b.linked()
-            told = [f"{page.here}/ws", str(count), json.dumps(subscribed())]
-            viewers = Program([sys.executable, "-c", VIEWERS, *told], tmp_path)
+            arguments = [f"{page.here}/ws", str(count), json.dumps(subscribed())]
+            viewers = Program([sys.executable, "-c", VIEWERS, *arguments], tmp_path)
             with b.commanding(0.3, 0.3), viewers:
                 until(lambda v=viewers, c=count: len(v.out) == c, 30.0, "all see")  # type: ignore[misc]
                 share, kb, periods, late = watched(page, daemon, b)
@@ -152,18 +152,18 @@ def lines_with(peer: Peer, speed: float, after: float) -> float | None:
 
 async def measured(peer: Peer, send: Callable[[float], object]) -> list[float]:
     """Send commands at 20 Hz. Return the time in ms from each one to its line at the board."""
-    found = []
+    delays_ms = []
     for n in range(COMMANDS):
         linear = 0.2 if n % 2 else 0.25
         sent = time.monotonic()
-        told = send(linear)
-        if asyncio.iscoroutine(told):
-            await told
+        result = send(linear)
+        if asyncio.iscoroutine(result):
+            await result
         await asyncio.sleep(0.05)
         at = lines_with(peer, linear / 0.05, sent)
         if at is not None:
-            found.append(1000 * (at - sent))
-    return found
+            delays_ms.append(1000 * (at - sent))
+    return delays_ms
 
 
 def told(what: str, times: list[float]) -> float:
@@ -221,14 +221,14 @@ class Finger:
         at = float(self.browser.js("window.finger")) / 1000 - wall + begun
 
         def line() -> float | None:
-            since = [heard for heard in self.peer.since(at) if heard.line.startswith(b"a")]
-            return next((heard.at for heard in since if wanted(wheels(heard.line)[0])), None)
+            since = [entry for entry in self.peer.since(at) if entry.line.startswith(b"a")]
+            return next((entry.at for entry in since if wanted(wheels(entry.line)[0])), None)
 
         return 1000 * (until(line, 5.0, "the finger's line") - at)
 
     def moved_to(self, y: float, speed: float) -> float:
         """Push the stick to `y`. Return the ms until the board receives this speed in rad/s."""
-        return self.waited(lambda: self.browser.push(0, y), lambda told: abs(told - speed) < 0.5)
+        return self.waited(lambda: self.browser.push(0, y), lambda value: abs(value - speed) < 0.5)
 
     def press(self) -> None:
         """Put the finger down and push forwards."""
@@ -256,7 +256,7 @@ def test_a_finger_on_the_stick_is_soon_on_the_port(tmp_path: Path) -> None:
         until(lambda: browser.text("mode") == "READY", 10.0, "a page")
         browser.js(FINGER)
         finger, begun = Finger(browser, peer), time.monotonic()
-        browser.hold(lambda: any(one.line.startswith(b"ap04") for one in peer.since(begun)))
+        browser.hold(lambda: any(entry.line.startswith(b"ap04") for entry in peer.since(begun)))
         pressed: list[float] = []
         moved: list[float] = []
         lifted: list[float] = []

@@ -243,11 +243,11 @@ class Board:
 
     def status(self) -> Status:
         """Return the current state of the simulated board."""
-        told = self.command("status")
-        told["motors"] = tuple(Motor(**motor) for motor in told["motors"])
-        told["to_board"] = Wire(**told["to_board"])
-        told["from_board"] = Wire(**told["from_board"])
-        return Status(**told)
+        fields = self.command("status")
+        fields["motors"] = tuple(Motor(**motor) for motor in fields["motors"])
+        fields["to_board"] = Wire(**fields["to_board"])
+        fields["from_board"] = Wire(**fields["from_board"])
+        return Status(**fields)
 
     def _answer(self) -> dict[str, Any]:
         # libsimavr prints the names of loaded files on the same standard output. Skip those lines.
@@ -316,9 +316,9 @@ def read_identity(line: bytes) -> Identity:
     """Decode an identity line. Fails if a field is missing or in the wrong place."""
     name, version, *words = line.decode().split(" ")
     assert (name, version) == ("!acsard-mcu", "1"), line
-    told = dict(word.split("=") for word in words)
-    assert tuple(told) == Identity._fields, line
-    *numbers, reset = told.values()
+    fields = dict(word.split("=") for word in words)
+    assert tuple(fields) == Identity._fields, line
+    *numbers, reset = fields.values()
     counts, watchdog_ms, check, sample, lines, refused, trips, runaways = map(int, numbers)
     return Identity(counts, watchdog_ms, check, sample, lines, refused, trips, runaways, reset)
 
@@ -419,13 +419,13 @@ class Host:
     def says(self, text: bytes, within: float = 3.0) -> bytes:
         """Return the first line that contains `text`. Fails if none comes within `within` s."""
         deadline = time.monotonic() + within + PATIENCE_S
-        heard: list[bytes] = []
+        lines: list[bytes] = []
         while time.monotonic() < deadline:
             for _, line in self.lines(0.05):
                 if text in line:
                     return line
-                heard.append(line)
-        raise AssertionError(f"not within {within:g} s: {text!r}; heard {heard[-5:]}")
+                lines.append(line)
+        raise AssertionError(f"not within {within:g} s: {text!r}; heard {lines[-5:]}")
 
     def ask(self, line: bytes, within: float = 3.0) -> Reply:
         """Send a line, and return the next received line, decoded as its reply."""
@@ -433,8 +433,8 @@ class Host:
         self.send(line)
         deadline = time.monotonic() + within + PATIENCE_S
         while time.monotonic() < deadline:
-            for at, got in self.lines(0.05):
-                return read_reply(got, at)
+            for at, answer in self.lines(0.05):
+                return read_reply(answer, at)
         raise AssertionError(f"no answer within {within:g} s to {line!r}")
 
     def identity(self) -> Identity:

@@ -285,24 +285,24 @@ def test_a_commanded_speed_is_reached_and_reported(
     replies = reached(board, host, speeds)
     status = board.status()
     for motor, wanted in enumerate(speeds):
-        said = [reply.speeds[motor] for reply in replies]
+        reports = [reply.speeds[motor] for reply in replies]
         true = status.motors[motor].speed
-        mean, noise = statistics.mean(said), statistics.pstdev(said)
+        mean, noise = statistics.mean(reports), statistics.pstdev(reports)
         print(f"{'abcd'[motor]}: wanted {wanted}, turns {true:.3f}, says {mean:.3f} +- {noise:.3f}")
         assert true == pytest.approx(wanted, rel=0.01, abs=0.02)
-        assert statistics.mean(said) == pytest.approx(wanted, rel=0.005, abs=0.02)
-        assert all(one == pytest.approx(wanted, rel=0.02, abs=0.1) for one in said)
+        assert statistics.mean(reports) == pytest.approx(wanted, rel=0.005, abs=0.02)
+        assert all(value == pytest.approx(wanted, rel=0.02, abs=0.1) for value in reports)
 
 
 def test_at_low_speed_the_report_is_quieter_than_counting_edges(board: Board, host: Host) -> None:
     replies = reached(board, host, (0.3, -0.3, 0.3, -0.3))
     counted = 2 * 3.14159 / COUNTS_PER_TURN / 0.01
     for i, sign in enumerate((1, -1, 1, -1)):
-        said = [sign * reply.speeds[i] for reply in replies]
-        noise = statistics.pstdev(said)
-        print(f"{'abcd'[i]}: 0.3 rad/s reported {statistics.mean(said):.3f} +- {noise:.3f}; "
+        reports = [sign * reply.speeds[i] for reply in replies]
+        noise = statistics.pstdev(reports)
+        print(f"{'abcd'[i]}: 0.3 rad/s reported {statistics.mean(reports):.3f} +- {noise:.3f}; "
               f"one count in 10 ms would be {counted:.3f}")  # fmt: skip
-        assert statistics.mean(said) == pytest.approx(0.3, abs=0.02)
+        assert statistics.mean(reports) == pytest.approx(0.3, abs=0.02)
         assert noise < counted / 4
 
 
@@ -453,8 +453,8 @@ def test_the_milliseconds_of_a_reply_are_the_board_s_clock(board: Board, host: H
     second, ended = host.ask(checked(ZERO, 2, "S")), board.status()
     assert first.milliseconds is not None
     assert second.milliseconds is not None
-    said = (second.milliseconds - first.milliseconds) % 65536
-    assert said == pytest.approx((ended.virtual_ns - began.virtual_ns) / MS, abs=25)
+    elapsed_ms = (second.milliseconds - first.milliseconds) % 65536
+    assert elapsed_ms == pytest.approx((ended.virtual_ns - began.virtual_ns) / MS, abs=25)
 
 
 @pytest.mark.nightly
@@ -514,7 +514,7 @@ def test_a_host_that_never_pauses_is_answered_and_controlled(board: Board, host:
         ahead = began.to_board.bytes + (time.monotonic() - end + 2.0) * 11520 + 300
         if board.status().to_board.bytes < ahead:
             host.write(line * 4)
-        replies += [read_reply(got, at) for at, got in host.lines(0.002)]
+        replies += [read_reply(answer, at) for at, answer in host.lines(0.002)]
     status = board.status()
     lines = (status.to_board.bytes - began.to_board.bytes) // len(line)
     print(f"{lines} lines in 2 s, {len(replies)} answered; load {status.load:.0%}")
@@ -657,8 +657,8 @@ def stays_cut(board: Board, host: Host) -> None:
     assert len(replies) >= 60
     assert replies[-1].milliseconds is not None
     assert board.status().on_ns == before.on_ns, "not for a moment"
-    assert (told := host.identity()).runaways == 1
-    assert told.trips == 0, "the silence had nothing to cut"
+    assert (identity := host.identity()).runaways == 1
+    assert identity.trips == 0, "the silence had nothing to cut"
     stays_off(board, 400)
     replies = host.drive((5.0, 0.0, 5.0, 5.0), 0.5)
     assert board.status().running, "silence has freed them"
@@ -754,8 +754,8 @@ def test_a_healthy_robot_is_never_cut(board: Board, host: Host) -> None:
     host.drive((30.0,) * 4, 0.8)
     board.command("load b 0.97")
     host.drive((30.0,) * 4, 2.5)
-    assert (told := host.identity()).runaways == 0
-    assert told.trips == 0
+    assert (identity := host.identity()).runaways == 0
+    assert identity.trips == 0
 
 
 @pytest.mark.nightly
@@ -769,11 +769,11 @@ def test_coarse_encoders_are_driven_reported_and_never_cut(runner: Path, tmp_pat
         for speed in (0.4, -0.4, 20.0, -20.0, 1.0, -1.0):
             host.drive((speed, -speed, speed, speed), 0.5)
         host.drive((0.5, 0.5, -0.5, 0.5), 2.0)
-        said = [reply.speeds[0] for reply in host.drive((0.5, 0.5, -0.5, 0.5), 3.0)]
-        true = statistics.mean(said)
-        print(f"0.5 rad/s at 96 counts a turn: says {true:.2f} +- {statistics.pstdev(said):.2f}")
+        reports = [reply.speeds[0] for reply in host.drive((0.5, 0.5, -0.5, 0.5), 3.0)]
+        true = statistics.mean(reports)
+        print(f"0.5 rad/s at 96 counts a turn: says {true:.2f} +- {statistics.pstdev(reports):.2f}")
         assert true == pytest.approx(0.5, rel=0.15)
-        assert max(said) < 2.0
+        assert max(reports) < 2.0
         assert host.identity()[:1] == (96,)
         assert host.identity().runaways == 0
 
@@ -827,7 +827,7 @@ def test_the_bench_is_faster_than_the_real_board(board: Board, host: Host) -> No
     factors = {}
     for what, speeds in (("at rest", STOPPED), ("40 rad/s", (40.0, -40.0, 40.0, -40.0))):
         host.drive(speeds, 0.3)
-        told = board.command("bench 200")
-        factors[what] = told["ms"] * MS / told["cpu_ns"]
+        result = board.command("bench 200")
+        factors[what] = result["ms"] * MS / result["cpu_ns"]
     print("real-time factor:", {what: round(factor, 1) for what, factor in factors.items()})
     assert min(factors.values()) > 2.0, "on a processor of its own"

@@ -225,11 +225,11 @@ def errors(odom: Following, wheels: Following, true: Status) -> Errors:
     now = time.monotonic()
     odom.find(lambda message: True, 3.0, "odometry at rest", after=now)
     turned = wheels.find(lambda message: True, 3.0, "wheels at rest", after=now).value["position"]
-    said, right = went([seen.value for seen in odom.seen]), truly(true)
+    odometry, right = went([entry.value for entry in odom.seen]), truly(true)
     angles = [motor.counts * ANGLE for motor in true.motors]
     assert min(map(abs, angles)) > 10.0, "far enough to tell"
     shares = tuple(a / b - 1 for a, b in zip(turned, angles, strict=True))
-    return Errors(said.distance / right.distance - 1, said.yaw / right.yaw - 1, shares)
+    return Errors(odometry.distance / right.distance - 1, odometry.yaw / right.yaw - 1, shares)
 
 
 # driving
@@ -349,7 +349,7 @@ def resets(rig: Rig, how: Callable[[Board], None], unseen: float) -> None:
             moves_nothing(board, off, 800)
             state = bus.state()
             assert (state["link"], state["mode"]) == ("up", "ready")
-            (waiting,) = [one for one in state["sources"] if one["name"] == "app"]
+            (waiting,) = [source for source in state["sources"] if source["name"] == "app"]
             assert waiting["waits_for"].startswith("send a zero first")
             coasted = truly(stands(board))
             gives_way(bus, commander)
@@ -358,14 +358,14 @@ def resets(rig: Rig, how: Callable[[Board], None], unseen: float) -> None:
         bus.at_rest()
         now = time.monotonic()
         odom.find(lambda message: True, 3.0, "odometry at rest", after=now)
-    said = went([seen.value for seen in odom.seen])
-    most = leap([seen.value for seen in odom.seen], 0.5)
+    odometry = went([entry.value for entry in odom.seen])
+    most = leap([entry.value for entry in odom.seen], 0.5)
     print(f"\n{how.__name__}: {true.distance:.3f} m, odometry "
-          f"{1000 * (said.distance - true.distance):+.1f} mm off; "
+          f"{1000 * (odometry.distance - true.distance):+.1f} mm off; "
           f"longest step {1000 * most:+.2f} mm beyond 0.5 m/s")  # fmt: skip
     assert coasted.distance > 0.05
-    assert -unseen < said.distance - true.distance < 0.002
-    assert abs(said.yaw - true.yaw) < 0.02
+    assert -unseen < odometry.distance - true.distance < 0.002
+    assert abs(odometry.yaw - true.yaw) < 0.02
     assert most < JITTER
     assert board.status().wrong == 0
 
@@ -462,8 +462,10 @@ def test_a_press_at_the_robot_stops_it_and_clear_is_refused_until_the_release(
         drives_in_the_end(board, bus, commander)
         board.command(f"contact {BUMPERS[1]} open")
         passes(board, 1500)
-        (row,) = [one for one in bus.get("diagnostics")["status"] if one["name"].endswith("board")]
-        values = {one["key"]: one["value"] for one in row["values"]}
+        (row,) = [
+            entry for entry in bus.get("diagnostics")["status"] if entry["name"].endswith("board")
+        ]
+        values = {entry["key"]: entry["value"] for entry in row["values"]}
         counters = bus.state()["counters"]
         print(f"\n{baud} baud, {rate} Hz: {values}; emergency stops "
               f"{counters['emergency_stops']}")  # fmt: skip
@@ -499,11 +501,11 @@ def test_a_bad_wire_costs_lines_and_no_wheel_a_wrong_speed(
                 drives(board)
                 before, status, speeds = bad_wire(board, fault, length_s)
             points, wrong = status.set_points - before.set_points, status.wrong - before.wrong
-            heard = status.to_board.lines - before.to_board.lines
+            lines = status.to_board.lines - before.to_board.lines
             bad = status.to_board.damaged + status.to_board.lost
             bad -= before.to_board.damaged + before.to_board.lost
             state = bus.state()
-            print(f"\n{fault}: {heard} lines with {bad} bad bytes: {points} changes of set points, "
+            print(f"\n{fault}: {lines} lines with {bad} bad bytes: {points} changes of set points, "
                   f"{wrong} to speeds nobody asked for {list(status.wrong_one) if wrong else ''}; "
                   f"slowest wheel {min(speeds):.2f} rad/s, then {state['mode']}, "
                   f"link {state['link']}; {skipped(status)}")  # fmt: skip
@@ -561,10 +563,10 @@ def test_a_lost_link_is_restored_and_the_commander_must_be_neutral_first(
 
             def link(word: str, since: float) -> float:
                 """Wait until `state` reports this link. Return the time since `since` in ms."""
-                seen = states.find(
+                event = states.find(
                     lambda state: state["link"] == word, 3.0, f"link {word}", after=since
                 )
-                return 1000 * (seen.at - since)
+                return 1000 * (event.at - since)
 
             drives(board)
             at = time.monotonic()

@@ -87,9 +87,9 @@ def test_the_battery_s_voltage_is_that_at_the_divider(
     board.command(f"analog {BATTERY} {millivolts}")
     passes(board, 1000)
     reports(host)
-    (told,) = until(lambda: [s for s in reports(host) if s.volts is not None], 5.0, "volts")[-1:]
-    print(f"{volts} V: reported {told.volts} V")
-    assert told.volts == pytest.approx(volts, abs=0.07)
+    (sample,) = until(lambda: [s for s in reports(host) if s.volts is not None], 5.0, "volts")[-1:]
+    print(f"{volts} V: reported {sample.volts} V")
+    assert sample.volts == pytest.approx(volts, abs=0.07)
 
 
 def test_the_reported_current_has_the_sign_of_its_direction(board: Board, host: Host) -> None:
@@ -97,8 +97,10 @@ def test_the_reported_current_has_the_sign_of_its_direction(board: Board, host: 
         board.command(f"analog {CURRENT} {millivolts}")
         passes(board, 1000)
         reports(host)
-        (told,) = until(lambda: [s for s in reports(host) if s.amps is not None], 5.0, "amps")[-1:]
-        assert told.amps == pytest.approx(amps, abs=0.25)
+        (sample,) = until(lambda: [s for s in reports(host) if s.amps is not None], 5.0, "amps")[
+            -1:
+        ]
+        assert sample.amps == pytest.approx(amps, abs=0.25)
 
 
 def test_a_press_is_on_the_line_within_ten_milliseconds(board: Board, host: Host) -> None:
@@ -122,18 +124,18 @@ def test_a_bounce_is_no_false_release(board: Board, host: Host) -> None:
     board.command(f"bounce {ESTOP} 2")
     board.command(f"contact {ESTOP} open")
     awaited(host, BoardStatus(estop=True, bumpers=(False,) * 4))
-    told = []
+    statuses = []
     for _ in range(60):
         board.command(f"bounce {ESTOP} 2")
         passes(board, 7)
-        told += reports(host)
-    assert len(told) >= 4
-    assert all(one.estop is not False for one in told)
+        statuses += reports(host)
+    assert len(statuses) >= 4
+    assert all(status.estop is not False for status in statuses)
     board.command(f"bounce {ESTOP} 2")
     board.command(f"contact {ESTOP} closed")
     awaited(host, FREE)
     passes(board, 150)
-    assert all(one.estop is not True for one in reports(host))
+    assert all(status.estop is not True for status in reports(host))
 
 
 def test_a_broken_wire_and_a_loose_one_read_as_pressed(board: Board, host: Host) -> None:
@@ -145,18 +147,18 @@ def test_a_broken_wire_and_a_loose_one_read_as_pressed(board: Board, host: Host)
     passes(board, 50)
     reports(host)
     passes(board, 900)
-    told = [one.estop for one in reports(host) if one.estop is not None]
-    assert len(told) >= 7
-    assert all(told)
+    presses = [status.estop for status in reports(host) if status.estop is not None]
+    assert len(presses) >= 7
+    assert all(presses)
 
 
 def test_a_restart_reports_no_false_press(board: Board, host: Host) -> None:
     board.command("reset")
     assert b"reset=pin" in host.says(b"!acsard")
     passes(board, 500)
-    told = [one.estop for one in reports(host) if one.estop is not None]
-    assert told == [False] * len(told)
-    assert len(told) >= 4
+    presses = [status.estop for status in reports(host) if status.estop is not None]
+    assert presses == [False] * len(presses)
+    assert len(presses) >= 4
 
 
 # motors
@@ -230,15 +232,15 @@ def test_each_line_has_its_reply_and_no_status_line_is_within_one(
     """
     with wired_board(runner, wired, baud) as board, Host(board.path) as host:
         host.says(b"!status")
-        sent, got, told, pressed = 0, list[Reply](), list[BoardStatus](), False
+        sent, replies, statuses, pressed = 0, list[Reply](), list[BoardStatus](), False
         start = board.status().virtual_ns
 
         def take(wait: float) -> None:
             for at, line in host.lines(wait):
                 if line.startswith(STATUS):
-                    told.append(decode_status(line, True))
+                    statuses.append(decode_status(line, True))
                 else:
-                    got.append(read_reply(line, at))
+                    replies.append(read_reply(line, at))
 
         while (due := board.status().virtual_ns + period * MS) < start + 3000 * MS:
             line = speeds_line(DRIVE) if sent else STOP
@@ -252,12 +254,12 @@ def test_each_line_has_its_reply_and_no_status_line_is_within_one(
         passes(board, 500)
         take(0)
         seconds = (board.status().virtual_ns - start) / 1e9
-        contacts = sum(one.estop is not None for one in told)
-        values = sum(one.volts is not None for one in told)
-        print(f"{baud} baud, each {period} ms, {letters!r}: {sent} lines, {len(got)} "
+        contacts = sum(status.estop is not None for status in statuses)
+        values = sum(status.volts is not None for status in statuses)
+        print(f"{baud} baud, each {period} ms, {letters!r}: {sent} lines, {len(replies)} "
               f"replies, {contacts} lines of contacts and {values} of values in "
               f"{seconds:.1f} s")  # fmt: skip
-        assert len(got) == sent
+        assert len(replies) == sent
         assert contacts >= least * seconds
         assert values >= 2
 
@@ -271,9 +273,9 @@ def test_no_status_line_takes_the_place_of_a_reply(board: Board, host: Host) -> 
     host.write((checked(STOP, 0, "S") + b"\r\n") * 250)
     passes(board, 1200)
     board.command(f"contact {ESTOP} open")
-    came = [line for _, line in host.lines()]
-    answers = [place for place, line in enumerate(came) if not line.startswith(STATUS)]
-    lengths = {len(read_reply(came[place]).line) for place in answers}
+    lines = [line for _, line in host.lines()]
+    answers = [place for place, line in enumerate(lines) if not line.startswith(STATUS)]
+    lengths = {len(read_reply(lines[place]).line) for place in answers}
     print(f"{len(answers)} replies to 251 lines in a second, "
           f"{answers[-1] + 1 - len(answers)} status lines between them")  # fmt: skip
     assert lengths == {31, 60}

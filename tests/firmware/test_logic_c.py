@@ -165,9 +165,11 @@ def test_a_steady_speed_is_measured_to_a_thousandth(
     wheel = SpeedC()
     at = ctypes.addressof(wheel)
     logic.speed_start(at, start % 65536, start)
-    said = [logic.speed_update(at, *reading) for reading in readings(rate, every, 1.0, start, 0.5)]
-    settled = said[len(said) // 2 :]
-    assert all(one == pytest.approx(speed, rel=1e-3, abs=1e-4) for one in settled)
+    speeds = [
+        logic.speed_update(at, *reading) for reading in readings(rate, every, 1.0, start, 0.5)
+    ]
+    settled = speeds[len(speeds) // 2 :]
+    assert all(value == pytest.approx(speed, rel=1e-3, abs=1e-4) for value in settled)
 
 
 def test_the_measured_speed_of_a_wheel_that_stopped_falls_to_zero(
@@ -179,10 +181,10 @@ def test_the_measured_speed_of_a_wheel_that_stopped_falls_to_zero(
     for reading in readings(500.0, 0.01, 0.5):
         logic.speed_update(at, *reading)
     count, edge, now = reading
-    said = [logic.speed_update(at, count, edge, now + ms * TICKS // 1000) for ms in range(5, 200)]
-    assert said == sorted(said, reverse=True)
-    assert said[-1] == 0.0
-    assert next(ms for ms, one in enumerate(said, 5) if one == 0.0) <= 105
+    speeds = [logic.speed_update(at, count, edge, now + ms * TICKS // 1000) for ms in range(5, 200)]
+    assert speeds == sorted(speeds, reverse=True)
+    assert speeds[-1] == 0.0
+    assert next(ms for ms, value in enumerate(speeds, 5) if value == 0.0) <= 105
 
 
 def test_the_first_edges_after_a_rest_make_no_spike(logic: ctypes.CDLL) -> None:
@@ -208,13 +210,13 @@ def edges_of(angle: Callable[[float], float], seconds: float, step: float) -> li
 
     `angle` gives the wheel's angle in counts at a time in s. `step` is the resolution in s.
     """
-    found, last = [], math.floor(angle(0.0))
+    edges, last = [], math.floor(angle(0.0))
     for i in range(round(seconds / step)):
         now = math.floor(angle(i * step))
         while last != now:
             last += 1 if now > last else -1
-            found.append((round(i * step * TICKS), last))
-    return found
+            edges.append((round(i * step * TICKS), last))
+    return edges
 
 
 def said_of(
@@ -259,9 +261,9 @@ def test_for_any_edges_the_measured_speed_is_at_most_what_the_window_allows(
     times = itertools.accumulate(step for step, _ in steps)
     counts = itertools.accumulate(way for _, way in steps)
     before, way = 0.0, 0
-    said = said_of(logic, zip(times, counts, strict=True), windows, start)
-    for turned, value, window, _ in said:
-        one = PITCH / (window / TICKS)
+    samples = said_of(logic, zip(times, counts, strict=True), windows, start)
+    for turned, value, window, _ in samples:
+        step_speed = PITCH / (window / TICKS)
         if not turned:
             assert abs(value) <= abs(before)
             assert value * before >= 0.0
@@ -269,7 +271,7 @@ def test_for_any_edges_the_measured_speed_is_at_most_what_the_window_allows(
             assert value * turned >= 0.0
             counted = abs(turned)
             most = counted + 1 if turned * way > 0 else counted - 1
-            assert (counted - 1) * one * 0.999 <= abs(value) <= most * one * 1.001
+            assert (counted - 1) * step_speed * 0.999 <= abs(value) <= most * step_speed * 1.001
             way = 1 if turned > 0 else -1
         before = value
 
@@ -286,8 +288,8 @@ def test_a_wheel_that_trembles_on_an_edge_has_a_measured_speed_of_zero(
     logic: ctypes.CDLL, edges: list[tuple[int, int]]
 ) -> None:
     for window in (10_000, 20_000, 40_000):
-        said = [value for _, value, _, _ in said_of(logic, edges, [window] * 200)]
-        assert set(said) == {0.0}
+        speeds = [value for _, value, _, _ in said_of(logic, edges, [window] * 200)]
+        assert set(speeds) == {0.0}
 
 
 @each(("amplitude", "frequency"), [(0.8, 50), (0.8, 23), (1.5, 37), (3.0, 11)])
@@ -298,8 +300,8 @@ def test_a_trembling_wheel_s_measured_speed_is_bounded_by_its_true_speed(
     omega = math.tau * frequency
     edges = edges_of(lambda t: 0.5 + amplitude * math.sin(omega * t), 1.0, 1e-5)
     for window in (10_000, 20_000, 40_000):
-        said = [value for _, value, _, _ in said_of(logic, edges, [window] * 200)]
-        assert max(map(abs, said)) <= (amplitude * omega + TICKS / window) * PITCH
+        speeds = [value for _, value, _, _ in said_of(logic, edges, [window] * 200)]
+        assert max(map(abs, speeds)) <= (amplitude * omega + TICKS / window) * PITCH
 
 
 @pytest.mark.slow
@@ -310,20 +312,20 @@ def test_a_coarse_encoder_measures_the_true_speed_also_at_low_speed(
     """With 96 counts a turn, a wheel at 0.2 rad/s makes one count in 330 ms, or many windows."""
     edges = edges_of(lambda t: speed / math.tau * 96 * t, 20.0, 1e-4)
     for every in (0.005, 0.01, 0.02):
-        told = list(said_of(coarse, edges, [round(every * TICKS)] * round(20.0 / every)))
-        settled = [value for _, value, _, now in told if now > 2.0 * TICKS]
+        samples = list(said_of(coarse, edges, [round(every * TICKS)] * round(20.0 / every)))
+        settled = [value for _, value, _, now in samples if now > 2.0 * TICKS]
         assert sum(settled) / len(settled) == pytest.approx(speed, rel=0.1)
         assert max(map(abs, settled)) < 1.1 * abs(speed)
-        assert max(abs(value) for _, value, _, _ in told) < 1.1 * abs(speed), "at the first edge"
+        assert max(abs(value) for _, value, _, _ in samples) < 1.1 * abs(speed), "at the first edge"
 
 
 def test_a_quick_start_after_a_long_rest_is_measured_without_delay(logic: ctypes.CDLL) -> None:
     for waited in (0, 40_000, 10_000_000, 2**30 - 4_500):
         last = waited + 20_000
         edges = [(5_000, 1), *((last - 4_000 + 1_000 * i, 2 + i) for i in range(5))]
-        said = list(said_of(logic, edges, [10_000, *([waited] * bool(waited)), 10_000]))
-        assert said[-1][0] == 5
-        assert said[-1][1] >= 4 * PITCH / 0.005 * 0.999
+        samples = list(said_of(logic, edges, [10_000, *([waited] * bool(waited)), 10_000]))
+        assert samples[-1][0] == 5
+        assert samples[-1][1] >= 4 * PITCH / 0.005 * 0.999
 
 
 def test_the_first_edge_after_a_rest_longer_than_the_clock_gives_no_high_speed(
@@ -333,16 +335,16 @@ def test_the_first_edge_after_a_rest_longer_than_the_clock_gives_no_high_speed(
     rests = [2**32 // 32] * 32
     far = sum(rests)
     edges = [(1000, 1), (far + 15_000, 2), (far + 25_000, 3)]
-    said = [value for _, value, _, _ in said_of(logic, edges, [10_000, *rests, 10_000, 10_000])]
-    assert abs(said[-2]) < 1e-5
-    assert said[-1] == pytest.approx(PITCH / 0.005, rel=0.01)
+    speeds = [value for _, value, _, _ in said_of(logic, edges, [10_000, *rests, 10_000, 10_000])]
+    assert abs(speeds[-2]) < 1e-5
+    assert speeds[-1] == pytest.approx(PITCH / 0.005, rel=0.01)
 
 
 @given(st.floats(-1e6, 1e6))
 def test_speeds_in_hundredths_are_rounded_and_clamped(logic: ctypes.CDLL, value: float) -> None:
-    said = logic.speed_hundredths(value)
-    assert abs(said) <= 9999
-    assert abs(said - max(-9999.0, min(9999.0, value * 100))) <= 0.51
+    hundredths = logic.speed_hundredths(value)
+    assert abs(hundredths) <= 9999
+    assert abs(hundredths - max(-9999.0, min(9999.0, value * 100))) <= 0.51
 
 
 # control
@@ -494,13 +496,13 @@ class Wheel:
 
     def _control(self, target: float) -> bool:
         library, bridge = self.library, self.parts[1]
-        seen = library.speed_update(
+        speed = library.speed_update(
             self.speeds, self.count % 65536, self.edge % 2**32, self.now % 2**32
         )
         had = bridge.duty * bridge.direction
-        if library.supervise_step(self.supervisor, had, seen, self.count % 65536):
+        if library.supervise_step(self.supervisor, had, speed, self.count % 65536):
             return True
-        wanted = int(library.pi_step(self.pi, target, seen, self.limited) * TOP)
+        wanted = int(library.pi_step(self.pi, target, speed, self.limited) * TOP)
         self.limited = not library.bridge_step(self.bridge, wanted)
         self.duty = bridge.duty * bridge.direction / TOP
         return False

@@ -106,19 +106,19 @@ class Parser:
 
     def lines(self, data: bytes) -> list[bytes]:
         """Return the whole lines in these bytes. The reader stores an incomplete line."""
-        got = []
+        lines = []
         for byte in data:
             length = self._feed(self._pointer, byte)
             if length:
-                got.append(ctypes.string_at(self._pointer, length))
-        return got
+                lines.append(ctypes.string_at(self._pointer, length))
+        return lines
 
     def stream(self, data: bytes) -> list[Command]:
         """Return the commands in a stream, read by a parser that has just started."""
         self._reader.length = 0
         self._reader.discarding = False
-        found = [self.parse(line) for line in self.lines(data)]
-        return [command for command in found if command is not None]
+        commands = [self.parse(line) for line in self.lines(data)]
+        return [command for command in commands if command is not None]
 
     def asks(self, line: bytes) -> bool:
         return bool(self._asks(line, len(line)))
@@ -211,17 +211,17 @@ def _with(line: bytes, at: int, byte: int) -> bytes:
 def test_mutated_lines_give_the_same_result_as_in_the_host_s_parser(parser: Parser) -> None:
     """Both parsers give the same result for valid lines with one to three changes."""
     rng = random.Random(1)
-    taken = 0
+    valid_count = 0
     for _ in range(50_000):
         line = speeds_line([rng.choice([0.0, 9.99, -10.0, 99.99, -0.01, 12.5]) for _ in range(4)])
         for _ in range(rng.randrange(1, 4)):
             line = rng.choice(MUTATIONS)(rng, line) or line
         if b"#" in line or b"*" in line:
             continue
-        got = parser.parse(line)
-        assert (got and got.hundredths) == said(line), line
-        taken += got is not None
-    assert 5_000 < taken < 45_000, "both kinds"
+        command = parser.parse(line)
+        assert (command and command.hundredths) == said(line), line
+        valid_count += command is not None
+    assert 5_000 < valid_count < 45_000, "both kinds"
 
 
 wheels = st.builds(WheelSpeeds, *[st.floats(-101.0, 101.0)] * 4)
@@ -363,11 +363,11 @@ def test_no_part_of_a_line_is_valid_after_a_byte_became_a_line_end(parser: Parse
         (whole,) = parser.stream(line + b"\r\n")
         for at in range(len(line)):
             for end in (b"\n", b"\r\n", b"\r"):
-                got = parser.stream(line[:at] + end + line[at + 1 :] + b"\r\n")
+                commands = parser.stream(line[:at] + end + line[at + 1 :] + b"\r\n")
                 if line[:at] in (SEED_LINE, SEED_LINE + b",") and end != b"\r":
-                    assert [command.hundredths for command in got] == [whole.hundredths]
+                    assert [command.hundredths for command in commands] == [whole.hundredths]
                 else:
-                    assert not got, (line, at, end)
+                    assert not commands, (line, at, end)
 
 
 def test_no_single_bit_error_that_makes_a_line_end_leaves_a_valid_line(parser: Parser) -> None:
@@ -389,12 +389,12 @@ def test_the_identity_line_is_readable_by_the_host_and_not_taken_for_feedback(
     parser: Parser, lines: int, refused: int, trips: int, runaways: int
 ) -> None:
     line = parser.identity(lines, refused, trips, runaways, b"brown-out")
-    told = (lines, min(refused, 999), min(trips, 999), min(runaways, 9), "brown-out")
-    assert read_identity(line.removesuffix(b"\r\n"))[4:] == told
-    ((heard, _),) = LineReader().feed(line)
-    assert heard.startswith(b"!acsard-mcu 1 counts=3200 watchdog_ms=300 check=1 sample=1 ")
+    fields = (lines, min(refused, 999), min(trips, 999), min(runaways, 9), "brown-out")
+    assert read_identity(line.removesuffix(b"\r\n"))[4:] == fields
+    ((text, _),) = LineReader().feed(line)
+    assert text.startswith(b"!acsard-mcu 1 counts=3200 watchdog_ms=300 check=1 sample=1 ")
     with pytest.raises(FrameError):
-        Codec(WheelMap()).decode(heard)
+        Codec(WheelMap()).decode(text)
 
 
 def test_the_longest_identity_line_has_126_bytes(parser: Parser) -> None:

@@ -67,7 +67,7 @@ class Inputs:
     def lines(self, levels: int, length_ms: int, readings: Sequence[int] = ()) -> list[BoardStatus]:
         """Keep these inputs for `length_ms`, and return the status lines of that time."""
         every = [self.sample(levels, readings) for _ in range(length_ms)]
-        return [one for one in every if one is not None]
+        return [status for status in every if status is not None]
 
 
 @pytest.fixture(scope="module")
@@ -109,10 +109,14 @@ def test_each_contact_is_reported_within_four_samples_in_its_own_field(
 
 def test_contacts_are_reported_ten_times_a_second_and_values_once(inputs: Inputs) -> None:
     inputs.boot()
-    told = inputs.lines(CLOSED, 10_000, (512, 512))
-    assert 98 <= sum(one.estop is False and one.bumpers is not None for one in told) <= 100
+    statuses = inputs.lines(CLOSED, 10_000, (512, 512))
+    assert (
+        98
+        <= sum(status.estop is False and status.bumpers is not None for status in statuses)
+        <= 100
+    )
     values = BoardStatus(driver_fault=False, volts=16.5, amps=0.0)
-    assert [one for one in told if one.estop is None] == [values] * 10
+    assert [status for status in statuses if status.estop is None] == [values] * 10
 
 
 def test_a_press_is_reported_before_the_fault_of_a_driver_that_lost_its_supply(
@@ -120,9 +124,9 @@ def test_a_press_is_reported_before_the_fault_of_a_driver_that_lost_its_supply(
 ) -> None:
     inputs.boot()
     inputs.lines(CLOSED, 997, (0, 0))
-    told = inputs.lines(1, 4, (0, 0))  # at 1000 ms both lines are due
-    assert [one.estop for one in told] == [True, None]
-    assert told[1].driver_fault
+    statuses = inputs.lines(1, 4, (0, 0))  # at 1000 ms both lines are due
+    assert [status.estop for status in statuses] == [True, None]
+    assert statuses[1].driver_fault
 
 
 def test_no_contact_is_reported_before_its_state_is_known(inputs: Inputs) -> None:
@@ -162,12 +166,12 @@ def test_a_bounce_of_two_ms_is_no_release_and_a_disturbance_of_two_ms_is_no_pres
     inputs.boot()
     inputs.lines(CLOSED, 100)
     for length in (1, 2):
-        assert not any(one.estop for one in inputs.lines(CLOSED ^ 1, length))
-        assert not any(one.estop for one in inputs.lines(CLOSED, 30))
+        assert not any(status.estop for status in inputs.lines(CLOSED ^ 1, length))
+        assert not any(status.estop for status in inputs.lines(CLOSED, 30))
     inputs.lines(CLOSED ^ 1, 10)
     for _ in range(100):
-        told = inputs.lines(CLOSED, 2) + inputs.lines(CLOSED ^ 1, 3)
-        assert all(one.estop is not False for one in told)
+        statuses = inputs.lines(CLOSED, 2) + inputs.lines(CLOSED ^ 1, 3)
+        assert all(status.estop is not False for status in statuses)
         assert inputs.stopped
 
 
@@ -203,11 +207,13 @@ def test_even_a_short_driver_fault_is_reported_within_110_ms(build: Build, lengt
     inputs.boot()
     inputs.lines(CLOSED, 1200)
     begun = inputs.milliseconds
-    while (told := inputs.sample(0 if inputs.milliseconds < begun + length_ms else CLOSED)) is None:
+    while (
+        report := inputs.sample(0 if inputs.milliseconds < begun + length_ms else CLOSED)
+    ) is None:
         pass
-    assert told.driver_fault
+    assert report.driver_fault
     assert inputs.milliseconds - begun <= 110
-    assert [one.driver_fault for one in inputs.lines(CLOSED, 1000)] == [False]
+    assert [status.driver_fault for status in inputs.lines(CLOSED, 1000)] == [False]
 
 
 def test_a_press_is_reported_before_the_fault_of_a_driver_that_lost_its_supply_a_little_earlier(
@@ -215,9 +221,9 @@ def test_a_press_is_reported_before_the_fault_of_a_driver_that_lost_its_supply_a
 ) -> None:
     inputs.boot()
     inputs.lines(CLOSED, 1200, (600, 512))
-    told = inputs.lines(0, 50, (600, 512)) + inputs.lines(1, 100, (600, 512))
-    pressed = next(i for i, one in enumerate(told) if one.estop)
-    assert [i for i, one in enumerate(told) if one.driver_fault] > [pressed]
+    statuses = inputs.lines(0, 50, (600, 512)) + inputs.lines(1, 100, (600, 512))
+    pressed = next(i for i, status in enumerate(statuses) if status.estop)
+    assert [i for i, status in enumerate(statuses) if status.driver_fault] > [pressed]
 
 
 @pytest.mark.slow
@@ -240,26 +246,26 @@ def test_volts_and_amperes_are_those_of_the_divider_and_the_sensor(
     inputs.boot()
     inputs.sample(CLOSED, (battery, current))
     inputs.milliseconds = 1000
-    told = inputs.line()
-    assert told is not None
-    assert told.volts == pytest.approx(battery * 5 / 1024 * 6.6, abs=0.006)
-    assert told.amps == pytest.approx((current * 5 / 1024 - 2.5) / 0.04, abs=0.006)
+    status = inputs.line()
+    assert status is not None
+    assert status.volts == pytest.approx(battery * 5 / 1024 * 6.6, abs=0.006)
+    assert status.amps == pytest.approx((current * 5 / 1024 - 2.5) / 0.04, abs=0.006)
 
 
 def test_the_volts_are_the_mean_of_a_second(build: Build) -> None:
     inputs = build("-DBATTERY_TOP_OHM=56000L")
     for _ in range(999):
         assert inputs.sample(0, (700 + 40 * (inputs.milliseconds % 2),)) is None
-    told = inputs.sample(0, (720,))
-    assert told is not None
-    assert told.volts == pytest.approx(720 * 5 / 1024 * 6.6, abs=0.02)
+    status = inputs.sample(0, (720,))
+    assert status is not None
+    assert status.volts == pytest.approx(720 * 5 / 1024 * 6.6, abs=0.02)
 
 
 def test_values_that_do_not_fit_the_line_are_clamped(build: Build) -> None:
     wide = build("-DBATTERY_TOP_OHM=188000L", "-DCURRENT_UV_PER_A=1000L")
-    told = wide.lines(0, 1000, (1023, 1023))[-1]
-    assert told.volts == pytest.approx(98.9, abs=0.01)
-    assert told.amps == 999.99
+    status = wide.lines(0, 1000, (1023, 1023))[-1]
+    assert status.volts == pytest.approx(98.9, abs=0.01)
+    assert status.amps == 999.99
     assert wide.lines(0, 1000, (0, 0))[-1] == BoardStatus(volts=0.0, amps=-999.99)
 
 

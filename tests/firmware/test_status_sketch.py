@@ -57,11 +57,11 @@ def sketch(tmp_path_factory: pytest.TempPathFactory) -> ctypes.CDLL:
 def test_the_example_reports_ten_times_a_second_and_a_change_immediately(
     sketch: ctypes.CDLL,
 ) -> None:
-    told = [(at, line) for at in range(1000) if (line := sketch.run(350 <= at < 620, at))]
-    pressed = {at for at, line in told if decode_status(line.removesuffix(b"\r\n"), False).estop}
-    assert all(line.endswith(b"\r\n") for _, line in told)
+    reports = [(at, line) for at in range(1000) if (line := sketch.run(350 <= at < 620, at))]
+    pressed = {at for at, line in reports if decode_status(line.removesuffix(b"\r\n"), False).estop}
+    assert all(line.endswith(b"\r\n") for _, line in reports)
     assert pressed == {350, 450, 550}
-    assert {at for at, _ in told} - pressed == {0, 100, 200, 300, 620, 720, 820, 920}
+    assert {at for at, _ in reports} - pressed == {0, 100, 200, 300, 620, 720, 820, 920}
 
 
 def test_each_status_line_of_the_page_is_valid() -> None:
@@ -74,6 +74,6 @@ def test_each_status_line_of_the_page_is_valid() -> None:
 def test_the_page_has_each_setting_of_the_inputs_with_its_value() -> None:
     page, config = PAGE.read_text(encoding="utf-8"), (FIRMWARE / "config.h").read_text()
     table = page.partition("settings of [the inputs]")[2].partition("\n\nAll wheels")[0]
-    shown = re.findall(r"^\| `(\w+)` \| (\d+) \|", table, re.MULTILINE)
+    settings = re.findall(r"^\| `(\w+)` \| (\d+) \|", table, re.MULTILINE)
     inputs = config.partition("/* Inputs.")[2].partition("/* Pins.")[0]
-    assert shown == re.findall(r"^#define (\w+) (\d+)", inputs, re.MULTILINE)
+    assert settings == re.findall(r"^#define (\w+) (\d+)", inputs, re.MULTILINE)

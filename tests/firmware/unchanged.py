@@ -78,14 +78,14 @@ for name, config in BOARDS.items():
 
 def machine_code(tree: Path, where: Path) -> list[str]:
     """Return a line for each build of the firmware: its definitions and the digest of its code."""
-    found = []
+    lines = []
     for number, defines in enumerate(BUILDS):
         place = where / str(number)
         words = ["make", "-s", f"BUILD={place}", f"DEFINES={defines}", f"{place}/firmware.hex"]
         subprocess.run(words, cwd=tree / "deploy" / "firmware", check=True, timeout=100)
         digest = hashlib.sha256((place / "firmware.hex").read_bytes()).hexdigest()
-        found.append(f"firmware {defines or 'as delivered'} {digest}")
-    return found
+        lines.append(f"firmware {defines or 'as delivered'} {digest}")
+    return lines
 
 
 def wire(tree: Path) -> list[str]:
@@ -108,8 +108,8 @@ def main(commit: str) -> int:
         subprocess.run(["tar", "-x"], cwd=before, input=archive.stdout, check=True)
         old = machine_code(before, where / "old") + wire(before)
         new = machine_code(ROOT, where / "new") + wire(ROOT)
-    for one, other in zip(old, new, strict=True):
-        print("same     " if one == other else "DIFFERENT", other)
+    for line, other in zip(old, new, strict=True):
+        print("same     " if line == other else "DIFFERENT", other)
     return int(old != new)
 
 

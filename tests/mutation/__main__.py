@@ -67,10 +67,10 @@ MOST_LEFT_OUT = 5
 
 def sources() -> list[str]:
     """Return the paths of the modules of the core."""
-    found: list[Path] = []
+    paths: list[Path] = []
     for path in CORE:
-        found += [ROOT / path] if path.endswith(".py") else sorted((ROOT / path).glob("*.py"))
-    return [path.relative_to(ROOT).as_posix() for path in found]
+        paths += [ROOT / path] if path.endswith(".py") else sorted((ROOT / path).glob("*.py"))
+    return [path.relative_to(ROOT).as_posix() for path in paths]
 
 
 def drawn(pool: list[Mutant], seed: int) -> list[Mutant]:

@@ -213,16 +213,17 @@ def change(before: str, after: str) -> str:
         del old[0], new[0]
     while old and new and old[-1] == new[-1]:
         del old[-1], new[-1]
-    said, says = (" ".join(line.strip() for line in lines) for lines in (old, new))
-    start = common(said, says)
-    end = common(said[start:][::-1], says[start:][::-1])
+    old_text, new_text = (" ".join(line.strip() for line in lines) for lines in (old, new))
+    start = common(old_text, new_text)
+    end = common(old_text[start:][::-1], new_text[start:][::-1])
     left = max(0, start - 30) if start > 60 else 0
     return " -> ".join(
-        repr(text[left : len(text) - end + 30 if end > 60 else None]) for text in (said, says)
+        repr(text[left : len(text) - end + 30 if end > 60 else None])
+        for text in (old_text, new_text)
     )
 
 
-def common(one: str, other: str) -> int:
+def common(first: str, other: str) -> int:
     """Return the length of the common prefix of two strings."""
-    pairs = enumerate(zip(one, other, strict=False))
-    return next((i for i, (a, b) in pairs if a != b), min(len(one), len(other)))
+    pairs = enumerate(zip(first, other, strict=False))
+    return next((i for i, (a, b) in pairs if a != b), min(len(first), len(other)))

@@ -261,10 +261,10 @@ class Trials:
 
         Returns False if that is not possible, for example if a function has other free variables.
         """
-        found: dict[str, list[CodeType]] = {}
+        by_name: dict[str, list[CodeType]] = {}
         for code in codes(compile(mutant.text, mutant.path, "exec", dont_inherit=True)):
-            found.setdefault(code.co_qualname, []).append(code)
-        for name, several in found.items():
+            by_name.setdefault(code.co_qualname, []).append(code)
+        for name, several in by_name.items():
             functions = self._functions.get((mutant.path, name), [])
             # A property and its setter have one name.
             lines = sorted({function.__code__.co_firstlineno for function in functions})

@@ -166,7 +166,7 @@ def backlog(dice: random.Random, speaker: Speaker, age: float, span: float, pour
     The backlog arrives within `poured` seconds.
     """
     world, hz = speaker.world, dice.choice((10.0, 20.0, 50.0))
-    now_ns, held = world.now_ns, []
+    now_ns, messages = world.now_ns, []
     zeros = pauses = 0
     with_zeros, with_pauses = dice.random() < 0.7, dice.random() < 0.4
     for number in range(max(2, round(span * hz))):
@@ -178,10 +178,10 @@ def backlog(dice: random.Random, speaker: Speaker, age: float, span: float, pour
         pauses -= 1
         zeros -= 1
         if pauses < 0:
-            held.append((number, speaker.message(0.0 if zeros >= 0 else 0.5)))
+            messages.append((number, speaker.message(0.0 if zeros >= 0 else 0.5)))
     world.now_ns = now_ns
     heaps = dice.choice((1, 1, 4, 12)) / hz
-    for number, message in held:
+    for number, message in messages:
         due = number / (span * hz) * poured
         due -= due % heaps if heaps > 1.5 / hz else 0.0
         world.run(max(0.0, (now_ns - world.now_ns) / NS_PER_S + due))

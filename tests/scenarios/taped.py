@@ -110,9 +110,9 @@ class Tape:
         writing = RecordingWriter(path, about)
         if first:
             writing.add("state", now.wall_ns, Checkpoint(first, self.states[first]).encode())
-        taken = self.taken[:end]
-        for at in range(first, len(taken), BATCH):
-            batch = taken[at : at + BATCH]
+        steps = self.taken[:end]
+        for at in range(first, len(steps), BATCH):
+            batch = steps[at : at + BATCH]
             writing.add("steps", batch[0].inputs.now.wall_ns, encode(at, batch))
             for _, outputs, _ in batch:
                 for event in outputs.events:
@@ -133,13 +133,13 @@ def recorded_world(
 
 def chunks(data: bytes | bytearray) -> list[tuple[int, int]]:
     """Return the start and end of each chunk in a file, found by the MCAP format alone."""
-    found, at = [], 8
+    spans, at = [], 8
     while at < len(data) - 8:
         opcode, length = struct.unpack_from("<BQ", data, at)
         if opcode == 6:
-            found.append((at, at + 9 + length))
+            spans.append((at, at + 9 + length))
         at += 9 + length
-    return found
+    return spans
 
 
 def replayed(tape: Tape, config: Config, first: int = 0) -> Replay:
@@ -160,7 +160,8 @@ def every_fault(mcu: FakeMcu) -> list[tuple[str, Callable[[], Fault]]]:
     plain = [(name, getattr(mcu, name)) for name in FAULTS if name not in INPUTS]
     cases = WITH_ARGUMENTS.items()
     return plain + [
-        (name, lambda name=name, given=given: getattr(mcu, name)(*given)) for name, given in cases
+        (name, lambda name=name, arguments=arguments: getattr(mcu, name)(*arguments))
+        for name, arguments in cases
     ]
 
 

@@ -252,10 +252,10 @@ def test_a_proven_zero_of_one_program_never_arms_the_delayed_speeds_of_another(c
         start_ns, arrival = world.now_ns, 0.0
         for number in range(160):
             sent = number / 20 + (2.5 if number > 80 else 0.0)
-            held, arrival = arrival, max(arrival, sent + dice.expovariate(1 / 0.06))
+            previous, arrival = arrival, max(arrival, sent + dice.expovariate(1 / 0.06))
             world.run(max(0.0, sent - (world.now_ns - start_ns) / 1e9))
             message = speeds.message(0.5)
-            world.run(max(0.0, arrival - max(sent, held)))
+            world.run(max(0.0, arrival - max(sent, previous)))
             speeds.deliver(message)
         assert not moved(world, start_ns), seed
 
@@ -275,9 +275,9 @@ def test_a_zero_from_before_a_restart_of_the_board_arms_no_sender(stall: float) 
     at_ns, ms = world.now_ns, 1_000_000
     clear = Query(999, "srv/clear", "srv/clear", "", payload, "", at_ns + ms)
     zero = msgspec.json.encode({"linear": {"x": 0.0}, "angular": {"z": 0.0}})
-    came = Arrival("cmd/app", True, zero, "", at_ns + 2 * ms, None, "", attachment=SIGNED)
+    arrival = Arrival("cmd/app", True, zero, "", at_ns + 2 * ms, None, "", attachment=SIGNED)
     world.bus.queries.append(clear)
-    world.bus.arrivals.append(came)
+    world.bus.arrivals.append(arrival)
     world.stall(stall / 2)
     world.mcu.reset(world.now_ns, deaf_ns=2 * ms)
     world.stall(stall / 2)
@@ -302,9 +302,9 @@ def test_a_stall_of_the_daemon_does_not_count_as_a_pause_after_another_sender_s_
     config = Config(commands=CommandsConfig(neutral_pause=pause))
     world = World(config)
     world.run(1.0)
-    one, other = Speaker(world, way), Speaker(world, way)
+    first, other = Speaker(world, way), Speaker(world, way)
     other.hold(0.4, 1.0)
-    one.send(0.0)
+    first.send(0.0)
     world.run(0.02)
     world.stall(pause)
     world.run(0.0005)

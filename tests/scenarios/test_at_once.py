@@ -115,7 +115,7 @@ def test_no_timing_of_commands_makes_a_ramp_steeper_or_steps_more(
         world.send(0.0)
         world.send(0.0, source="teleop")
         world.run(0.05)
-    steps, began_ns, heard = world.steps, world.now_ns, world.loop.robot.session.good_lines
+    steps, began_ns, good_lines = world.steps, world.now_ns, world.loop.robot.session.good_lines
     lines: list[tuple[int, float]] = []
 
     def watch(outputs: Outputs) -> None:
@@ -138,8 +138,10 @@ def test_no_timing_of_commands_makes_a_ramp_steeper_or_steps_more(
         # A stall is made up for by at most MAX_DT; a line rounds to 0.01 rad/s.
         assert faster - slower <= min(after_ns - before_ns, 50 * MS) * 1e-9 + 1e-3
     periods = (world.now_ns - began_ns) / (10 * MS)
-    heard = world.loop.robot.session.good_lines - heard
-    assert world.steps - steps <= (5 + MAX_IDLE_WAKES) * (periods + 1) + heard + len(happenings)
+    good_lines = world.loop.robot.session.good_lines - good_lines
+    assert world.steps - steps <= (5 + MAX_IDLE_WAKES) * (periods + 1) + good_lines + len(
+        happenings
+    )
 
 
 def unplug(world: World) -> None:

@@ -26,13 +26,13 @@ def test_a_drained_battery_warns_and_then_stops_the_robot_until_it_is_charged() 
     world = World(DRAINED)
     world.run(0.3)
     assert level(world) == "unknown"
-    seen: list[tuple[str, str]] = []
+    levels: list[tuple[str, str]] = []
     world.drive(0.3, seconds=0.5)
     for _ in range(300):
         world.hold(0.3, seconds=0.2)
-        if (level(world), world.state.mode) not in seen:
-            seen.append((level(world), world.state.mode))
-    assert seen == [
+        if (level(world), world.state.mode) not in levels:
+            levels.append((level(world), world.state.mode))
+    assert levels == [
         ("unknown", "driving"),
         ("ok", "driving"),
         ("warning", "driving"),
@@ -103,7 +103,7 @@ def test_a_recording_replays_a_battery_that_runs_empty() -> None:
         world.run(20.0)
         world.call("clear")
         world.drive(0.3, seconds=1.0)
-    assert {"driving", "stopped", "ready"} <= {taken.outputs.mode for taken in tape.taken}
+    assert {"driving", "stopped", "ready"} <= {step.outputs.mode for step in tape.taken}
     for first in (0, middle):
         comparison = replayed(tape, DRAINED, first).comparison
         assert comparison.first is None

@@ -238,7 +238,7 @@ def test_a_recording_replays_presses_and_releases(config: Config) -> None:
     while world.state.latch and not world.call("clear").success:
         world.run(0.2)
     world.drive(0.5, seconds=1.0)
-    names = {event.name for taken in tape.taken for event in taken.outputs.events}
+    names = {event.name for step in tape.taken for event in step.outputs.events}
     assert {"bumper_pressed", "bumper_released"} <= names
     for first in (0, middle):
         comparison = replayed(tape, config, first).comparison

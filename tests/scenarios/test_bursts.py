@@ -46,8 +46,8 @@ def drive(seed: int, seconds: float) -> tuple[float, float, int]:
             made.drive(linear, angular, 0.5)
         made.hold(linear, angular, chance.uniform(0.5, 3.0))
     made.hold(0.0, 0.0, 1.5)
-    told, true = made.state, made.mcu.vehicle.pose
-    return math.dist((told.x, told.y), (true.x, true.y)), made.loop.robot.travelled, lost
+    state, true = made.state, made.mcu.vehicle.pose
+    return math.dist((state.x, state.y), (true.x, true.y)), made.loop.robot.travelled, lost
 
 
 @pytest.mark.parametrize(

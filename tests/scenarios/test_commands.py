@@ -209,8 +209,8 @@ def test_state_reports_a_new_sender_and_counts_its_ignored_commands() -> None:
     # Every sender begins like this: nothing is refused, and no warning is logged.
     assert not [name for name in world.state.counters if name.startswith("command_")]
     assert world.state.refused == ""
-    (told,) = [event for event in world.events if event.name == "new_sender"][:1]
-    assert told.level == "info"
+    (warning,) = [event for event in world.events if event.name == "new_sender"][:1]
+    assert warning.level == "info"
     client.hold(0.4, 0.3)
     assert world.state.mode == "driving"
 
@@ -247,9 +247,9 @@ def test_failed_hardware_holds_the_robot_and_the_reason_is_reported(world: World
         "driving: ros2_control keeps the robot at rest: it has sent only zeros for over 10 s; the "
         "speeds of nav have no effect"
     )
-    (told,) = [event.text for event in world.events if event.name == "commands_without_effect"]
-    assert "ros2_control keeps the robot at rest" in told
-    assert "the speeds of nav have no effect" in told
+    (text,) = [event.text for event in world.events if event.name == "commands_without_effect"]
+    assert "ros2_control keeps the robot at rest" in text
+    assert "the speeds of nav have no effect" in text
     world.run(0.3)
     world.drive(0.3, seconds=0.5, source="nav")
     assert world.state.reason == "driving: commanded by nav"
@@ -266,8 +266,8 @@ def test_the_first_try_of_a_ros_user_is_answered_in_words(world: World, way: Way
     assert world.state.x == 0.0
     assert "send a zero first: app must send a zero" in world.state.reason
     assert "`ros2 topic pub` with a speed never sends a zero" in world.state.reason
-    (told,) = [event for event in world.events if event.name == "commands_without_effect"]
-    assert told.text == f"app: {world.state.reason}"
+    (warning,) = [event for event in world.events if event.name == "commands_without_effect"]
+    assert warning.text == f"app: {world.state.reason}"
 
 
 def test_the_reason_for_a_native_sender_names_no_ros_tools(world: World) -> None:

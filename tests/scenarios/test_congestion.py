@@ -125,9 +125,9 @@ def test_a_sender_with_a_steady_clock_drives_on_as_soon_as_it_is_prompt_again() 
     world = quiet()
     speaker = Speaker(world, "client")
     speaker.open()
-    held = [speaker.message(0.4) for _ in range(3)]
+    messages = [speaker.message(0.4) for _ in range(3)]
     world.run(8.0)
-    for message in held:
+    for message in messages:
         speaker.deliver(message)
     world.run(0.02)
     assert world.state.mode == "ready"

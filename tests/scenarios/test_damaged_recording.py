@@ -91,9 +91,9 @@ def places(path: Path, count: int, seed: int = 1) -> list[tuple[int, int]]:
 
 def spans_of_states(data: bytes) -> list[tuple[int, int]]:
     """Return the start and end position of each chunk that contains a robot state."""
-    found = [place.chunk for place in walk(data) if place.chunk is not None]
+    parts = [place.chunk for place in walk(data) if place.chunk is not None]
     state = CHANNEL_NUMBERS["state"]
-    return [(c.begin, c.end) for c in found if [m.channel for m in c.messages] == [state]]
+    return [(c.begin, c.end) for c in parts if [m.channel for m in c.messages] == [state]]
 
 
 def judge(path: Path, new: Path, place: int, length: int) -> float:
@@ -197,9 +197,9 @@ def test_another_configuration_stays_in_force_after_a_damaged_section(
     for _ in plain.steps():
         pass
     assert run.gaps == plain.gaps
-    (found,) = limits
-    assert found.angular_speed == 0.3
-    assert found.linear_speed == plain.robot.config.limits.linear_speed != 1.0
+    (limit,) = limits
+    assert limit.angular_speed == 0.3
+    assert limit.linear_speed == plain.robot.config.limits.linear_speed != 1.0
 
 
 def test_damage_that_hides_the_end_of_a_file_is_not_reported_as_a_truncation(

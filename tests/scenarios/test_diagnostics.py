@@ -20,8 +20,8 @@ def world() -> World:
 def row(world: World, name: str) -> DiagnosticStatus:
     message = world.loop.report.current("diagnostics", world.loop._look)
     assert isinstance(message, DiagnosticArray)
-    (found,) = [status for status in message.status if status.name == f"acsard: {name}"]
-    return found
+    (row_status,) = [status for status in message.status if status.name == f"acsard: {name}"]
+    return row_status
 
 
 def test_a_stop_is_a_warning_until_it_is_cleared(world: World) -> None:
@@ -63,9 +63,9 @@ def test_a_second_program_on_a_source_is_a_warning_until_one_of_them_is_silent(
         first.send(0.4)
         second.send(0.0)
         world.run(0.05)
-    told = row(world, "commands")
-    assert told.level == WARN
-    assert "2 programs send as app" in told.message
+    status = row(world, "commands")
+    assert status.level == WARN
+    assert "2 programs send as app" in status.message
     second.hold(0.0, 1.0)
     assert row(world, "commands").level == OK
 
@@ -78,7 +78,7 @@ def test_missed_periods_are_a_warning_for_a_minute(world: World) -> None:
         world.run(0.05)
     assert row(world, "control loop").level == WARN
     world.run(61.0)
-    found = row(world, "control loop")
-    assert found.level == OK
-    assert found.message.startswith("0 of ")
+    status = row(world, "control loop")
+    assert status.level == OK
+    assert status.message.startswith("0 of ")
     assert world.state.counters["missed_periods"] > 60

@@ -57,9 +57,9 @@ def test_a_full_circle_comes_back_to_its_start(world: World) -> None:
     world.drive(0.5, 1.0, seconds=2 * math.pi)
     world.send(0.0)
     world.run(2.0)
-    true, seen = world.mcu.vehicle.pose, world.state
-    assert math.hypot(seen.x - true.x, seen.y - true.y) < 0.02
-    assert math.remainder(seen.yaw - true.yaw, math.tau) == pytest.approx(0.0, abs=0.02)
+    true, state = world.mcu.vehicle.pose, world.state
+    assert math.hypot(state.x - true.x, state.y - true.y) < 0.02
+    assert math.remainder(state.yaw - true.yaw, math.tau) == pytest.approx(0.0, abs=0.02)
 
 
 @pytest.mark.slow
@@ -109,11 +109,11 @@ def test_silence_begins_a_ramp_within_the_timeout_and_a_tick(world: World) -> No
 
 def test_no_wheel_speeds_up_while_the_robot_brakes_out_of_an_arc(world: World) -> None:
     world.drive(0.9, 3.0, seconds=2.0)
-    seen: list[tuple[float, ...]] = []
-    world.watch = lambda outputs: seen.append(outputs.speeds.as_tuple())
+    speeds: list[tuple[float, ...]] = []
+    world.watch = lambda outputs: speeds.append(outputs.speeds.as_tuple())
     world.run(0.25)
     world.run(2.0)
-    falling = seen[60:]
+    falling = speeds[60:]
     for before, after in pairwise(falling):
         assert all(abs(b) <= abs(a) + 1e-12 for a, b in zip(before, after, strict=True))
     assert falling[-1] == (0.0, 0.0, 0.0, 0.0)

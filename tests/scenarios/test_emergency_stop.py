@@ -378,7 +378,7 @@ def test_a_recording_replays_a_press_and_its_release() -> None:
     world.drive(0.5, seconds=1.5)
     assert world.call("clear").success
     world.drive(0.5, seconds=1.0)
-    assert {"driving", "stopped", "ready"} <= {taken.outputs.mode for taken in tape.taken}
+    assert {"driving", "stopped", "ready"} <= {step.outputs.mode for step in tape.taken}
     for first in (0, middle):
         comparison = replayed(tape, config, first).comparison
         assert comparison.first is None

@@ -84,12 +84,14 @@ def driven(config: Config) -> tuple[World, Tape]:
 
 def exported(recording: Recording) -> Said:
     run = RecordedRun(recording)
-    publisher, said = Publisher(run.robot, recording.about.started_ns), defaultdict(list)
+    publisher, messages = Publisher(run.robot, recording.about.started_ns), defaultdict(list)
     for step in run.steps():
-        for one in publisher.step(step, replay_step(run.robot, step)):
-            said[one.channel.native.replace("<source>", one.source)].append(one.message)
+        for output in publisher.step(step, replay_step(run.robot, step)):
+            messages[output.channel.native.replace("<source>", output.source)].append(
+                output.message
+            )
     assert run.gaps == []
-    return said
+    return messages
 
 
 @pytest.fixture(
@@ -125,34 +127,37 @@ def file(recorded: Any) -> Path:
 
 def assert_same(then: Sequence[Message], now: Sequence[Message]) -> None:
     """Compare two lists of messages. The failure shows the first difference."""
-    for number, (one, other) in enumerate(zip(then, now, strict=False)):
-        assert one == other, f"message {number}"
+    for number, (item, other) in enumerate(zip(then, now, strict=False)):
+        assert item == other, f"message {number}"
     assert len(then) == len(now) > 0
 
 
 @pytest.mark.slow
 @each("key", ["odom", "tf", "tf_static", "wheel_states", "cmd_vel_out", "battery"])
 def test_every_exported_message_equals_the_published_one(key: str, both: Any) -> None:
-    world, _, said = both
-    assert_same(world.bus.published[key], said[key])
+    world, _, exports = both
+    assert_same(world.bus.published[key], exports[key])
 
 
 def test_every_exported_state_equals_the_published_one_without_latencies(both: Any) -> None:
-    world, _, said = both
-    then = [replace(one, latencies={}) for one in world.bus.published["state"]]
-    assert all(isinstance(one, RobotState) and one.counters["lines"] for one in then[20:])
-    assert_same(then, said["state"])
+    world, _, exports = both
+    then = [replace(robot_state, latencies={}) for robot_state in world.bus.published["state"]]
+    assert all(
+        isinstance(robot_state, RobotState) and robot_state.counters["lines"]
+        for robot_state in then[20:]
+    )
+    assert_same(then, exports["state"])
     assert then[-1].counters["commands_superseded"] > 0
 
 
 def test_every_exported_diagnostics_has_the_same_rows_except_measured_ones(both: Any) -> None:
-    world, _, said = both
+    world, _, exports = both
     left_out = MEASURED_ROWS | {"acsard: recording"}
     then = [
-        DiagnosticArray(one.header, [row for row in one.status if row.name not in left_out])
-        for one in world.bus.published["diagnostics"]
+        DiagnosticArray(message.header, [row for row in message.status if row.name not in left_out])
+        for message in world.bus.published["diagnostics"]
     ]
-    assert_same(then, said["diagnostics"])
+    assert_same(then, exports["diagnostics"])
     assert {row.name for row in then[-1].status} >= {"acsard: mode", "acsard: commands"}
 
 
@@ -166,32 +171,32 @@ def happened(world: World) -> list[Any]:
 
     Consecutive `events` messages contain the same events again.
     """
-    told: list[Any] = []
+    log_events: list[Any] = []
     for events in world.bus.published["events"]:
         assert isinstance(events, Events)
-        told += events.events[len(events.events) - (events.total - len(told)) :]
-    return told
+        log_events += events.events[len(events.events) - (events.total - len(log_events)) :]
+    return log_events
 
 
 def test_every_event_is_a_line_of_the_log(both: Any) -> None:
-    world, _, said = both
-    told = happened(world)
-    assert len(told) > 20
-    lines = [line for line in said[LOG_CHANNEL.native] if line.name not in ADDED]
-    assert [(one.stamp, plain(one.name)) for one in told] == [
-        (one.stamp, plain(one.name)) for one in lines
+    world, _, exports = both
+    events = happened(world)
+    assert len(events) > 20
+    lines = [line for line in exports[LOG_CHANNEL.native] if line.name not in ADDED]
+    assert [(event.stamp, plain(event.name)) for event in events] == [
+        (event.stamp, plain(event.name)) for event in lines
     ]
     others = {
-        one.name
-        for one, line in zip(told, lines, strict=True)
-        if replace(log(one, line.stamp), name=line.name) != line
+        event.name
+        for event, line in zip(events, lines, strict=True)
+        if replace(log(event, line.stamp), name=line.name) != line
     }
     assert others <= COUNTED
 
 
 def test_every_line_reason_of_the_log_is_a_reason_that_the_state_has(both: Any) -> None:
-    _, tape, said = both
-    lines = [line for line in said[LOG_CHANNEL.native] if line.name == "reason"]
+    _, tape, exports = both
+    lines = [line for line in exports[LOG_CHANNEL.native] if line.name == "reason"]
     steps = {step.inputs.now.wall_ns: step.recorded.status for step in tape.steps()}
     assert lines
     for line in lines:
@@ -200,19 +205,21 @@ def test_every_line_reason_of_the_log_is_a_reason_that_the_state_has(both: Any) 
 
 
 def test_every_command_is_exported_under_its_source_with_its_arrival_time(both: Any) -> None:
-    _, tape, said = both
+    _, tape, exports = both
     offset_ns = {}
-    heard: Said = defaultdict(list)
+    arrivals: Said = defaultdict(list)
     for inputs, _, _ in tape.taken:
         offset_ns = inputs.now.wall_ns - inputs.now.mono_ns
-        for one in inputs.commands:
-            heard[f"cmd/{one.source}"].append(
-                (one.arrived_ns + offset_ns, one.twist.linear, one.twist.angular)
+        for command in inputs.commands:
+            arrivals[f"cmd/{command.source}"].append(
+                (command.arrived_ns + offset_ns, command.twist.linear, command.twist.angular)
             )
-    assert set(heard) == {key for key in said if key.startswith("cmd/")} >= {"cmd/app"}
-    for key, commands in heard.items():
-        told = [(m.header.stamp.to_ns(), m.twist.linear.x, m.twist.angular.z) for m in said[key]]
-        assert told == commands
+    assert set(arrivals) == {key for key in exports if key.startswith("cmd/")} >= {"cmd/app"}
+    for key, commands in arrivals.items():
+        values = [
+            (m.header.stamp.to_ns(), m.twist.linear.x, m.twist.angular.z) for m in exports[key]
+        ]
+        assert values == commands
 
 
 # the file
@@ -225,16 +232,16 @@ def commanded(source: str) -> str:
 
 def replay_file(world: World, tape: Tape) -> Said:
     """Return the messages that a client received or sent, by ROS topic, except those of the log."""
-    found: Said = defaultdict(list)
+    messages: Said = defaultdict(list)
     for key in BY_KEY:
-        found[BY_KEY[key].topic("")] = [_as_told(one) for one in world.bus.published[key]]
+        messages[BY_KEY[key].topic("")] = [_as_told(item) for item in world.bus.published[key]]
     for inputs, _, _ in tape.taken:
-        for one in inputs.commands:
-            arrived = one.arrived_ns + inputs.now.wall_ns - inputs.now.mono_ns
-            asked = Twist(Vector3(x=one.twist.linear), Vector3(z=one.twist.angular))
+        for item in inputs.commands:
+            arrived = item.arrived_ns + inputs.now.wall_ns - inputs.now.mono_ns
+            asked = Twist(Vector3(x=item.twist.linear), Vector3(z=item.twist.angular))
             stamped = TwistStamped(Header(Time.from_ns(arrived), "base_link"), asked)
-            found[commanded(one.source)].append(stamped)
-    return found
+            messages[commanded(item.source)].append(stamped)
+    return messages
 
 
 def _as_told(message: Message) -> Any:
@@ -279,14 +286,14 @@ def test_the_file_has_each_message_that_was_published_to_the_byte(
     published = replay_file(world, tape)
     assert set(written) == {*published, "/log"} >= set(rows)
     for name, messages in published.items():
-        data = [rows.get(name, CMD_VEL_IN).encode(one) for one in messages]
+        data = [rows.get(name, CMD_VEL_IN).encode(item) for item in messages]
         assert written[name] == data, f"{name}: {len(written[name])} of {len(data)}"
     events = happened(world)
     assert len(written["/log"]) == len(events)
     others = {
-        one.name
-        for one, data in zip(events, written["/log"], strict=True)
-        if LOG_CHANNEL.encode(replace(log(one, one.stamp), name=name_of(data))) != data
+        item.name
+        for item, data in zip(events, written["/log"], strict=True)
+        if LOG_CHANNEL.encode(replace(log(item, item.stamp), name=name_of(data))) != data
     }
     assert others <= COUNTED
 
@@ -297,8 +304,8 @@ def by_mcap_ros2(path: Path, reader: Any) -> Iterator[tuple[str, Any]]:
     It uses only the message definitions in the file.
     """
     with path.open("rb") as stream:
-        for one in reader(stream, decoder_factories=[DecoderFactory()]).iter_decoded_messages():
-            yield one.channel.topic, one.decoded_message
+        for message in reader(stream, decoder_factories=[DecoderFactory()]).iter_decoded_messages():
+            yield message.channel.topic, message.decoded_message
 
 
 def by_rosbags(path: Path) -> Iterator[tuple[str, Any]]:
@@ -320,15 +327,15 @@ def fields(kind: type[msgspec.Struct]) -> tuple[str, ...]:
     return kind.__struct_fields__
 
 
-def same(told: Any, ours: Any) -> bool:
+def same(message: Any, ours: Any) -> bool:
     """Return whether two messages are equal in every field. NaN equals None."""
     if isinstance(ours, msgspec.Struct):
-        return all(same(getattr(told, name), getattr(ours, name)) for name in fields(type(ours)))
+        return all(same(getattr(message, name), getattr(ours, name)) for name in fields(type(ours)))
     if isinstance(ours, (list, tuple)):
-        return len(told) == len(ours) and all(map(same, told, ours))
+        return len(message) == len(ours) and all(map(same, message, ours))
     if ours is None:
-        return math.isnan(told)
-    return bool(told == ours)
+        return math.isnan(message)
+    return bool(message == ours)
 
 
 @pytest.mark.slow
@@ -339,19 +346,21 @@ def test_two_libraries_decode_the_file_by_its_definitions_to_the_published_messa
     world, tape, _ = recorded
     readers = {"seeking": SeekingReader, "not seeking": NonSeekingReader}
     messages = by_mcap_ros2(file, readers[library]) if library in readers else by_rosbags(file)
-    told: Said = defaultdict(list)
+    by_topic: Said = defaultdict(list)
     for name, message in messages:
-        told[name].append(message)
+        by_topic[name].append(message)
     for name, published in replay_file(world, tape).items():
-        assert len(told[name]) == len(published) > 0
-        for number, (one, ours) in enumerate(zip(told[name], published, strict=True)):
-            assert same(one, ours), f"{name}, message {number}: {one} for {ours}"
+        assert len(by_topic[name]) == len(published) > 0
+        for number, (item, ours) in enumerate(zip(by_topic[name], published, strict=True)):
+            assert same(item, ours), f"{name}, message {number}: {item} for {ours}"
     lines = [
-        (one.stamp.sec, one.stamp.nanosec, plain(one.name))
-        for one in told["/log"]
-        if one.name not in ADDED
+        (item.stamp.sec, item.stamp.nanosec, plain(item.name))
+        for item in by_topic["/log"]
+        if item.name not in ADDED
     ]
-    assert lines == [(one.stamp.sec, one.stamp.nanosec, plain(one.name)) for one in happened(world)]
+    assert lines == [
+        (item.stamp.sec, item.stamp.nanosec, plain(item.name)) for item in happened(world)
+    ]
 
 
 def test_the_libraries_decode_by_the_definitions_in_the_file(file: Path, tmp_path: Path) -> None:
@@ -362,6 +371,6 @@ def test_the_libraries_decode_by_the_definitions_in_the_file(file: Path, tmp_pat
     other.write_bytes(whole.replace(b"string child_frame_id", b"string child_grame_id"))
     with other.open("rb") as stream:
         reader = SeekingReader(stream, decoder_factories=[DecoderFactory()])
-        one = next(iter(reader.iter_decoded_messages("/odom")))
-    assert one.decoded_message.child_grame_id == "base_link"
-    assert not hasattr(one.decoded_message, "child_frame_id")
+        message = next(iter(reader.iter_decoded_messages("/odom")))
+    assert message.decoded_message.child_grame_id == "base_link"
+    assert not hasattr(message.decoded_message, "child_frame_id")

@@ -247,11 +247,11 @@ def test_a_replay_finds_a_forged_summary_at_the_end_of_the_file(
 ) -> None:
     data, end = original.read_bytes(), read_end(original)
     assert end is not None
-    said = end.said
-    assert "unnamed" in said
-    at = data.rindex(said.encode())
+    summary = end.said
+    assert "unnamed" in summary
+    at = data.rindex(summary.encode())
     forged = tmp_path / original.name
-    name = said.replace("unnamed", "unknown").encode()
+    name = summary.replace("unnamed", "unknown").encode()
     forged.write_bytes(data[:at] + name + data[at + len(name) :])
     assert main(["recording", "replay", str(forged)]) == Exit.FAILURE
     assert "(stopped by unknown (native))" in capsys.readouterr().out

@@ -130,8 +130,8 @@ def test_a_gyro_that_dies_is_reported_and_the_wheels_go_on() -> None:
     assert made.state.yaw - before == pytest.approx(1.0, abs=0.1)
     made.gyro_dead = False
     made.hold(0.3, 0.5, 1.0)
-    told = [event.text.partition(":")[0] for event in made.events if event.name == "gyro"]
-    assert told == ["waiting for rest", "waiting for turn", "silent", "used"]
+    reports = [event.text.partition(":")[0] for event in made.events if event.name == "gyro"]
+    assert reports == ["waiting for rest", "waiting for turn", "silent", "used"]
 
 
 @pytest.mark.slow
@@ -210,8 +210,8 @@ def test_without_its_gyro_the_robot_keeps_a_good_heading_by_the_learned_track() 
     assert asked.error < 0.1 * plain.error
     assert " (in use), configured 1.000" in asked.world.state.effective_track
     assert plain.world.state.effective_track.endswith("(only reported), configured 1.000 (in use)")
-    (told,) = [event for event in asked.world.events if event.name == "learned_track"]
-    assert told.text.endswith(" (in use), configured 1.000")
+    (report,) = [event for event in asked.world.events if event.name == "learned_track"]
+    assert report.text.endswith(" (in use), configured 1.000")
     assert not [event for event in plain.world.events if event.name == "learned_track"]
 
 

@@ -60,13 +60,13 @@ def asked_everything(world: World) -> None:
 
 def names(texts: list[bytes]) -> list[str]:
     """Return every word, and every quoted run of characters, that may be a sender's id."""
-    found: dict[str, None] = {}
+    words: dict[str, None] = {}
     for text in texts:
         decoded = text.decode("utf-8", "replace")
-        for one in (*WORD.findall(decoded), *re.findall(r"[\"'(]([^\"'()]*)[\"')]", decoded)):
-            if 0 < len(one) <= 64 and any(part in one for part in ("here", "/")):
-                found[one] = None
-    return list(found)
+        for word in (*WORD.findall(decoded), *re.findall(r"[\"'(]([^\"'()]*)[\"')]", decoded)):
+            if 0 < len(word) <= 64 and any(part in word for part in ("here", "/")):
+                words[word] = None
+    return list(words)
 
 
 def driven() -> tuple[World, Speaker, list[bytes]]:
@@ -89,8 +89,8 @@ def test_the_secret_of_a_sender_is_published_nowhere() -> None:
 @pytest.mark.slow
 def test_an_attacker_that_reads_all_published_messages_cannot_drive_as_the_operator() -> None:
     world, victim, texts = driven()
-    shown = world.state.sender
-    candidates = list(dict.fromkeys([shown, *names(texts)]))
+    sender = world.state.sender
+    candidates = list(dict.fromkeys([sender, *names(texts)]))
     assert len(candidates) > 3
     for name in candidates:
         attacker = Speaker(world, "signed", name)
@@ -100,20 +100,20 @@ def test_an_attacker_that_reads_all_published_messages_cannot_drive_as_the_opera
             attacker.deliver(attacker.message(0.0), angular=1.0)
             world.run(0.02)
         assert abs(turn_rate(world)) < 0.01, name
-        assert (world.state.mode, world.state.sender) == ("driving", shown), name
+        assert (world.state.mode, world.state.sender) == ("driving", sender), name
 
 
 def test_the_session_that_stamps_a_command_is_not_published() -> None:
     tape, world = recorded_world(wanted=EVERY_KEY)
     speaker = Speaker(world, "zenoh", SECRET)
     speaker.open(0.4)
-    shown = world.state.sender
+    sender = world.state.sender
     world.put("stop", b"", stamp_ns=1, session=speaker.session)
     world.run(0.1)
     assert not [text for text in published(world, tape) if SECRET.encode() in text]
     (stop,) = (event for event in world.events if event.name == "stop")
     assert re.fullmatch(r"unnamed \(native, session ([0-9a-f]{16})\)", stop.by)
-    assert shown in stop.by
+    assert sender in stop.by
 
 
 @pytest.mark.parametrize("certificate", ["", "anna"])
@@ -124,19 +124,19 @@ def test_a_stolen_secret_is_useless_under_another_certificate(certificate: str) 
     victim.key += f"/{certificate}" if certificate else ""
     thief.key += "/mallory"
     victim.open(0.4)
-    shown = world.state.sender
-    assert shown.endswith(" [anna]") == bool(certificate)
+    sender = world.state.sender
+    assert sender.endswith(" [anna]") == bool(certificate)
     for _ in range(50):
         victim.send(0.4)
         thief.deliver(thief.message(0.0), angular=1.0)
         world.run(0.02)
         assert abs(turn_rate(world)) < 0.01
-    assert (world.state.mode, world.state.sender) == ("driving", shown)
+    assert (world.state.mode, world.state.sender) == ("driving", sender)
     assert world.state.counters["command_other_certificate"] == 50
     assert "this sender id is already in use" in world.state.refused
     world.run(1.0)
     refused = [event for event in world.events if event.name == "command_refused"]
-    assert {event.by for event in refused} == {f"{shown.partition(' [')[0]} [mallory]"}
+    assert {event.by for event in refused} == {f"{sender.partition(' [')[0]} [mallory]"}
 
 
 @pytest.mark.slow

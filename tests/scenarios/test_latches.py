@@ -64,11 +64,11 @@ def runaway(world: World) -> None:
 
 def test_a_clear_read_before_a_later_stop_and_delivered_after_it_is_refused(world: World) -> None:
     call(world, "stop", "ann")
-    seen = world.state.latch
+    latch = world.state.latch
     world.run(3.0)
     call(world, "stop", "joe")
     world.run(3.0)
-    reply = call(world, "clear", "ann", seen)
+    reply = call(world, "clear", "ann", latch)
     assert (reply.success, world.state.mode) == (False, "stopped")
     assert f"would release now; the robot is still stopped by {JOE} (native)" in reply.message
     assert call(world, "clear", "ann", world.state.latch).success
@@ -96,28 +96,28 @@ def test_a_plain_clear_is_refused_for_two_seconds_after_a_stop(world: World, via
 
 
 def test_every_stop_is_a_new_latch_also_while_one_holds(world: World) -> None:
-    seen = []
+    latches = []
     for name in ("ann", "joe", "joe"):
         call(world, "stop", name)
-        seen.append(world.state.latch)
+        latches.append(world.state.latch)
         assert f"stopped by {public_name(name)} (native) at 2027-01-15 08:00" in world.state.reason
         world.run(1.0)
-    assert seen == sorted(set(seen))
-    assert msgspec.json.decode(msgspec.json.encode(float(seen[-1]))) == seen[-1]
+    assert latches == sorted(set(latches))
+    assert msgspec.json.decode(msgspec.json.encode(float(latches[-1]))) == latches[-1]
 
 
 def test_a_bumper_does_not_hide_the_client_that_stopped_the_robot(world: World) -> None:
     with world.mcu.bumpers():
         world.run(0.2)
         call(world, "stop", "joe")
-        seen = world.state.latch
+        latch = world.state.latch
         with world.mcu.bumper_pressed(1, 0.0, 0.0):
             world.run(0.2)
         world.run(0.2)
-        assert world.state.latch > seen
+        assert world.state.latch > latch
         assert "bumper 1 pressed (latched at 2027" in world.state.reason
         assert f"; also stopped by {JOE} (native) at 2027" in world.state.reason
-        assert not call(world, "clear", "ann", seen).success
+        assert not call(world, "clear", "ann", latch).success
         assert call(world, "clear", "ann", world.state.latch).success
         assert world.state.mode == "ready"
 
@@ -159,7 +159,7 @@ def test_no_delayed_clear_releases_a_stop_that_its_sender_had_not_seen(seed: int
         elif roll < 0.4:
             read = max(0, len(states) - 1 - dice.randrange(20))
             pending.append((world.now_ns + dice.randrange(5 * NS_PER_S), read))
-        for clear in [one for one in pending if one[0] <= world.now_ns]:
+        for clear in [request for request in pending if request[0] <= world.now_ns]:
             pending.remove(clear)
             read_ns, latch = states[clear[1]]
             was = world.state.mode
@@ -181,26 +181,26 @@ def test_an_activate_read_before_a_later_deactivate_and_delivered_after_it_is_re
     world: World,
 ) -> None:
     call(world, "deactivate", "ann")
-    seen = world.state.latch
+    latch = world.state.latch
     world.run(3.0)
-    assert call(world, "activate", "ann", seen).success
+    assert call(world, "activate", "ann", latch).success
     call(world, "deactivate", "joe")
     world.run(3.0)
-    reply = call(world, "activate", "eve", seen)
+    reply = call(world, "activate", "eve", latch)
     assert (reply.success, world.state.mode) == (False, "inactive")
-    told = f"would release now; the robot is still switched off by {JOE} (native)"
-    assert told in reply.message
+    message = f"would release now; the robot is still switched off by {JOE} (native)"
+    assert message in reply.message
     assert call(world, "activate", "ann", world.state.latch).success
     assert world.state.mode == "ready"
 
 
 def test_an_activate_read_between_two_deactivates_does_not_undo_the_second(world: World) -> None:
     call(world, "deactivate", "ann")
-    seen = world.state.latch
+    latch = world.state.latch
     world.run(3.0)
     call(world, "deactivate", "joe")
     world.run(3.0)
-    assert not call(world, "activate", "ann", seen).success
+    assert not call(world, "activate", "ann", latch).success
     assert world.state.mode == "inactive"
 
 
@@ -249,14 +249,14 @@ def test_a_clear_of_one_fault_does_not_release_another_fault_that_came_after_it(
     with world.mcu.dead_motor(0):
         world.drive(0.5, seconds=1.2)
     assert world.state.mode == "fault"
-    seen = world.state.latch
+    latch = world.state.latch
     with world.mcu.driver_fault(0.0, 0.3):
         world.run(0.25)
-        assert world.state.latch > seen
+        assert world.state.latch > latch
         world.run(1.0)  # until the board reports that the driver's fault is over
     assert "a fault of a motor driver" in world.state.reason
     assert "front_right wheel does not turn" in world.state.reason
-    reply = world.call("clear", msgspec.json.encode({"latch": seen}))
+    reply = world.call("clear", msgspec.json.encode({"latch": latch}))
     assert not reply.success
     assert world.state.mode == "fault"
     assert world.call("clear", msgspec.json.encode({"latch": world.state.latch})).success

@@ -52,9 +52,9 @@ class Drive:
                 made.hold(linear, angular, 0.5)
             made.hold(0.0, 0.0, 1.0)
         assert made.loop.robot.travelled > 1.5
-        told = made.state
-        print(f"{1000 * self.off(told):.1f} mm off after {made.loop.robot.travelled:.1f} m")
-        return self.off(told)
+        state = made.state
+        print(f"{1000 * self.off(state):.1f} mm off after {made.loop.robot.travelled:.1f} m")
+        return self.off(state)
 
     @property
     def floor(self) -> float:
@@ -70,10 +70,10 @@ class Drive:
             path.advance((right + left) / 2 * 0.05, (right - left) * 0.05 / 0.30)
         return self.off(path.pose)
 
-    def off(self, told: RobotState | Pose) -> float:
+    def off(self, pose: RobotState | Pose) -> float:
         """Return the distance of the pose from the robot's true place, m."""
         true = self.world.mcu.vehicle.pose
-        return math.dist((told.x, told.y), (true.x, true.y))
+        return math.dist((pose.x, pose.y), (true.x, true.y))
 
 
 REPORTS = pytest.mark.parametrize("reports", [False, True], ids=["prompted", "reporting"])
@@ -138,9 +138,9 @@ class Gap:
 @pytest.mark.parametrize("mute", [False, True], ids=["lost replies", "mute"])
 @pytest.mark.parametrize("waiting", [0.0, 0.2])
 @pytest.mark.parametrize("stall", [0.2, 0.3, 0.5])
-@pytest.mark.parametrize("kept", [0.0, 0.05])
+@pytest.mark.parametrize("commanded", [0.0, 0.05])
 def test_a_stall_in_a_gap_does_not_end_the_motion_in_the_pose_before_rest_is_commanded(
-    kept: float, stall: float, waiting: float, mute: bool
+    commanded: float, stall: float, waiting: float, mute: bool
 ) -> None:
     """During the gap the daemon stalls and sends nothing, and the robot drives on.
 
@@ -157,24 +157,24 @@ def test_a_stall_in_a_gap_does_not_end_the_motion_in_the_pose_before_rest_is_com
     if waiting:
         gap.world.stall(waiting)
     with gap.world.mcu.mute() if mute else gap.world.mcu.lost_replies(1):
-        gap.world.hold(0.5, seconds=kept)
+        gap.world.hold(0.5, seconds=commanded)
         gap.world.stall(stall)
-        gap.world.run(0.6 - kept - stall)
+        gap.world.run(0.6 - commanded - stall)
     off, deviation = gap.end()
     assert abs(off) < 0.1
     assert abs(off) < 3 * deviation
 
 
 def test_a_stall_behind_the_command_to_rest_changes_nothing_in_the_pose() -> None:
-    found = []
+    deviations = []
     for stall in (0.0, 0.3):
         gap = Gap(0.5)
         with gap.world.mcu.mute():
             gap.world.hold(0.5, seconds=0.3)
             gap.world.stall(stall)
             gap.world.run(0.5 - stall)
-        found.append(gap.end()[0])
-    assert found[0] == pytest.approx(found[1], abs=0.002)
+        deviations.append(gap.end()[0])
+    assert deviations[0] == pytest.approx(deviations[1], abs=0.002)
 
 
 @pytest.mark.parametrize("speed", [0.3, 0.6, 0.9])

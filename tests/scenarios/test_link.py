@@ -97,16 +97,16 @@ def test_a_robot_that_never_received_feedback_reports_no_speed_and_no_age() -> N
 
 def test_a_port_that_closes_while_it_is_read_is_down_in_the_same_step(world: World) -> None:
     world.drive(0.5, seconds=1.0)
-    seen: list[tuple[str, bytes | None]] = []
+    outcomes: list[tuple[str, bytes | None]] = []
 
     def close(late: Instant | None = None) -> tuple[Received, ...]:
         world.port.unplug()
-        world.watch = lambda outputs: seen.append((outputs.link, outputs.line))
+        world.watch = lambda outputs: outcomes.append((outputs.link, outputs.line))
         return ()
 
     world.port.take = close  # type: ignore[method-assign]
     world.run(0.011)
-    assert seen[0] == ("down", ZERO)
+    assert outcomes[0] == ("down", ZERO)
 
 
 def test_after_replugging_nothing_moves_before_a_zero(world: World) -> None:
@@ -189,9 +189,9 @@ def test_a_reset_mcu_does_not_move_before_neutral(world: World) -> None:
     world.drive(0.5, seconds=1.0)
     x = world.state.x
     world.mcu.reset(world.now_ns)
-    heard = world.mcu.valid_lines
+    valid = world.mcu.valid_lines
     world.hold(0.5, seconds=4.0)
-    assert world.mcu.valid_lines > heard
+    assert world.mcu.valid_lines > valid
     assert world.state.mode == "ready"
     assert world.mcu.vehicle.set_points == [0.0] * 4
     assert world.state.x == pytest.approx(x, abs=0.1)
@@ -267,10 +267,10 @@ def test_blocked_output_is_superseded_and_never_delivered_late(world: World) -> 
     world.hold(0.5, seconds=0.2)
     # A zero that did not leave is sent again in the next period, and not with the next 10 Hz.
     assert 20 <= world.state.counters["lines_superseded"] <= 22
-    heard = len(world.mcu.heard)
+    before = len(world.mcu.heard)
     world.port.blocked = False
     world.run(0.02)
-    assert len(world.mcu.heard) - heard <= 2
+    assert len(world.mcu.heard) - before <= 2
 
 
 def test_after_a_long_block_the_robot_starts_over_from_rest(world: World) -> None:
@@ -384,10 +384,10 @@ def test_a_zero_line_is_sent_however_long_the_step_stalled(world: World) -> None
 def test_a_torn_line_moves_nothing_and_spoils_no_later_line(world: World) -> None:
     world.drive(0.5, seconds=1.0)
     world.run(0.005)  # the last one arrives
-    valid, heard = world.mcu.valid_lines, len(world.mcu.heard)
+    valid, count = world.mcu.valid_lines, len(world.mcu.heard)
     world.port.takes = 10
     world.run(0.1)
-    torn, *behind = [line for _, line in list(world.mcu.heard)[heard:]]
+    torn, *behind = [line for _, line in list(world.mcu.heard)[count:]]
     assert torn == b"ap10.00,bp\r\n"
     assert len(behind) >= 8
     assert world.mcu.valid_lines == valid + len(behind)
@@ -474,9 +474,9 @@ def test_a_link_that_loses_lines_is_reported_once(fault: str) -> None:
     world = World()
     with world.mcu.switched_on(named(fault)):
         world.run(25.0)
-    told = [event for event in world.events if event.name == "lines_lost"]
-    assert [event.level for event in told] == ["warning"]
-    assert "answered only" in told[0].text
+    events = [event for event in world.events if event.name == "lines_lost"]
+    assert [event.level for event in events] == ["warning"]
+    assert "answered only" in events[0].text
 
 
 @pytest.mark.slow
@@ -497,13 +497,15 @@ def test_each_silence_of_a_board_is_counted() -> None:
 def test_a_simulator_that_is_configured_mute_never_brings_the_link_up() -> None:
     world = World(Config(sim=SimConfig(faults=("mute",))), wanted={"state"})
     world.run(10.0)
-    states = [one for one in world.bus.published["state"] if isinstance(one, RobotState)]
+    states = [
+        message for message in world.bus.published["state"] if isinstance(message, RobotState)
+    ]
     assert {state.link for state in states} == {"booting"}
     assert world.mcu.valid_lines > 0
 
 
 @pytest.mark.parametrize(
-    ("fault", "heard", "mend"),
+    ("fault", "received", "mend"),
     [
         ("mute", "nothing was received", "does the board have power"),
         ("noise", r"none good, the last one is `\x00\xff~ap00.00,", "is there noise on the cable"),
@@ -515,7 +517,7 @@ def test_a_simulator_that_is_configured_mute_never_brings_the_link_up() -> None:
     ],
 )
 def test_a_silent_or_garbled_board_is_diagnosed_by_the_received_bytes(
-    fault: str, heard: str, mend: str
+    fault: str, received: str, mend: str
 ) -> None:
     world = World(wanted={"state"})
     with world.mcu.switched_on(named(fault)):
@@ -523,11 +525,11 @@ def test_a_silent_or_garbled_board_is_diagnosed_by_the_received_bytes(
         assert "first good lines" in world.state.reason
         states = len(world.bus.published["state"])
         world.run(6.5)
-    assert heard in world.state.reason
+    assert received in world.state.reason
     assert mend in world.state.reason
     assert "`acsard mcu check`" in world.state.reason
     assert len(world.bus.published["state"]) - states < 80, "its figures are not news of their own"
     (event,) = [
-        event for event in world.events if event.name == "link_booting" and heard in event.text
+        event for event in world.events if event.name == "link_booting" and received in event.text
     ]
     assert event.level == "warning"

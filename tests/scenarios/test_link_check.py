@@ -87,9 +87,9 @@ def test_a_new_mcu_is_driven_with_checked_lines(check: str) -> None:
     assert "(serial lines checked)" in world.state.reason
     assert check_of(world) == "checked"
     assert texts(world, "link_check") == ["the lines on the serial port are now checked"]
-    heard = moving(world.lines())
-    assert len(heard) > 150
-    assert all(protocol.reference(line) and b"#" in line for line in heard)
+    lines = moving(world.lines())
+    assert len(lines) > 150
+    assert all(protocol.reference(line) and b"#" in line for line in lines)
     world.run(1.5)
     assert stopped(world)
     assert world.state.x == pytest.approx(world.mcu.vehicle.pose.x, abs=0.005)
@@ -206,9 +206,9 @@ def test_a_reset_mcu_does_not_move_before_it_is_asked_and_commanders_are_neutral
     before = world.state.x
     world.mcu.reset(world.now_ns, deaf_ms * MS)
     world.hold(0.5, seconds=deaf_ms / 1000 + 0.02, hz=100.0)
-    heard = len(world.lines())
+    count = len(world.lines())
     world.hold(0.5, seconds=3.0)
-    assert not moving(world.lines()[heard + 1 :])
+    assert not moving(world.lines()[count + 1 :])
     assert world.state.mode == "ready"
     assert "send a zero first" in world.state.reason
     assert stopped(world)
@@ -287,14 +287,14 @@ def test_noise_never_talks_an_mcu_out_of_the_check() -> None:
 def test_bit_errors_both_ways_change_no_speed(every: int) -> None:
     world = started(config("require", 3200))
     world.drive(0.4, seconds=0.5)
-    told: set[float] = set()
+    set_points: set[float] = set()
     with world.mcu.bit_errors(every):
         for _ in range(200):
             world.hold(0.4, seconds=0.01, hz=100.0)
-            told.update(world.mcu.vehicle.set_points)
+            set_points.update(world.mcu.vehicle.set_points)
             assert all(abs(speed) < 8.5 for speed in world.state.wheels)
-    assert max(told) <= 8.0
-    assert min(told) >= 0.0
+    assert max(set_points) <= 8.0
+    assert min(set_points) >= 0.0
 
 
 def flips(line: bytes) -> Iterator[bytes]:
@@ -309,18 +309,18 @@ def accepted_by_the_mcu(data: bytes, understand: object = protocol.reference) ->
     `understand` decodes one line.
     """
     assert callable(understand)
-    found = [understand(piece + b"\n") for piece in data.split(b"\n")[:-1]]
-    return [command.values for command in found if command is not None]
+    commands = [understand(piece + b"\n") for piece in data.split(b"\n")[:-1]]
+    return [command.values for command in commands if command is not None]
 
 
 def accepted_by_the_host(data: bytes, codec: Codec, checked: bool) -> list[object]:
-    found: list[object] = []
+    speeds: list[object] = []
     for line, _ in LineReader().feed(data):
         try:
-            found.append(codec.decode(unseal(line).plain if checked else line))
+            speeds.append(codec.decode(unseal(line).plain if checked else line))
         except FrameError:
             continue
-    return found
+    return speeds
 
 
 @pytest.mark.parametrize(
@@ -337,24 +337,24 @@ def test_no_single_bit_error_changes_a_value_on_a_checked_link(count: int) -> No
         text = plain[:-2]
         reply = text + protocol.suffix(text, sequence, sample) + b"\r\n"
         command = text + protocol.suffix(text, sequence, ()) + b"\r\n"
-        said, meant = codec.decode(text), protocol.reference(plain)
-        assert meant is not None
+        reply_speeds, reference = codec.decode(text), protocol.reference(plain)
+        assert reference is not None
         # There is one line end more, so that no damage reaches the next line.
         for data in flips(reply):
             tried["reply"] += 1
-            got = accepted_by_the_host(data + b"\n", codec, checked=True)
-            wrong["reply"] += any(speeds != said for speeds in got)
+            results = accepted_by_the_host(data + b"\n", codec, checked=True)
+            wrong["reply"] += any(speeds != reply_speeds for speeds in results)
         for data in flips(command):
             tried["command"] += 1
-            got = accepted_by_the_mcu(data + b"\n")
-            wrong["command"] += any(values != meant.values for values in got)
+            results = accepted_by_the_mcu(data + b"\n")
+            wrong["command"] += any(values != reference.values for values in results)
         for data in flips(plain) if number % 8 == 0 else ():
             tried["plain reply"] += 1
-            got = accepted_by_the_host(data + b"\n", codec, checked=False)
-            wrong["plain reply"] += any(speeds != said for speeds in got)
+            results = accepted_by_the_host(data + b"\n", codec, checked=False)
+            wrong["plain reply"] += any(speeds != reply_speeds for speeds in results)
             tried["plain command"] += 1
-            got = accepted_by_the_mcu(data + b"\n", protocol.plain_only)
-            wrong["plain command"] += any(values != meant.values for values in got)
+            results = accepted_by_the_mcu(data + b"\n", protocol.plain_only)
+            wrong["plain command"] += any(values != reference.values for values in results)
     print()
     for name, number in tried.items():
         print(f"  {name:<13} {number:8} bit errors, {wrong[name] / number:7.3%} a wrong value")
@@ -401,10 +401,10 @@ class LatePort(VirtualPort):
         now = self.world.instant
         if now.mono_ns < self.ready_ns or not self.held:
             return ()
-        got = Received(now, b"".join(self.held))
+        chunk = Received(now, b"".join(self.held))
         self.held.clear()
         self.ready_ns = now.mono_ns + self.dice.choice((0, 3, 20, 60)) * MS
-        return (got,)
+        return (chunk,)
 
 
 def jittery_drive(check: str, counts: int) -> World:

@@ -56,8 +56,8 @@ def off(made: World) -> tuple[float, float]:
 def row(made: World) -> DiagnosticStatus:
     message = made.loop.report.current("diagnostics", made.loop._look)
     assert isinstance(message, DiagnosticArray)
-    (found,) = [status for status in message.status if status.name == "acsard: wheels"]
-    return found
+    (row_status,) = [status for status in message.status if status.name == "acsard: wheels"]
+    return row_status
 
 
 def lies(made: World, kind: str, wheel: int) -> Fault:
@@ -93,8 +93,8 @@ def test_with_one_wheel_fault_the_pose_stays_right_and_state_names_the_wheel(
         distance, turn = off(made)
         assert distance < 0.02
         assert turn < 0.03
-    told = [event.text for event in made.events if event.name == "wheel_fault"]
-    assert f"{WHEELS[wheel]} wheel is left out" in told[0]
+    reports = [event.text for event in made.events if event.name == "wheel_fault"]
+    assert f"{WHEELS[wheel]} wheel is left out" in reports[0]
 
 
 def test_a_stuck_wheel_is_left_out_within_50_ms_and_the_fault_follows_in_time() -> None:
@@ -174,11 +174,11 @@ def reversed_encoder(seed: int) -> tuple[float, float, str]:
 
 @pytest.mark.slow
 def test_forty_robots_of_96_counts_with_a_reversed_encoder_are_all_found() -> None:
-    found = [reversed_encoder(seed) for seed in range(40)]
-    kept, phantom = sum(one[0] for one in found), sum(one[1] for one in found)
-    print(f"\n{kept / phantom:.1%} of the phantom of {phantom:.1f} rad is kept")
-    assert [seed for seed, (_, _, reason) in enumerate(found) if not reason] == []
-    assert kept < 0.05 * phantom
+    results = [reversed_encoder(seed) for seed in range(40)]
+    remainder, phantom = sum(result[0] for result in results), sum(result[1] for result in results)
+    print(f"\n{remainder / phantom:.1%} of the phantom of {phantom:.1f} rad is kept")
+    assert [seed for seed, (_, _, reason) in enumerate(results) if not reason] == []
+    assert remainder < 0.05 * phantom
 
 
 @pytest.mark.slow

@@ -41,10 +41,10 @@ def lives_again(tape: Tape, config: Config, first: int = 0, least: int = 100) ->
     assert comparison.first is None
     assert comparison.exact
     assert comparison.steps == comparison.modes_same == len(tape.taken) - first
-    taken = tape.taken[first:]
-    lines = sum(one.outputs.line is not None for one in taken)
+    steps = tape.taken[first:]
+    lines = sum(step.outputs.line is not None for step in steps)
     assert comparison.lines == comparison.lines_same == lines >= least
-    poses = sum(len(one.outputs.estimates) for one in taken)
+    poses = sum(len(step.outputs.estimates) for step in steps)
     assert comparison.poses == comparison.poses_same == poses >= least
     assert comparison.end is not None
     assert comparison.end[0] == comparison.end[1]
@@ -86,9 +86,9 @@ def test_a_drive_through_every_fault_is_replayed_to_the_last_bit(config: Config)
     tape, world = recorded_world(config)
     # `test_emergency_stop.py` and `test_bumpers.py` replay the inputs.
     assert {*drive_through_faults(world, 45.0)} == {*FAULTS, *WITH_ARGUMENTS} - INPUTS
-    inputs = [taken.inputs for taken in tape.taken]
+    inputs = [record.inputs for record in tape.taken]
     for has in ("superseded", "missed", "refusals", "requests", "port_trouble", "commands"):
-        assert any(getattr(one, has) for one in inputs), has
+        assert any(getattr(step, has) for step in inputs), has
     lives_again(tape, config)
 
 
@@ -151,13 +151,13 @@ def test_a_line_that_differs_is_reported_with_the_inputs_of_both_sides() -> None
     number = len(tape.taken) - 3
     while tape.taken[number].outputs.line is None:
         number -= 1
-    taken = tape.taken[number]
-    other = replace(taken.outputs, line=b"ap01.00,bp01.00,cp01.00,dp01.00\r\n")
-    tape.taken[number] = taken._replace(outputs=other)
+    step = tape.taken[number]
+    other = replace(step.outputs, line=b"ap01.00,bp01.00,cp01.00,dp01.00\r\n")
+    tape.taken[number] = step._replace(outputs=other)
     first = replayed(tape, PLAIN).comparison.first
     assert first is not None
     assert (first.number, first.what) == (number, ("line",))
-    assert (first.recorded.line, first.replayed.line) == (other.line, taken.outputs.line)
+    assert (first.recorded.line, first.replayed.line) == (other.line, step.outputs.line)
 
 
 def test_a_replay_without_one_recorded_command_differs() -> None:
@@ -165,8 +165,8 @@ def test_a_replay_without_one_recorded_command_differs() -> None:
     World(recorder=tape).drive(0.5, 0.2, seconds=1.0)
     moves = [n for n, t in enumerate(tape.taken) for c in t.inputs.commands if c.twist.linear]
     number = moves[0]
-    taken = tape.taken[number]
-    tape.taken[number] = taken._replace(inputs=replace(taken.inputs, commands=()))
+    step = tape.taken[number]
+    tape.taken[number] = step._replace(inputs=replace(step.inputs, commands=()))
     first = replayed(tape, PLAIN).comparison.first
     assert first is not None
     assert number <= first.number <= number + 1
@@ -177,10 +177,10 @@ def test_a_pose_that_differs_in_one_bit_is_the_same_but_not_exact() -> None:
     tape = Tape()
     World(recorder=tape).drive(0.5, 0.2, seconds=1.0)
     number = max(n for n, t in enumerate(tape.taken) if t.outputs.estimates)
-    taken = tape.taken[number]
-    (estimate,) = taken.outputs.estimates
+    step = tape.taken[number]
+    (estimate,) = step.outputs.estimates
     nudged = replace(estimate, pose=replace(estimate.pose, x=estimate.pose.x + 1e-15))
-    tape.taken[number] = taken._replace(outputs=replace(taken.outputs, estimates=(nudged,)))
+    tape.taken[number] = step._replace(outputs=replace(step.outputs, estimates=(nudged,)))
     comparison = replayed(tape, PLAIN).comparison
     assert (comparison.same, comparison.exact) == (True, False)
 

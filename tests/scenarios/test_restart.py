@@ -384,8 +384,8 @@ def test_a_stop_in_a_step_that_raises_is_in_force_at_the_next_start(
     host.restart()
     host.patrols(2 * CYCLE_S)
     assert host.world.state.mode == "stopped"
-    who = public_name("somebody") if by == "put" else "unnamed"
-    assert f"stopped by {who} (native)" in host.world.state.reason
+    client = public_name("somebody") if by == "put" else "unnamed"
+    assert f"stopped by {client} (native)" in host.world.state.reason
 
 
 def test_a_stop_during_the_shutdown_is_in_force_at_the_next_start() -> None:

@@ -302,8 +302,8 @@ def test_no_hand_latches_a_fault_whatever_the_mode(count: int, world: World) -> 
         shove(world, mode, dice)
         latched = told(world, "fault")
         assert (world.state.mode, latched) == (mode, []), f"push {trial} in {mode}: {latched}"
-        held = mode == "driving" and world.state.reason.startswith("driving: app keeps")
-        assert mode == "ready" or held or world.state.reason == reason
+        resisting = mode == "driving" and world.state.reason.startswith("driving: app keeps")
+        assert mode == "ready" or resisting or world.state.reason == reason
         kinds[mode] += 1
         world.run(0.5)
         leave(world, mode)
@@ -335,8 +335,8 @@ ONE_OF_EACH = {(0.2, "zero"), (0.4, "stop"), (0.6, "silence")}
 @pytest.mark.parametrize(
     ("lag", "way"),
     [
-        pytest.param(*one, marks=[] if one in ONE_OF_EACH else pytest.mark.slow)
-        for one in product((0.05, 0.2, 0.4, 0.6), ("stop", "silence", "zero"))
+        pytest.param(*case, marks=[] if case in ONE_OF_EACH else pytest.mark.slow)
+        for case in product((0.05, 0.2, 0.4, 0.6), ("stop", "silence", "zero"))
     ],
 )
 def test_motors_that_are_slow_to_stop_are_no_runaway_and_no_hand(lag: float, way: str) -> None:

@@ -39,14 +39,14 @@ def config(world: World) -> Config:
 
 def applied(world: World) -> list[tuple[float, float]]:
     """Return a list to which each later step with a line adds its time (s) and speed (m/s)."""
-    found: list[tuple[float, float]] = []
+    speeds: list[tuple[float, float]] = []
 
     def note(outputs: Outputs) -> None:
         if outputs.line is not None:
-            found.append((outputs.now.mono_ns / NS_PER_S, outputs.applied.linear))
+            speeds.append((outputs.now.mono_ns / NS_PER_S, outputs.applied.linear))
 
     world.watch = note
-    return found
+    return speeds
 
 
 def slopes(lines: list[tuple[float, float]]) -> list[float]:
@@ -57,11 +57,11 @@ def slopes(lines: list[tuple[float, float]]) -> list[float]:
 def test_a_daemon_without_a_file_keeps_nothing_and_sets_nothing(world: World) -> None:
     wishes = {"settings": {"limits.linear_speed": 0.4}, "keep": True}
     reply = world.call("set", msgspec.json.encode(wishes))
-    told = (
+    message = (
         "no setting was changed: this daemon has no configuration file in which to keep settings; "
         "leave `keep` out of the request"
     )
-    assert (reply.success, reply.message) == (False, told)
+    assert (reply.success, reply.message) == (False, message)
     assert config(world).limits.linear_speed == Config().limits.linear_speed
     assert world.call("set", msgspec.json.encode(wishes | {"keep": False})).success
 
@@ -113,8 +113,8 @@ def test_a_setting_is_in_config_and_in_the_log_with_its_client_and_old_value(
 def test_each_of_several_settings_is_reported(world: World) -> None:
     for speed in (0.9, 0.8, 0.7):
         sets(world, limits__linear_speed=speed)
-    told = [event.text for event in world.events if event.name == "set"]
-    assert told == [
+    texts = [event.text for event in world.events if event.name == "set"]
+    assert texts == [
         "limits.linear_speed = 0.9 (was 1.0)",
         "limits.linear_speed = 0.8 (was 0.9)",
         "limits.linear_speed = 0.7 (was 0.8)",
@@ -236,9 +236,9 @@ def test_rates_and_covariances_are_in_force_from_the_next_message_on(world: Worl
     ).success
     world.bus.wanted.add("odom")
     world.run(2.0)
-    found = world.bus.published["odom"]
-    assert 19 <= len(found) <= 21
-    last = found[-1]
+    messages = world.bus.published["odom"]
+    assert 19 <= len(messages) <= 21
+    last = messages[-1]
     assert isinstance(last, Odometry)
     assert last.pose.covariance[::7] == diagonal
 

@@ -105,7 +105,7 @@ def silence(world: World, dice: random.Random, timeout: float) -> float:
 @pytest.mark.slow
 @pytest.mark.parametrize("count", [50, more(200), long(10_000, 1200)])
 def test_after_silence_the_ramp_starts_within_the_timeout_and_a_tick(count: int) -> None:
-    dice, kept, latest = random.Random(1), 0, 0.0
+    dice, hits, latest = random.Random(1), 0, 0.0
     for trial in range(count):
         if trial % 25 == 0:
             rate = dice.choice((10.0, 20.0, 50.0, 100.0, 100.0, 200.0))
@@ -119,12 +119,12 @@ def test_after_silence_the_ramp_starts_within_the_timeout_and_a_tick(count: int)
             world.run(1.0)
         took = silence(world, dice, timeout)
         late = (took - timeout) * rate
-        kept += 0.0 <= late <= 1.0 + 1e-6
+        hits += 0.0 <= late <= 1.0 + 1e-6
         latest = max(latest, late)
     print(
-        f"\nsilence: {kept} of {count} ramps within timeout + 1 tick; the latest {latest:.3f} tick"
+        f"\nsilence: {hits} of {count} ramps within timeout + 1 tick; the latest {latest:.3f} tick"
     )
-    assert kept == count
+    assert hits == count
 
 
 # b. neutral first
@@ -181,7 +181,7 @@ def start_over(world: World, kind: str, dice: random.Random) -> World:
 @pytest.mark.slow
 @pytest.mark.parametrize("count", [8, more(48), long(1_000, 1800)])
 def test_the_robot_does_not_move_before_neutral_after_any_kind_of_restart(count: int) -> None:
-    dice, kept, seen = random.Random(2), 0, Counter[str]()
+    dice, successes, counts = random.Random(2), 0, Counter[str]()
     world = World()
     world.run(0.3)
     for trial in range(count):
@@ -197,16 +197,18 @@ def test_the_robot_does_not_move_before_neutral_after_any_kind_of_restart(count:
         world.hold(linear, dice.uniform(-1, 1), 1.5, source, hz)
         lines = [line for _, line in world.port.sent]
         still = len(lines) > 100 and lines[0] == ZERO and set(lines) == {ZERO}
-        told = world.state.mode == "ready" and f"send a zero first: {source}" in world.state.reason
-        kept += still and told
-        seen[kind] += still and told
+        waiting = (
+            world.state.mode == "ready" and f"send a zero first: {source}" in world.state.reason
+        )
+        successes += still and waiting
+        counts[kind] += still and waiting
         world.run(0.3)
         world.drive(linear, seconds=0.2, source=source)
         assert world.state.mode == "driving"  # it is not simply dead
         world.send(0.0, source=source)
         world.run(1.5)
-    print(f"\nneutral first: {kept} of {count}; {dict(seen)}")
-    assert kept == count
+    print(f"\nneutral first: {successes} of {count}; {dict(counts)}")
+    assert successes == count
 
 
 # c. blackholes
@@ -264,8 +266,8 @@ def blackhole(dice: random.Random, slow: bool, seconds: float) -> tuple[int, int
 def test_no_stale_command_is_obeyed_after_a_blackhole(count: int) -> None:
     dice, stale, backward, accepted = random.Random(3), 0, 0, 0
     for trial in range(count):
-        held, moved, counted = blackhole(dice, trial % 2 == 1, dice.uniform(0.3, 15.0))
-        stale, backward, accepted = stale + held, backward + moved, accepted + counted
+        stale_count, moved, counted = blackhole(dice, trial % 2 == 1, dice.uniform(0.3, 15.0))
+        stale, backward, accepted = stale + stale_count, backward + moved, accepted + counted
     print(
         f"\nblackholes: {count}, {stale} stale commands held back, {accepted} accepted, "
         f"{backward} lines moved by them"
@@ -305,10 +307,10 @@ def trouble(world: World, kind: str, dice: random.Random) -> str:
     if kind == "unplug":
         world.port.unplug()
         world.hold(linear, seconds=seconds)
-        found = _word(world, "reopened")
+        word = _word(world, "reopened")
         world.mcu = FakeMcu(world.config, world.now_ns)
         world.port.plug(world.mcu)
-        return found
+        return word
     if kind == "block":
         world.port.blocked = True
         world.hold(linear, seconds=seconds)
@@ -358,8 +360,8 @@ def recover(world: World) -> None:
 
 def empty(world: World) -> int:
     """Delete the messages that only the test stores. Return the number of memory blocks in use."""
-    for kept in (world.events, world.bus.replies, world.bus.finished, world.port.sent):
-        kept.clear()
+    for messages in (world.events, world.bus.replies, world.bus.finished, world.port.sent):
+        messages.clear()
     world.mcu.heard.clear()
     gc.collect()
     return sys.getallocatedblocks()
@@ -426,8 +428,8 @@ def walk(count: int, jumps: bool) -> tuple[int, int, list[int], object]:
         nonlocal ticks
         ticks += outputs.due
         for estimate in outputs.estimates:
-            told = (estimate.at.mono_ns, msgspec.to_builtins(estimate.pose), estimate.positions)
-            trace[0] = zlib.crc32(repr(told).encode(), trace[0])
+            values = (estimate.at.mono_ns, msgspec.to_builtins(estimate.pose), estimate.positions)
+            trace[0] = zlib.crc32(repr(values).encode(), trace[0])
         if outputs.line is not None:
             trace[1] = zlib.crc32(b"%d %s" % (outputs.now.mono_ns, outputs.line), trace[1])
 
@@ -492,14 +494,14 @@ def poured_out(dice: random.Random, way: Way, running: bool) -> bool:
 def test_no_backlog_moves_the_robot_for_a_new_or_a_known_sender(
     count: int,
 ) -> None:
-    dice, kept, seen = random.Random(7), 0, Counter[str]()
+    dice, successes, counts = random.Random(7), 0, Counter[str]()
     for trial in range(count):
         way, running = STAMPED[trial % len(STAMPED)], trial % 8 >= 4
         still = not poured_out(dice, way, running)
-        kept += still
-        seen[f"{way}, {'running' if running else 'fresh'}"] += not still
-    print(f"\nbacklogs: {count - kept} of {count} moved the robot {dict(+seen)}")
-    assert kept == count
+        successes += still
+        counts[f"{way}, {'running' if running else 'fresh'}"] += not still
+    print(f"\nbacklogs: {count - successes} of {count} moved the robot {dict(+counts)}")
+    assert successes == count
 
 
 @pytest.mark.slow
@@ -515,16 +517,16 @@ def test_a_replay_in_real_time_by_a_new_sender_looks_like_a_clock_that_is_behind
     for known in (False, True):
         world = World()
         world.run(0.3)
-        speaker, held = Speaker(world, way), []
+        speaker, messages = Speaker(world, way), []
         if known:
             speaker.open()
             world.run(1.0)
         for number in range(80):
-            held.append(speaker.message(0.0 if number < 20 else 0.4))
+            messages.append(speaker.message(0.0 if number < 20 else 0.4))
             world.run(0.05)
         world.run(5.0)
         since_ns = world.now_ns
-        for message in held:
+        for message in messages:
             speaker.deliver(message)
             world.run(0.05)
         assert moved(world, since_ns) is not known
@@ -564,12 +566,12 @@ def stale_moves(world: World, speaker: Speaker, cut: float) -> bool:
     If the sender's clock has gained time, its commands look fresher by that time, so the newest
     commands are left out.
     """
-    held, end_ns = [], world.now_ns + int(cut * NS_PER_S)
+    messages, end_ns = [], world.now_ns + int(cut * NS_PER_S)
     while world.now_ns < end_ns:
-        held.append(speaker.message(-0.5))
+        messages.append(speaker.message(-0.5))
         world.run(0.05)
     since_ns = world.now_ns
-    for message in held[: -6 - round(20 * max(0.0, speaker.gained))]:
+    for message in messages[: -6 - round(20 * max(0.0, speaker.gained))]:
         speaker.deliver(message)
         world.run(0.001)
     world.run(0.1)
@@ -605,8 +607,8 @@ def test_a_sender_s_clock_may_have_any_offset_and_be_adjusted_at_any_time(count:
         step = dice.choice((-1, 1)) * dice.choice((0.1, 0.3, 1.0, dice.uniform(0.1, 10.0)))
         if way == "zenoh":  # one that is ahead is unstamped, as Zenoh replaces it
             ahead = -abs(ahead) - 10.0
-        found = stepped(dice, way, ahead, step)
-        wrong[found] += bool(found)
+        error = stepped(dice, way, ahead, step)
+        wrong[error] += bool(error)
     print(f"\nclocks set: {count} by 0.1 to 10 s, wrong: {dict(+wrong)}")
     assert not +wrong
 
@@ -707,13 +709,15 @@ def stuck(dice: random.Random, way: Way, hz: float, kind: str) -> bool:
     ],
 )
 def test_a_sender_that_never_returns_to_neutral_never_drives_again(kind: str, count: int) -> None:
-    dice, found = random.Random(9), Counter[str]()
+    dice, failures = random.Random(9), Counter[str]()
     ways: tuple[Way, ...] = (*STAMPED, "plain", "bridge")
     for trial in range(count * len(RATES_HZ)):
         way, hz = ways[trial % len(ways)], RATES_HZ[trial % len(RATES_HZ)]
-        found[f"{way} at {hz:g} Hz"] += stuck(dice, way, hz, kind)
-    print(f"\n{kind}: {found.total()} of {count * len(RATES_HZ)} moved the robot {dict(+found)}")
-    assert not +found
+        failures[f"{way} at {hz:g} Hz"] += stuck(dice, way, hz, kind)
+    print(
+        f"\n{kind}: {failures.total()} of {count * len(RATES_HZ)} moved the robot {dict(+failures)}"
+    )
+    assert not +failures
 
 
 @pytest.mark.slow
@@ -723,7 +727,7 @@ def test_a_sender_that_never_returns_to_neutral_never_drives_again(kind: str, co
 def test_zeros_of_another_sender_do_not_arm_a_stalled_sender_that_looks_the_same(
     count: int, way: Way
 ) -> None:
-    dice, found = random.Random(10), 0
+    dice, failures = random.Random(10), 0
     for trial in range(count):
         world = World()
         world.run(0.3)
@@ -740,5 +744,5 @@ def test_zeros_of_another_sender_do_not_arm_a_stalled_sender_that_looks_the_same
         speaker.send(0.0)
         world.run(stall * 0.1)
         speaker.hold(0.5, 1.5, hz)
-        found += moved(world, since_ns)
-    assert found == 0
+        failures += moved(world, since_ns)
+    assert failures == 0

@@ -45,13 +45,13 @@ def config(world: World) -> Config:
 
 def fastest(world: World) -> list[float]:
     """Return a list to which each later step adds its linear speed in m/s, without its sign."""
-    found: list[float] = []
+    speeds: list[float] = []
 
     def note(outputs: Outputs) -> None:
-        found.append(abs(outputs.applied.linear))
+        speeds.append(abs(outputs.applied.linear))
 
     world.watch = note
-    return found
+    return speeds
 
 
 @pytest.mark.slow
@@ -68,9 +68,9 @@ def test_a_zone_slows_the_robot_and_its_end_lets_it_go_on_as_before(world: World
     world.hold(0.8, seconds=1.5)
     assert world.state.linear == pytest.approx(0.8, abs=0.02)
     assert (world.state.speed_limit, config(world)) == ("", Config())
-    told = [(event.text, event.by.rpartition(") ")[2]) for event in world.events
+    events = [(event.text, event.by.rpartition(") ")[2]) for event in world.events
             if event.name == "set"]  # fmt: skip
-    assert told == [
+    assert events == [
         ("limits.linear_speed = 0.25 (was 1.0)", "on the key speed_limit"),
         ("limits.linear_speed = 1.0 (was 0.25)", "on the key speed_limit"),
     ]

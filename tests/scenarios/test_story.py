@@ -168,8 +168,8 @@ def full_disk() -> Iterator[None]:
 
 def by(name: str, source: str = "") -> str:
     """Return a pattern that matches the part of a line which names this client and its source."""
-    found = f"{re.escape(name)}/[0-9a-f]{{16}}"
-    return rf"\(by {source} \({found}\)\)" if source else rf"\(by {found} \(native\)\)"
+    client = f"{re.escape(name)}/[0-9a-f]{{16}}"
+    return rf"\(by {source} \({client}\)\)" if source else rf"\(by {client} \(native\)\)"
 
 
 NINE = 1_800_000_000 * NS_PER_S
@@ -412,15 +412,15 @@ def reported(where: Path, directory: Path) -> list[Line]:
     cells = (
         r'<td class="time">(.*?)</td><td class="name .*?">(.*?)</td><td>(.*?)</td><td>(.*?)</td>'
     )
-    found = []
+    lines = []
     for path in sorted(directory.glob("*.html")):
         page = path.read_text(encoding="utf-8")
         (began,) = re.findall(r"<dt>When</dt><dd>(\S+) ", page)
         for row in re.findall(f"<tr>{cells}</tr>", page):
             at, name, text, client = map(html.unescape, row)
-            who = f" (by {client})" if client else ""
-            found.append(Line(seconds_of(at, began), f"{name}: {text}{who}"))
-    return found
+            author = f" (by {client})" if client else ""
+            lines.append(Line(seconds_of(at, began), f"{name}: {text}{author}"))
+    return lines
 
 
 def exported(where: Path, directory: Path) -> list[Line]:
@@ -431,15 +431,15 @@ def exported(where: Path, directory: Path) -> list[Line]:
 
 def log_of(path: Path) -> list[Line]:
     """Return the lines of the topic `log` in an exported file."""
-    found = []
+    lines = []
     with path.open("rb") as stream:
         reader = make_reader(stream, decoder_factories=[DecoderFactory()])
         for decoded in reader.iter_decoded_messages("/log"):
             message = decoded.decoded_message
             seconds = message.stamp.sec + message.stamp.nanosec / 1e9
             text = f"{message.name.replace('_', ' ')}: {message.msg}"
-            found.append(Line(seconds, text))
-    return found
+            lines.append(Line(seconds, text))
+    return lines
 
 
 class Story(NamedTuple):
@@ -495,7 +495,9 @@ def test_the_three_outputs_have_the_same_lines_at_the_same_times(story: Story) -
     for output in ("report", "export"):
         lines = story.outputs[output]
         assert [line.text for line in lines] == [line.text for line in show], output
-        apart = [abs(one.seconds - other.seconds) for one, other in zip(lines, show, strict=True)]
+        apart = [
+            abs(entry.seconds - other.seconds) for entry, other in zip(lines, show, strict=True)
+        ]
         assert max(apart) < 0.002, output
 
 

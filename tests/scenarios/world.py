@@ -85,9 +85,9 @@ class VirtualPort:
     def take(self, late: Instant | None = None) -> tuple[Received, ...]:
         if not self._received:
             return ()
-        got = tuple(self._received)
+        batch = tuple(self._received)
         self._received.clear()
-        return got
+        return batch
 
     def offer(self, line: bytes, now: Instant) -> Offered:
         if self.mcu is None:
@@ -121,7 +121,7 @@ class MemoryBus:
     def take(self, queries: int) -> BusInput:
         if not (self.arrivals or self.queries):
             return NO_INPUT
-        got = BusInput(
+        batch = BusInput(
             tuple(self.arrivals),
             tuple(self.queries[:queries]),
             overrun_sources=tuple(sorted(self.overrun_sources)),
@@ -129,7 +129,7 @@ class MemoryBus:
         self.arrivals.clear()
         self.overrun_sources.clear()
         del self.queries[:queries]
-        return got
+        return batch
 
     def publish(self, key: str, message: Message) -> None:
         self.published.setdefault(key, deque(maxlen=100_000)).append(message)
@@ -214,8 +214,8 @@ class World:
         self.truth = sight.pose
         if not self.gyro_dead:
             wall_ns = sight.at_ns + self.wall_offset_ns - int(self.config.sim.gyro_delay * NS_PER_S)
-            said = turn_rate(sight, "base_link", self.config.sim.gyro_noise, wall_ns)
-            payload, signed = encode(said, "msgpack"), Signature(SIMULATOR_SENDER).pack()
+            message = turn_rate(sight, "base_link", self.config.sim.gyro_noise, wall_ns)
+            payload, signed = encode(message, "msgpack"), Signature(SIMULATOR_SENDER).pack()
             self.bus.arrivals.append(
                 Arrival("imu", True, payload, "", sight.at_ns, None, "", "native", signed)
             )

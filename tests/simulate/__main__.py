@@ -32,11 +32,11 @@ MOST_SHRUNK = 3
 
 def commit() -> str:
     """Return the commit of this checkout, with a + if files have changed since."""
-    told = subprocess.run(
+    result = subprocess.run(
         ["git", "describe", "--always", "--dirty=+"],
         capture_output=True, text=True, check=False, cwd=HERE,
     )  # fmt: skip
-    return told.stdout.strip() or "unknown"
+    return result.stdout.strip() or "unknown"
 
 
 def results(seed: int, seconds: float, workers: int, within_s: float) -> Iterator[Result]:
@@ -52,8 +52,8 @@ def results(seed: int, seconds: float, workers: int, within_s: float) -> Iterato
         following, total = seed + workers, 0.0
         while running:
             done, running = wait(running, return_when=FIRST_COMPLETED)
-            for one in done:
-                result = one.result()
+            for future in done:
+                result = future.result()
                 total += result.simulated_s
                 yield result
                 if total < seconds and time.monotonic() < end:

@@ -198,7 +198,7 @@ class Run:
         return self.counts
 
     def _begin(self) -> None:
-        plan, seen = self.plan, Counter[str]()
+        plan, clocks = self.plan, Counter[str]()
         self.lasting = [(name, tuple(values)) for name, *values in plan["board"]]
         self.active = list(self.lasting)
         self._board()
@@ -207,13 +207,13 @@ class Run:
             for shape in sender["congestion"]:
                 self.counts[f"congestion {shape[2]}"] += 1
             if sender["way"] in ("header", "bridged"):
-                seen[f"header native/{sender['source']}" if sender["way"] == "header"
+                clocks[f"header native/{sender['source']}" if sender["way"] == "header"
                      else "session of the bridge"] += 1  # fmt: skip
             elif sender["way"] == "routed":
-                seen.update({name for _, name in sender["routers"]})
+                clocks.update({name for _, name in sender["routers"]})
             else:
                 for own in (sender["id"], f"session of {sender['id']}"):
-                    seen[own] += 1
+                    clocks[own] += 1
             if sender["churn"]:
                 self.witness.churned.add(sender["source"])
             queue = messages(sender, plan["seed"], plan["seconds"], START_NS + WALL_OFFSET_NS)
@@ -223,7 +223,7 @@ class Run:
             if sender["name"] in self.liveness.lawful and sender["way"] in FOREIGN:
                 for _, at, *_ in sender["clock"]:
                     self.at(int(at * NS), lambda: self.liveness.event(TROUBLE_NS))
-        several = (name for name, count in seen.items() if count > 1)
+        several = (name for name, count in clocks.items() if count > 1)
         self.witness.shared_clocks = frozenset(several)
         for event in plan["events"]:
             self.counts[f"event {event['do']} {event.get('verb', '')}".strip()] += 1
@@ -248,15 +248,15 @@ class Run:
             return
         waited_ns = self._bus_ns if self._bus_ns <= self.true_ns else 0
         at_ns = self._arrival(max(message.arrives_ns, waited_ns))
-        one = sample(sender, message, self.plan["config"], self.product.wall_ns)
+        command = sample(sender, message, self.plan["config"], self.product.wall_ns)
         true_ns = at_ns - START_NS + self.slept_ns
-        wish = self.witness.command(sender, message, one, true_ns)
-        self.followed.command(sender, message, one, at_ns, wish)
-        self.liveness.command(sender, one)
-        self.reasons.command(sender, message, one)
-        shared = one.clock in self.witness.shared_clocks
-        self.reports.command(sender, message, one, at_ns, shared)
-        self.product.deliver(at_ns, one.key, one.payload, **one.options)
+        wish = self.witness.command(sender, message, command, true_ns)
+        self.followed.command(sender, message, command, at_ns, wish)
+        self.liveness.command(sender, command)
+        self.reasons.command(sender, message, command)
+        shared = command.clock in self.witness.shared_clocks
+        self.reports.command(sender, message, command, at_ns, shared)
+        self.product.deliver(at_ns, command.key, command.payload, **command.options)
 
     def _dropped(self, key: str) -> None:
         """Note that the inbox dropped its oldest message of this key unread."""
@@ -496,7 +496,7 @@ class Run:
         """Apply all active faults to the simulated board."""
         self.product.board(list(self.active))
         self._names = {name for name, _ in self.active}
-        new = [one for one in self.active if one not in self.lasting]
+        new = [entry for entry in self.active if entry not in self.lasting]
         self._troubling = [name for name, _ in new if name not in NO_TROUBLE]
         added = self.active[len(self.lasting) :]
         self.witness.lies = [fault for fault in added if fault[0] not in NO_TROUBLE]
@@ -535,8 +535,8 @@ class Run:
         if not self.product.plugged:
             if without:
                 names = tuple(without)
-                self.lasting = [one for one in self.lasting if not one[0].startswith(names)]
-                self.active = [one for one in self.active if not one[0].startswith(names)]
+                self.lasting = [fault for fault in self.lasting if not fault[0].startswith(names)]
+                self.active = [fault for fault in self.active if not fault[0].startswith(names)]
                 self._board()
                 self.inputs.replaced()
             self.product.plug(new)
@@ -662,11 +662,11 @@ class Run:
         if self._linked:
             self.witness.arming(true_ns)
 
-    def _see(self, seen: Seen) -> None:
+    def _see(self, snapshot: Seen) -> None:
         if self.failure is not None:
             return
         try:
-            self._judge(seen)
+            self._judge(snapshot)
         except BrokenError as error:
             self.failure = error
 
@@ -693,22 +693,24 @@ class Run:
         """Return the number of good lines that the daemon has counted."""
         return int(self.product.state()["counters"]["lines"])
 
-    def _judge(self, seen: Seen) -> None:
+    def _judge(self, snapshot: Seen) -> None:
         witness, offset = self.witness, self.slept_ns - START_NS
-        true_ns = seen.at_ns + offset
-        if seen.at_ns - seen.decided_ns > NS // 1000:
+        true_ns = snapshot.at_ns + offset
+        if snapshot.at_ns - snapshot.decided_ns > NS // 1000:
             # A stall in a step waits for a step that makes a line.
             self._stalled_ns = max(self._stalled_ns, true_ns)
         witness.read()
-        self.longest_reason = max(self.longest_reason, len(seen.reason))
+        self.longest_reason = max(self.longest_reason, len(snapshot.reason))
         if self._puts_ns:
-            self._puts_ns = [at_ns for at_ns in self._puts_ns if at_ns > seen.decided_ns + offset]
+            self._puts_ns = [
+                at_ns for at_ns in self._puts_ns if at_ns > snapshot.decided_ns + offset
+            ]
         if self.product.disk.full:
             self._full_ns = true_ns
         if witness.blocked_ns is not None:
             self._blocked_ns = true_ns
         calm_ns = max(self._stalled_ns - offset, self.resumed_ns)
-        self.inputs.take(seen.decided_ns, offset, calm_ns)
+        self.inputs.take(snapshot.decided_ns, offset, calm_ns)
         if self._calls:
             self._take_answers()
             self._late_answers(true_ns)
@@ -721,8 +723,8 @@ class Run:
                 self.pose.placed()
         for name in self._troubling:
             witness.troubles[name] = true_ns
-        if seen.followed_ns is not None:
-            clock = self.reports.follows(true_ns, seen.followed_ns)
+        if snapshot.followed_ns is not None:
+            clock = self.reports.follows(true_ns, snapshot.followed_ns)
             if clock:
                 witness.ages.clocks[clock].followed = True
         witness.away = self.inputs.limiting
@@ -731,22 +733,24 @@ class Run:
             witness.disarmed_ns = max(witness.disarmed_ns, true_ns)
             self.followed.forget()
             self.liveness.event()
-        self.followed.step(true_ns, seen.decided_ns, seen.followed_ns, seen.mode, seen.link)
-        if any(name == "fault" for name, _, _ in seen.events):
-            witness.faults.append(seen.decided_ns + offset)
-        witness.step(seen.decided_ns + offset, seen.mode, seen.reason, self._fed_ns)
-        if seen.link == "up" and self._link not in ("up", "stale"):
+        self.followed.step(
+            true_ns, snapshot.decided_ns, snapshot.followed_ns, snapshot.mode, snapshot.link
+        )
+        if any(name == "fault" for name, _, _ in snapshot.events):
+            witness.faults.append(snapshot.decided_ns + offset)
+        witness.step(snapshot.decided_ns + offset, snapshot.mode, snapshot.reason, self._fed_ns)
+        if snapshot.link == "up" and self._link not in ("up", "stale"):
             # Commands that came before the link do not count.
             witness.disarmed_ns = max(witness.disarmed_ns, true_ns)
-        self._link = seen.link
-        witness.linked = seen.link == "up"
+        self._link = snapshot.link
+        witness.linked = snapshot.link == "up"
         # Lines without the check that the configuration requires make no link.
         self._linked |= witness.linked
         witness.cut |= not witness.linked
-        self._whole = bool(seen.lines) and seen.lines[-1][1].endswith(b"\n")
-        for at_ns, line in seen.lines:
+        self._whole = bool(snapshot.lines) and snapshot.lines[-1][1].endswith(b"\n")
+        for at_ns, line in snapshot.lines:
             before = witness.last
-            witness.line(at_ns + offset, line, self._fed_ns, seen.decided_ns + offset)
+            witness.line(at_ns + offset, line, self._fed_ns, snapshot.decided_ns + offset)
             self.followed.line(true_ns, before, witness.last)
             if witness.linked:  # the daemon that has lost the link believes no line
                 self.echo.line(at_ns + offset, witness.last)
@@ -754,38 +758,40 @@ class Run:
                     self.half_duplex.line(witness.last)
             if any(witness.last):
                 self.moved_ns = at_ns + offset
-        told = seen.mode == "driving" and not witness.pending and not self.inputs.limiting
-        driven = self.followed.wish if told else None
-        whole = sum(line.endswith(b"\n") for _, line in seen.lines)
+        driving = snapshot.mode == "driving" and not witness.pending and not self.inputs.limiting
+        driven = self.followed.wish if driving else None
+        whole = sum(line.endswith(b"\n") for _, line in snapshot.lines)
         self.course.step(true_ns, driven, witness.last, whole)
         self.liveness.look(true_ns)
         self.reasons.look(true_ns, self._stalled_ns)
         if self._plain and not self.echo.on:
             self.damage.look(true_ns, self._lines, self._stalled_ns == true_ns)
-        if seen.estimates:
+        if snapshot.estimates:
             lies, truth = self._names, self.product.truth()
             self.pose.gyro(true_ns, self.product.gyro)
-            self.pose.see(true_ns, seen.estimates, truth, offset, lies)
+            self.pose.see(true_ns, snapshot.estimates, truth, offset, lies)
             if self.half_duplex.on:
-                self.half_duplex.see(true_ns, seen.mode, seen.estimates[-1][1:3], truth[1:3])
+                self.half_duplex.see(
+                    true_ns, snapshot.mode, snapshot.estimates[-1][1:3], truth[1:3]
+                )
             if self._stalled_ns > true_ns - NS:
                 self.spread.forget()
-            for estimate in seen.estimates:
+            for estimate in snapshot.estimates:
                 self.spread.see(true_ns, estimate, lies)
             witness.wheels(true_ns, truth[4])
         if self.pose.end_step():
             self.spread.forget()
-        self.log_lines.see(true_ns, seen)
+        self.log_lines.see(true_ns, snapshot)
         calm_ns = max(self._stalled_ns, self._blocked_ns) - offset
-        calm = seen.decided_ns - calm_ns > 3 * witness.period_ns
-        self.inputs.step(true_ns, seen, offset, calm, self.product.state)
-        self.plugging.see(true_ns, seen, self.product, calm_ns)
+        calm = snapshot.decided_ns - calm_ns > 3 * witness.period_ns
+        self.inputs.step(true_ns, snapshot, offset, calm, self.product.state)
+        self.plugging.see(true_ns, snapshot, self.product, calm_ns)
         if self.log is not None:
             self.log(
                 {
-                    "at": seen.at_ns, "mode": seen.mode, "reason": seen.reason,
-                    "lines": [[at, line.decode("latin-1")] for at, line in seen.lines],
-                    "odometry": seen.estimates,
+                    "at": snapshot.at_ns, "mode": snapshot.mode, "reason": snapshot.reason,
+                    "lines": [[at, line.decode("latin-1")] for at, line in snapshot.lines],
+                    "odometry": snapshot.estimates,
                 }
             )  # fmt: skip
 

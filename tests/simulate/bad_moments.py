@@ -32,7 +32,7 @@ def add(plan: Plan) -> None:
         if dice.random() < share and fits(plan):
             plan["moment"] = name
             give(plan, dice)
-            plan["events"].sort(key=lambda one: one["at"])
+            plan["events"].sort(key=lambda event: event["at"])
             return
 
 
@@ -55,7 +55,7 @@ NEW = {"flip", "half_duplex", "constant_answers", "gyro"}
 def _best(plan: Plan) -> dict[str, Any]:
     """Return the source of the highest priority."""
     sources: list[dict[str, Any]] = plan["config"]["commands"]["sources"]
-    return max(sources, key=lambda one: one["priority"])
+    return max(sources, key=lambda source: source["priority"])
 
 
 def _driver(plan: Plan, source: dict[str, Any], **more: Any) -> dict[str, Any]:
@@ -251,7 +251,7 @@ def _inputs(plan: Plan, dice: random.Random, names: tuple[str, ...]) -> str:
     config, name = plan["config"], dice.choice(names)
     config.pop("battery", None)
     config["safety"] = {}
-    plan["board"] = [one for one in plan["board"] if one[0] not in INPUTS]
+    plan["board"] = [fault for fault in plan["board"] if fault[0] not in INPUTS]
     if name == "bumpers":
         config["safety"] = {"bumpers": [dice.choice(PLACES) for _ in range(dice.randint(1, 4))]}
     plan["board"].append({"driver": ["driver_fault", NEVER_S, 1.0]}.get(name, [name]))
@@ -294,15 +294,15 @@ def _other_board(plan: Plan, dice: random.Random) -> None:
     _alone(plan, dice, _drives(plan, dice, 0.3, 1.0, 4.0))
     name = _inputs(plan, dice, ("driver", "estop"))
     at, lasts = round(dice.uniform(3.0, 15.0), 3), round(dice.uniform(0.3, 3.0), 3)
-    gone = round(at + dice.uniform(0.05, 2.0), 3)
+    unplug_s = round(at + dice.uniform(0.05, 2.0), 3)
     plan["events"] = [
         {
             "at": at, "do": "board", "for": plan["seconds"],
             "fault": _press(dice, plan, name, plan["seconds"]),
         },
-        {"at": gone, "do": "unplug", "for": lasts, "new": True, "without": [name]},
-        _call(gone + lasts + 5.0, "clear", named=True),
-        _call(gone + lasts + 6.0, "clear", named=True),
+        {"at": unplug_s, "do": "unplug", "for": lasts, "new": True, "without": [name]},
+        _call(unplug_s + lasts + 5.0, "clear", named=True),
+        _call(unplug_s + lasts + 6.0, "clear", named=True),
     ]  # fmt: skip
 
 

@@ -94,7 +94,7 @@ def add(plan: Plan) -> None:
         dice = random.Random(f"{name} {plan['seed']}")
         if dice.random() < OTHERS:
             give(plan, dice)
-    plan["events"].sort(key=lambda one: one["at"])
+    plan["events"].sort(key=lambda event: event["at"])
 
 
 def _bumpers(plan: Plan, dice: random.Random) -> None:
@@ -231,8 +231,8 @@ def kinds(plan: Plan) -> set[str]:
     `stop` and `away` are bumpers that stop the robot, or from which it may drive away.
     """
     safety, names = plan["config"].get("safety", {}), {name for name, *_ in plan["board"]}
-    found = names & {"estop", "battery", "driver_fault"}
-    return found | ({safety.get("bumper", "stop")} if "bumpers" in safety else set())
+    inputs = names & {"estop", "battery", "driver_fault"}
+    return inputs | ({safety.get("bumper", "stop")} if "bumpers" in safety else set())
 
 
 def removed(plan: Plan) -> Plan:
@@ -550,7 +550,7 @@ class Inputs:
     def step(
         self,
         true_ns: int,
-        seen: Seen,
+        snapshot: Seen,
         offset: int,
         calm: bool,
         state: Callable[[], dict[str, Any]],
@@ -561,69 +561,69 @@ class Inputs:
         """
         if not self._reports:
             return
-        witness, moving = self._witness, self._moving(seen.lines)
+        witness, moving = self._witness, self._moving(snapshot.lines)
         if self._away and self.bumpers.known and b"X" in self.bumpers.marks:
             self._drives_away(true_ns, moving)
-            self._pushes(seen.decided_ns + offset)
+            self._pushes(snapshot.decided_ns + offset)
         for name, pressed_ns in self._stopping():
             since = f"pressed since {pressed_ns / NS:.3f} s"
             if moving:
                 text = f"{moving}, {since}"
                 raise BrokenError(f"nothing moves while {name} is pressed", true_ns, text)
-            if seen.mode not in STOPPED:
-                text = f"{seen.mode}: {seen.reason}, {since}"
+            if snapshot.mode not in STOPPED:
+                text = f"{snapshot.mode}: {snapshot.reason}, {since}"
                 raise BrokenError(f"{name} that is pressed stops the robot", true_ns, text)
-        if self._latches and seen.mode not in STOPPED:
-            text = f"{seen.mode}: {seen.reason}"
+        if self._latches and snapshot.mode not in STOPPED:
+            text = f"{snapshot.mode}: {snapshot.reason}"
             raise BrokenError("a press stops the robot, however short", true_ns, text)
         if self._fresh and moving:
             raise BrokenError("a press is a zero at once", true_ns, str(moving))
-        if not self._mode and self._estopped and PRESSED in seen.reason:
+        if not self._mode and self._estopped and PRESSED in snapshot.reason:
             # A new daemon knows a stop of the emergency stop from its latch file. Only `clear` ends
             # it, also if a full disk has lost the `clear` of the daemon before.
             self._powered = self._driver_faulted = False
-        self._drivers(true_ns, seen)
-        self._answers(true_ns, seen, calm)
-        self._keeps_names(true_ns, seen)
+        self._drivers(true_ns, snapshot)
+        self._answers(true_ns, snapshot, calm)
+        self._keeps_names(true_ns, snapshot)
         for name in self._needed:
             known = self.estop if name == "estop" else self.bumpers
-            if known.awaited and (moving or seen.mode in ("ready", "driving")):
-                text = f"{seen.mode}, and the board has not reported {name}"
+            if known.awaited and (moving or snapshot.mode in ("ready", "driving")):
+                text = f"{snapshot.mode}, and the board has not reported {name}"
                 raise BrokenError("a robot waits for its inputs", true_ns, text)
-        self._empty(true_ns, seen)
+        self._empty(true_ns, snapshot)
         if self._doubtful:  # a clear that is answered only now may be older than the doubt
             witness.perhaps_latched.add("clear")
         causes = witness.stops or witness.perhaps_latched or witness.pending
-        if seen.mode == "stopped" and self._mode not in (*STOPPED, "") and not causes:
-            raise BrokenError("no stop without a cause", true_ns, seen.reason)
+        if snapshot.mode == "stopped" and self._mode not in (*STOPPED, "") and not causes:
+            raise BrokenError("no stop without a cause", true_ns, snapshot.reason)
         maybe = "maybe" in (self.estop.silent, self.bumpers.silent)
-        if self._doubtful and not maybe and seen.mode in ("ready", "driving"):
+        if self._doubtful and not maybe and snapshot.mode in ("ready", "driving"):
             self._doubtful = False
             witness.perhaps_latched.discard("clear")
-        self._mode, self._stepped_ns = seen.mode, true_ns
+        self._mode, self._stepped_ns = snapshot.mode, true_ns
         self._before = witness.last, witness.last_ns
-        self._looked_ns = self._looked_ns or seen.decided_ns
-        if seen.decided_ns - self._looked_ns > NS:
-            self._looked_ns = seen.decided_ns
-            self._state(true_ns, state(), seen.decided_ns)
+        self._looked_ns = self._looked_ns or snapshot.decided_ns
+        if snapshot.decided_ns - self._looked_ns > NS:
+            self._looked_ns = snapshot.decided_ns
+            self._state(true_ns, state(), snapshot.decided_ns)
 
-    def _keeps_names(self, true_ns: int, seen: Seen) -> None:
+    def _keeps_names(self, true_ns: int, snapshot: Seen) -> None:
         """Check that the reason names a client that has stopped the robot, until a clear.
 
         The judge learns a client's name from the answer to its stop, and forgets all names when the
         daemon ends. The reason names only a few clients. If it names the maximum number, the
         clients known to the judge may be missing.
         """
-        if not self._names or seen.mode not in STOPPED:
+        if not self._names or snapshot.mode not in STOPPED:
             self._names.clear()
-        elif seen.mode == "stopped" and not self._witness.pending:
+        elif snapshot.mode == "stopped" and not self._witness.pending:
             self._witness.counts["names of stops"] += 1
-            known = any(name in seen.reason for _, name in self._names)
-            if not known and len(CLIENT.findall(seen.reason)) < MAX_CLIENTS:
-                text = f"{[name for _, name in self._names]} asked, and it is {seen.reason!r}"
+            known = any(name in snapshot.reason for _, name in self._names)
+            if not known and len(CLIENT.findall(snapshot.reason)) < MAX_CLIENTS:
+                text = f"{[name for _, name in self._names]} asked, and it is {snapshot.reason!r}"
                 raise BrokenError("a stop keeps the name of its client", true_ns, text)
 
-    def _drivers(self, true_ns: int, seen: Seen) -> None:
+    def _drivers(self, true_ns: int, snapshot: Seen) -> None:
         """Check that a fault of a motor driver stops the robot.
 
         A pressed emergency stop removes the drivers' power, and the fault that they then report
@@ -634,20 +634,22 @@ class Inputs:
         free |= estop.known and estop.marks == b"." and not self._fresh
         pressed = estop.pressed_ns is not None and estop.pressed_ns < self._stepped_ns
         pressed |= not self._witness.driver_fault
-        began = seen.mode == "fault" != self._mode and DRIVER in seen.reason.partition(";")[0]
+        began = (
+            snapshot.mode == "fault" != self._mode and DRIVER in snapshot.reason.partition(";")[0]
+        )
         if self._driver_faulted and free:
-            if seen.mode not in ("fault", "shutdown"):
-                text = f"{seen.mode}: {seen.reason}"
+            if snapshot.mode not in ("fault", "shutdown"):
+                text = f"{snapshot.mode}: {snapshot.reason}"
                 raise BrokenError("a fault of a motor driver stops the robot", true_ns, text)
             if began:
                 self._witness.counts["driver fault"] += 1
                 self._ramps(true_ns, "a fault of a motor driver")
         pressed |= self._cut_ns is not None and self._cut_ns < self._stepped_ns
-        if seen.mode not in STOPPED:  # a clear ends the excuse
+        if snapshot.mode not in STOPPED:  # a clear ends the excuse
             self._cut_ns = None
-            self._powered |= seen.mode in ("ready", "driving")
+            self._powered |= snapshot.mode in ("ready", "driving")
         if began and pressed and self._mode:
-            text = f"{seen.reason}, the emergency stop was pressed at {self._cut_ns} ns"
+            text = f"{snapshot.reason}, the emergency stop was pressed at {self._cut_ns} ns"
             raise BrokenError("drivers without power are no fault", true_ns, text)
 
     def _stopping(self) -> Iterator[tuple[str, int]]:
@@ -660,19 +662,19 @@ class Inputs:
 
     def _moving(self, lines: list[tuple[int, bytes]]) -> list[tuple[float, ...]]:
         """Return the wheel speeds of each line that moves a wheel."""
-        found = []
+        speeds = []
         for match in filter(None, (LINE.match(line) for _, line in lines)):
             motors = [float(g[1:]) * (1 if g[:1] == b"p" else -1) for g in match.groups()]
-            found.append(tuple(motors[place] * sign for place, sign in self._witness.motors))
-        return [wheels for wheels in found if any(wheels)]
+            speeds.append(tuple(motors[place] * sign for place, sign in self._witness.motors))
+        return [wheels for wheels in speeds if any(wheels)]
 
-    def _answers(self, true_ns: int, seen: Seen, calm: bool) -> None:
+    def _answers(self, true_ns: int, snapshot: Seen, calm: bool) -> None:
         """Check that the daemon sends a line within a period after a press."""
         if self._due_ns is None:
             return
-        if seen.lines or not calm or seen.link != "up":
+        if snapshot.lines or not calm or snapshot.link != "up":
             self._due_ns = None
-        elif seen.decided_ns > self._due_ns:
+        elif snapshot.decided_ns > self._due_ns:
             text = f"no line until {self._due_ns / NS:.3f} s of its clock"
             raise BrokenError("a press is a zero within a period", true_ns, text)
 
@@ -702,18 +704,18 @@ class Inputs:
         for source, wish in reversed(witness.wishes):
             if wish.arrived_ns <= self._stepped_ns:
                 return
-            who, mine = (source, wish.identity), witness.priority[source]
-            rivals = [one for one in witness.senders if witness.priority[one[0]] >= mine]
+            sender, mine = (source, wish.identity), witness.priority[source]
+            rivals = [rival for rival in witness.senders if witness.priority[rival[0]] >= mine]
             live = now_ns - wish.arrived_ns < witness.timeout[source] - MARGIN_NS
             elsewhere = (wish.v or wish.w) and (not sign or wish.v * sign < -0.01)
-            if who not in latest and rivals == [who] and wish.certain and live and elsewhere:
-                known = witness.senders[who]
+            if sender not in latest and rivals == [sender] and wish.certain and live and elsewhere:
+                known = witness.senders[sender]
                 known.armed_ns = wish.armed_ns = -1
                 known.zeros.clear()
                 witness.counts["pushes against a bumper"] += 1
-            latest.add(who)
+            latest.add(sender)
 
-    def _empty(self, true_ns: int, seen: Seen) -> None:
+    def _empty(self, true_ns: int, snapshot: Seen) -> None:
         """Check the stop of an empty battery. The judge allows a small error of the mean."""
         battery, witness = self.battery, self._witness
         if not battery.bounds:
@@ -723,13 +725,13 @@ class Inputs:
             self._doubtful = True
             witness.perhaps_latched.add("clear")
             return
-        if battery.may["stop"] and seen.mode == "stopped" != self._mode and not witness.stops:
+        if battery.may["stop"] and snapshot.mode == "stopped" != self._mode and not witness.stops:
             witness.counts["battery empty"] += 1
             witness.stops.append(true_ns)
             self._ramps(true_ns, "an empty battery")
         self._empty_ns = (self._empty_ns or true_ns) if battery.must["stop"] else None
-        if battery.must["stop"] and seen.mode not in STOPPED:
-            text = f"{seen.mode}: {seen.reason}, the mean is {battery.mean:.2f}"
+        if battery.must["stop"] and snapshot.mode not in STOPPED:
+            text = f"{snapshot.mode}: {snapshot.reason}, the mean is {battery.mean:.2f}"
             raise BrokenError("an empty battery stops the robot", true_ns, text)
 
     def _ramps(self, true_ns: int, cause: str) -> None:
@@ -743,7 +745,7 @@ class Inputs:
 
     def cleared(self, asked_ns: int) -> None:
         """Check that no input forbade a clear that the daemon has executed."""
-        self._names = [one for one in self._names if one[0] > asked_ns]
+        self._names = [entry for entry in self._names if entry[0] > asked_ns]
         for name, pressed_ns in self._stopping():
             if asked_ns > pressed_ns:
                 text = f"pressed since {pressed_ns / NS:.3f} s"
@@ -770,8 +772,8 @@ class Inputs:
             name = f"the level of the battery of mean {battery.mean:.2f}"
             self._same(true_ns, name, state["battery"]["level"], battery.level)
 
-    def _same(self, true_ns: int, name: str, said: str, expected: set[str]) -> None:
+    def _same(self, true_ns: int, name: str, value: str, expected: set[str]) -> None:
         self._witness.counts["input looks"] += 1
-        if said not in expected:
-            text = f"{name} is {said}, allowed is {sorted(expected)}"
+        if value not in expected:
+            text = f"{name} is {value}, allowed is {sorted(expected)}"
             raise BrokenError("state has the inputs of the board", true_ns, text)

@@ -56,15 +56,15 @@ class Course:
         if not enough or witness.unsure:
             return
         witness.counts["settled speeds"] += 1
-        goal, got = witness.clamped(*wish, witness.limits), witness.twist(wheels)
+        goal, twist = witness.clamped(*wish, witness.limits), witness.twist(wheels)
         room = witness.radius * 0.02
         rooms = room, room / witness.half
-        if any(abs(a - b) > r for a, b, r in zip(got, goal, rooms, strict=True)):
-            raise BrokenError("the robot drives as told", true_ns, f"{got} for {goal} of {wish}")
-        (v, w), (goal_v, goal_w) = got, goal
+        if any(abs(a - b) > r for a, b, r in zip(twist, goal, rooms, strict=True)):
+            raise BrokenError("the robot drives as told", true_ns, f"{twist} for {goal} of {wish}")
+        (v, w), (goal_v, goal_w) = twist, goal
         error = 0.51 * (rooms[0] * abs(goal_w) + rooms[1] * abs(goal_v))
         if wheels != ZERO and abs(v * goal_w - w * goal_v) > error:
-            raise BrokenError("the robot drives on the curve", true_ns, f"{got} for {goal}")
+            raise BrokenError("the robot drives on the curve", true_ns, f"{twist} for {goal}")
 
     def _begin(self, goal: tuple[object, ...], true_ns: int, wheels: tuple[float, ...]) -> None:
         """Expect a new ramp from these wheel speeds to the goal."""
@@ -90,9 +90,9 @@ class Course:
         seconds, due = (true_ns - self._from_ns - LATE_NS - witness.period_ns) / NS, 0.0
         if seconds <= 0.0:
             return
-        room, got = witness.radius * 0.02, witness.twist(wheels)
+        room, twist = witness.radius * 0.02, witness.twist(wheels)
         rooms, aims = (room, room / witness.half), witness.clamped(*wish, limits)
-        if all(abs(a - b) <= r for a, b, r in zip(got, aims, rooms, strict=True)):
+        if all(abs(a - b) <= r for a, b, r in zip(twist, aims, rooms, strict=True)):
             self._reached = wheels
             return
         begun = witness.twist(self._from)
@@ -106,5 +106,5 @@ class Course:
             return
         raise BrokenError(
             "a ramp ends in time", true_ns,
-            f"{got} for {aims} of {wish}, on a ramp from {begun} at {self._from_ns / NS:.3f} s",
+            f"{twist} for {aims} of {wish}, on a ramp from {begun} at {self._from_ns / NS:.3f} s",
         )  # fmt: skip

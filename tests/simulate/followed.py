@@ -146,47 +146,47 @@ class Followed:
         self._count += 1
         if wish is None:
             return
-        who = sender["source"], sample.identity
+        key = sender["source"], sample.identity
         numbered = sender["way"] in NUMBERED and not sample.shared
-        found = Command(
-            at_ns, wish.arrived_ns, who, sender, message, sample.clock, wish.v, wish.w, numbered
+        command = Command(
+            at_ns, wish.arrived_ns, key, sender, message, sample.clock, wish.v, wish.w, numbered
         )
-        if self._is_overtaken(found):
-            found = found._replace(overtaken=True)
+        if self._is_overtaken(command):
+            command = command._replace(overtaken=True)
         else:
-            self._latest[who] = found
+            self._latest[key] = command
         if not (wish.v or wish.w or message.junk):
-            self._rests_ns[who] = at_ns
-            insort(self._stamps_ns.setdefault(who, []), message.stamp_ns)
-            self._zero_ns[who] = max(message.sent_ns, self._zero_ns.get(who, 0))
+            self._rests_ns[key] = at_ns
+            insort(self._stamps_ns.setdefault(key, []), message.stamp_ns)
+            self._zero_ns[key] = max(message.sent_ns, self._zero_ns.get(key, 0))
         if self._keeper is not None:
             priority = self._witness.priority
-            if self._keeper.who == who:
+            if self._keeper.who == key:
                 self._go_on(at_ns)
-            elif priority[who[0]] > priority[self._keeper.who[0]]:
+            elif priority[key[0]] > priority[self._keeper.who[0]]:
                 self._higher.append(wish)
-        self._arrived[at_ns] = None if at_ns in self._arrived else found
+        self._arrived[at_ns] = None if at_ns in self._arrived else command
         if len(self._arrived) > KEPT:
             del self._arrived[next(iter(self._arrived))]
-        if self._certain(found, sample, wish):
-            self._waiting[who] = found
+        if self._certain(command, sample, wish):
+            self._waiting[key] = command
 
-    def _is_overtaken(self, found: Command) -> bool:
+    def _is_overtaken(self, command: Command) -> bool:
         """Return whether a later zero of the same sender arrived before this speed.
 
         A zero that arrived more than the timeout earlier does not count, because the sender may
         have restarted its numbers since.
         """
-        zero, timeout_ns = self._latest.get(found.who), self._witness.timeout[found.who[0]]
+        zero, timeout_ns = self._latest.get(command.who), self._witness.timeout[command.who[0]]
         return (
             zero is not None
             and zero.zero
-            and not found.zero
+            and not command.zero
             and zero.numbered
-            and found.numbered
-            and zero.sender is found.sender
-            and zero.message.number > found.message.number
-            and found.arrived_ns - zero.arrived_ns < timeout_ns - MARGIN_NS
+            and command.numbered
+            and zero.sender is command.sender
+            and zero.message.number > command.message.number
+            and command.arrived_ns - zero.arrived_ns < timeout_ns - MARGIN_NS
         )
 
     def _go_on(self, at_ns: int) -> None:
@@ -202,12 +202,12 @@ class Followed:
         else:
             self._keeper = None
 
-    def _certain(self, found: Command, sample: Sample, wish: Wish) -> bool:
+    def _certain(self, command: Command, sample: Sample, wish: Wish) -> bool:
         """Return whether the daemon certainly accepts this command."""
-        witness, sender, message = self._witness, found.sender, found.message
+        witness, sender, message = self._witness, command.sender, command.message
         newest = self._newest.get(sample.clock, 0)
         self._newest[sample.clock] = max(newest, message.number)
-        if found.who[0] in witness.churned or message.junk or sender.get("stamps_speeds"):
+        if command.who[0] in witness.churned or message.junk or sender.get("stamps_speeds"):
             return False
         if not sample.clock:
             # A zero of a shared identity counts only behind its pause.
@@ -225,8 +225,10 @@ class Followed:
             # no longer count the commands before.
             self._fell_ns[sample.clock] = wish.arrived_ns
             for commands in (self._waiting, self._sure):
-                for who in [who for who, one in commands.items() if one.clock == sample.clock]:
-                    del commands[who]
+                for key in [
+                    key for key, waiting in commands.items() if waiting.clock == sample.clock
+                ]:
+                    del commands[key]
         # The daemon may know a clock that it has never followed, also behind a silence.
         least = min(least, age)
         self._least[sample.clock] = witness.ages.learned_ns, least
@@ -239,7 +241,7 @@ class Followed:
         ):
             run = self._runs[sample.clock] = Run(at_ns, age)
         run.low, run.high, run.last_ns = min(run.low, age), max(run.high, age), at_ns
-        timeout_ns = witness.timeout[found.who[0]]
+        timeout_ns = witness.timeout[command.who[0]]
         proof_ns = 3 * NS + 2 * min(timeout_ns, 2 * NS)
         if sender["way"] in FOREIGN and age - least > timeout_ns - FALL_NS:
             self._late_ns[sample.clock] = at_ns
@@ -268,14 +270,14 @@ class Followed:
             return None
         return None if holder.overtaken else (holder.v, holder.w)
 
-    def _has_later_zero(self, found: Command) -> bool:
+    def _has_later_zero(self, command: Command) -> bool:
         """Return whether a zero of the same sender has a stamp that is later by up to the timeout.
 
         The daemon ignores a zero whose stamp is later by more than that.
         """
-        stamps_ns, stamp_ns = self._stamps_ns.get(found.who, []), found.message.stamp_ns
+        stamps_ns, stamp_ns = self._stamps_ns.get(command.who, []), command.message.stamp_ns
         place = bisect_right(stamps_ns, stamp_ns)
-        longest_ns = self._witness.timeout[found.who[0]]
+        longest_ns = self._witness.timeout[command.who[0]]
         return place < len(stamps_ns) and stamps_ns[place] - stamp_ns <= longest_ns
 
     @property
@@ -315,18 +317,18 @@ class Followed:
             # command nevertheless.
             self._keeper = None
         self._higher.clear()
-        found = None if followed_ns is None else self._arrived.get(followed_ns)
-        if found is not None:
-            self._first_keeps(true_ns, decided_ns, found)
-            self._highest_wins(true_ns, decided_ns, found)
-            self._newest_counts(true_ns, decided_ns, found)
-            if found.clock and not stable(found.sender):
-                self._adjusted_needs_zero(true_ns, found)
-            if found.clock in self._runs:
-                run = self._runs[found.clock]
-                run.followed |= found.true_ns >= run.begun_ns
+        command = None if followed_ns is None else self._arrived.get(followed_ns)
+        if command is not None:
+            self._first_keeps(true_ns, decided_ns, command)
+            self._highest_wins(true_ns, decided_ns, command)
+            self._newest_counts(true_ns, decided_ns, command)
+            if command.clock and not stable(command.sender):
+                self._adjusted_needs_zero(true_ns, command)
+            if command.clock in self._runs:
+                run = self._runs[command.clock]
+                run.followed |= command.true_ns >= run.begun_ns
         # A step may follow a command and forget it: a call that releases the robot comes later.
-        self._holder = None if disarmed else found
+        self._holder = None if disarmed else command
         if disarmed:
             self._keeper = None
 
@@ -360,24 +362,24 @@ class Followed:
             )  # fmt: skip
         self._slowest = min(v, least_v), min(w, least_w)
 
-    def _first_keeps(self, true_ns: int, decided_ns: int, found: Command) -> None:
+    def _first_keeps(self, true_ns: int, decided_ns: int, command: Command) -> None:
         """Check that the robot leaves its sender only for a source of higher priority.
 
         It may also leave a sender that is silent, or that the daemon refuses because its clock was
         set.
         """
         keeper, witness = self._keeper, self._witness
-        if keeper is None or keeper.who != found.who:
+        if keeper is None or keeper.who != command.who:
             if keeper is not None and self._is_kept(keeper, decided_ns):
                 priority = witness.priority
-                if priority[found.who[0]] <= priority[keeper.who[0]]:
+                if priority[command.who[0]] <= priority[keeper.who[0]]:
                     raise BrokenError(
                         "the first of equal priority keeps the robot", true_ns,
-                        f"{found.who} is followed, {keeper.who} goes on, and was followed "
+                        f"{command.who} is followed, {keeper.who} goes on, and was followed "
                         f"{(decided_ns - keeper.arrived_ns) / NS:.3f} s ago",
                     )  # fmt: skip
-            self._going_ns = found.arrived_ns
-        self._keeper, self._going_ns = found, max(self._going_ns, found.arrived_ns)
+            self._going_ns = command.arrived_ns
+        self._keeper, self._going_ns = command, max(self._going_ns, command.arrived_ns)
 
     def _is_kept(self, keeper: Command, decided_ns: int) -> bool:
         """Return whether the daemon must continue to follow this sender."""
@@ -389,9 +391,9 @@ class Followed:
             and source not in witness.churned
         )
 
-    def _highest_wins(self, true_ns: int, decided_ns: int, found: Command) -> None:
+    def _highest_wins(self, true_ns: int, decided_ns: int, entry: Command) -> None:
         witness = self._witness
-        priority = witness.priority[found.who[0]]
+        priority = witness.priority[entry.who[0]]
         for (source, identity), other in self._sure.items():
             if witness.priority[source] <= priority:
                 continue
@@ -399,27 +401,27 @@ class Followed:
             if OBEYED_NS + witness.period_ns < age < witness.timeout[source] - witness.period_ns:
                 raise BrokenError(
                     "the highest priority wins", true_ns,
-                    f"{found.who} is followed, {source} by {identity} arrived {age / NS:.3f} s ago",
+                    f"{entry.who} is followed, {source} by {identity} arrived {age / NS:.3f} s ago",
                 )  # fmt: skip
 
-    def _newest_counts(self, true_ns: int, decided_ns: int, found: Command) -> None:
-        newest, late_ns = self._sure.get(found.who), OBEYED_NS + self._witness.period_ns
-        if newest is not None and found.arrived_ns < newest.arrived_ns < decided_ns - late_ns:
+    def _newest_counts(self, true_ns: int, decided_ns: int, command: Command) -> None:
+        newest, late_ns = self._sure.get(command.who), OBEYED_NS + self._witness.period_ns
+        if newest is not None and command.arrived_ns < newest.arrived_ns < decided_ns - late_ns:
             raise BrokenError(
                 "the newest command is obeyed at once", true_ns,
-                f"{found.who} sent one {(decided_ns - newest.arrived_ns) / NS:.3f} s ago, and "
-                f"that of {(decided_ns - found.arrived_ns) / NS:.3f} s ago is followed",
+                f"{command.who} sent one {(decided_ns - newest.arrived_ns) / NS:.3f} s ago, and "
+                f"that of {(decided_ns - command.arrived_ns) / NS:.3f} s ago is followed",
             )  # fmt: skip
 
-    def _adjusted_needs_zero(self, true_ns: int, found: Command) -> None:
+    def _adjusted_needs_zero(self, true_ns: int, command: Command) -> None:
         """Check that a sender sends a zero after its foreign clock was stepped.
 
         Only steps larger than the timeout count. The check is left out if something may hide the
         step: a longer network delay after a step forwards, a second step, or a sleep of the robot.
         """
-        witness, sender, message = self._witness, found.sender, found.message
-        before = self._before.get(found.clock)
-        self._before[found.clock] = found
+        witness, sender, message = self._witness, command.sender, command.message
+        before = self._before.get(command.clock)
+        self._before[command.clock] = command
         if before is None or before.message.sent_ns >= message.sent_ns:
             return
         since_ns, slewed_s, steps = before.message.sent_ns, 0.0, []
@@ -434,12 +436,12 @@ class Followed:
             or not witness.neutral_first
             or message.sent_ns - since_ns > KNOWN_NS
             or before.true_ns < witness.ages.learned_ns
-            or found.clock in witness.shared_clocks
-            or found.who[0] in witness.churned
+            or command.clock in witness.shared_clocks
+            or command.who[0] in witness.churned
         ):
             return
         at_s, by_s = steps[0]
-        timeout_s = max(witness.timeout[found.who[0]], NS // 4) / NS
+        timeout_s = max(witness.timeout[command.who[0]], NS // 4) / NS
         late_s = (before.true_ns - since_ns) / NS - sender["delay"]
         if by_s > 0.0:
             if sender["congestion"] or sender["jitter"] > EVEN_NS / NS / 2:
@@ -448,8 +450,8 @@ class Followed:
         if abs(by_s) < timeout_s + max(0.0, late_s) + slewed_s + 0.15:
             return
         witness.counts["clocks that jumped"] += 1
-        if self._zero_ns.get(found.who, -1) < at_s * NS:
+        if self._zero_ns.get(command.who, -1) < at_s * NS:
             raise BrokenError(
                 "a clock that jumped needs a zero", true_ns,
-                f"{found.who} was set by {by_s:g} s at {at_s:.3f} s and has sent no zero since",
+                f"{command.who} was set by {by_s:g} s at {at_s:.3f} s and has sent no zero since",
             )  # fmt: skip

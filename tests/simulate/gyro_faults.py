@@ -38,7 +38,7 @@ def add(plan: Plan, kinds: list[str]) -> None:
         _add_wrong_samples(plan, random.Random(f"wrong gyro samples {plan['seed']}"))
     if "hanging gyro" in kinds:
         _add_hangs(plan, random.Random(f"hanging gyro {plan['seed']}"))
-    plan["events"].sort(key=lambda one: one["at"])
+    plan["events"].sort(key=lambda event: event["at"])
 
 
 def _moment(plan: Plan, dice: random.Random) -> float:

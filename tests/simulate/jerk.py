@@ -32,13 +32,13 @@ class Slope:
             room: The largest possible rounding error of the speed.
         """
         before, self._seen = self._seen, speed
-        seen = (speed - before + 2 * room) / seconds if seconds > 0.0 else acceleration
+        slope = (speed - before + 2 * room) / seconds if seconds > 0.0 else acceleration
         if speed < before or speed <= room:
-            self._high, self._slope = speed + room, seen
+            self._high, self._slope = speed + room, slope
             return True
         most = min(acceleration, max(self._slope, 0.0) + jerk * seconds)
         high = max(self._high, 0.0) + most * seconds
-        self._high, self._slope = min(speed + room, high), min(most, seen)
+        self._high, self._slope = min(speed + room, high), min(most, slope)
         return speed - room <= high
 
     def lose(self, speed: float, room: float, acceleration: float) -> None:

@@ -95,12 +95,13 @@ class Liveness:
         """Time of the first command behind each lawful sender's last silence."""
         self._latest: dict[str, tuple[int, str]] = {}
         self._pauses = {
-            one["name"]: max(PAUSE_NS, int(1.2 * NS / one["hz"])) for one in run.plan["senders"]
+            sender["name"]: max(PAUSE_NS, int(1.2 * NS / sender["hz"]))
+            for sender in run.plan["senders"]
         }
         """Longest time between two commands of each sender that does not pause."""
         self._proofs = {
-            one["name"]: max(PROOF_NS, int(PROOF_COUNT * NS / one["hz"]))
-            for one in run.plan["senders"]
+            sender["name"]: max(PROOF_NS, int(PROOF_COUNT * NS / sender["hz"]))
+            for sender in run.plan["senders"]
         }
         self._followed_ns: dict[str, int] = {}
         """When the robot last followed each of these senders."""
@@ -135,7 +136,7 @@ class Liveness:
     @cached_property
     def lawful(self) -> set[str]:
         """The names of the senders that obey all rules and have no rival."""
-        return {one["name"] for one in self.run.plan["senders"] if self._keeps_rules(one)}
+        return {sender["name"] for sender in self.run.plan["senders"] if self._keeps_rules(sender)}
 
     @property
     def _tick_ns(self) -> int:
@@ -238,13 +239,13 @@ class Liveness:
 
         The reason in `state` names a source but no sender, so with several senders it is ambiguous.
         """
-        found: dict[str, str] = {}
+        names: dict[str, str] = {}
         senders = self.run.plan["senders"]
-        for source in {one["source"] for one in senders} - self.run.witness.churned:
-            one, *others = [one for one in senders if one["source"] == source]
-            if not others and one["way"] in UNSHARED and not one.get("bad_stamps"):
-                found[source] = one["name"]
-        return found
+        for source in {sender["source"] for sender in senders} - self.run.witness.churned:
+            sender, *others = [sender for sender in senders if sender["source"] == source]
+            if not others and sender["way"] in UNSHARED and not sender.get("bad_stamps"):
+                names[source] = sender["name"]
+        return names
 
     def end(self) -> None:
         """End all faults, release all latches, and check that a lawful sender drives."""
@@ -287,8 +288,8 @@ class Liveness:
             raise BrokenError("memory is bounded", run.true_ns, f"a {kind} of {size} entries")
         longest = LONGEST_TEXT + 2 * min(run.longest_reason, LONGEST_REASON)
         if text > longest or buffer > LONGEST_BUFFER:
-            found = f"a text of {text} letters, a buffer of {buffer} bytes"
-            raise BrokenError("memory is bounded", run.true_ns, found)
+            sizes = f"a text of {text} letters, a buffer of {buffer} bytes"
+            raise BrokenError("memory is bounded", run.true_ns, sizes)
 
     def _drive_lawfully(self, clears_ns: int) -> None:
         """Let a lawful sender send zeros and a speed, and check that the robot drives.
@@ -303,14 +304,14 @@ class Liveness:
             "form": "json", "ahead": 0.0, "drift": 0.0, "clock": [], "churn": False, "delay": 0.002,
         }  # fmt: skip
         own = [
-            one
-            for one in plan["senders"]
-            if one["way"] in ("client", "page")
+            candidate
+            for candidate in plan["senders"]
+            if candidate["way"] in ("client", "page")
             and not (
-                one["churn"]
-                or one["junk"]
-                or one.get("bad_stamps")
-                or one["id"] in run.witness.shared_clocks
+                candidate["churn"]
+                or candidate["junk"]
+                or candidate.get("bad_stamps")
+                or candidate["id"] in run.witness.shared_clocks
             )
         ]
         number = 10**6
@@ -354,12 +355,14 @@ class Liveness:
         """Check that the robot drives as commanded, or slower on the same curve."""
         run = self.run
         witness, limits = run.witness, run.witness.limits
-        got, told = witness.twist(witness.last), witness.clamped(speed, turn)
-        takes_s = told[0] / limits["linear_acceleration"] + told[1] / limits["angular_acceleration"]
+        twist, target = witness.twist(witness.last), witness.clamped(speed, turn)
+        takes_s = (
+            target[0] / limits["linear_acceleration"] + target[1] / limits["angular_acceleration"]
+        )
         if takes_s > 2.5 or limits.get("linear_jerk") or limits.get("angular_jerk"):
             return
         if witness.unsure:
             return
         room = witness.radius * 0.02, witness.radius * 0.02 / witness.half
-        if any(abs(a - b) > r for a, b, r in zip(got, told, room, strict=True)):
-            raise BrokenError("the robot drives as told", run.true_ns, f"{got} for {told}")
+        if any(abs(a - b) > r for a, b, r in zip(twist, target, room, strict=True)):
+            raise BrokenError("the robot drives as told", run.true_ns, f"{twist} for {target}")

@@ -29,15 +29,15 @@ class LogLines:
         self._since_ns = 0
         """Since when it lacks them."""
 
-    def see(self, true_ns: int, seen: Seen) -> None:
+    def see(self, true_ns: int, snapshot: Seen) -> None:
         """Judge the lines of one step."""
-        now_ns = seen.decided_ns
-        if seen.mode != self._mode:
+        now_ns = snapshot.decided_ns
+        if snapshot.mode != self._mode:
             # A daemon that starts does not log its first mode as a change.
-            self._awaited = f"-> {seen.mode}" if self._mode else ""
-            self._mode, self._since_ns = seen.mode, now_ns
-        names = {name for name, _, _ in seen.events}
-        for name, level, text in seen.events:
+            self._awaited = f"-> {snapshot.mode}" if self._mode else ""
+            self._mode, self._since_ns = snapshot.mode, now_ns
+        names = {name for name, _, _ in snapshot.events}
+        for name, level, text in snapshot.events:
             if {"stop", "clear"} <= names and name in ("stop", "clear"):
                 continue  # the one that waited comes with the other one, and is not charged
             paid_ns = max(self._paid_ns.get(name, 0), now_ns)

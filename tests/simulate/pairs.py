@@ -207,8 +207,8 @@ def compare(
         with ThreadPoolExecutor(len(pairs)) as pool:
             while total < seconds:
                 plans = [comparable(made(seed + runs + n)) for n in range(len(pairs))]
-                found = pool.map(lambda pair, plan: pair.differs(plan), pairs, plans)
-                for plan, (difference, simulated_s) in zip(plans, found, strict=True):
+                results = pool.map(lambda pair, plan: pair.differs(plan), pairs, plans)
+                for plan, (difference, simulated_s) in zip(plans, results, strict=True):
                     runs += 1
                     total += simulated_s
                     if difference:

@@ -99,7 +99,7 @@ def made(seed: int, seconds: float | None = None) -> Plan:
     events = _events(dice, kinds, length, config, plan["senders"])
     if driven:
         events += _rare_events(random.Random(f"rare events {seed}"), plan)
-    plan["events"] = sorted(events, key=lambda one: one["at"])
+    plan["events"] = sorted(events, key=lambda event: event["at"])
     board_inputs.add(plan)
     bad_moments.add(plan)
     if "moment" not in plan:  # in a plan with a moment nothing else happens
@@ -185,11 +185,11 @@ def _draw_lawful_driver(dice: random.Random, plan: Plan) -> bool:
         return False
     seconds: float = plan["seconds"]
     first: dict[str, Any] = plan["senders"][0]
-    source = max(plan["config"]["commands"]["sources"], key=lambda one: one["priority"])
+    source = max(plan["config"]["commands"]["sources"], key=lambda item: item["priority"])
     below = {
-        one["name"]
-        for one in plan["config"]["commands"]["sources"]
-        if one["priority"] < source["priority"]
+        item["name"]
+        for item in plan["config"]["commands"]["sources"]
+        if item["priority"] < source["priority"]
     }
     hz = dice.choice((20.0, 50.0)) if source["timeout"] > 0.1 else 50.0
     first |= {
@@ -200,9 +200,11 @@ def _draw_lawful_driver(dice: random.Random, plan: Plan) -> bool:
         "churn": False, "loss": 0.0, "twice": 0.0, "swap": 0.0,
     }  # fmt: skip
     plan["senders"] = [first] + [
-        one
-        for one in plan["senders"][1:]
-        if one["source"] in below and not (one["junk"] or one["churn"]) and one["id"] != first["id"]
+        item
+        for item in plan["senders"][1:]
+        if item["source"] in below
+        and not (item["junk"] or item["churn"])
+        and item["id"] != first["id"]
     ]
     return True
 
@@ -585,7 +587,7 @@ def _events(
         if dice.random() < 0.6:
             return [at]
         gap, count = dice.uniform(0.3, 1.5), dice.randrange(3, 15)
-        return [one for n in range(count) if (one := round(at + n * gap, 3)) < seconds]
+        return [start_s for n in range(count) if (start_s := round(at + n * gap, 3)) < seconds]
 
     def board(at: float, length: float, *fault: Any) -> None:
         events.append({"at": at, "do": "board", "for": round(length, 3), "fault": list(fault)})
@@ -762,15 +764,15 @@ def _events(
 
 def _settings(dice: random.Random, config: dict[str, Any]) -> dict[str, float]:
     """Return settings for a `set`, legal or not. The daemon must refuse illegal ones."""
-    limits, found = config["limits"], {}
+    limits, settings = config["limits"], {}
     what = dice.choice(("limits", "limits", "commands", "both"))
     if what != "commands":
         for name in dice.sample(sorted(limits), dice.randrange(1, 3)):
             share = dice.choice((0.1, 0.5, 0.8, 1.3, 3.0))
-            found[f"limits.{name}"] = round(limits[name] * share, 3)
+            settings[f"limits.{name}"] = round(limits[name] * share, 3)
     if what != "limits":
         source = dice.choice(config["commands"]["sources"])["name"]
-        found[f"commands.sources.{source}.timeout"] = dice.choice((0.1, 0.25, 0.4, 1.0))
+        settings[f"commands.sources.{source}.timeout"] = dice.choice((0.1, 0.25, 0.4, 1.0))
         if dice.random() < 0.3:
-            found["commands.neutral_pause"] = dice.choice((0.5, 1.0, 3.0))
-    return found
+            settings["commands.neutral_pause"] = dice.choice((0.5, 1.0, 3.0))
+    return settings

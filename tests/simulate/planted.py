@@ -269,8 +269,8 @@ def main() -> int:
     options = parser.parse_args()
     chosen = [f for f in (*FAULTS, *CASES) if f.name.startswith(options.only or "")]
     if options.missing:
-        found = {name for name, row in read().items() if row.seed}
-        chosen = [fault for fault in chosen if fault.name not in found]
+        names = {name for name, row in read().items() if row.seed}
+        chosen = [fault for fault in chosen if fault.name not in names]
     if options.again:
         return min(1, again(chosen, options.jobs))
     lock, lost = Lock(), 0

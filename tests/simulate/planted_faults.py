@@ -226,7 +226,7 @@ FAULTS = (
         ARBITER,
         "present[0].rank(now_ns) < first[1].rank(now_ns)",
         "present[0].rank(now_ns) > first[1].rank(now_ns)",
-        Edit(ARBITER, "and kept in present\n", "and False\n"),
+        Edit(ARBITER, "and previous in present\n", "and False\n"),
     ),
     fault(
         "arbiter keeps",
@@ -673,8 +673,8 @@ FAULTS = (
         "sanity dead",
         "a healthy wheel that follows its command slowly is called dead",
         WITNESS,
-        "moving and least > MIN_FAULT_SPEED and abs(seen) < 0.1 * least",
-        "moving and least > MIN_FAULT_SPEED and abs(seen) < 0.97 * least",
+        "moving and least > MIN_FAULT_SPEED and abs(raw_speed) < 0.1 * least",
+        "moving and least > MIN_FAULT_SPEED and abs(raw_speed) < 0.97 * least",
     ),
     fault(
         "sanity blind",
@@ -809,7 +809,7 @@ FAULTS = (
         "wheel press",
         "a wheel that rested during a press and is then turned by hand is a runaway",
         WITNESS,
-        "self.driven = self.driven and not self._rests(seen, dt, count)",
+        "self.driven = self.driven and not self._rests(raw_speed, dt, count)",
         "self.driven = self.driven",
     ),
     fault(

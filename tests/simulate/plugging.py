@@ -30,26 +30,26 @@ class Plugging:
         self._line_ns = -1
         """When the step ended that made the last line, or in which the link was not up."""
 
-    def see(self, true_ns: int, seen: Seen, product: Product, calm_ns: int) -> None:
+    def see(self, true_ns: int, snapshot: Seen, product: Product, calm_ns: int) -> None:
         """Judge a step. The last stall of the host, or block of the output, ended at `calm_ns`."""
         if not product.plugged:
-            late_ns = seen.decided_ns - product.unplugged_ns
-            if seen.link == "up" and late_ns > SEEN_NS + self._period_ns:
-                text = f"unplugged for {late_ns / NS:.3f} s, and the link is {seen.link}"
+            late_ns = snapshot.decided_ns - product.unplugged_ns
+            if snapshot.link == "up" and late_ns > SEEN_NS + self._period_ns:
+                text = f"unplugged for {late_ns / NS:.3f} s, and the link is {snapshot.link}"
                 raise BrokenError("an unplugged board is seen", true_ns, text)
             return
         plugged_ns = product.plugged_ns
-        if seen.lines or seen.link != "up":
-            self._line_ns = seen.at_ns
+        if snapshot.lines or snapshot.link != "up":
+            self._line_ns = snapshot.at_ns
         else:
-            late_ns = seen.decided_ns - max(self._line_ns, plugged_ns, calm_ns)
+            late_ns = snapshot.decided_ns - max(self._line_ns, plugged_ns, calm_ns)
             if late_ns > PERIODS * self._period_ns + SEEN_NS:
                 text = f"no line for {late_ns / NS:.3f} s"
                 raise BrokenError("a linked board gets a line in each period", true_ns, text)
         if plugged_ns == self._judged_ns:
             return
         # A line of which the kernel took only a part is not judged here.
-        for at_ns, line in seen.lines:
+        for at_ns, line in snapshot.lines:
             if at_ns >= plugged_ns and line.endswith(b"\n"):
                 self._judged_ns = plugged_ns
                 match = LINE.match(line)
@@ -58,6 +58,6 @@ class Plugging:
                     raise BrokenError("the first line is a zero", true_ns, text)
                 return
         # The kernel may take only a part of the first lines.
-        if seen.decided_ns - max(plugged_ns, calm_ns) > FIRST_LINE_NS + 3 * self._period_ns:
+        if snapshot.decided_ns - max(plugged_ns, calm_ns) > FIRST_LINE_NS + 3 * self._period_ns:
             text = f"plugged in at {plugged_ns / NS:.3f} s of its clock"
             raise BrokenError("a board that is plugged in gets a line", true_ns, text)

@@ -115,8 +115,8 @@ class PoseWitness:
         )
         """Time that a motor needs to follow its command again."""
         counts = config.get("sim", {}).get("encoder_counts")
-        told = config.get("mcu", {}).get("encoder_counts")
-        turn = COARSE_COUNTS * math.tau / 96 if counts == 96 and not told else 0.0
+        mcu_counts = config.get("mcu", {}).get("encoder_counts")
+        turn = COARSE_COUNTS * math.tau / 96 if counts == 96 and not mcu_counts else 0.0
         self._unsure_m: float = turn * drive.get("wheel_radius", 0.05)
         """Distance that such encoders may be off, m."""
         rate = config.get("control", {}).get("rate", 100.0)
@@ -130,7 +130,7 @@ class PoseWitness:
         rates = config.get("odometry", {})
         sure = rates.get("yaw_variance_per_metre", 1.0) < 1e-4
         sure |= rates.get("yaw_variance_per_radian", 1.0) < 1e-2
-        coarse = (counts or 3200) <= 400 and not told
+        coarse = (counts or 3200) <= 400 and not mcu_counts
         fast = isinstance(rate, float) and rate > 100.0
         # Nobody knows the heading as well as these rates say at ten lines a second, or from lines
         # so frequent that their speeds are a count or none.

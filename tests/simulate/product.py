@@ -82,15 +82,15 @@ def problems(config: dict[str, Any]) -> list[str]:
     return []
 
 
-def _plain(found: Measured) -> Estimate:
-    pose, spread = found.pose, found.covariance
+def _plain(estimate: Measured) -> Estimate:
+    pose, spread = estimate.pose, estimate.covariance
     return (
-        found.at.mono_ns,
+        estimate.at.mono_ns,
         pose.x,
         pose.y,
         pose.yaw,
         (spread.xx, spread.xy, spread.xyaw, spread.yy, spread.yyaw, spread.yawyaw),
-        found.positions,
+        estimate.positions,
     )
 
 
@@ -154,16 +154,16 @@ class Disk:
     def read(self, now: Instant) -> Latches:
         """Return the latches that the next start of the daemon uses."""
         try:
-            found = decode("acsar", self._data)
+            latches = decode("acsar", self._data)
         except LatchFileError as error:
-            found = stopped(Latches(), unreadable("FILE", str(error)), now)
+            latches = stopped(Latches(), unreadable("FILE", str(error)), now)
         self._running, self.trouble = True, ""
-        self._newest = self._written = found
+        self._newest = self._written = latches
         if not self.full:
-            self._data = encode("acsar", found)  # the daemon tries out whether it can write
+            self._data = encode("acsar", latches)  # the daemon tries out whether it can write
         if self.full:
             self.trouble = unwritable("FILE", "no space left on device")
-            self._newest = after_failed_write(found, at_start(self.trouble), now)
+            self._newest = after_failed_write(latches, at_start(self.trouble), now)
         return self._newest
 
 
@@ -219,7 +219,9 @@ class Product:
         if world.events:
             events = [(event.name, event.level, event.text) for event in world.events]
             world.events.clear()
-        estimates = [_plain(one) for one in outputs.estimates] if outputs.estimates else NONE
+        estimates = (
+            [_plain(estimate) for estimate in outputs.estimates] if outputs.estimates else NONE
+        )
         self._see(
             Seen(
                 world.now_ns,
@@ -283,7 +285,7 @@ class Product:
         else:
             arrivals.append(arrival)
             if len(arrivals) > HELD:
-                same = [one for one in arrivals if one.key == key]
+                same = [waiting for waiting in arrivals if waiting.key == key]
                 if len(same) > HELD:
                     arrivals.remove(same[0])
                     world.bus.overrun_sources.add(key.split("/")[1])
@@ -315,10 +317,12 @@ class Product:
         bus = self._world.bus
         if not bus.replies:
             return []
-        found = [(ticket, reply.payload) for ticket, all_ in bus.replies.items() for reply in all_]
+        payloads = [
+            (ticket, reply.payload) for ticket, all_ in bus.replies.items() for reply in all_
+        ]
         bus.replies.clear()
         bus.finished.clear()
-        return found
+        return payloads
 
     @property
     def shows_state(self) -> bool:
@@ -328,8 +332,8 @@ class Product:
 
     def state(self) -> dict[str, Any]:
         """Return the present `state`, as a client reads it."""
-        found: dict[str, Any] = msgspec.json.decode(encode_message(self._world.state, "json"))
-        return found
+        state: dict[str, Any] = msgspec.json.decode(encode_message(self._world.state, "json"))
+        return state
 
     # the board
 
@@ -459,9 +463,9 @@ class Product:
     def block(self, blocked: bool) -> None:
         self._world.port.blocked = blocked
 
-    def tear(self, taken: int) -> None:
+    def tear(self, count: int) -> None:
         """Let the kernel accept only this many bytes of the next line."""
-        self._world.port.takes = taken
+        self._world.port.takes = count
 
     def step_wall(self, seconds: float) -> None:
         self._world.wall_offset_ns += int(seconds * 1e9)
@@ -520,28 +524,28 @@ class Product:
 
         The last two numbers are the lengths of its longest text and its longest byte buffer.
         """
-        seen: set[int] = set()
+        visited: set[int] = set()
         todo: deque[object] = deque([self._world.loop])
         best, text, buffer = (0, ""), 0, 0
         while todo:
-            one = todo.pop()
-            if id(one) in seen:
+            item = todo.pop()
+            if id(item) in visited:
                 continue
-            seen.add(id(one))
-            if isinstance(one, Arrival):
+            visited.add(id(item))
+            if isinstance(item, Arrival):
                 continue  # only the messages of the last step are kept, as they came
-            if isinstance(one, str):
-                text = max(text, len(one))
-            elif isinstance(one, bytes | bytearray):
-                buffer = max(buffer, len(one))
-            elif isinstance(one, dict):
-                best = max(best, (len(one), "dict"))
-                todo.extend(one.values())
-            elif isinstance(one, list | tuple | set | deque):
-                best = max(best, (len(one), type(one).__name__))
-                todo.extend(one)
-            elif type(one).__module__.startswith(acsard.__name__):
-                slots = getattr(type(one), "__struct_fields__", ())
-                todo.extend(getattr(one, name) for name in slots)
-                todo.extend(getattr(one, "__dict__", {}).values())
+            if isinstance(item, str):
+                text = max(text, len(item))
+            elif isinstance(item, bytes | bytearray):
+                buffer = max(buffer, len(item))
+            elif isinstance(item, dict):
+                best = max(best, (len(item), "dict"))
+                todo.extend(item.values())
+            elif isinstance(item, list | tuple | set | deque):
+                best = max(best, (len(item), type(item).__name__))
+                todo.extend(item)
+            elif type(item).__module__.startswith(acsard.__name__):
+                slots = getattr(type(item), "__struct_fields__", ())
+                todo.extend(getattr(item, name) for name in slots)
+                todo.extend(getattr(item, "__dict__", {}).values())
         return *best, text, buffer

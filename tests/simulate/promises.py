@@ -217,9 +217,9 @@ class Witness:
         self.timeout = dict(self.file_timeout)
         self.pause_ns = self.file_pause_ns
         for name, value in self.file.items():
-            kept = not name.endswith("_deceleration") and "jerk" not in name
-            self.limits[name] = min(value, self.limits[name]) if kept else value
-            if not kept:
+            capped = not name.endswith("_deceleration") and "jerk" not in name
+            self.limits[name] = min(value, self.limits[name]) if capped else value
+            if not capped:
                 self.unsure.discard(name)
         self.before = dict(self.limits)
         self.changed_ns = at_ns
@@ -267,8 +267,8 @@ class Witness:
         wish = Wish(arrived_ns, v, w)
         wish.identity, wish.shared = sample.identity, sample.shared
         loose = sample.clock in self.shared_clocks
-        seen = sender, message, sample, arrived_ns, self.timeout[source], loose
-        self._unread[-1] = sample.key, wish, seen
+        arguments = sender, message, sample, arrived_ns, self.timeout[source], loose
+        self._unread[-1] = sample.key, wish, arguments
         wish.certain = (
             not sample.clock and message.junk == "" and sender["way"] in ("plain", "bridge")
         )
@@ -304,9 +304,9 @@ class Witness:
         self._unread.clear()
 
     def _judge_ages(self) -> None:
-        for place, (key, wish, seen) in enumerate(self._unread):
+        for place, (key, wish, arguments) in enumerate(self._unread):
             if wish is not None:
-                wish.fresh = self.ages.fresh(*seen)
+                wish.fresh = self.ages.fresh(*arguments)
                 self._unread[place] = key, None, ()
 
     def _cancel_zeros(self, source: str, now_ns: int) -> None:
@@ -367,9 +367,9 @@ class Witness:
         # The network may deliver one clear twice, and its sender may not know of a start.
         last_ns = max(self.born_ns, self.unfaulted_ns if latched is not self.offs else 0)
         for at_ns in latched[: len(latched) - len(later)]:
-            seen = read_ns is not None and read_ns >= at_ns
+            known = read_ns is not None and read_ns >= at_ns
             late = read_ns is None and asked_ns >= max(at_ns, last_ns) + LOOK_NS - MARGIN_NS
-            if not (seen or late):
+            if not (known or late):
                 text = f"the call of {name} released what was latched at {at_ns / NS:.3f} s"
                 raise BrokenError(promise, asked_ns, text)
         latched[:] = later
@@ -479,18 +479,18 @@ class Witness:
     @property
     def held(self) -> tuple[int, str] | None:
         """The time since which the robot must not move, and the cause, or None."""
-        found = []
+        causes = []
         if self.stops:
-            found.append((self.stops[0], "a stop"))
+            causes.append((self.stops[0], "a stop"))
         if self.fault_ns is not None:
-            found.append((self.fault_ns, "a fault"))
+            causes.append((self.fault_ns, "a fault"))
         if self.offs:
-            found.append((self.offs[0], "being switched off"))
+            causes.append((self.offs[0], "being switched off"))
         if self.dormant_ns is not None:
-            found.append((self.dormant_ns, "being switched off"))
+            causes.append((self.dormant_ns, "being switched off"))
         if self.ending_ns is not None:
-            found.append((self.ending_ns, "SIGTERM"))
-        return min(found, default=None)
+            causes.append((self.ending_ns, "SIGTERM"))
+        return min(causes, default=None)
 
     @property
     def _surely_held(self) -> tuple[int, str] | None:
@@ -501,15 +501,15 @@ class Witness:
         if not self.pending:
             return self.held
         cleared_ns, active_ns = self.pending.get("clear", -1), self.pending.get("activate", -1)
-        found = [(at_ns, "a stop") for at_ns in self.stops if at_ns > cleared_ns]
+        causes = [(at_ns, "a stop") for at_ns in self.stops if at_ns > cleared_ns]
         if self.fault_ns is not None and self.fault_ns > cleared_ns:
-            found.append((self.fault_ns, "a fault"))
-        found += [(at_ns, "being switched off") for at_ns in self.offs if at_ns > active_ns]
+            causes.append((self.fault_ns, "a fault"))
+        causes += [(at_ns, "being switched off") for at_ns in self.offs if at_ns > active_ns]
         if self.dormant_ns is not None and self.dormant_ns > active_ns:
-            found.append((self.dormant_ns, "being switched off"))
+            causes.append((self.dormant_ns, "being switched off"))
         if self.ending_ns is not None:
-            found.append((self.ending_ns, "SIGTERM"))
-        return min(found, default=None)
+            causes.append((self.ending_ns, "SIGTERM"))
+        return min(causes, default=None)
 
     def ended(self, at_ns: int, moving: tuple[float, ...]) -> None:
         """Judge the orderly end of the daemon, which began at these wheel speeds.
@@ -569,11 +569,11 @@ class Witness:
         )
         if "set" not in self.pending:
             self._limits(at_ns, wheels, before, made_ns - last_ns, grows)
-        held = self._surely_held
-        if held is None:
+        hold = self._surely_held
+        if hold is None:
             self.braking = None
         else:
-            self._held(at_ns, held, grows, line, wheels)
+            self._held(at_ns, hold, grows, line, wheels)
         self._wished(at_ns, wheels, before, grows, line)
         self.obeyed(at_ns, wheels)
         self.last, self.last_ns, self.cut, self.rested = wheels, made_ns, False, False
@@ -746,12 +746,12 @@ class Witness:
     def _held(
         self,
         at_ns: int,
-        held: tuple[int, str],
+        hold: tuple[int, str],
         grows: bool,
         line: bytes,
         wheels: tuple[float, ...],
     ) -> None:
-        since_ns, why = held
+        since_ns, why = hold
         name = f"nothing moves after {why}"
         if grows and at_ns > since_ns + self.period_ns:
             raise BrokenError(name, at_ns, f"{line!r} grows, held since {since_ns / NS:.3f} s")
@@ -773,10 +773,10 @@ class Witness:
         self.rested |= at_ns - self._turns_ns > NS
         if fastest < 0.5:
             return
-        held = self._surely_held
-        if held is None:
+        hold = self._surely_held
+        if hold is None:
             return
-        since_ns, why = held
+        since_ns, why = hold
         if at_ns < since_ns + self.ramp_ns(stop=False) + STAND_NS:
             return
         if all(at_ns - last_ns > 6 * NS for last_ns in self.troubles.values()):
@@ -847,7 +847,7 @@ class Witness:
         if self.churned:
             return 0
         # A call without an answer may be in force.
-        found, armed_ns = 0, max(self.armed_since_ns, self.disarmed_ns)
+        lowest, armed_ns = 0, max(self.armed_since_ns, self.disarmed_ns)
         since_ns = max(armed_ns, *self.pending.values(), 0)
         for source, wish in self.wishes:
             if self.neutral_first and wish.shared and wish.armed_ns <= armed_ns:
@@ -855,8 +855,8 @@ class Witness:
             age = at_ns - wish.arrived_ns
             live = 2 * MARGIN_NS < age < self.timeout[source] - self.period_ns - MARGIN_NS
             if live and wish.certain and wish.arrived_ns > since_ns + MARGIN_NS:
-                found = max(found, self.priority[source])
-        return found
+                lowest = max(lowest, self.priority[source])
+        return lowest
 
     def _leads(self, wish: Wish, wheels: tuple[float, ...], before: tuple[float, ...]) -> bool:
         """Return whether the change from `before` to `wheels` approaches the commanded speeds."""

@@ -139,7 +139,7 @@ class Reasons:
         self._junk: set[str] = set()
         """Sources with refused messages, any of which may undo the zero of a shared identity."""
 
-    def command(self, sender: dict[str, Any], message: Message, one: Sample) -> None:
+    def command(self, sender: dict[str, Any], message: Message, sample: Sample) -> None:
         """Record a command. The caller has passed it to the witness before."""
         source = sender["source"]
         if message.junk or sender.get("bad_stamps"):
@@ -148,23 +148,23 @@ class Reasons:
             return
         wish = self.run.witness.wishes[-1][1]
         at_ns, delay_ns = wish.arrived_ns, wish.arrived_ns - message.sent_ns
-        heard = self._heard.setdefault(source, {}).setdefault(one.identity, _Heard())
-        heard.arrived_ns, heard.armed_ns = at_ns, wish.armed_ns
-        heard.shared = one.shared
-        heard.stamped |= bool(one.clock)
-        heard.foreign, heard.own = sender["way"] in FOREIGN, sender["way"] != "zenoh"
+        record = self._heard.setdefault(source, {}).setdefault(sample.identity, _Heard())
+        record.arrived_ns, record.armed_ns = at_ns, wish.armed_ns
+        record.shared = sample.shared
+        record.stamped |= bool(sample.clock)
+        record.foreign, record.own = sender["way"] in FOREIGN, sender["way"] != "zenoh"
         if wish.v or wish.w:
-            heard.speed_ns = at_ns
-        if not one.clock:
-            heard.clock = None
+            record.speed_ns = at_ns
+        if not sample.clock:
+            record.clock = None
             return
-        clock = self._clock(one.clock, at_ns, delay_ns)
+        clock = self._clock(sample.clock, at_ns, delay_ns)
         wild = (sender.get(name) for name in ("clock", "twice", "swap", "bad_stamps"))
         clock.odd |= any(wild) or sender.get("stamps_speeds", False)
-        clock.odd |= one.clock in self.run.witness.shared_clocks
+        clock.odd |= sample.clock in self.run.witness.shared_clocks
         clock.proved |= clock.known(at_ns, self.run.witness.timeout[source])
         clock.believed |= clock.may_be_known(at_ns, self.run.witness.timeout[source])
-        heard.clock = clock
+        record.clock = clock
 
     def dropped(self, key: str, at_ns: int) -> None:
         """Note that the inbox dropped a message on this key before a step read it."""
@@ -205,26 +205,26 @@ class Reasons:
         wishing = [
             source
             for source, senders in self._heard.items()
-            for heard in senders.values()
-            if self._waits(source, heard, now_ns, tick_ns)
+            for record in senders.values()
+            if self._waits(source, record, now_ns, tick_ns)
         ]
         if wishing:
             self._judge(now_ns, wishing, run.product.state())
 
-    def _waits(self, source: str, heard: _Heard, now_ns: int, tick_ns: int) -> bool:
+    def _waits(self, source: str, record: _Heard, now_ns: int, tick_ns: int) -> bool:
         """Return whether the daemon certainly has a fresh speed of this sender."""
-        age_ns = now_ns - heard.speed_ns
+        age_ns = now_ns - record.speed_ns
         return (
-            heard.speed_ns == heard.arrived_ns > self._calm_ns + tick_ns
+            record.speed_ns == record.arrived_ns > self._calm_ns + tick_ns
             and tick_ns < age_ns < self.run.witness.timeout[source] - tick_ns
-            and not (heard.clock and heard.clock.odd)
+            and not (record.clock and record.clock.odd)
         )
 
     def _judge(self, now_ns: int, wishing: list[str], state: dict[str, Any]) -> None:
         """Compare the words of `state` with the possible causes."""
         self.run.counts["reason looks"] += 1
         name = "every refusal has its reason in state"
-        words = {one["name"]: one["waits_for"] for one in state["sources"]}
+        words = {source_row["name"]: source_row["waits_for"] for source_row in state["sources"]}
         for source in wishing:
             kind, _ = kind_of(words[source])
             allowed = self.allowed(source, now_ns)
@@ -239,37 +239,37 @@ class Reasons:
 
     def allowed(self, source: str, now_ns: int) -> set[str]:
         """Return the kinds of causes for which this source may wait now."""
-        witness, found = self.run.witness, set[str]()
+        witness, causes = self.run.witness, set[str]()
         timeout_ns = witness.timeout[source]
-        for heard in self._live(source, now_ns):
-            clock, certain = heard.clock, not (heard.shared and source in self._junk)
+        for sender in self._live(source, now_ns):
+            clock, certain = sender.clock, not (sender.shared and source in self._junk)
             if clock is None:
-                certain &= not heard.stamped
+                certain &= not sender.stamped
             else:
-                certain &= clock.known(heard.armed_ns, timeout_ns)
-                may_be_known = not heard.foreign or clock.may_be_known(now_ns, timeout_ns)
+                certain &= clock.known(sender.armed_ns, timeout_ns)
+                may_be_known = not sender.foreign or clock.may_be_known(now_ns, timeout_ns)
                 if may_be_known and (not clock.steady or self._stood):
-                    found.add("late")
+                    causes.add("late")
                 # A foreign clock that was known is not new again, however late it becomes.
-                if not (clock.known(now_ns, timeout_ns) or (heard.foreign and clock.proved)):
-                    found.add("proof")
-            since_ns = max(self._calm_ns, self._dropped_ns.get(source, -1) if heard.shared else -1)
-            armed = heard.armed_ns > since_ns and certain
-            if witness.neutral_first and not (armed and heard.own):
-                found.add("neutral")
+                if not (clock.known(now_ns, timeout_ns) or (sender.foreign and clock.proved)):
+                    causes.add("proof")
+            since_ns = max(self._calm_ns, self._dropped_ns.get(source, -1) if sender.shared else -1)
+            armed = sender.armed_ns > since_ns and certain
+            if witness.neutral_first and not (armed and sender.own):
+                causes.add("neutral")
         if now_ns - self._stalled_ns < timeout_ns + MARGIN_NS and any(
-            heard.arrived_ns <= self._stalled_ns for heard in self._heard.get(source, {}).values()
+            sender.arrived_ns <= self._stalled_ns for sender in self._heard.get(source, {}).values()
         ):
             # A stall prolongs the place of a sender that has not sent since.
-            found.add("stalled")
+            causes.add("stalled")
         mine = witness.priority[source]
         for other, priority in witness.priority.items():
             if other != source and priority >= mine and self._live(other, now_ns):
-                found.add("priority")
-        return found
+                causes.add("priority")
+        return causes
 
     def _live(self, source: str, now_ns: int) -> list[_Heard]:
         """Return the senders of this source whose last command may still be fresh."""
         longest_ns = self.run.witness.timeout[source] + MARGIN_NS
         senders = self._heard.get(source, {}).values()
-        return [heard for heard in senders if now_ns - heard.arrived_ns <= longest_ns]
+        return [sender for sender in senders if now_ns - sender.arrived_ns <= longest_ns]

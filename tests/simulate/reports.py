@@ -105,11 +105,11 @@ class Reports:
 
 def judge_state(at_ns: int, state: dict[str, Any], fed_ns: int, quiet_ns: int) -> None:
     """Check that `state` has no speeds if the board has been silent since `fed_ns` for too long."""
-    said = state["linear"], state["angular"], state["wheels"]
-    if at_ns - fed_ns > quiet_ns + 2 * MARGIN_NS and said != (None, None, []):
+    speeds = state["linear"], state["angular"], state["wheels"]
+    if at_ns - fed_ns > quiet_ns + 2 * MARGIN_NS and speeds != (None, None, []):
         raise BrokenError(
             "state has no speed of a silent board", at_ns,
-            f"last heard {fed_ns / NS:.3f} s, and state says {said}",
+            f"last heard {fed_ns / NS:.3f} s, and state says {speeds}",
         )  # fmt: skip
 
 
@@ -117,10 +117,10 @@ def judge_pose(
     at_ns: int, state: dict[str, Any], pose: tuple[float, float, float], fed_ns: int, quiet_ns: int
 ) -> None:
     """Check that the pose in `state` does not change while the board is silent."""
-    said = state["x"], state["y"], state["yaw"]
-    moved = max(abs(a - b) for a, b in zip(said, pose, strict=True))
+    position = state["x"], state["y"], state["yaw"]
+    moved = max(abs(a - b) for a, b in zip(position, pose, strict=True))
     if at_ns - fed_ns > quiet_ns + 2 * MARGIN_NS and moved > 1e-6:
-        text = f"last heard {fed_ns / NS:.3f} s; the pose was {pose}, and state says {said}"
+        text = f"last heard {fed_ns / NS:.3f} s; the pose was {pose}, and state says {position}"
         raise BrokenError("the pose of a silent board stays", at_ns, text)
 
 

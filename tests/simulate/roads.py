@@ -69,7 +69,7 @@ def messages(sender: dict[str, Any], seed: int, seconds: float, wall_ns: int) ->
     kinds = swarm.sample(JUNK, swarm.choice((1, 1, 2, len(JUNK))))
     bad_stamps = random.Random(f"stamps {seed} {sender['name']}")
     bad_share = sender.get("bad_stamps", 0.0)
-    found: list[Message] = []
+    arrivals: list[Message] = []
     last_ns, number, t = 0, 0, float(sender["from"])
     phases, place = sender["phases"], -1
     ends, ended = dict(sender.get("ends", ())), -1
@@ -96,26 +96,28 @@ def messages(sender: dict[str, Any], seed: int, seconds: float, wall_ns: int) ->
                 v, w = float(wish[0]), float(wish[1])
                 message = Message(int(t * NS), arrives_ns, v, w, stamp_ns, number, junk)
                 if place >= 0 and ends.get(phases[place][0]):
-                    _let_last_wait(found, number - 1, arrives_ns + SWAPPED_NS)
-                found.append(message)
+                    _let_last_wait(arrivals, number - 1, arrives_ns + SWAPPED_NS)
+                arrivals.append(message)
                 if chance[5] < sender["twice"]:
                     again_ns = arrives_ns + int(chance[0] * 0.4 * NS)
-                    found.append(message._replace(arrives_ns=again_ns))
+                    arrivals.append(message._replace(arrives_ns=again_ns))
                 if "doubled" in sender:
                     again_ns = arrives_ns + int(sender["doubled"] * NS)
-                    found.append(message._replace(arrives_ns=again_ns))
+                    arrivals.append(message._replace(arrives_ns=again_ns))
             ended = place
         hz = _hz(sender, t)
         t += (0.9 + 0.2 * chance[0]) / hz if sender["jitter"] else 1 / hz
     end_ns = int((seconds + 0.2) * NS)
-    return sorted((one for one in found if one.arrives_ns < end_ns), key=lambda m: m.arrives_ns)
+    return sorted(
+        (item for item in arrivals if item.arrives_ns < end_ns), key=lambda m: m.arrives_ns
+    )
 
 
-def _let_last_wait(found: list[Message], number: int, until_ns: int) -> None:
+def _let_last_wait(arrivals: list[Message], number: int, until_ns: int) -> None:
     """Let the message with this number, which is the last one so far, arrive at this time."""
-    for place in range(max(0, len(found) - 2), len(found)):
-        if found[place].number == number:
-            found[place] = found[place]._replace(arrives_ns=until_ns)
+    for place in range(max(0, len(arrivals) - 2), len(arrivals)):
+        if arrivals[place].number == number:
+            arrivals[place] = arrivals[place]._replace(arrives_ns=until_ns)
 
 
 def _hz(sender: dict[str, Any], t: float) -> float:
@@ -345,8 +347,8 @@ def read_reply(reply: bytes, via: str, listed: bool = False) -> tuple[bool, str]
     `listed` is true for a reply of ROS with a list of results, of which the first is read.
     """
     if via == "native":
-        found = msgspec.json.decode(reply)
-        return found["success"], found["message"]
+        decoded = msgspec.json.decode(reply)
+        return decoded["success"], decoded["message"]
     if listed:
         reply = reply[4:]
     # CDR: a bool, three bytes to the next multiple of four, and a string with its length.

@@ -106,7 +106,9 @@ def settings(plan: Plan) -> list[Part]:
 def without(plan: Plan, parts: list[Part]) -> Plan:
     """Return the plan without these parts."""
     less = deepcopy(plan)
-    for part in sorted(parts, key=lambda one: [str(x).zfill(6) for x in one], reverse=True):
+    for part in sorted(
+        parts, key=lambda part_path: [str(x).zfill(6) for x in part_path], reverse=True
+    ):
         inner: Any = less
         for name in part[:-1]:
             inner = inner[name]
@@ -128,8 +130,8 @@ def shrunk(plan: Plan, result: Result, report: Callable[[str], None] = lambda te
 
 def written(plan: Plan, result: Result, commit: str) -> str:
     """Return a corpus file as text."""
-    found = {"promise": result.promise, "found": f"{commit} seed {result.seed}", "plan": plan}
-    return json.dumps(found, indent=1) + "\n"
+    record = {"promise": result.promise, "found": f"{commit} seed {result.seed}", "plan": plan}
+    return json.dumps(record, indent=1) + "\n"
 
 
 def kept(plan: Plan, result: Result, commit: str, path: Path) -> str:

@@ -50,9 +50,9 @@ class Spread:
         # Slow motors, odd radii, and few counts or short periods look like slip, which widens it.
         usual = SHORTEST_NS <= witness.period_ns < LONGEST_NS
         counts = config.get("sim", {}).get("encoder_counts")
-        told = config["mcu"].get("encoder_counts")
-        coarse = counts == 96 and not told
-        self._rough = counts == 400 and not told
+        mcu_counts = config["mcu"].get("encoder_counts")
+        coarse = counts == 96 and not mcu_counts
+        self._rough = counts == 400 and not mcu_counts
         """Whether lines that follow each other sooner than `SHORTEST_NS` look like slip."""
         self._judged = not config.get("odometry") and usual and not coarse
         self._track = 2 * witness.half

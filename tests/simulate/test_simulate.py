@@ -64,10 +64,10 @@ def quiet() -> Plan:
 @pytest.mark.slow
 def test_a_seed_gives_the_same_bytes_again_also_when_its_plan_was_written_to_a_file() -> None:
     first, again = Trace(), Trace()
-    one = made(4, 15.0)
-    text = json.dumps(one)
+    plan = made(4, 15.0)
+    text = json.dumps(plan)
     assert text == json.dumps(made(4, 15.0))
-    results = [played(one, first.step), played(json.loads(text), again.step)]
+    results = [played(plan, first.step), played(json.loads(text), again.step)]
     assert first.hashes == again.hashes
     assert len(first.hashes) > 15
     assert results[0].finding == results[1].finding == ""
@@ -76,16 +76,16 @@ def test_a_seed_gives_the_same_bytes_again_also_when_its_plan_was_written_to_a_f
 @pytest.mark.slow
 def test_every_configuration_of_a_plan_is_legal_and_every_kind_of_trouble_is_drawn() -> None:
     plans = [made(seed) for seed in range(30)]
-    assert [problems(one["config"]) for one in plans] == [[]] * 30
-    assert {kind for one in plans for kind in one["kinds"]} == {*KINDS, *LATER_KINDS}
+    assert [problems(plan["config"]) for plan in plans] == [[]] * 30
+    assert {kind for plan in plans for kind in plan["kinds"]} == {*KINDS, *LATER_KINDS}
 
 
 def test_a_sender_sends_the_same_without_the_other_senders() -> None:
-    one = next(p for p in map(made, range(20)) if len(p["senders"]) > 2)
-    alone = shrink.without(one, [("senders", 0)])
+    plan = next(p for p in map(made, range(20)) if len(p["senders"]) > 2)
+    alone = shrink.without(plan, [("senders", 0)])
     both = [
-        messages(plan_["senders"][place], plan_["seed"], one["seconds"], 0)
-        for plan_, place in ((one, 1), (alone, 0))
+        messages(plan_["senders"][place], plan_["seed"], plan["seconds"], 0)
+        for plan_, place in ((plan, 1), (alone, 0))
     ]
     assert both[0] == both[1] != []
 
@@ -137,15 +137,15 @@ def test_seeds_are_played_until_the_time_is_simulated_and_what_they_covered_is_p
 def test_the_plan_of_each_finding_is_kept_and_the_first_ones_are_shrunk(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def broken(one: Plan) -> Result:
-        return Result(one["seed"], "so", "a made-up promise", int(2 * NS), 2.0, 0.1, Counter())
+    def broken(plan: Plan) -> Result:
+        return Result(plan["seed"], "so", "a made-up promise", int(2 * NS), 2.0, 0.1, Counter())
 
     monkeypatch.setattr(shrink, "played", broken)
     seeds = range(main.MOST_SHRUNK + 1)
     main.keep_plans([broken({"seed": seed}) for seed in seeds], tmp_path / "findings")
-    kept = [shrink.load(tmp_path / "findings" / f"{seed}.json") for seed in seeds]
-    assert [one["senders"] for one in kept[:-1]] == [[]] * main.MOST_SHRUNK
-    assert kept[-1] == json.loads(json.dumps(made(main.MOST_SHRUNK)))
+    plans = [shrink.load(tmp_path / "findings" / f"{seed}.json") for seed in seeds]
+    assert [plan["senders"] for plan in plans[:-1]] == [[]] * main.MOST_SHRUNK
+    assert plans[-1] == json.loads(json.dumps(made(main.MOST_SHRUNK)))
 
 
 # the witness
@@ -232,8 +232,8 @@ class Bench:
         if data:
             self.inputs.fed(at_ns, data)
         self.inputs.take(at_ns, 0, -NS)
-        seen = Seen(at_ns, at_ns, mode, self.reason, None, "up", [*lines], ())
-        self.inputs.step(at_ns, seen, 0, True, lambda: self.state)
+        snapshot = Seen(at_ns, at_ns, mode, self.reason, None, "up", [*lines], ())
+        self.inputs.step(at_ns, snapshot, 0, True, lambda: self.state)
 
 
 @pytest.mark.parametrize(
@@ -340,10 +340,10 @@ def test_a_late_answer_to_a_clear_does_not_end_the_doubt_about_a_silence(silent:
     bench.inputs.fed(at_ns, b"" if silent else OK)
     bench.inputs.take(at_ns, 0, -NS)
     bench.witness.cleared(12 * NS // 10, 11 * NS // 10, CLEARED, "ann")
-    seen = Seen(at_ns, at_ns, "stopped", "a reason", None, "up", [], ())
+    snapshot = Seen(at_ns, at_ns, "stopped", "a reason", None, "up", [], ())
     expected = nullcontext() if silent else pytest.raises(BrokenError, match="without a cause")
     with expected:
-        bench.inputs.step(at_ns, seen, 0, True, dict)
+        bench.inputs.step(at_ns, snapshot, 0, True, dict)
 
 
 def test_a_pressed_emergency_stop_that_was_silent_is_no_new_press() -> None:
@@ -540,24 +540,24 @@ def test_a_battery_stops_the_robot_by_its_mean_and_not_by_a_motor_start() -> Non
 @pytest.mark.slow
 def test_some_plans_have_inputs_and_are_legal_and_an_older_product_gets_none() -> None:
     plans = list(map(made, range(200)))
-    with_inputs = [one for one in plans if kinds(one)]
+    with_inputs = [plan for plan in plans if kinds(plan)]
     for kind in ("estop", "stop", "away", "battery", "driver_fault"):
-        assert 4 <= sum(kind in kinds(one) for one in plans) <= 30
-    for one in with_inputs:
-        assert problems(one["config"]) == []
-        if kinds(one) == {"stop"} and "moment" not in one:
-            faults = {event["fault"][0] for event in one["events"] if event["do"] == "board"}
+        assert 4 <= sum(kind in kinds(plan) for plan in plans) <= 30
+    for plan in with_inputs:
+        assert problems(plan["config"]) == []
+        if kinds(plan) == {"stop"} and "moment" not in plan:
+            faults = {event["fault"][0] for event in plan["events"] if event["do"] == "board"}
             assert faults == {"bumper_pressed"}
-            assert not {"reset", "restart", "unplug"} & {event["do"] for event in one["events"]}
-        older = pairs.comparable(one)
+            assert not {"reset", "restart", "unplug"} & {event["do"] for event in plan["events"]}
+        older = pairs.comparable(plan)
         text = json.dumps([older["config"], older["board"], older["events"]])
         assert not {"safety", "battery", "estop", "bumper"} & set(re.findall("[a-z]+", text))
 
 
 @pytest.mark.slow
 def test_a_plan_with_bumpers_breaks_no_promise_and_a_robot_that_ignores_them_does() -> None:
-    plans = [one for one in map(made, range(100)) if kinds(one) == {"stop"}]
-    plan = min(plans, key=lambda one: one["seconds"])
+    plans = [item for item in map(made, range(100)) if kinds(item) == {"stop"}]
+    plan = min(plans, key=lambda item: item["seconds"])
     result = played(plan)
     assert result.finding == ""
     assert result.counts["bumper pressed"] > 0
@@ -571,7 +571,7 @@ def test_a_plan_with_bumpers_breaks_no_promise_and_a_robot_that_ignores_them_doe
 
 def driven(**changes: Any) -> Plan:
     """Return a plan in which a lawful sender drives from 1.3 s on."""
-    source = max(PLAIN["config"]["commands"]["sources"], key=lambda one: one["priority"])
+    source = max(PLAIN["config"]["commands"]["sources"], key=lambda entry: entry["priority"])
     clean = {
         "wheels": False, "hz": 50.0, "from": 0.0, "to": 12.0, "jitter": 0.0, "congestion": [],
         "clock": [], "bursts": [], "bad_stamps": 0.0, "junk": 0.0, "churn": False, "loss": 0.0,
@@ -747,9 +747,9 @@ def test_a_hand_that_turns_wheels_at_rest_causes_no_fault() -> None:
         witness.step(3 * NS, "fault", "a wheel turns by itself")
 
 
-@pytest.mark.parametrize(("steps", "seen"), [(4, True), (0, False)])
+@pytest.mark.parametrize(("steps", "visible"), [(4, True), (0, False)])
 def test_wheels_that_rest_only_while_the_host_stalls_may_look_like_a_runaway(
-    steps: int, seen: bool
+    steps: int, visible: bool
 ) -> None:
     witness = witnessed()
     witness.rested = False
@@ -758,7 +758,7 @@ def test_wheels_that_rest_only_while_the_host_stalls_may_look_like_a_runaway(
     witness.wheels(9 * NS // 4, 0.0)
     witness.troubles["pushed"] = 3 * NS
     witness.wheels(5 * NS // 2, 9.0)
-    expected = pytest.raises(BrokenError, match="without a cause") if seen else nullcontext()
+    expected = pytest.raises(BrokenError, match="without a cause") if visible else nullcontext()
     with expected:
         witness.step(3 * NS, "fault", "a wheel turns by itself")
 
@@ -877,13 +877,13 @@ def test_a_robot_may_not_speed_up_by_a_speed_that_a_zero_overtook(
     for number, v, at_ns in ((1, 1.0, NS), (3, 0.0, NS + 50_000_000), (2, 1.0, NS + 52_000_000)):
         message = Message(at_ns, at_ns, v, 0.0, at_ns, number, "")
         clock = "header s0" if v else "s0"
-        one = Sample(f"cmd/{source}", b"", {}, "s0", False, clock)
+        value = Sample(f"cmd/{source}", b"", {}, "s0", False, clock)
         wish = Wish(at_ns, v, 0.0)
-        followed.command(sender, message, one, at_ns, wish)
+        followed.command(sender, message, value, at_ns, wish)
     witness.mode = "driving"
     followed.step(at_ns + 1, at_ns + 1, at_ns, "driving", "up")
     assert followed.wish is None
-    before, after = ((one / witness.radius,) * 4 for one in (0.6, speed))
+    before, after = ((value / witness.radius,) * 4 for value in (0.6, speed))
     if finding:
         with pytest.raises(BrokenError, match="a speed that a zero overtook"):
             followed.line(at_ns, before, after)
@@ -905,8 +905,8 @@ def test_only_a_zero_before_a_clock_was_set_back_may_have_a_stamp_that_is_later_
     zero_ns = 4 * NS + round(later * witness.timeout[source])
     for number, v, at_ns, stamp_ns in ((1, 0.0, NS, zero_ns), (2, 1.0, 9 * NS, 4 * NS)):
         message = Message(at_ns, at_ns, v, 0.0, stamp_ns, number, "")
-        one = Sample(f"cmd/{source}", b"", {}, "s0", False, "s0")
-        followed.command(sender, message, one, at_ns, Wish(at_ns, v, 0.0))
+        command = Sample(f"cmd/{source}", b"", {}, "s0", False, "s0")
+        followed.command(sender, message, command, at_ns, Wish(at_ns, v, 0.0))
     witness.mode = "driving"
     followed.step(at_ns + 1, at_ns + 1, at_ns, "driving", "up")
     assert followed.wish == (None if excused else (1.0, 0.0))
@@ -917,11 +917,11 @@ def test_a_drive_may_end_with_a_single_zero_that_overtakes_the_last_speed() -> N
     sender = driven()["senders"][0] | {"id": "s0", "way": "rmw", "phases": phases}
     sender |= {"stamps_speeds": True, "ends": [[1.0, True]]}
     sent = messages(sender, 1, 2.0, 0)
-    zeros = [one for one in sent if one.sent_ns >= NS]
+    zeros = [message for message in sent if message.sent_ns >= NS]
     assert len(zeros) == 1
     assert sent[-2:] == [zeros[0], sent[-1]]
     assert sent[-1].number == zeros[0].number - 1
-    clocks = [sample(sender, one, PLAIN["config"], 0).clock for one in sent[-2:]]
+    clocks = [sample(sender, message, PLAIN["config"], 0).clock for message in sent[-2:]]
     assert clocks == ["s0", "header s0"]
 
 
@@ -978,8 +978,10 @@ def test_a_zero_before_what_may_be_a_speed_of_the_same_identity_arms_nobody(
     witness = witnessed()
     sender = made(1)["senders"][0] | {"way": "plain", "source": "app", "churn": False}
     for at_s, v, kind in ((1.0, 0.0, ""), (1.5, 0.0, junk), (2.5, 0.3, "")):
-        one = Message(int(at_s * NS), int(at_s * NS), v, 0.0, 0, 0, kind)
-        witness.command(sender, one, sample(sender, one, PLAIN["config"], 0), one.arrives_ns)
+        message = Message(int(at_s * NS), int(at_s * NS), v, 0.0, 0, 0, kind)
+        witness.command(
+            sender, message, sample(sender, message, PLAIN["config"], 0), message.arrives_ns
+        )
     assert (witness.wishes[-1][1].armed_ns == NS) is armed
 
 
@@ -991,8 +993,10 @@ def test_a_speed_of_another_shared_identity_of_the_source_undoes_a_zero(
     plain = made(1)["senders"][0] | {"way": "plain", "source": "app", "churn": False}
     other = plain | {"way": way, "routers": [[0.0, "session of router 1"]]}
     for at_s, sender, v in ((1.0, plain, 0.0), (1.5, other, 0.3), (2.5, plain, 0.3)):
-        one = Message(int(at_s * NS), int(at_s * NS), v, 0.0, NS, 0, "")
-        witness.command(sender, one, sample(sender, one, PLAIN["config"], NS), one.arrives_ns)
+        message = Message(int(at_s * NS), int(at_s * NS), v, 0.0, NS, 0, "")
+        witness.command(
+            sender, message, sample(sender, message, PLAIN["config"], NS), message.arrives_ns
+        )
     assert (witness.wishes[-1][1].armed_ns == NS) is armed
 
 
@@ -1000,13 +1004,15 @@ def test_a_sender_behind_routers_has_the_identity_of_the_session_that_stamps() -
     routers = [[0.0, "session of router 1"], [2.0, ""], [3.0, "session of router 2"]]
     sender = made(1)["senders"][0] | {"way": "routed", "source": "app", "churn": False}
     sender["routers"] = routers
-    found = []
+    identities = []
     for at_s in (1, 2, 4):
-        one = Message(at_s * NS, at_s * NS, 0.3, 0.0, NS, 1, "")
-        got = sample(sender, one, PLAIN["config"], NS)
-        found.append((got.identity, got.clock, got.options["session"], got.shared))
+        message = Message(at_s * NS, at_s * NS, 0.3, 0.0, NS, 1, "")
+        command = sample(sender, message, PLAIN["config"], NS)
+        identities.append(
+            (command.identity, command.clock, command.options["session"], command.shared)
+        )
     first, _, last = [name for _, name in routers]
-    assert found == [
+    assert identities == [
         (first, first, first, True), ("native/app", "", "", True), (last, last, last, True)
     ]  # fmt: skip
 
@@ -1015,9 +1021,9 @@ def test_a_sender_behind_routers_has_the_identity_of_the_session_that_stamps() -
 def test_some_plans_have_several_senders_behind_routers_on_one_source() -> None:
     together = 0
     for seed in range(200):
-        senders = [one for one in made(seed)["senders"] if one["way"] == "routed"]
-        assert all(one["routers"][0][0] == 0.0 for one in senders)
-        together += len(senders) > 1 and len({one["source"] for one in senders}) == 1
+        senders = [sender for sender in made(seed)["senders"] if sender["way"] == "routed"]
+        assert all(sender["routers"][0][0] == 0.0 for sender in senders)
+        together += len(senders) > 1 and len({sender["source"] for sender in senders}) == 1
     assert together > 3
 
 
@@ -1029,9 +1035,9 @@ def test_a_late_sender_is_new_again_only_after_a_thousand_new_names(
     sender = {"way": "client", "delay": 0.001, "clock": []}
 
     def fresh(clock: str, at_ns: int, delay_ns: int) -> bool:
-        one = Message(at_ns - delay_ns, at_ns, 0.3, 0.0, at_ns - delay_ns, 1, "")
+        message = Message(at_ns - delay_ns, at_ns, 0.3, 0.0, at_ns - delay_ns, 1, "")
         by = Sample("cmd/app", b"", {}, clock, False, clock)
-        return ages.fresh(sender, one, by, at_ns, NS // 4, loose=False)
+        return ages.fresh(sender, message, by, at_ns, NS // 4, loose=False)
 
     assert fresh("slow", NS, NS // 1000)
     for number in range(names):
@@ -1047,9 +1053,9 @@ def test_a_delay_that_falls_is_a_backlog_unless_the_robot_knew_it_before(known: 
 
     def fresh(at_ms: int, delay_ms: int) -> bool:
         at_ns, delay_ns = at_ms * NS // 1000, delay_ms * NS // 1000
-        one = Message(at_ns - delay_ns, at_ns, 0.3, 0.0, at_ns - delay_ns, 1, "")
+        message = Message(at_ns - delay_ns, at_ns, 0.3, 0.0, at_ns - delay_ns, 1, "")
         by = Sample("cmd/app", b"", {}, "ann", False, "ann")
-        return ages.fresh(sender, one, by, at_ns, NS // 4, loose=False)
+        return ages.fresh(sender, message, by, at_ns, NS // 4, loose=False)
 
     if known:
         for at_ms in range(5000, 6000, 50):
@@ -1072,9 +1078,9 @@ def test_the_robot_knows_a_lower_delay_of_a_foreign_clock_only_when_it_has_staye
     ages, sender = Ages(0), {"way": "zenoh", "delay": 0.001, "clock": []}
 
     def fresh(at_ns: int, delay_ns: int) -> bool:
-        one = Message(at_ns - delay_ns, at_ns, 0.3, 0.0, at_ns - delay_ns, 1, "")
+        message = Message(at_ns - delay_ns, at_ns, 0.3, 0.0, at_ns - delay_ns, 1, "")
         by = Sample("cmd/app", b"", {}, "ann", False, "ann")
-        return ages.fresh(sender, one, by, at_ns, NS // 4, loose=False)
+        return ages.fresh(sender, message, by, at_ns, NS // 4, loose=False)
 
     for at_ns in range(NS, 2 * NS, NS // 20):
         fresh(at_ns, NS)
@@ -1098,8 +1104,8 @@ def test_a_robot_does_not_learn_the_delay_of_a_command_that_the_inbox_dropped(
     }  # fmt: skip
 
     def arrives(at_ns: int, delay_ns: int) -> None:
-        one = Message(at_ns - delay_ns, at_ns, 0.3, 0.0, at_ns - delay_ns, 1, "")
-        witness.command(sender, one, sample(sender, one, PLAIN["config"], 0), at_ns)
+        message = Message(at_ns - delay_ns, at_ns, 0.3, 0.0, at_ns - delay_ns, 1, "")
+        witness.command(sender, message, sample(sender, message, PLAIN["config"], 0), at_ns)
 
     arrives(5 * NS, NS)
     if dropped:
@@ -1319,10 +1325,10 @@ def test_behind_a_suspend_only_a_sender_that_was_proved_before_may_be_called_lat
     for at_ns in (*range(end_ns - int(lasted_s * NS), end_ns, NS // 20), end_ns):
         if at_ns == end_ns:
             reasons.restart(stood)
-        one = Message(at_ns, at_ns, 0.1, 0.0, at_ns, at_ns, "")
-        found = sample(SIGNED, one, PLAIN["config"], 0)
-        witness.command(SIGNED, one, found, at_ns)
-        reasons.command(SIGNED, one, found)
+        message = Message(at_ns, at_ns, 0.1, 0.0, at_ns, at_ns, "")
+        command = sample(SIGNED, message, PLAIN["config"], 0)
+        witness.command(SIGNED, message, command, at_ns)
+        reasons.command(SIGNED, message, command)
     assert ("late" in reasons.allowed("app", end_ns)) is late
 
 
@@ -1336,10 +1342,10 @@ def test_only_a_sender_that_was_silent_since_a_stall_may_wait_because_of_it(
     witness.timeout["app"] = NS
     run: Any = SimpleNamespace(witness=witness)
     reasons, at_ns = Reasons(run), 3 * NS
-    one = Message(at_ns, at_ns, 0.1, 0.0, at_ns, 1, "")
-    found = sample(SIGNED, one, PLAIN["config"], 0)
-    witness.command(SIGNED, one, found, at_ns)
-    reasons.command(SIGNED, one, found)
+    message = Message(at_ns, at_ns, 0.1, 0.0, at_ns, 1, "")
+    command = sample(SIGNED, message, PLAIN["config"], 0)
+    witness.command(SIGNED, message, command, at_ns)
+    reasons.command(SIGNED, message, command)
     reasons._stalled_ns = int(stalled_s * NS)
     assert ("stalled" in reasons.allowed("app", int((stalled_s + after_s) * NS))) is excused
 
@@ -1349,10 +1355,10 @@ def test_a_shared_identity_may_wait_for_a_zero_behind_messages_that_were_dropped
     run: Any = SimpleNamespace(witness=witness)
     reasons, plain = Reasons(run), SIGNED | {"way": "plain"}
     for at_ns in range(0, 3 * NS, NS // 20):
-        one = Message(at_ns, at_ns, 0.1 * (at_ns > 2 * NS), 0.0, 0, at_ns, "")
-        found = sample(plain, one, PLAIN["config"], 0)
-        witness.command(plain, one, found, at_ns)
-        reasons.command(plain, one, found)
+        message = Message(at_ns, at_ns, 0.1 * (at_ns > 2 * NS), 0.0, 0, at_ns, "")
+        command = sample(plain, message, PLAIN["config"], 0)
+        witness.command(plain, message, command, at_ns)
+        reasons.command(plain, message, command)
     assert reasons.allowed("app", 3 * NS) == set()
     reasons.dropped("cmd/app", 3 * NS)
     assert reasons.allowed("app", 3 * NS) == {"neutral"}
@@ -1373,7 +1379,7 @@ def test_a_port_that_is_opened_again_has_no_rest_of_a_line() -> None:
 
 @pytest.mark.slow
 def test_rare_events_come_at_the_time_of_a_drive() -> None:
-    found = {"echo": 0, "block": 0}
+    counts = {"echo": 0, "block": 0}
     for seed in range(200, 400):
         plan = made(seed)
         before = {key: plan[key] for key in ("board", "config")} | {"seconds": plan["seconds"]}
@@ -1382,8 +1388,8 @@ def test_rare_events_come_at_the_time_of_a_drive() -> None:
         for event in _rare_events(random.Random(seed), before | {"senders": [sender]}):
             assert 1.0 <= event["at"] <= plan["seconds"]
             assert any(abs(event["at"] - time) <= 3.0 for time, *_ in drives)
-            found["block" if event["do"] == "block" else event["fault"][0]] += 1
-    assert min(found.values()) > 5
+            counts["block" if event["do"] == "block" else event["fault"][0]] += 1
+    assert min(counts.values()) > 5
 
 
 @pytest.mark.slow
@@ -1402,8 +1408,8 @@ def state_of(counters: dict[str, int]) -> dict[str, Any]:
 def test_junk_that_is_counted_by_another_reason_is_a_finding() -> None:
     reports, sender = Reports(), made(1)["senders"][0] | {"way": "plain", "wheels": False}
     for n, junk in enumerate(("huge", "delete", "fields")):
-        one = Message(n, n, 0.1, 0.0, 0, n, junk)
-        reports.command(sender, one, sample(sender, one, PLAIN["config"], 0), n, False)
+        message = Message(n, n, 0.1, 0.0, 0, n, junk)
+        reports.command(sender, message, sample(sender, message, PLAIN["config"], 0), n, False)
     right = {"command_too_big": 1, "command_not_a_put": 1, "command_wrong_shape": 1}
     reports.judge_junk(NS, state_of(right), 0)
     reports.judge_junk(NS, state_of(right | {"command_too_big": 0}), 1)
@@ -1465,9 +1471,9 @@ def test_a_board_that_cannot_be_read_loses_the_link_and_comes_back(fault: list[A
     run = Run(quiet_with({"at": 2.0, "for": 2.0, "do": "board", "fault": fault}))
     see = run.product._see
 
-    def look(seen: Seen) -> None:
-        links[seen.link] += 2 < seen.at_ns / NS - START.mono_ns / NS < 4
-        see(seen)
+    def look(snapshot: Seen) -> None:
+        links[snapshot.link] += 2 < snapshot.at_ns / NS - START.mono_ns / NS < 4
+        see(snapshot)
 
     run.product._see = look
     assert run.play()["lawful drives"] == 1
@@ -1486,15 +1492,15 @@ def test_a_command_with_a_bad_stamp_is_one_of_its_key_or_of_a_clock_that_is_not_
     way: str, stamp_ns: int
 ) -> None:
     sender = made(1)["senders"][0] | {"way": way, "source": "app", "churn": False, "wheels": False}
-    one = Message(NS, NS, 0.3, 0.0, stamp_ns, 1, "")
-    got = sample(sender, one, PLAIN["config"], START.wall_ns)
-    options = {name: value for name, value in got.options.items() if name != "put"}
+    message = Message(NS, NS, 0.3, 0.0, stamp_ns, 1, "")
+    command = sample(sender, message, PLAIN["config"], START.wall_ns)
+    options = {name: value for name, value in command.options.items() if name != "put"}
     options["sender"] = options.pop("session")
     encoding, arrived_ns = options.pop("encoding", ""), START.mono_ns
-    seen = Receiver(JointsConfig(), Kinematics(DriveConfig())).command(
-        Arrival(got.key, True, got.payload, encoding, arrived_ns, **options)
+    result = Receiver(JointsConfig(), Kinematics(DriveConfig())).command(
+        Arrival(command.key, True, command.payload, encoding, arrived_ns, **options)
     )
-    assert (seen.shared, seen.stamp_ns is None) == (got.shared, got.clock == "")
+    assert (result.shared, result.stamp_ns is None) == (command.shared, command.clock == "")
 
 
 # the pose and the board that comes and goes
@@ -1599,11 +1605,11 @@ def test_the_judge_sees_a_board_that_comes_and_goes(
 ) -> None:
     at_ns = after_ms * NS // 1000
     lines = [(at_ns, line)] if line else []
-    seen = Seen(at_ns, at_ns, "waiting", "no board", None, link, lines, [])
+    snapshot = Seen(at_ns, at_ns, "waiting", "no board", None, link, lines, [])
     board: Any = Board(line is not None)
     judged = pytest.raises(BrokenError, match=promise) if promise else nullcontext()
     with judged:
-        Plugging(NS // 100).see(at_ns, seen, board, 0)
+        Plugging(NS // 100).see(at_ns, snapshot, board, 0)
 
 
 @pytest.mark.parametrize(("lost", "finding"), [(2, False), (3, True)])
@@ -1659,12 +1665,12 @@ def followed_in_turn(
         sender = SIGNED | {"id": name, "clock": [["step", 5.0, by_s]] if by_s else []}
         at_ns = int(at_s * NS)
         sent_ns = at_ns - NS * (at_s in late)
-        one = Message(sent_ns, at_ns, v, 0.0, sent_ns, number, "")
-        found = sample(sender, one, PLAIN["config"], 0)
-        wish = witness.command(sender, one, found, at_ns)
+        message = Message(sent_ns, at_ns, v, 0.0, sent_ns, number, "")
+        command = sample(sender, message, PLAIN["config"], 0)
+        wish = witness.command(sender, message, command, at_ns)
         for _ in range(flood * (at_s in refused)):
-            followed.command(sender, one, found, at_ns, None)
-        followed.command(sender, one, found, at_ns, wish)
+            followed.command(sender, message, command, at_ns, None)
+        followed.command(sender, message, command, at_ns, wish)
         followed_ns = followed_ns if at_s in refused else at_ns
         followed.step(at_ns + 1, at_ns + 1, followed_ns, "driving", "up")
 
@@ -1703,10 +1709,10 @@ def test_a_command_of_higher_priority_may_end_the_place_of_the_first_sender(
             sender, sent_ns = SIGNED | {"id": name}, at_ns
             if name == source:
                 sender, sent_ns = sender | {"source": source}, at_ns - int(late_s * NS)
-            one = Message(sent_ns, at_ns, 0.3, 0.0, sent_ns, number, "")
-            found = sample(sender, one, PLAIN["config"], 0)
-            wish = witness.command(sender, one, found, at_ns)
-            followed.command(sender, one, found, at_ns, wish)
+            message = Message(sent_ns, at_ns, 0.3, 0.0, sent_ns, number, "")
+            command = sample(sender, message, PLAIN["config"], 0)
+            wish = witness.command(sender, message, command, at_ns)
+            followed.command(sender, message, command, at_ns, wish)
             followed_ns = None if name == source else at_ns
             witness.read()
             followed.step(at_ns + 1, at_ns + 1, followed_ns, "driving", "up")
@@ -1732,10 +1738,10 @@ def test_a_robot_that_is_released_forgets_the_command_that_it_followed_in_that_s
     with expected:
         for number, name in enumerate("ab"):
             at_ns, sender = 4 * NS + number * NS // 20, SIGNED | {"id": name}
-            one = Message(at_ns, at_ns, 0.3, 0.0, at_ns, number, "")
-            found = sample(sender, one, PLAIN["config"], 0)
-            wish = witness.command(sender, one, found, at_ns)
-            followed.command(sender, one, found, at_ns, wish)
+            message = Message(at_ns, at_ns, 0.3, 0.0, at_ns, number, "")
+            command = sample(sender, message, PLAIN["config"], 0)
+            wish = witness.command(sender, message, command, at_ns)
+            followed.command(sender, message, command, at_ns, wish)
             if released and not number:
                 witness.arming(at_ns + 1)
             followed.step(at_ns + 2, at_ns + 2, at_ns, "driving", "up")
@@ -1746,10 +1752,10 @@ def test_a_clock_whose_delay_falls_has_no_certain_command_any_more() -> None:
     followed, sender = Followed(witness), SIGNED | {"way": "client", "delay": 1.0}
 
     def arrives(at_ns: int, delay_ns: int) -> None:
-        one = Message(at_ns - delay_ns, at_ns, 0.3, 0.0, at_ns - delay_ns, at_ns, "")
-        found = sample(sender, one, PLAIN["config"], 0)
-        wish = witness.command(sender, one, found, at_ns)
-        followed.command(sender, one, found, at_ns, wish)
+        message = Message(at_ns - delay_ns, at_ns, 0.3, 0.0, at_ns - delay_ns, at_ns, "")
+        command = sample(sender, message, PLAIN["config"], 0)
+        wish = witness.command(sender, message, command, at_ns)
+        followed.command(sender, message, command, at_ns, wish)
 
     for at_ns in range(NS, 8 * NS, NS // 20):
         arrives(at_ns, NS)
@@ -1772,10 +1778,10 @@ def test_an_adjusted_clock_with_a_late_command_has_no_certain_command_for_a_whil
     for at_ns in range(NS, 9 * NS, NS // 20):
         late = at_ns == 4 * NS
         sent_ns = at_ns - (2 * NS if late else NS // 100)
-        one = Message(sent_ns, at_ns, 0.3, 0.0, sent_ns, at_ns, "")
-        found = sample(sender, one, PLAIN["config"], 0)
-        wish = witness.command(sender, one, found, at_ns)
-        followed.command(sender, one, found, at_ns, wish)
+        message = Message(sent_ns, at_ns, 0.3, 0.0, sent_ns, at_ns, "")
+        command = sample(sender, message, PLAIN["config"], 0)
+        wish = witness.command(sender, message, command, at_ns)
+        followed.command(sender, message, command, at_ns, wish)
         certain_ns += [at_ns] if followed._waiting else []
         followed.step(at_ns + 1, at_ns + 1, None if late else at_ns, "driving", "up")
     assert certain_ns[0] < 4 * NS < 8 * NS < certain_ns[-1]
@@ -1790,11 +1796,11 @@ def test_a_command_older_than_one_without_motion_is_not_certain(number: int) -> 
         (10 * NS, 201, "cancels"),
         (10 * NS + 1, number, ""),
     ):
-        one = Message(at_ns, at_ns, 0.3, 0.0, at_ns, sequence, junk)
-        found = sample(sender, one, PLAIN["config"], 0)
-        wish = followed._witness.command(sender, one, found, at_ns)
+        message = Message(at_ns, at_ns, 0.3, 0.0, at_ns, sequence, junk)
+        command = sample(sender, message, PLAIN["config"], 0)
+        wish = followed._witness.command(sender, message, command, at_ns)
         followed.step(at_ns, at_ns, None, "driving", "up")
-        followed.command(sender, one, found, at_ns, wish)
+        followed.command(sender, message, command, at_ns, wish)
     assert bool(followed._waiting) is (number > 201)
 
 
@@ -1806,11 +1812,11 @@ def test_a_clock_that_was_set_and_drives_without_a_zero_is_a_finding() -> None:
 
 def test_a_slope_that_grows_faster_than_the_jerk_is_seen_through_the_rounding() -> None:
     for jerk, allowed in ((2.0, True), (6.0, False)):
-        slope, found = Slope(), True
+        slope, plausible = Slope(), True
         for n in range(30):
             speed = round(jerk * (n * 0.01) ** 2 / 2 / 0.0005) * 0.0005
-            found = slope.take(speed, 0.01, 2.0, 4.0, 0.00026) and found
-        assert found is allowed
+            plausible = slope.take(speed, 0.01, 2.0, 4.0, 0.00026) and plausible
+        assert plausible is allowed
 
 
 # shrinking
@@ -1818,10 +1824,10 @@ def test_a_slope_that_grows_faster_than_the_jerk_is_seen_through_the_rounding() 
 
 @pytest.mark.slow
 def test_shrinking_leaves_what_the_finding_needs(monkeypatch: pytest.MonkeyPatch) -> None:
-    def broken(one: Plan) -> Result:
-        verbs = [event.get("verb") for event in one["events"]]
-        found = "clear" in verbs and any(s["phases"] for s in one["senders"])
-        name = "a made-up promise" if found else ""
+    def broken(plan: Plan) -> Result:
+        verbs = [event.get("verb") for event in plan["events"]]
+        fails = "clear" in verbs and any(s["phases"] for s in plan["senders"])
+        name = "a made-up promise" if fails else ""
         return Result(1, name, name, int(500 * NS), 1.0, 0.1, Counter())
 
     monkeypatch.setattr(shrink, "played", broken)
@@ -1853,27 +1859,27 @@ def test_a_paired_run_finds_no_difference_to_the_same_code_and_names_the_first_o
     tmp_path: Path,
 ) -> None:
     other = copy_of_the_package(tmp_path)
-    one = quiet()
+    plan = quiet()
     pair = Pair(OURS, other)
     assert pair.sides[1].package.is_relative_to(tmp_path)
-    assert pair.differs(one)[0] == ""
+    assert pair.differs(plan)[0] == ""
     pair.close()
     words = other / "acsard" / "core" / "motion" / "arbiter_text.py"
     text = words.read_text(encoding="utf-8")
     words.write_text(text.replace("waiting for a command", "no command"), encoding="utf-8")
     pair = Pair(OURS, other)
-    difference, _ = pair.differs(one)
+    difference, _ = pair.differs(plan)
     pair.close()
     assert "reason: here 'waiting for a command" in difference
     assert "there 'no command" in difference
 
 
 def test_an_event_that_is_left_out_of_pairs_is_in_no_plan_of_theirs() -> None:
-    one = next(p for p in map(made, range(99)) if any(e["do"] == "restart" for e in p["events"]))
-    less = pairs.comparable(one, (("do", "restart", "it restarts in another way"),))
-    assert {event["do"] for event in one["events"]} - {event["do"] for event in less["events"]} == {
-        "restart"
-    }
+    plan = next(p for p in map(made, range(99)) if any(e["do"] == "restart" for e in p["events"]))
+    less = pairs.comparable(plan, (("do", "restart", "it restarts in another way"),))
+    assert {event["do"] for event in plan["events"]} - {
+        event["do"] for event in less["events"]
+    } == {"restart"}
 
 
 def test_a_pair_goes_on_behind_a_broken_promise_and_ends_at_an_exception_of_the_product(
@@ -1915,12 +1921,12 @@ def test_a_listed_difference_is_taken_out_on_both_sides() -> None:
 @cache
 def plans_of_moments() -> dict[str, Plan]:
     """Return, for each moment of `bad_moments.py`, the first plan that has it."""
-    found: dict[str, Plan] = {}
+    plans: dict[str, Plan] = {}
     for plan in map(made, range(2000)):
-        found.setdefault(plan.get("moment", ""), plan)
-        if found.keys() >= MOMENTS.keys():
+        plans.setdefault(plan.get("moment", ""), plan)
+        if plans.keys() >= MOMENTS.keys():
             break
-    return found
+    return plans
 
 
 @pytest.mark.slow
@@ -1935,16 +1941,16 @@ def test_a_plan_with_a_moment_is_legal_and_an_older_product_knows_its_faults(nam
 
 
 def test_an_echo_beside_a_board_is_a_finding_only_if_the_pose_is_wrong_for_long() -> None:
-    one = HalfDuplex()
-    one.begin()
-    one.see(0, "driving", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    judge = HalfDuplex()
+    judge.begin()
+    judge.see(0, "driving", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
     for n in range(55):
         speed = max(0, n - 5) / 5
-        one.line((speed, speed, speed, speed))
-    one.see(NS, "driving", (1.0, 0.0, 0.0), (0.6, 0.0, 0.0))
-    one.see(2 * NS, "waiting", (2.0, 0.0, 0.0), (1.2, 0.0, 0.0))
+        judge.line((speed, speed, speed, speed))
+    judge.see(NS, "driving", (1.0, 0.0, 0.0), (0.6, 0.0, 0.0))
+    judge.see(2 * NS, "waiting", (2.0, 0.0, 0.0), (1.2, 0.0, 0.0))
     with pytest.raises(BrokenError, match="an echo beside a board is seen"):
-        one.see(3 * NS, "driving", (2.1, 0.0, 0.0), (1.2, 0.0, 0.0))
+        judge.see(3 * NS, "driving", (2.1, 0.0, 0.0), (1.2, 0.0, 0.0))
 
 
 @pytest.mark.parametrize(("yaw", "finding"), [(0.0, False), (0.5, True)])
@@ -1992,9 +1998,9 @@ def test_a_reason_may_leave_out_a_client_only_if_it_names_four_others(
 
 def test_a_message_in_a_hole_is_lost_and_every_message_of_a_doubling_network_comes_twice() -> None:
     sender = driven()["senders"][0]
-    numbers = [one.number for one in messages(sender, 0, 2.0, 0)]
-    holes = [one.number for one in messages(sender | {"holes": [[0.5, 0.7]]}, 0, 2.0, 0)]
-    twice = [one.number for one in messages(sender | {"doubled": 0.003}, 0, 2.0, 0)]
+    numbers = [message.number for message in messages(sender, 0, 2.0, 0)]
+    holes = [message.number for message in messages(sender | {"holes": [[0.5, 0.7]]}, 0, 2.0, 0)]
+    twice = [message.number for message in messages(sender | {"doubled": 0.003}, 0, 2.0, 0)]
     assert 0 < len(holes) < len(numbers)
     assert set(holes) < set(numbers)
     assert sorted(twice) == sorted(numbers * 2)

@@ -34,8 +34,8 @@ class Unjudged(Run):
         """Deliver a message to the daemon if it runs."""
         if self.product.alive:
             at_ns = self._arrival(message.arrives_ns)
-            one = sample(sender, message, self.plan["config"], self.product.wall_ns)
-            self.product.deliver(at_ns, one.key, one.payload, **one.options)
+            command = sample(sender, message, self.plan["config"], self.product.wall_ns)
+            self.product.deliver(at_ns, command.key, command.payload, **command.options)
 
     def _fed(self, at_ns: int, data: bytes) -> None: ...
 
@@ -47,14 +47,14 @@ class Unjudged(Run):
         for ticket, _ in self.product.replies():
             self._calls.pop(ticket, None)
 
-    def _judge(self, seen: Seen) -> None:
+    def _judge(self, snapshot: Seen) -> None:
         if self._calls:
             self._take_answers()
         if self.log is not None:
             self.log(
                 {
-                    "at": seen.at_ns, "mode": seen.mode, "reason": seen.reason,
-                    "lines": [[at, line.decode("latin-1")] for at, line in seen.lines],
-                    "odometry": seen.estimates,
+                    "at": snapshot.at_ns, "mode": snapshot.mode, "reason": snapshot.reason,
+                    "lines": [[at, line.decode("latin-1")] for at, line in snapshot.lines],
+                    "odometry": snapshot.estimates,
                 }
             )  # fmt: skip

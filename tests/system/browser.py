@@ -76,20 +76,20 @@ class Page(Program):
     def client(self, token: str = "", address: str = "") -> aiohttp.ClientSession:
         """Return an HTTP session like that of another host's program, with or without a token."""
         trusted = ssl.create_default_context(cafile=str(self.tls / "ca.pem"))
-        told = {"Authorization": f"Bearer {token}"} if token else {}
+        headers = {"Authorization": f"Bearer {token}"} if token else {}
         local = (address, 0) if address else None
         connector = aiohttp.TCPConnector(resolver=_Here(), ssl=trusted, limit=0, local_addr=local)
-        return aiohttp.ClientSession(connector=connector, headers=told)
+        return aiohttp.ClientSession(connector=connector, headers=headers)
 
     def refused(self) -> dict[str, float]:
         """Return how many requests the page has refused so far, by reason."""
         with urllib.request.urlopen(f"{self.here}/metrics") as answer:
-            told = answer.read().decode()
-        found = {}
-        for line in told.splitlines():
+            metrics = answer.read().decode()
+        counts = {}
+        for line in metrics.splitlines():
             if line.startswith("acsard_page_refused_total{"):
-                found[line.partition('reason="')[2].partition('"')[0]] = float(line.split()[-1])
-        return found
+                counts[line.partition('reason="')[2].partition('"')[0]] = float(line.split()[-1])
+        return counts
 
 
 class _Here(aiohttp.abc.AbstractResolver):
@@ -107,8 +107,8 @@ class _Here(aiohttp.abc.AbstractResolver):
 
 async def answer(url: str) -> tuple[int, str]:
     """Return the status and the body of the answer to a GET request."""
-    async with aiohttp.ClientSession() as session, session.get(url) as got:
-        return got.status, await got.text()
+    async with aiohttp.ClientSession() as session, session.get(url) as response:
+        return response.status, await response.text()
 
 
 async def text(url: str) -> str:
@@ -148,19 +148,21 @@ class Hands:
             while True:
                 message = await self.socket.receive()
                 assert message.type == aiohttp.WSMsgType.TEXT, message
-                said = json.loads(message.data)
-                self.heard.append(said)
-                if look(said):
-                    return said
+                frame = json.loads(message.data)
+                self.heard.append(frame)
+                if look(frame):
+                    return frame
 
     async def call(self, name: str, **payload: object) -> Any:
         await self.say(call=name, id=name, payload=payload)
-        return await self.find(lambda said: said.get("answer") == name)
+        return await self.find(lambda frame: frame.get("answer") == name)
 
     async def state(self, look: Callable[[Any], Any]) -> Any:
         """Return the first state that `look` accepts."""
-        found = await self.find(lambda said: said.get("key") == "state" and look(said["value"]))
-        return found["value"]
+        message = await self.find(
+            lambda frame: frame.get("key") == "state" and look(frame["value"])
+        )
+        return message["value"]
 
     async def until_driving(self, linear: float) -> None:
         """Send zeros for 0.6 s, then this speed until the robot reaches it."""

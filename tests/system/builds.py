@@ -19,10 +19,10 @@ LIBCLANG = "no libclang: it builds the bridge's bindings (Debian: apt install li
 
 def program(name: str, needed: str) -> str:
     """Return the path of a tool; skips the test if it is not installed."""
-    found = shutil.which(name)
-    if found is None:
+    path = shutil.which(name)
+    if path is None:
         pytest.skip(f"no {name} on the PATH: {needed}")
-    return found
+    return path
 
 
 def finished(words: Sequence[str], where: Path, **more: str) -> subprocess.CompletedProcess[str]:
@@ -39,14 +39,14 @@ def run(words: Sequence[str], where: Path, **more: str) -> str:
     return done.stdout
 
 
-def ros2dds_bridge(kept: Path) -> str:
+def ros2dds_bridge(cache: Path) -> str:
     """Return the installed zenoh-bridge-ros2dds, or build the program in `tests/ros2dds`."""
-    if (found := shutil.which("zenoh-bridge-ros2dds")) is not None:
-        return found
+    if (path := shutil.which("zenoh-bridge-ros2dds")) is not None:
+        return path
     cargo = program("cargo", "it builds the bridge in tests/ros2dds")
     for tool in ("cmake", "c++"):
         program(tool, "it builds the Cyclone DDS of the bridge")
-    target = kept / "ros2dds"
+    target = cache / "ros2dds"
     words = [cargo, "build", "--quiet", "--locked"]
     done = finished(words, ROOT / "tests/ros2dds", CARGO_TARGET_DIR=str(target))
     if done.returncode != 0 and "Unable to find libclang" in done.stderr:

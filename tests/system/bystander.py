@@ -61,11 +61,11 @@ class Bystander:
         """
         end = time.monotonic() if to is None else to
         deadline = end + 10.0
-        while (seen := ROW.unpack_from(self._book))[1] < end:
+        while (row := ROW.unpack_from(self._book))[1] < end:
             assert self._process.poll() is None, "the bystander has ended"
             assert time.monotonic() < deadline, "the bystander stands still"
             time.sleep(TICK_S)
-        count, total = int(seen[0]), 0.0
+        count, total = int(row[0]), 0.0
         for number in range(count - 1, max(0, count - ROWS), -1):
             at, late = ROW.unpack_from(self._book, ROW.size * (1 + number % ROWS))
             if at < since:

@@ -90,10 +90,10 @@ class Browser:
                 [*words, "about:blank"],
                 stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True,
             )  # fmt: skip
-        told = self._where / "DevToolsActivePort"
+        port_file = self._where / "DevToolsActivePort"
 
         def port() -> str | None:
-            return next(iter(told.read_text().split()), None) if told.exists() else None
+            return next(iter(port_file.read_text().split()), None) if port_file.exists() else None
 
         self._wait(self._connect(until(port, 20.0, "a browser")))
 
@@ -119,7 +119,9 @@ class Browser:
         with self._there():
             async with self._session.get("/json") as answer:
                 pages = await answer.json()
-        return {one["id"]: one["webSocketDebuggerUrl"] for one in pages if one["type"] == "page"}
+        return {
+            page["id"]: page["webSocketDebuggerUrl"] for page in pages if page["type"] == "page"
+        }
 
     async def _attend(self, tab: str) -> None:
         url = (await self._tabs())[tab]
@@ -148,21 +150,21 @@ class Browser:
 
     async def _read(self) -> None:
         async for message in self._socket:
-            told = json.loads(message.data)
-            if "id" in told:
-                answer = self._answers.pop(told["id"], None)
+            frame = json.loads(message.data)
+            if "id" in frame:
+                answer = self._answers.pop(frame["id"], None)
                 if answer is not None and not answer.done():
-                    answer.set_result(told)
-            elif told["method"] == "Runtime.consoleAPICalled":
-                self.said.append(" ".join(str(a.get("value")) for a in told["params"]["args"]))
-            elif told["method"] == "Runtime.exceptionThrown":
-                self.said.append(json.dumps(told["params"]["exceptionDetails"]))
-            elif told["method"] == "Log.entryAdded":
-                self.said.append(told["params"]["entry"]["text"])
-            elif told["method"] == "Network.loadingFinished":
-                self.received += int(told["params"]["encodedDataLength"])
-            elif told["method"] == "Network.webSocketFrameReceived":
-                self.received += len(told["params"]["response"]["payloadData"].encode())
+                    answer.set_result(frame)
+            elif frame["method"] == "Runtime.consoleAPICalled":
+                self.said.append(" ".join(str(a.get("value")) for a in frame["params"]["args"]))
+            elif frame["method"] == "Runtime.exceptionThrown":
+                self.said.append(json.dumps(frame["params"]["exceptionDetails"]))
+            elif frame["method"] == "Log.entryAdded":
+                self.said.append(frame["params"]["entry"]["text"])
+            elif frame["method"] == "Network.loadingFinished":
+                self.received += int(frame["params"]["encodedDataLength"])
+            elif frame["method"] == "Network.webSocketFrameReceived":
+                self.received += len(frame["params"]["response"]["payloadData"].encode())
 
     def ask(self, method: str, **params: object) -> Any:
         """Run one command of the DevTools protocol, and return its result."""
@@ -172,9 +174,9 @@ class Browser:
         self._number += 1
         answer = self._answers[self._number] = self._loop.create_future()
         await self._socket.send_json({"id": self._number, "method": method, "params": params})
-        told = await answer
-        assert "error" not in told, told
-        return told["result"]
+        reply = await answer
+        assert "error" not in reply, reply
+        return reply["result"]
 
     def _wait(self, work: Any) -> Any:
         return asyncio.run_coroutine_threadsafe(work, self._loop).result(20.0 + PATIENCE_S)
@@ -196,9 +198,9 @@ class Browser:
 
     def js(self, text: str) -> Any:
         """Evaluate a JavaScript expression in the page, wait for a promise, return the value."""
-        told = self.ask("Runtime.evaluate", expression=text, returnByValue=True, awaitPromise=True)
-        assert "exceptionDetails" not in told, told["exceptionDetails"]
-        return told["result"].get("value")
+        reply = self.ask("Runtime.evaluate", expression=text, returnByValue=True, awaitPromise=True)
+        assert "exceptionDetails" not in reply, reply["exceptionDetails"]
+        return reply["result"].get("value")
 
     def text(self, name: str) -> str:
         """Return the text of the element with this id, or "" if there is no such element."""
@@ -207,8 +209,8 @@ class Browser:
     def middle(self, name: str) -> tuple[float, float]:
         """Return the position of the element's centre, in px."""
         box = f"document.getElementById({name!r}).getBoundingClientRect()"
-        found = self.js(f"(b => [b.x + b.width / 2, b.y + b.height / 2])({box})")
-        return found[0], found[1]
+        point = self.js(f"(b => [b.x + b.width / 2, b.y + b.height / 2])({box})")
+        return point[0], point[1]
 
     def too_small(self) -> list[Any]:
         """Return the visible controls that are too small for a finger: name, width, height."""
@@ -222,11 +224,11 @@ class Browser:
         rules = json.dumps({"runOnly": [only]} if only else {})
         if not self.js("'axe' in window"):
             self.js(files("axe_core_python").joinpath("axe.min.js").read_text() + ";1")
-        found: list[Any] = self.js(
+        violations: list[Any] = self.js(
             f"axe.run({rules}).then(told =>"
             " told.violations.map(one => [one.impact, one.id, one.nodes[0].html]))"
         )
-        return found
+        return violations
 
     def touch(self, kind: str, *points: tuple[float, float]) -> None:
         """Send a touch event (Start, Move, End or Cancel) with the fingers that are down."""
@@ -274,11 +276,11 @@ class Browser:
 
         If a busy machine makes the page release the stick, the finger presses it again.
         """
-        told: list[str] = []
+        texts: list[str] = []
 
         def look() -> bool:
             if not self.js("document.getElementById('stick').matches('.held')"):
-                told.append(self.text("told"))
+                texts.append(self.text("told"))
                 self.lift()
                 self.push(0, 0, "Start")
                 self.push(0, 90)
@@ -287,7 +289,7 @@ class Browser:
         try:
             until(look, 10.0, "it drives")
         except AssertionError as error:
-            raise AssertionError(f"{error}; it said {told}") from None
+            raise AssertionError(f"{error}; it said {texts}") from None
 
     def key(self, kind: str, code: str, key: str) -> None:
         """Send a keyboard event. `kind` is Down or Up."""
@@ -303,13 +305,13 @@ class Browser:
 
     def picture(self, path: Path, *, whole: bool = False) -> None:
         """Write a PNG of the visible page, or of the `whole` page down to its end."""
-        told = self.ask(
+        reply = self.ask(
             "Page.captureScreenshot",
             format="png",
             captureBeyondViewport=whole,
             **{"clip": self._whole()} if whole else {},
         )
-        path.write_bytes(base64.b64decode(told["data"]))
+        path.write_bytes(base64.b64decode(reply["data"]))
 
     def _whole(self) -> dict[str, float]:
         size = self.ask("Page.getLayoutMetrics")["cssContentSize"]

@@ -42,16 +42,16 @@ class Guided:
     async def says(self, look: Callable[[Any], Any]) -> Any:
         """Return the first message that `look` accepts. Fails if the procedure has ended before."""
 
-        def found(said: Any) -> Any:
-            found = "guide" in said and look(said["guide"])
-            assert found or "ended" not in said.get("guide", {}), said
+        def found(frame: Any) -> Any:
+            found = "guide" in frame and look(frame["guide"])
+            assert found or "ended" not in frame.get("guide", {}), frame
             return found
 
         return (await self.ours.find(found))["guide"]
 
     async def asks(self, words: str = "") -> Any:
         """Return the next question, which must contain these words."""
-        question = await self.says(lambda said: "question" in said)
+        question = await self.says(lambda message: "question" in message)
         assert words in question["words"], question
         return question
 
@@ -59,7 +59,7 @@ class Guided:
         await self.ours.say(reply=question["question"], value=value)
 
     async def ended(self) -> Any:
-        return await self.says(lambda said: "ended" in said)
+        return await self.says(lambda message: "ended" in message)
 
     async def starts(self, words: str = "") -> None:
         """Start the next leg."""

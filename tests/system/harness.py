@@ -64,9 +64,9 @@ def until(look: Callable[[], T | None], within: float = 10.0, what: str = "") ->
     """
     deadline = time.monotonic() + within + PATIENCE_S
     while True:
-        got = look()
-        if got:
-            return got
+        result = look()
+        if result:
+            return result
         if time.monotonic() > deadline:
             raise AssertionError(f"not in {within + PATIENCE_S:g} s: {what}")
         time.sleep(0.005)
@@ -107,15 +107,15 @@ def _states() -> str:
 def children(pid: int, words: str) -> list[int]:
     """Return the pids of a process's children whose command line contains these words."""
     born = [file.read_text().split() for file in Path(f"/proc/{pid}/task").glob("*/children")]
-    found = []
+    pids = []
     for child in itertools.chain.from_iterable(born):
         try:
             line = Path(f"/proc/{child}/cmdline").read_text().replace("\0", " ")
         except OSError:
             continue  # it has ended meanwhile
         if words in line:
-            found.append(int(child))
-    return found
+            pids.append(int(child))
+    return pids
 
 
 class Program:
@@ -189,13 +189,13 @@ class Program:
         """Return the first line on standard output that contains `text`."""
 
         def look() -> str | None:
-            found = next((line for line in list(self.out) if text in line), None)
-            if found is None and self.process.poll() is not None:
+            result = next((line for line in list(self.out) if text in line), None)
+            if result is None and self.process.poll() is not None:
                 for reader in self._readers:
                     reader.join(END_S)
                 if not any(text in line for line in self.out):
                     raise AssertionError(f"ended with {self.process.returncode}\n{self}")
-            return found
+            return result
 
         return until(look, within, f"{text!r} from {self.words}\n{self}")
 
@@ -272,16 +272,16 @@ class Daemon(Program):
         **how: Any,
     ) -> None:
         self.endpoint = endpoint or free_endpoint()
-        given = {table: dict(values) for table, values in (config or {}).items()}
-        given.setdefault("mcu", {}).setdefault("port", str(port))
-        given.setdefault("bus", {}).setdefault("listen", [self.endpoint])
+        tables = {table: dict(values) for table, values in (config or {}).items()}
+        tables.setdefault("mcu", {}).setdefault("port", str(port))
+        tables.setdefault("bus", {}).setdefault("listen", [self.endpoint])
         self.states = where / f"{name}.states"
         """Directory of the latch file. The next daemon of this name starts with its latches."""
-        given.setdefault("control", {}).setdefault("state_directory", str(self.states))
-        self.config = write_config(where / f"{name}.toml", given)
+        tables.setdefault("control", {}).setdefault("state_directory", str(self.states))
+        self.config = write_config(where / f"{name}.toml", tables)
         self._ready = ready
-        listens = given["bus"].get("mode") != "client"
-        self._has_gateway = listens and "'tls/" in str(given["bus"]["listen"])
+        listens = tables["bus"].get("mode") != "client"
+        self._has_gateway = listens and "'tls/" in str(tables["bus"]["listen"])
         run = [*before, *acsard("run", "--config", str(self.config), *words)]
         if shell:
             run = ["sh", "-c", f'exec "$@" {shell}', "sh", *run]
@@ -311,8 +311,8 @@ class Daemon(Program):
 
     def events(self, name: str) -> list[dict[str, Any]]:
         """Return the log lines of one event so far."""
-        found = [json.loads(line) for line in list(self.err) if line.startswith("{")]
-        return [event for event in found if event["event"] == name]
+        entries = [json.loads(line) for line in list(self.err) if line.startswith("{")]
+        return [event for event in entries if event["event"] == name]
 
 
 # the kernel's figures for a process
@@ -386,7 +386,7 @@ class Session:
 
     def said(self) -> list[bytes]:
         """Return the lines without their times."""
-        return [heard.line for heard in list(self.lines)]
+        return [entry.line for entry in list(self.lines)]
 
 
 class Peer:
@@ -464,12 +464,12 @@ class Peer:
         """Fill the kernel's buffer of bytes to this board with line ends. Return their number."""
         assert self._ends is not None
         os.set_blocking(self._ends[1], False)
-        taken = 0
+        size = 0
         try:
             while True:
-                taken += os.write(self._ends[1], b"\r\n")
+                size += os.write(self._ends[1], b"\r\n")
         except BlockingIOError:
-            return taken
+            return size
 
     def say(self, data: bytes) -> None:
         """Send bytes without being asked."""
@@ -489,7 +489,7 @@ class Peer:
         return self.session.said()[-1]
 
     def _serve(self, master: int, session: Session) -> None:
-        held, turning, told = b"", STANDING, STANDING
+        buffer, turning, target = b"", STANDING, STANDING
         while not self._leave.is_set():
             if not self._listens.is_set():
                 self._idle += 1
@@ -501,15 +501,15 @@ class Peer:
             data = os.read(master, 4096)
             now = time.monotonic()
             session.raw.append(Heard(now, data))
-            *lines, held = (held + data).split(b"\n")
+            *lines, buffer = (buffer + data).split(b"\n")
             for line in lines:
                 session.lines.append(Heard(now, line + b"\n"))
                 speeds = _speeds(line)
                 if speeds is not None:
                     # Replies that equal the command lines would look like an echo, so the wheels
                     # lag.
-                    a, b, c, d = ((one + two) / 2 for one, two in zip(turning, told, strict=True))
-                    answer, turning, told = self.reply((a, b, c, d)), told, speeds
+                    a, b, c, d = ((old + two) / 2 for old, two in zip(turning, target, strict=True))
+                    answer, turning, target = self.reply((a, b, c, d)), target, speeds
                     if answer:
                         os.write(master, answer)
 
@@ -566,9 +566,9 @@ class FarPeer(Program):
 
     def since(self, at: float, to: float = float("inf")) -> list[Heard]:
         """Return the lines between two times."""
-        heard = self._all()
-        first, last = (bisect.bisect_right(heard, time, key=lambda h: h.at) for time in (at, to))
-        return heard[first:last]
+        lines = self._all()
+        first, last = (bisect.bisect_right(lines, time, key=lambda h: h.at) for time in (at, to))
+        return lines[first:last]
 
     def _all(self) -> list[Heard]:
         for text in self.out[1 + len(self._heard) :]:
@@ -644,9 +644,9 @@ class Following:
 
     def add(self, sample: zenoh.Sample) -> None:
         """Store a sample. Zenoh calls this function."""
-        seen = Seen(time.monotonic(), read(sample), str(sample.encoding))
+        entry = Seen(time.monotonic(), read(sample), str(sample.encoding))
         with self._news:
-            self.seen.append(seen)
+            self.seen.append(entry)
             self._news.notify_all()
 
     def find(
@@ -656,9 +656,9 @@ class Following:
         deadline, looked = time.monotonic() + within + PATIENCE_S, 0
         with self._news:
             while True:
-                for seen in self.seen[looked:]:
-                    if seen.at >= after and wanted(seen.value):
-                        return seen
+                for entry in self.seen[looked:]:
+                    if entry.at >= after and wanted(entry.value):
+                        return entry
                 looked = len(self.seen)
                 left = deadline - time.monotonic()
                 if left <= 0 or not self._news.wait(left):
@@ -672,7 +672,7 @@ def broken(states: Following, since: float, to: float = float("inf")) -> bool:
     On a busy machine the board, or the kernel's thread for its pty, may have to wait. The robot
     then stops correctly, and the test learns nothing from its behaviour.
     """
-    return any(since <= seen.at <= to and seen.value["link"] != "up" for seen in states.seen)
+    return any(since <= entry.at <= to and entry.value["link"] != "up" for entry in states.seen)
 
 
 class Answered(NamedTuple):
@@ -718,16 +718,16 @@ class Bus:
         A `clear` or `activate` names the latch of `state`, as acsard's tools do.
         """
         data = self.payload(key, payload)
-        found = []
+        answers = []
         for reply in self.session.get(f"{self.root}/{key}", payload=data, timeout=5.0):
             if reply.ok is not None:
                 sample, where = reply.ok, str(reply.ok.key_expr).removeprefix(self.root + "/")
                 encoding, payload_bytes = str(sample.encoding), sample.payload.to_bytes()
-                found.append(Answered(where, True, encoding, payload_bytes))
+                answers.append(Answered(where, True, encoding, payload_bytes))
             elif reply.err is not None:
                 text = reply.err.payload.to_bytes()
-                found.append(Answered("", False, str(reply.err.encoding), text))
-        return found
+                answers.append(Answered("", False, str(reply.err.encoding), text))
+        return answers
 
     def get(self, key: str, payload: object = None) -> Any:
         """Return the one JSON reply to a query.
@@ -736,7 +736,9 @@ class Bus:
         """
         deadline = time.monotonic() + 5.0
         answers = self.ask(key, payload)
-        while [one.payload for one in answers] == [BUSY.encode()] and time.monotonic() < deadline:
+        while [answer.payload for answer in answers] == [
+            BUSY.encode()
+        ] and time.monotonic() < deadline:
             time.sleep(0.02)
             answers = self.ask(key, payload)
         assert len(answers) == 1, f"{key}: {answers}"

@@ -53,18 +53,18 @@ class Certificates:
         """Issue one more certificate by this robot's authority."""
         Authority.load(self.robot, str).issue(directory, name, [], days)
 
-    def config(self, who: Identity, plain: str, tls: str) -> zenoh.Config:
+    def config(self, identity: Identity, plain: str, tls: str) -> zenoh.Config:
         """Return the Zenoh settings of a client with this identity.
 
         Each client trusts the robot's CA.
         """
-        if who == "local":
+        if identity == "local":
             return client_config(plain)
-        return self.shown(tls, self.own(who))
+        return self.shown(tls, self.own(identity))
 
-    def own(self, who: Identity) -> Path | None:
+    def own(self, identity: Identity) -> Path | None:
         """Return the directory of the identity's certificate."""
-        return self._client.get(who)
+        return self._client.get(identity)
 
     def shown(self, endpoint: str, own: Path | None) -> zenoh.Config:
         """Return the Zenoh settings of a client that presents the certificate in `own`, if any."""

@@ -309,9 +309,9 @@ class Samples:
             )
         )
 
-    def take(self, seen: Sample) -> None:
+    def take(self, sample: Sample) -> None:
         with self._news:
-            self.seen.append(seen)
+            self.seen.append(sample)
             self._news.notify_all()
 
     def first(
@@ -321,9 +321,9 @@ class Samples:
         deadline, looked = time.monotonic() + within, 0
         with self._news:
             while True:
-                for seen in self.seen[looked:]:
-                    if wanted(seen):
-                        return seen
+                for sample in self.seen[looked:]:
+                    if wanted(sample):
+                        return sample
                 looked = len(self.seen)
                 left = deadline - time.monotonic()
                 if left <= 0 or not self._news.wait(left):
@@ -534,8 +534,8 @@ class RmwClient(ZenohClient):
     @contextmanager
     def tokens(self) -> Iterator[list[str]]:
         """Provide the liveliness tokens of the ROS graph, as each rmw_zenoh node gets them."""
-        with listed(self.session, f"@ros2_lv/{self.domain}/**") as found:
-            yield found
+        with listed(self.session, f"@ros2_lv/{self.domain}/**") as tokens:
+            yield tokens
 
 
 class BridgeHalf(ZenohClient):
@@ -555,18 +555,18 @@ class BridgeHalf(ZenohClient):
 @contextmanager
 def listed(session: zenoh.Session, pattern: str) -> Iterator[list[str]]:
     """Provide a list of the matching liveliness tokens, updated while the body runs."""
-    found: list[str] = []
+    tokens: list[str] = []
 
     def on_token(sample: zenoh.Sample) -> None:
         key = str(sample.key_expr)
         if sample.kind == zenoh.SampleKind.PUT:
-            found.append(key)
-        elif key in found:
-            found.remove(key)
+            tokens.append(key)
+        elif key in tokens:
+            tokens.remove(key)
 
     subscriber = session.liveliness().declare_subscriber(pattern, on_token, history=True)
     try:
-        yield found
+        yield tokens
     finally:
         subscriber.undeclare()
 
@@ -637,7 +637,7 @@ def changes(before: Any, after: Any) -> dict[str, int]:
     }
 
 
-def refused_without_motion(bus: Bus, send: Callable[[], None], reason: str, said: str) -> None:
+def refused_without_motion(bus: Bus, send: Callable[[], None], reason: str, text: str) -> None:
     before = bus.state()
     send()
     counted = before["counters"].get(f"command_{reason}", 0)
@@ -649,7 +649,7 @@ def refused_without_motion(bus: Bus, send: Callable[[], None], reason: str, said
     lines = bus.count("lines_sent")
     until(lambda: bus.count("lines_sent") >= lines + 2, 3.0, "two more lines")
     after = bus.state()
-    assert said in after["refused"], after["refused"]
+    assert text in after["refused"], after["refused"]
     assert changes(before, after).keys() == {f"command_{reason}"}
     for key in ("x", "y", "yaw", "linear", "angular", "wheels"):
         assert after[key] == before[key], key

@@ -149,8 +149,8 @@ def _questions() -> Iterator[Try]:
     # Wildcards are allowed only on the robot's machine.
     yield from (Try(f"{key}/@adv/**", HERE) for key in (f"{ME}/tf_static", "tf_static", RMW_STATIC))
     yield Try(f"{ME}/config", KEEPERS)
-    for role, who in (("viewer", ANYBODY), ("operator", DRIVERS), ("maintainer", KEEPERS)):
-        yield Try(f"{ME}/whoami/{role}", who)
+    for role, identities in (("viewer", ANYBODY), ("operator", DRIVERS), ("maintainer", KEEPERS)):
+        yield Try(f"{ME}/whoami/{role}", identities)
     yield from (Try(f"{ME}/whoami/{role}", NOBODY) for role in ("*", "admin"))
     yield from (Try(f"{ME}/{key}", HERE) for key in ("*", "**", "schema/*", "stat$*"))
     services = ("srv/*", "srv/**", "srv/sto$*", "srv/ghost", "cmd/app")
@@ -168,10 +168,10 @@ def _questions() -> Iterator[Try]:
 
 def _services() -> Iterator[Try]:
     least = dict.fromkeys(ros.TRIGGERS, DRIVERS) | {"stop": ANYBODY}
-    for verb, who in least.items():
-        yield Try(f"{ME}/srv/{verb}", who)
-        yield Try(f"acsard/{verb}", who, ros.EMPTY_REQUEST)
-        yield Try(ros.rmw_key(f"acsard/{verb}", ros.TRIGGER), who, ros.EMPTY_REQUEST)
+    for verb, identities in least.items():
+        yield Try(f"{ME}/srv/{verb}", identities)
+        yield Try(f"acsard/{verb}", identities, ros.EMPTY_REQUEST)
+        yield Try(ros.rmw_key(f"acsard/{verb}", ros.TRIGGER), identities, ros.EMPTY_REQUEST)
     yield Try(f"{ME}/srv/set_pose", KEEPERS, POSE_JSON)
     yield Try(f"{ME}/srv/set", KEEPERS, SET_JSON)
     for name, kind in ros.PARAMETER_SERVICES.items():
@@ -255,8 +255,8 @@ class Robot:
         self._fooled.clear()
         return was
 
-    def config(self, who: Identity) -> zenoh.Config:
-        return self.certificates.config(who, self.plain, self.tls)
+    def config(self, identity: Identity) -> zenoh.Config:
+        return self.certificates.config(identity, self.plain, self.tls)
 
     def comes(self, look: Callable[[], bool], steps: int = 5) -> bool:
         """Return whether `look` returns True within `steps` control periods.
@@ -264,10 +264,10 @@ class Robot:
         A period is long compared with the delivery of a message on one machine.
         """
         begun = self.here.count("lines_sent")
-        while not (found := look()):
+        while not (result := look()):
             if self.here.count("lines_sent") >= begun + steps:
                 return look()
-        return found
+        return result
 
     def settled(self) -> None:
         """Wait some control periods, so that every earlier message has certainly arrived."""
@@ -284,30 +284,30 @@ class Robot:
             assert self.here.get("srv/clear")["success"]
         assert self.here.get("srv/activate")["success"]
 
-    def outcome(self, who: Identity, verb: Verb) -> Outcome:
+    def outcome(self, identity: Identity, verb: Verb) -> Outcome:
         """Try each row of this verb with this identity, once per test run. Return the results."""
-        if (who, verb) not in self._outcomes:
-            self._outcomes[who, verb] = self._tried(who, verb)
-        return self._outcomes[who, verb]
+        if (identity, verb) not in self._outcomes:
+            self._outcomes[identity, verb] = self._tried(identity, verb)
+        return self._outcomes[identity, verb]
 
-    def _tried(self, who: Identity, verb: Verb) -> Outcome:
+    def _tried(self, identity: Identity, verb: Verb) -> Outcome:
         rows = ROWS[verb]
         try:
-            one = Visitor(self, who)
+            visitor = Visitor(self, identity)
         except zenoh.ZError:
-            assert who not in ADMITTED
+            assert identity not in ADMITTED
             return dict.fromkeys((row.label for row in rows), False)
-        with one:
+        with visitor:
             if verb == "query":
-                found = one.asked([r for r in rows if not r.payload and "/srv/" not in r.key])
+                outcome = visitor.asked([r for r in rows if not r.payload and "/srv/" not in r.key])
                 assert self.here.state()["mode"] != "stopped"
-                found |= one.asked([row for row in rows if row.label not in found])
+                outcome |= visitor.asked([row for row in rows if row.label not in outcome])
                 self.restored()
-                return found
-            attempt = one.followed if verb == "subscribe" else partial(one.sent, verb)
+                return outcome
+            attempt = visitor.followed if verb == "subscribe" else partial(visitor.sent, verb)
             # Try all rows that should have no effect at once, and one by one only if something
             # happened.
-            idle = [row for row in rows if who not in row.who]
+            idle = [row for row in rows if identity not in row.who]
             quiet = idle if idle and not attempt(idle) else []
             return {row.label: row not in quiet and attempt([row]) for row in rows}
 
@@ -387,29 +387,29 @@ class Visitor:
             )
         self._behind()
         self._robot.settled()
-        found: Outcome = {}
+        outcome: Outcome = {}
 
         def look(label: str) -> bool:
             try:
                 reply = waiting[label].try_recv()
             except zenoh.ZError:
                 return True  # all answers have arrived
-            found[label] = found[label] or (reply is not None and reply.ok is not None)
-            return found[label]
+            outcome[label] = outcome[label] or (reply is not None and reply.ok is not None)
+            return outcome[label]
 
         for row in rows:
-            found[row.label] = False
+            outcome[row.label] = False
             if look(row.label) or self._who not in row.who:
                 continue
             self._robot.comes(partial(look, row.label), 100)
-        return found
+        return outcome
 
     def followed(self, rows: Sequence[Try]) -> bool:
         """Return whether any of these subscriptions received a sample."""
-        came = threading.Event()
+        event = threading.Event()
 
         def on_sample(sample: zenoh.Sample) -> None:
-            came.set()
+            event.set()
 
         # Use a session of its own: within one session, every subscription gets the samples that any
         # of them requested.
@@ -425,7 +425,7 @@ class Visitor:
                 here.session.put(RMW_CMD, CDR_TWIST, attachment=self._attachment(RMW_CMD))
             if any(row.key.endswith("events") for row in rows):
                 self._robot.switched()
-            done = self._robot.comes(came.is_set, self._patience(rows))
+            done = self._robot.comes(event.is_set, self._patience(rows))
             for subscriber in subscribers:
                 subscriber.undeclare()
         return done
@@ -460,23 +460,23 @@ def robot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Robot]:
 
 @pytest.mark.variations(8)
 @pytest.mark.parametrize("verb", VERBS)
-@pytest.mark.parametrize("who", IDENTITIES)
+@pytest.mark.parametrize("identity", IDENTITIES)
 def test_each_certificate_may_do_exactly_what_the_access_table_allows(
-    robot: Robot, who: Identity, verb: Verb
+    robot: Robot, identity: Identity, verb: Verb
 ) -> None:
     wrong = [
         f"{row.label}: {'let through' if done else 'kept out'}"
-        for row, done in zip(ROWS[verb], robot.outcome(who, verb).values(), strict=True)
-        if done != (who in row.who)
+        for row, done in zip(ROWS[verb], robot.outcome(identity, verb).values(), strict=True)
+        if done != (identity in row.who)
     ]
     assert not wrong
 
 
 def test_a_put_that_no_certificate_may_send_never_reaches_the_daemon(robot: Robot) -> None:
     before = robot.here.state()["counters"]
-    with Visitor(robot, "maintainer") as one:
-        assert not one.sent("put", [row for row in ROWS["put"] if not row.who])
-        assert not one.sent("delete", ROWS["delete"])
+    with Visitor(robot, "maintainer") as visitor:
+        assert not visitor.sent("put", [row for row in ROWS["put"] if not row.who])
+        assert not visitor.sent("delete", ROWS["delete"])
     after = robot.here.state()["counters"]
     refused = {name for name in after if name.startswith("command_")}
     assert {name: after[name] for name in refused} == {name: before.get(name) for name in refused}

@@ -90,11 +90,11 @@ BAD = [
 def refused_without_motion(bus: Bus, *bad: Bad) -> None:
     """Send these bad commands. Check that each is counted and reported, and that nothing moves."""
     # The source may drive: if a bad command were accepted, the robot would move.
-    heard = bus.count("commands")
+    commands = bus.count("commands")
     bus.put("cmd/app", ZERO)
-    until(lambda: bus.count("commands") > heard, 5.0, "the zero was received")
+    until(lambda: bus.count("commands") > commands, 5.0, "the zero was received")
     before = state = bus.state()
-    for payload, reason, said, key, encoding in bad:
+    for payload, reason, text, key, encoding in bad:
         name, counted = f"command_{reason}", state["counters"].get(f"command_{reason}", 0)
         whole = key if "acsard" in key or key == "**" else f"acsard/acsar/{key}"
         # The daemon's session drops a sample that follows within 1 ms of one with the same key.
@@ -109,7 +109,7 @@ def refused_without_motion(bus: Bus, *bad: Bad) -> None:
             return state if state["counters"].get(name, 0) > counted else None
 
         state = until(told, 3.0, f"{key} is counted as {reason}")
-        assert said in state["refused"], state["refused"]
+        assert text in state["refused"], state["refused"]
         assert len(state["refused"]) <= 300
     lines = bus.count("lines_sent")
     until(lambda: bus.count("lines_sent") >= lines + 5, 3.0, "five more lines")
@@ -119,7 +119,7 @@ def refused_without_motion(bus: Bus, *bad: Bad) -> None:
         assert after[part] == before[part], part
     reasons = {k for k in after["counters"] if k.startswith("command_")}
     changed = {k for k in reasons if after["counters"][k] != before["counters"].get(k, 0)}
-    assert changed == {f"command_{one.reason}" for one in bad}
+    assert changed == {f"command_{case.reason}" for case in bad}
 
 
 def test_a_bad_command_is_counted_and_reported_and_moves_nothing(bus: Bus) -> None:
@@ -128,11 +128,11 @@ def test_a_bad_command_is_counted_and_reported_and_moves_nothing(bus: Bus) -> No
 
 def test_a_command_held_up_on_the_way_is_counted_as_stale(bus: Bus) -> None:
     # The source's own clock is known from here on.
-    heard = bus.count("commands")
+    before = bus.count("commands")
 
     def counted() -> bool:
         bus.session.put("acsard/acsar/cmd/app", stamped(0.0).replace(b"0.5", b"0.0"))
-        return bus.count("commands") > heard
+        return bus.count("commands") > before
 
     until(counted, 5.0, "stamped zeros")
     refused_without_motion(bus, Bad(stamped(1.0), "stale", "the network delayed it"))
@@ -143,17 +143,17 @@ def test_enormous_wheel_speeds_are_clamped_to_the_limits(bus: Bus) -> None:
     # NaN on the way.
     with bus.follow("cmd_vel_out") as applied:
         bus.at_rest()
-        heard = bus.count("commands")
+        count = bus.count("commands")
         bus.put("wheel_cmd/app", {"name": ALL_JOINTS, "velocity": [0.0] * 4})
         # A message of an earlier test may still arrive after this point.
-        until(lambda: bus.count("commands") >= heard + 1, 5.0, "the zero was received")
+        until(lambda: bus.count("commands") >= count + 1, 5.0, "the zero was received")
         bus.put("wheel_cmd/app", {"name": ALL_JOINTS, "velocity": [1e300, 1e300, -1e300, -1e300]})
-        until(lambda: bus.count("commands") >= heard + 2, 5.0, "the speeds were received")
+        until(lambda: bus.count("commands") >= count + 2, 5.0, "the speeds were received")
         until(lambda: bus.state()["mode"] == "ready", 5.0, "their timeout is over")
         until(lambda: bus.state()["linear"] == bus.state()["angular"] == 0, 5.0, "at rest")
-    for seen in applied.seen:
-        assert abs(seen.value["twist"]["linear"]["x"]) <= 1.0
-        assert abs(seen.value["twist"]["angular"]["z"]) <= 4.0
+    for entry in applied.seen:
+        assert abs(entry.value["twist"]["linear"]["x"]) <= 1.0
+        assert abs(entry.value["twist"]["angular"]["z"]) <= 4.0
 
 
 def test_a_message_over_the_link_s_size_harms_only_its_sender(bus: Bus, shared: Daemon) -> None:
@@ -305,12 +305,12 @@ def test_a_flood_from_ros_is_limited_to_a_thousand_commands_a_second(
     def counted(*names: str) -> int:
         return sum(after["counters"].get(n, 0) - before["counters"].get(n, 0) for n in names)
 
-    taken, overrun = counted("commands"), counted("bus_overrun")
-    print(f"flood of {count} puts in {lasted:.2f} s by {way}: {taken} taken, overrun {overrun}")
+    commands, overrun = counted("commands"), counted("bus_overrun")
+    print(f"flood of {count} puts in {lasted:.2f} s by {way}: {commands} taken, overrun {overrun}")
     assert count > 5000
-    assert taken > 100
+    assert commands > 100
     # Without the limit, the excess would be overrun, or would still be accepted.
-    assert taken + overrun + counted("command_stale") <= 1100 * lasted
+    assert commands + overrun + counted("command_stale") <= 1100 * lasted
 
 
 @pytest.mark.slow

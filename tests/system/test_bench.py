@@ -52,7 +52,7 @@ def test_bench_measures_the_simulator_and_moves_nothing_on_a_real_port(
     is_sane(json.loads(simulated.stdout))
     says_what_it_could_not_see(json.loads(real.stdout))
     assert len(peer.lines) > 200
-    assert {heard.line for heard in peer.lines} <= {ZERO_LINE, b"\r\n"}
+    assert {entry.line for entry in peer.lines} <= {ZERO_LINE, b"\r\n"}
 
 
 def is_sane(result: dict[str, Any]) -> None:
@@ -101,26 +101,26 @@ def test_bench_gives_the_daemons_reason_if_no_command_reaches_the_wire() -> None
     config = replace(config, control=ControlConfig(auto_activate=False))
     with pytest.raises(
         MendableError, match=r"none of the \d+ commands, .* reports: switched off"
-    ) as told:
+    ) as error:
         measure(config, "", 1.0)
-    assert told.value.code == Exit.FAILURE
+    assert error.value.code == Exit.FAILURE
 
 
 @pytest.mark.parametrize(
-    ("words", "who"),
+    ("words", "process"),
     [
         ("acsard run", "the daemon"),
         ("acsard.bench.far_end", "the simulated microcontroller's process"),
     ],
 )
 def test_bench_names_its_child_process_that_was_killed(
-    tmp_path: Path, words: str, who: str
+    tmp_path: Path, words: str, process: str
 ) -> None:
     with Program(acsard("bench", "--seconds", "30"), tmp_path) as bench:
         pid = until(lambda: next(iter(children(bench.pid, words)), None), 15.0, words)
         os.kill(pid, signal.SIGKILL)
         assert bench.ended(20.0) == 1
-        assert bench.err == [f"acsard: {who} was ended by signal 9"]
+        assert bench.err == [f"acsard: {process} was ended by signal 9"]
 
 
 @pytest.mark.slow

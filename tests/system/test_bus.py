@@ -252,8 +252,8 @@ def test_a_put_with_any_payload_on_stop_latches(bus: Bus, payload: bytes) -> Non
         x = bus.state()["x"]
         sent = time.monotonic()
         bus.session.put("acsard/acsar/stop", payload)
-        told = states.find(lambda state: state["mode"] == "stopped", 2.0, "stopped", after=sent)
-        assert told.at - sent < 0.2 + lost(sent, told.at)
+        entry = states.find(lambda state: state["mode"] == "stopped", 2.0, "stopped", after=sent)
+        assert entry.at - sent < 0.2 + lost(sent, entry.at)
         with bus.commanding(0.3):
             waited = bus.count("lines_sent")
             until(lambda: bus.count("lines_sent") > waited + 30, 5.0, "30 lines")
@@ -293,10 +293,10 @@ def test_a_flood_of_deletes_on_the_stop_key_displaces_no_stop(
                 put = time.monotonic()
                 bus.session.put("acsard/acsar/stop", b"")
                 pushed = overrun()
-                told = states.find(
+                entry = states.find(
                     lambda state: state["mode"] == "stopped", 2.0, "stopped", after=put
                 )
-                took.append(told.at - put - lost(put, told.at))
+                took.append(entry.at - put - lost(put, entry.at))
                 until(lambda: overrun() > pushed, 5.0, "DELETEs are pushed out behind")  # noqa: B023
                 assert bus.get("srv/clear")["success"]
         state = bus.state()
@@ -322,9 +322,9 @@ def test_every_published_key_names_its_encoding_and_has_the_same_fields_in_json(
             if key == "events":
                 bus.get("srv/reset_odometry")
             for form, messages in (("msgpack", packed), ("json", texts)):
-                seen = messages.find(lambda _: True, 3.0, f"{key} in {form}")
-                assert seen.encoding == f"application/{form};acsard.{name}.v1"
-                assert set(seen.value) == FIELDS[key]
+                entry = messages.find(lambda _: True, 3.0, f"{key} in {form}")
+                assert entry.encoding == f"application/{form};acsard.{name}.v1"
+                assert set(entry.value) == FIELDS[key]
 
 
 def test_an_event_has_its_name_level_count_text_and_client(bus: Bus) -> None:
@@ -332,37 +332,40 @@ def test_an_event_has_its_name_level_count_text_and_client(bus: Bus) -> None:
     with bus.follow("events") as messages:
         bus.get("srv/reset_odometry")
         # Messages of other tests here may be reported at any moment.
-        seen = messages.find(
-            lambda one: (
-                one["total"] > before["total"] and one["events"][-1]["name"] == "reset_odometry"
+        entry = messages.find(
+            lambda message: (
+                message["total"] > before["total"]
+                and message["events"][-1]["name"] == "reset_odometry"
             ),
             3.0,
             "news",
         )
-    last = seen.value["events"][-1]
+    last = entry.value["events"][-1]
     assert last["level"] == "info"
     assert last["count"] >= 1  # actions of other tests in the same second are counted with it
     assert "x 0, y 0" in last["text"]
     assert last["by"]
-    assert seconds(last["stamp"]) == seconds(seen.value["stamp"]) >= seconds(before["stamp"])
-    assert len(seen.value["events"]) <= 20
+    assert seconds(last["stamp"]) == seconds(entry.value["stamp"]) >= seconds(before["stamp"])
+    assert len(entry.value["events"]) <= 20
 
 
 def test_each_json_message_equals_the_message_on_the_plain_key(bus: Bus) -> None:
     with bus.follow("odom") as packed, bus.follow("json/odom") as texts:
         until(lambda: len(packed.seen) > 20 and len(texts.seen) > 20, 5.0, "both")
-        told = {seconds(seen.value["header"]["stamp"]): seen.value for seen in list(packed.seen)}
-        again = [seen.value for seen in list(texts.seen)]
-    both = [value for value in again if seconds(value["header"]["stamp"]) in told]
+        by_stamp = {
+            seconds(entry.value["header"]["stamp"]): entry.value for entry in list(packed.seen)
+        }
+        again = [entry.value for entry in list(texts.seen)]
+    both = [value for value in again if seconds(value["header"]["stamp"]) in by_stamp]
     assert len(both) > 10
-    assert all(value == told[seconds(value["header"]["stamp"])] for value in both)
+    assert all(value == by_stamp[seconds(value["header"]["stamp"])] for value in both)
 
 
 def test_a_json_key_answers_its_exact_name_and_no_wildcard(bus: Bus) -> None:
     (answer,) = bus.ask("json/tf_static")
     assert (answer.ok, answer.key) == (True, "json/tf_static")
     assert json.loads(answer.payload) == bus.get("tf_static")
-    assert not [one.key for one in bus.ask("**") if one.key.startswith("json/")]
+    assert not [reply.key for reply in bus.ask("**") if reply.key.startswith("json/")]
 
 
 @pytest.mark.slow
@@ -371,11 +374,11 @@ def test_odometry_comes_a_hundred_times_a_second_and_state_ten_times(bus: Bus) -
     waited = kept_waiting(pid)
     with bus.follow("odom") as odoms, bus.follow("state") as states:
         until(lambda: len(states.seen) > 12, 5.0, "a dozen states")
-        stamps = [seconds(seen.value["header"]["stamp"]) for seen in list(odoms.seen)]
-        told = [seen.value for seen in list(states.seen)]
+        stamps = [seconds(entry.value["header"]["stamp"]) for entry in list(odoms.seen)]
+        reports = [entry.value for entry in list(states.seen)]
         machine_s = lost(begun) + kept_waiting(pid) - waited
-    slow = [seconds(state["stamp"]) for state in told]
-    what = [[state[name] for name in ("mode", "reason", "link", "source")] for state in told]
+    slow = [seconds(state["stamp"]) for state in reports]
+    what = [[state[name] for name in ("mode", "reason", "link", "source")] for state in reports]
     changes = sum(now != before for before, now in pairwise(what))
     spans = stamps[-1] - stamps[0], slow[-1] - slow[0]
     counts = len(stamps) - 1, len(slow) - 1
@@ -386,33 +389,33 @@ def test_odometry_comes_a_hundred_times_a_second_and_state_ten_times(bus: Bus) -
     assert stamps == sorted(set(stamps))
     # The daemon publishes a state at once when it has changed. On a machine that stands still the
     # link may change.
-    if any(state["link"] != "up" for state in told):
+    if any(state["link"] != "up" for state in reports):
         return  # the kernel's thread that carries bytes through the simulator's pty had no core
-    for heard, more, span, rate, near in zip(
+    for count, more, span, rate, near in zip(
         counts, (0, changes), spans, (100.0, 10.0), (0.03, 0.1), strict=True
     ):
         least = (1 - near) * span - machine_s
         # Messages that the machine delayed at the beginning have a late stamp, so the span is
         # short.
-        assert least * rate <= heard <= (1 + near) * (span + machine_s) * rate + more
+        assert least * rate <= count <= (1 + near) * (span + machine_s) * rate + more
 
 
 def test_odom_tf_and_wheel_states_of_one_sample_carry_one_stamp(bus: Bus) -> None:
     def stamps(following: Following, header: Any) -> set[tuple[int, int]]:
-        found = [header(seen.value)["stamp"] for seen in list(following.seen)]
-        return {(stamp["sec"], stamp["nanosec"]) for stamp in found}
+        groups = [header(entry.value)["stamp"] for entry in list(following.seen)]
+        return {(stamp["sec"], stamp["nanosec"]) for stamp in groups}
 
     with bus.follow("odom") as odom, bus.follow("tf") as tf, bus.follow("wheel_states") as wheels:
         three = (odom, tf, wheels)
-        until(lambda: all(len(one.seen) > 40 for one in three), 5.0, "40 of each")
-        found = [
+        until(lambda: all(len(item.seen) > 40 for item in three), 5.0, "40 of each")
+        groups = [
             stamps(odom, lambda value: value["header"]),
             stamps(tf, lambda value: value["transforms"][0]["header"]),
             stamps(wheels, lambda value: value["header"]),
         ]
     # The subscriptions began and ended one after the other. In between the streams are the same.
-    first, last = max(map(min, found)), min(map(max, found))
-    between = [{stamp for stamp in one if first <= stamp <= last} for one in found]
+    first, last = max(map(min, groups)), min(map(max, groups))
+    between = [{stamp for stamp in item if first <= stamp <= last} for item in groups]
     assert len(between[0]) > 20
     assert between[0] == between[1] == between[2]
 
@@ -426,12 +429,12 @@ def test_a_late_advanced_subscriber_gets_tf_static_within_a_second(bus: Bus) -> 
         following.add,
         history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=1),
     )
-    seen = following.find(lambda _: True, 3.0, "the latched transform")
+    entry = following.find(lambda _: True, 3.0, "the latched transform")
     subscriber.undeclare()
-    print(f"tf_static by history: {seen.at - asked:.3f} s")
+    print(f"tf_static by history: {entry.at - asked:.3f} s")
     # This is well under the 5 s after which it would be sent again anyway.
-    assert seen.at - asked < 1.0 + lost(asked, seen.at)
-    assert seen.value["transforms"][0]["child_frame_id"] == "lidar_link"
+    assert entry.at - asked < 1.0 + lost(asked, entry.at)
+    assert entry.value["transforms"][0]["child_frame_id"] == "lidar_link"
 
 
 # the token
@@ -443,24 +446,24 @@ def test_the_alive_token_is_there_while_the_daemon_runs_and_gone_after(
     tmp_path: Path, number: signal.Signals
 ) -> None:
     with Daemon(tmp_path) as daemon, alive_at(daemon.endpoint, daemon) as alive:
-        seen = until(alive.try_recv, 5.0, "the alive token")
-        assert seen.kind == zenoh.SampleKind.PUT
-        assert str(seen.key_expr) == "acsard/acsar/alive"
+        token_put = until(alive.try_recv, 5.0, "the alive token")
+        assert token_put.kind == zenoh.SampleKind.PUT
+        assert str(token_put.key_expr) == "acsard/acsar/alive"
         daemon.signal(number)
         daemon.ended(5.0)
         ended = time.monotonic()
-        gone = until(alive.try_recv, 5.0, "the token's end")
-        assert gone.kind == zenoh.SampleKind.DELETE
+        token_end = until(alive.try_recv, 5.0, "the token's end")
+        assert token_end.kind == zenoh.SampleKind.DELETE
         print(f"{number.name}: token gone {time.monotonic() - ended:.3f} s after the end")
 
 
 def test_the_alive_token_is_found_by_a_liveliness_query(bus: Bus) -> None:
-    found = [
+    keys = [
         str(reply.ok.key_expr)
         for reply in bus.session.liveliness().get("acsard/*/alive", timeout=5.0)
         if reply.ok is not None
     ]
-    assert found == ["acsard/acsar/alive"]
+    assert keys == ["acsard/acsar/alive"]
 
 
 # many at once
@@ -495,8 +498,8 @@ def test_a_stop_query_after_more_queries_than_the_limit_stops_the_robot(
             asked = time.monotonic()
             unanswered += not list(crowd.session.get("acsard/acsar/srv/stop", timeout=5.0))
             states.find(lambda state: state["mode"] == "stopped", 2.0, "stopped", after=asked)
-            for one in open_ones:
-                list(one)  # read to the end, so that the next round starts afresh
+            for replies in open_ones:
+                list(replies)  # read to the end, so that the next round starts afresh
             assert bus.get("srv/clear")["success"]
     print(f"{unanswered} of 3 stops came with 512 queries open; all of them stopped")
 
@@ -515,11 +518,11 @@ def test_two_clients_receive_the_same_odometry(bus: Bus, shared: Daemon) -> None
 
 
 def test_a_late_plain_subscriber_gets_tf_static_within_6_s(late: Late) -> None:
-    seen = late.find(lambda _: True, 6.0, "tf_static is sent again")
-    print(f"tf_static to a plain subscriber: {seen.at - late.since:.2f} s")
-    assert seen.at - late.since < 6.0
-    assert seen.encoding == "application/msgpack;acsard.TFMessage.v1"
-    assert seen.value["transforms"][0]["child_frame_id"] == "lidar_link"
+    entry = late.find(lambda _: True, 6.0, "tf_static is sent again")
+    print(f"tf_static to a plain subscriber: {entry.at - late.since:.2f} s")
+    assert entry.at - late.since < 6.0
+    assert entry.encoding == "application/msgpack;acsard.TFMessage.v1"
+    assert entry.value["transforms"][0]["child_frame_id"] == "lidar_link"
 
 
 def test_no_request_of_this_module_raised_an_exception_in_the_daemon(shared: Daemon) -> None:

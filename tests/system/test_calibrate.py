@@ -85,9 +85,9 @@ RIDES_S = 120.0
 @contextmanager
 def calibrating(daemon: Daemon, *words: str) -> Iterator[tuple[Terminal, Program]]:
     """Run `acsard calibrate` at a separate terminal. Its results go into a pipe."""
-    given = ("calibrate", "--config", str(daemon.config), *words)
-    with at_terminal(daemon.config.parent, *given, piped="stdout") as found:
-        yield found
+    arguments = ("calibrate", "--config", str(daemon.config), *words)
+    with at_terminal(daemon.config.parent, *arguments, piped="stdout") as pair:
+        yield pair
 
 
 def asks(terminal: Terminal, program: Program, words: str, times: int, within: float) -> None:
@@ -181,16 +181,18 @@ def found_with_a_gyro(daemon: Daemon, bus: Bus) -> dict[str, Any]:
 @pytest.mark.soak
 def test_a_person_with_a_gyro_is_guided_from_the_start_to_the_written_file(tmp_path: Path) -> None:
     with running(tmp_path, config=SKIDDING) as (daemon, bus):
-        found = tried(bus, lambda: found_with_a_gyro(daemon, bus))
+        results = tried(bus, lambda: found_with_a_gyro(daemon, bus))
         written = parse(daemon.config.read_bytes())
-    print(f"turn: {found['turn_error_before']:.0f} -> {found['turn_error_after']:.1f} deg in 360")
-    assert found["turn_error_after"] < found["turn_error_before"] / 10
-    assert found["scale"] == "distance"
-    assert abs(found["wheel_separation_multiplier"] - 1.6 * 1.06) < 0.1
-    assert found["left_wheel_radius"] == pytest.approx(0.0495, rel=0.01)
+    print(
+        f"turn: {results['turn_error_before']:.0f} -> {results['turn_error_after']:.1f} deg in 360"
+    )
+    assert results["turn_error_after"] < results["turn_error_before"] / 10
+    assert results["scale"] == "distance"
+    assert abs(results["wheel_separation_multiplier"] - 1.6 * 1.06) < 0.1
+    assert results["left_wheel_radius"] == pytest.approx(0.0495, rel=0.01)
     drive = written.drive
     assert drive.wheel_separation_multiplier == pytest.approx(
-        found["wheel_separation_multiplier"], abs=1e-5
+        results["wheel_separation_multiplier"], abs=1e-5
     )
     assert written.odometry.wheel_separation_multiplier_std > 0
 
@@ -225,12 +227,12 @@ def shown(terminal: Terminal) -> str:
     return " ".join(terminal.screen.split())
 
 
-def question(terminal: Terminal, program: Program, seen: int) -> str | None:
-    """Return the question after the first `seen` characters, or None if there is none yet.
+def question(terminal: Terminal, program: Program, offset: int) -> str | None:
+    """Return the question after the first `offset` characters, or None if there is none yet.
 
     Returns `ENDED` if the program has ended.
     """
-    words = shown(terminal)[seen:]
+    words = shown(terminal)[offset:]
     if words.endswith((" mm:", " m:", " deg:", "q quits.")):
         return words
     return ENDED if program.process.poll() is not None else None
@@ -254,10 +256,10 @@ Reads = Callable[[str], str]
 def goes_through(daemon: Daemon, bus: Bus, way: str, reads: Reads) -> str:
     """Do a whole calibration with the method `way`, answer each question, and return the output."""
     with calibrating(daemon, "--method", way, "--write") as (terminal, program):
-        seen = 0
+        offset = 0
         while program.process.poll() is None:
-            words = until(lambda: question(terminal, program, seen), RIDES_S, "a question")  # noqa: B023
-            seen = len(shown(terminal))
+            words = until(lambda: question(terminal, program, offset), RIDES_S, "a question")  # noqa: B023
+            offset = len(shown(terminal))
             if STARTS in words:
                 reads(words)
                 terminal.press("\n")
@@ -276,9 +278,9 @@ def test_a_person_with_a_tape_alone_is_guided_to_the_written_file(tmp_path: Path
         return "" if STARTS in words else measured(bus, words)
 
     with running(tmp_path, config=SKIDDING) as (daemon, bus):
-        said = goes_through(daemon, bus, "tape", reads)
+        output = goes_through(daemon, bus, "tape", reads)
         written = parse(daemon.config.read_bytes()).drive
-    assert "heading error after a turn of 360 deg" in said
+    assert "heading error after a turn of 360 deg" in output
     assert abs(written.wheel_separation_multiplier - 1.6 * 1.06) < 0.1
     assert written.left_wheel_radius_multiplier == pytest.approx(0.99, abs=0.006)
     assert written.right_wheel_radius_multiplier == pytest.approx(1.0, abs=0.006)
@@ -296,7 +298,7 @@ class Beside:
 
     def reads(self, words: str) -> str:
         if STARTS in words:
-            if any(one in words for one in SETS):
+            if any(phrase in words for phrase in SETS):
                 self._place, self._yaw = self._true()
             return ""
         place, yaw = self._true()
@@ -323,11 +325,11 @@ def test_a_person_with_a_wall_or_marks_is_guided_to_the_written_file(
 ) -> None:
     config = SKIDDING | {"control": {"rate": 10.0}}  # the link, which a busy machine may interrupt
     with running(tmp_path, config=config) as (daemon, bus):
-        said = tried(bus, lambda: goes_through(daemon, bus, way, Beside(bus).reads))
+        output = tried(bus, lambda: goes_through(daemon, bus, way, Beside(bus).reads))
         written = parse(daemon.config.read_bytes()).drive
     print(f"{way}: {written.wheel_separation_multiplier} {written.left_wheel_radius_multiplier} "
           f"{written.right_wheel_radius_multiplier}")  # fmt: skip
-    assert "heading error after a turn of 360 deg" in said
+    assert "heading error after a turn of 360 deg" in output
     assert abs(written.wheel_separation_multiplier - 1.6 * 1.06) < 0.1
     ratio = written.left_wheel_radius_multiplier / written.right_wheel_radius_multiplier
     assert ratio == pytest.approx(0.99, abs=0.006)
@@ -398,11 +400,11 @@ def test_the_simulator_is_calibrated_by_its_true_pose_without_a_person(tmp_path:
         words = ["calibrate", "--positions", "sim/pose", "--yes", "--json"]
         with Program(acsard(*words, "--config", str(daemon.config)), tmp_path) as program:
             assert program.ended(RIDES_S) == 0, program.stderr
-        found = json.loads(program.stdout)
-    assert found["reference"] == "positions"
-    assert abs(found["wheel_separation_multiplier"] - 1.6 * 1.06) < 0.1
-    assert found["left_wheel_radius"] == pytest.approx(0.0495, abs=0.0001)
-    assert not any("better with the wheels than a sensor can" in note for note in found["notes"])
+        results = json.loads(program.stdout)
+    assert results["reference"] == "positions"
+    assert abs(results["wheel_separation_multiplier"] - 1.6 * 1.06) < 0.1
+    assert results["left_wheel_radius"] == pytest.approx(0.0495, abs=0.0001)
+    assert not any("better with the wheels than a sensor can" in note for note in results["notes"])
 
 
 @pytest.mark.soak
@@ -421,8 +423,8 @@ def test_on_the_simulator_a_process_suspended_for_1_5_s_does_not_end_the_calibra
             process.send_signal(signal.SIGCONT)
             assert program.ended(2 * RIDES_S) == 0, program.stderr
         assert "was disturbed" in program.stderr
-        found = json.loads(program.stdout)
-    assert abs(found["wheel_separation_multiplier"] - 1.6 * 1.06) < 0.1
+        results = json.loads(program.stdout)
+    assert abs(results["wheel_separation_multiplier"] - 1.6 * 1.06) < 0.1
 
 
 POSE = {
@@ -441,16 +443,16 @@ AS_ODOMETRY = {
 def test_positions_of_another_program_are_received_as_both_types_in_every_encoding(
     free: str,
 ) -> None:
-    with router(free) as said, client_session(free, "") as heard:
+    with router(free) as sender, client_session(free, "") as receiver:
         for cls, value in ((PoseStamped, AS_POSE), (Odometry, AS_ODOMETRY)):
             message = msgspec.convert(value, cls)
             for form in FORMATS:
                 key = f"slam/{cls.__name__}/{form}"
-                sensor = Sensor(heard, key, POSITION_TYPES)
+                sensor = Sensor(receiver, key, POSITION_TYPES)
                 recorder = Recorder(JointsConfig().as_tuple())
 
                 def came() -> bool:
-                    said.put(key, encode(message, form))  # noqa: B023
+                    sender.put(key, encode(message, form))  # noqa: B023
                     return sensor.receive(recorder.place, 9.0) > 0  # noqa: B023
 
                 until(came, 5.0, f"a position on {key}")
@@ -461,13 +463,13 @@ def test_positions_that_are_missing_or_of_another_type_are_reported(
     free: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(robot_on_bus, "FIRST_STATE_TIMEOUT_S", 0.2)
-    with router(free) as said, client_session(free, "") as heard:
-        sensor = Sensor(heard, "slam/pose", POSITION_TYPES)
+    with router(free) as sender, client_session(free, "") as receiver:
+        sensor = Sensor(receiver, "slam/pose", POSITION_TYPES)
         with pytest.raises(GuideError, match="does not arrive on the Zenoh key slam/pose"):
             sensor.await_first("a position")
 
         def came() -> int:
-            said.put("slam/pose", b'{"x": 1}')
+            sender.put("slam/pose", b'{"x": 1}')
             return sensor.receive(lambda message, now: None, 0.0)
 
         with pytest.raises(GuideError, match="cannot be read"):
@@ -476,13 +478,13 @@ def test_positions_that_are_missing_or_of_another_type_are_reported(
 
 @pytest.mark.slow
 def test_an_unreadable_state_ends_the_leg_with_the_reason(free: str) -> None:
-    with router(free) as said, client_session(free, "") as heard:
-        client = Client(heard, "acsar", "app")
+    with router(free) as sender, client_session(free, "") as receiver:
+        client = Client(receiver, "acsar", "app")
         ended = threading.Event()
 
         def publish() -> None:
             while not ended.wait(0.05):
-                said.put(client.key("state"), b"\xc1")
+                sender.put(client.key("state"), b"\xc1")
 
         publisher = threading.Thread(target=publish)
         publisher.start()

@@ -75,8 +75,8 @@ def tool(shared: Daemon, *words: str) -> Finished:
 def test_help_lists_the_verbs_the_exit_codes_and_examples(tmp_path: Path) -> None:
     ended = finish(acsard("--help"), tmp_path)
     assert (ended.code, ended.err) == (0, "")
-    for told in (*VERBS, "69", "75", "78", "try:"):
-        assert told in ended.out
+    for word in (*VERBS, "69", "75", "78", "try:"):
+        assert word in ended.out
     print(f"--help: {ended.seconds:.2f} s")
 
 
@@ -109,8 +109,8 @@ def test_without_a_verb_the_daemon_runs_with_the_options_and_the_local_acsard_to
     endpoint = free_endpoint()
     (tmp_path / "acsard.toml").write_text('[robot]\nid = "handy"\n')
     with Program(acsard("--listen", endpoint), tmp_path) as daemon:
-        told = daemon.says("bus ")
-        assert (endpoint in told, "acsard/handy/" in told) == (True, True)
+        line = daemon.says("bus ")
+        assert (endpoint in line, "acsard/handy/" in line) == (True, True)
         assert "SIMULATOR" in daemon.stdout
         daemon.signal(signal.SIGINT)
         assert daemon.ended(3.0) == 0
@@ -254,10 +254,10 @@ def test_a_tool_that_waits_for_a_message_prints_the_reason_once_and_goes_on_wait
         assert waiting.process.poll() is None
         waiting.signal(signal.SIGINT)
         assert waiting.ended(5.0) == 0
-    (told,) = waiting.stderr.splitlines()
+    (line,) = waiting.stderr.splitlines()
     key = "state" if "state" in words else words[1]
-    assert told.startswith("acsard: waiting for messages on acsard/acs")
-    assert f"/{key}: " in told
+    assert line.startswith("acsard: waiting for messages on acsard/acs")
+    assert f"/{key}: " in line
 
 
 @pytest.mark.slow
@@ -344,9 +344,9 @@ def test_without_a_daemon_a_tool_ends_with_69_and_suggests_acsard_run(
     endpoint, begun = free_endpoint(), time.monotonic()
     ended = tool(shared, *words, "--connect", endpoint)
     assert (ended.code, ended.out) == (69, "")
-    (told,) = ended.err.splitlines()
-    assert endpoint in told
-    assert "acsard run" in told
+    (line,) = ended.err.splitlines()
+    assert endpoint in line
+    assert "acsard run" in line
     assert ended.seconds < 4.0 + lost(begun)
 
 
@@ -402,7 +402,7 @@ def test_a_verb_for_one_robot_refuses_several_ids_and_names_the_verb_for_many(
 
 @pytest.mark.variations(3)
 @pytest.mark.parametrize(
-    ("words", "meant"),
+    ("words", "suggestion"),
     [
         (["get", "inof"], "info"),
         (["echo", "oddom", "--timeout", "0.01"], "odom"),
@@ -413,10 +413,10 @@ def test_a_verb_for_one_robot_refuses_several_ids_and_names_the_verb_for_many(
     ],
 )
 def test_a_misspelt_key_service_setting_or_verb_gets_a_suggestion(
-    shared: Daemon, bus: Bus, words: list[str], meant: str
+    shared: Daemon, bus: Bus, words: list[str], suggestion: str
 ) -> None:
     ended = tool(shared, *words)
-    assert f"did you mean {meant}?" in ended.out + ended.err
+    assert f"did you mean {suggestion}?" in ended.out + ended.err
     assert ended.code != 0 or words[0] == "hz"
 
 
@@ -449,7 +449,7 @@ def test_call_set_pose_sets_it(shared: Daemon, bus: Bus, pose: tuple[str, ...]) 
     ended = tool(shared, "call", "set_pose", *pose)
     state = bus.state()
     assert ended.code == 0
-    assert [state["x"], state["y"], state["yaw"]] == pytest.approx([float(one) for one in pose])
+    assert [state["x"], state["y"], state["yaw"]] == pytest.approx([float(value) for value in pose])
     assert tool(shared, "call", "reset_odometry").code == 0
     assert bus.state()["x"] == 0.0
 
@@ -504,17 +504,17 @@ def test_set_changes_the_robot_that_runs_and_with_write_the_file(
 def test_set_without_arguments_lists_the_settings_and_when_they_can_change(
     shared: Daemon, bus: Bus
 ) -> None:
-    told = tool(shared, "set")
-    assert told.code == 0
-    assert "highest speed, forwards and backwards: a number from 0 to 10 m/s" in told.out
-    assert "only while the robot stands" in told.out
-    found = json.loads(tool(shared, "set", "--json").out)
-    assert found["limits.linear_speed"] == bus.get("config")["limits"]["linear_speed"]
-    assert "mcu.port" not in found
+    listing = tool(shared, "set")
+    assert listing.code == 0
+    assert "highest speed, forwards and backwards: a number from 0 to 10 m/s" in listing.out
+    assert "only while the robot stands" in listing.out
+    settings = json.loads(tool(shared, "set", "--json").out)
+    assert settings["limits.linear_speed"] == bus.get("config")["limits"]["linear_speed"]
+    assert "mcu.port" not in settings
 
 
 @pytest.mark.parametrize(
-    ("words", "code", "said"),
+    ("words", "code", "reason"),
     [
         (("limits.linear_speed", "20"), 1, "expected a number from 0 to 10 m/s"),
         (("mcu.port", "/dev/x"), 1, "read only when the daemon starts"),
@@ -524,12 +524,12 @@ def test_set_without_arguments_lists_the_settings_and_when_they_can_change(
     ],
 )
 def test_a_setting_that_cannot_be_set_is_refused_with_the_reason_and_changes_nothing(
-    shared: Daemon, bus: Bus, words: tuple[str, ...], code: int, said: str
+    shared: Daemon, bus: Bus, words: tuple[str, ...], code: int, reason: str
 ) -> None:
     before, text = bus.get("config"), shared.config.read_text(encoding="utf-8")
     ended = tool(shared, "set", *words)
     assert ended.code == code
-    assert said in ended.out + ended.err
+    assert reason in ended.out + ended.err
     assert (bus.get("config"), shared.config.read_text(encoding="utf-8")) == (before, text)
 
 
@@ -642,7 +642,7 @@ def screened(shared: Daemon, columns: int) -> Iterator[tuple[Terminal, Program]]
     with at_terminal(
         shared.config.parent, *drive, term=SCREEN, columns=columns, piped="stderr"
     ) as (terminal, program):
-        until(lambda: [one for one in screens(terminal) if WAITS in one], 10.0, "it")
+        until(lambda: [screen for screen in screens(terminal) if WAITS in screen], 10.0, "it")
         yield terminal, program
 
 
@@ -656,11 +656,11 @@ def test_drive_shows_reason_pose_and_help_on_a_screen_of_any_width(
             until(lambda: "DRIVING" in screens(terminal)[-1], 5.0, "driving")
         frames = screens(terminal)
     assert all("u  i  o" in frame for frame in frames if "as teleop" in frame)
-    shown = next(frame for frame in frames if WAITS in frame)
-    told = " ".join(shown.split())
+    screen = next(frame for frame in frames if WAITS in frame)
+    content = " ".join(screen.split())
     for text in ("READY", "no source has sent one within its timeout", "yaw", "rad/s", "u i o"):
-        assert text in told
-    assert all(len(line.rstrip()) <= columns for line in shown.split("\r\n"))
+        assert text in content
+    assert all(len(line.rstrip()) <= columns for line in screen.split("\r\n"))
     # Each screen overwrites the one before: nothing scrolls.
     assert "\x1b[?1049h" in terminal.screen
     assert all(frame.count("\n") < 24 for frame in frames)

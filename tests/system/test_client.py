@@ -108,7 +108,7 @@ def examples(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Outcome]:
         for name, bus in buses.items():
             bus.linked()
             before[name] = kept_waiting(bus.get("info")["pid"])
-        heard = {name: stack.enter_context(bus.follow("cmd/app")) for name, bus in buses.items()}
+        samples = {name: stack.enter_context(bus.follow("cmd/app")) for name, bus in buses.items()}
         running = {
             name: stack.enter_context(Program(words(at_endpoint(code, endpoints[name])), where))
             for name, code in codes.items()
@@ -122,7 +122,7 @@ def examples(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Outcome]:
                 f"{name}: exit {code}, x {state['x']:.4f} y {state['y']:.4f} yaw {state['yaw']:.4f}"
             )
             waited_s = kept_waiting(buses[name].get("info")["pid"]) - before[name]
-            silent_s = silences([seen.at for seen in heard[name].seen])
+            silent_s = silences([entry.at for entry in samples[name].seen])
             late = lost(program.started) + waited_s + silent_s
             outcomes[name] = Outcome(ended, state, late)
     return outcomes
@@ -165,10 +165,12 @@ def test_the_plain_zenoh_example_of_the_readme_drives_one_metre_and_follows_the_
 ) -> None:
     ended, state, late = examples["plain zenoh"]
     assert (ended.code, ended.err) == (0, "")
-    seen = [json.loads(line) for line in ended.out.splitlines()]
-    assert len(seen) > 10
-    assert {odom["child_frame_id"] for odom in seen} == {"base_link"}
-    first, last = (one["pose"]["pose"]["position"]["x"] for one in (seen[0], seen[-1]))
+    odometry = [json.loads(line) for line in ended.out.splitlines()]
+    assert len(odometry) > 10
+    assert {odom["child_frame_id"] for odom in odometry} == {"base_link"}
+    first, last = (
+        message["pose"]["pose"]["position"]["x"] for message in (odometry[0], odometry[-1])
+    )
     assert first < 0.5 * state["x"] < last
     # The example's own sleeps add up to a little more than 2 s.
     assert state["x"] == pytest.approx(1.03, abs=0.05 + 0.5 * late), state["counters"]
@@ -319,10 +321,10 @@ def test_a_put_on_a_wildcard_is_not_taken_for_a_message_of_the_robot(
         keys = iter(str(sample.key_expr) for sample in raw)
         until(lambda: next(keys) == "acsard/acsar/**", 5.0, "the stranger's")
         until(lambda: next(keys) == "acsard/acsar/state", 5.0, "one of the robot's after it")
-        heard = []
+        names = []
         while (sample := states.try_recv()) is not None:
-            heard.append(str(sample.key_expr))
-    assert set(heard) == {"acsard/acsar/state"}
+            names.append(str(sample.key_expr))
+    assert set(names) == {"acsard/acsar/state"}
 
 
 def test_services_answer_with_success_and_a_message(shared: Daemon, fresh: Bus) -> None:
@@ -342,9 +344,9 @@ def test_a_drive_of_a_stopped_robot_raises_the_daemon_s_reason(shared: Daemon, f
         robot.call("stop")
         with pytest.raises(NotDrivenError, match=f"stopped by {robot.name}"):
             robot.drive(0.5, seconds=0.2)
-        seen = robot.get("state").latch
+        latch = robot.get("state").latch
         robot.call("stop")
-        refused = robot.call("clear", latch=seen)
+        refused = robot.call("clear", latch=latch)
         assert (
             refused.success,
             "is not the latch that srv/clear would release now" in refused.message,
@@ -397,13 +399,15 @@ def test_a_drive_of_a_robot_that_dies_behind_a_router_with_storages_raises(tmp_p
 
     def answer(query: zenoh.Query) -> None:
         answered.append(True)
-        for one in last[-1:]:
-            query.reply(one.key_expr, one.payload, encoding=one.encoding, timestamp=one.timestamp)
+        for item in last[-1:]:
+            query.reply(
+                item.key_expr, item.payload, encoding=item.encoding, timestamp=item.timestamp
+            )
 
     answered: list[bool] = []
     with ExitStack() as stack:
         router = stack.enter_context(zenoh.open(client_config(endpoint, "router")))
-        kept: list[Any] = [
+        handles: list[Any] = [
             router.declare_subscriber("acsard/acsar/state", last.append),
             router.declare_queryable("acsard/acsar/state", answer),
         ]
@@ -421,8 +425,8 @@ def test_a_drive_of_a_robot_that_dies_behind_a_router_with_storages_raises(tmp_p
             robot.drive(0.3, seconds=4.0)
         killing.result()
         assert answered
-        for one in kept:
-            one.undeclare()
+        for item in handles:
+            item.undeclare()
 
 
 def test_a_reader_sleeps_between_messages(shared: Daemon, fresh: Bus) -> None:
@@ -452,14 +456,14 @@ def test_a_drive_begins_and_ends_with_a_zero(shared: Daemon, fresh: Bus) -> None
         missed = lost(begun) / 0.05  # it sends at 20 Hz
         commands.find(lambda value: value["twist"]["linear"]["x"] == 0.3, 2.0, "the command")
         speeds = until(
-            lambda: _ended([seen.value["twist"]["linear"]["x"] for seen in commands.seen]),
+            lambda: _ended([entry.value["twist"]["linear"]["x"] for entry in commands.seen]),
             2.0,
             "the last zero",
         )
         assert speeds[0] == 0.0
         assert 3 - missed <= speeds.count(0.3) <= 6
         assert commands.seen[0].encoding == "application/msgpack;acsard.TwistStamped.v1"
-        assert all(seen.value["header"]["stamp"]["sec"] > 0 for seen in commands.seen)
+        assert all(entry.value["header"]["stamp"]["sec"] > 0 for entry in commands.seen)
 
 
 def _ended(speeds: list[float]) -> list[float]:
@@ -481,7 +485,7 @@ def test_a_drive_that_is_interrupted_sends_a_zero(shared: Daemon, fresh: Bus) ->
             drive_and_fail(robot)
         # A source may have a timeout of several seconds, so the robot must not wait for it.
         until(
-            lambda: _ended([seen.value["twist"]["linear"]["x"] for seen in commands.seen]),
+            lambda: _ended([entry.value["twist"]["linear"]["x"] for entry in commands.seen]),
             1.0,
             "the last zero",
         )
@@ -493,17 +497,17 @@ def test_a_drive_that_is_interrupted_sends_a_zero(shared: Daemon, fresh: Bus) ->
 
 @pytest.mark.slow
 async def test_an_async_drive_runs_while_odometry_is_followed(shared: Daemon, fresh: Bus) -> None:
-    begun, seen = time.monotonic(), []
+    begun, messages = time.monotonic(), []
     async with connect_async(shared.endpoint) as robot:
         driving = asyncio.create_task(robot.drive(0.5, seconds=0.6))
         async for odom in robot.messages("odom"):
-            seen.append(odom)
+            messages.append(odom)
             if driving.done() and odom.twist.twist.linear.x == 0.0:
                 break
     late = lost(begun)
-    assert len(seen) > 60 - 100 * late
-    assert max(odom.twist.twist.linear.x for odom in seen) > 0.4
-    assert seen[-1].pose.pose.position.x == pytest.approx(0.3, abs=0.03 + 0.5 * late)
+    assert len(messages) > 60 - 100 * late
+    assert max(odom.twist.twist.linear.x for odom in messages) > 0.4
+    assert messages[-1].pose.pose.position.x == pytest.approx(0.3, abs=0.03 + 0.5 * late)
 
 
 @pytest.mark.slow
@@ -541,9 +545,9 @@ async def test_cancelling_an_async_drive_sends_the_zero_immediately(
     print(f"cancel -> zero on the bus: {zero.at - cancelled:.4f} s")
     assert zero.at - cancelled < 0.2 + lost(cancelled, zero.at)
     assert not [
-        seen
-        for seen in commands.seen
-        if seen.at > zero.at and seen.value["twist"]["linear"]["x"] != 0.0
+        entry
+        for entry in commands.seen
+        if entry.at > zero.at and entry.value["twist"]["linear"]["x"] != 0.0
     ]
 
 
@@ -565,7 +569,7 @@ async def test_an_async_drive_does_not_go_on_after_its_event_loop_was_blocked(
         commands.find(
             lambda value: value["twist"]["linear"]["x"] == 0.0, 2.0, "a zero", after=awake
         )
-    speeds = [seen.value["twist"]["linear"]["x"] for seen in commands.seen if seen.at > awake]
+    speeds = [sample.value["twist"]["linear"]["x"] for sample in commands.seen if sample.at > awake]
     assert set(speeds) == {0.0}
 
 
@@ -618,7 +622,7 @@ def test_the_client_repeats_a_query_to_a_busy_daemon_and_never_a_service_call() 
     config.insert_json5("listen/endpoints", json.dumps([endpoint]))
     config.insert_json5("scouting/multicast/enabled", "false")
     with zenoh.open(config) as busy:
-        kept = [
+        queryables = [
             busy.declare_queryable(f"acsard/acsar/{key}", answer) for key in ("config", "srv/*")
         ]
         with connect(endpoint) as robot:
@@ -629,7 +633,7 @@ def test_the_client_repeats_a_query_to_a_busy_daemon_and_never_a_service_call() 
             with pytest.raises(ReplyError, match="busy"):
                 robot.call("deactivate")
             assert asked == ["acsard/acsar/srv/deactivate"]
-        assert kept
+        assert queryables
 
 
 def test_no_client_request_raised_an_exception_in_the_daemon(shared: Daemon) -> None:

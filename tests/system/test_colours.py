@@ -30,8 +30,8 @@ SGR = re.compile(r"\x1b\[([\d;:]*)m")
 
 def colours(text: str) -> list[str]:
     """Return the sequences that set a colour. Bold, faint and reversed are not colours."""
-    found = (match[1] for match in SGR.finditer(text))
-    return [one for one in found if any(map(_is_colour, re.split("[;:]", one)))]
+    sequences = (match[1] for match in SGR.finditer(text))
+    return [sequence for sequence in sequences if any(map(_is_colour, re.split("[;:]", sequence)))]
 
 
 def _is_colour(number: str) -> bool:
@@ -101,7 +101,9 @@ def typed_at(daemon: Daemon, words: Sequence[str]) -> list[str]:
 
 
 @pytest.mark.variations(4)
-@pytest.mark.parametrize(("words", "text"), SCREENS, ids=[" ".join(one) for one, _ in SCREENS])
+@pytest.mark.parametrize(
+    ("words", "text"), SCREENS, ids=[" ".join(command) for command, _ in SCREENS]
+)
 @pytest.mark.nightly
 def test_no_screen_has_a_colour_if_no_color_is_set(
     shared: Daemon, bus: Bus, tmp_path: Path, words: list[str], text: str
@@ -122,9 +124,9 @@ def test_a_screen_has_colours_unless_no_color_is_set(
 @pytest.mark.slow
 def test_no_help_and_no_usage_error_has_a_colour_if_no_color_is_set(tmp_path: Path) -> None:
     words = [sys.executable, "-c", EVERY_HELP]
-    told = shown(words, tmp_path, "that was all", NO_COLOR="1")
-    assert told.count("usage: acsard") >= 2 * len(VERBS)
-    assert colours(told) == []
+    output = shown(words, tmp_path, "that was all", NO_COLOR="1")
+    assert output.count("usage: acsard") >= 2 * len(VERBS)
+    assert colours(output) == []
 
 
 @pytest.mark.variations(5)

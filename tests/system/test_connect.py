@@ -36,7 +36,9 @@ def router(where: Path, endpoint: str) -> Program:
 
 def row(bus: Bus) -> Any:
     """Return the router's row in `diagnostics`."""
-    rows = [one for one in bus.get("diagnostics")["status"] if one["name"] == "acsard: router"]
+    rows = [
+        status for status in bus.get("diagnostics")["status"] if status["name"] == "acsard: router"
+    ]
     return rows[0] if rows else None
 
 
@@ -54,16 +56,16 @@ def test_a_peer_says_that_its_router_is_missing_and_that_it_came_and_went(tmp_pa
         until(lambda: row(bus) is not None, 2.0, "diagnostics say it")
         assert (row(bus)["level"], row(bus)["message"]) == (1, f"not connected to {meeting}")
         toml = f'[bus]\nlisten = ["{daemon.endpoint}"]\nconnect = ["{meeting}"]\n'
-        _, found = examined(tmp_path, toml)
-        says = [(one["level"], one["text"]) for one in found["router"]]
-        assert ("warning", f"no program listens at {meeting}") in says
-        assert ("warning", f"the daemon is not connected to {meeting}") in says
+        _, findings = examined(tmp_path, toml)
+        rows = [(finding["level"], finding["text"]) for finding in findings["router"]]
+        assert ("warning", f"no program listens at {meeting}") in rows
+        assert ("warning", f"the daemon is not connected to {meeting}") in rows
         with router(tmp_path, meeting) as there:
             assert told(daemon, "router_found", 1) == f"connected to {meeting}"
             until(lambda: row(bus)["level"] == 0, 2.0, "diagnostics say it")
-            _, found = examined(tmp_path, toml)
-            says = [(one["level"], one["text"]) for one in found["router"]]
-            assert says == [("ok", "the daemon is connected")]
+            _, findings = examined(tmp_path, toml)
+            rows = [(finding["level"], finding["text"]) for finding in findings["router"]]
+            assert rows == [("ok", "the daemon is connected")]
             there.signal(signal.SIGKILL)
             told(daemon, "router_missing", 2)
         assert bus.count("router_missing") == 2
@@ -76,9 +78,9 @@ def test_a_client_says_that_its_router_went_and_came_back(tmp_path: Path) -> Non
     toml = f'[bus]\nmode = "client"\nconnect = ["{meeting}"]\n'
     with Daemon(tmp_path, config=config, ready=False) as daemon:
         until(lambda: daemon.events("connecting"), 20.0, "it waits for its router")
-        _, found = examined(tmp_path, toml)
-        assert found["router"][0]["text"] == f"no program listens at {meeting}"
-        assert "only through the Zenoh router" in found["daemon"][0]["text"]
+        _, findings = examined(tmp_path, toml)
+        assert findings["router"][0]["text"] == f"no program listens at {meeting}"
+        assert "only through the Zenoh router" in findings["daemon"][0]["text"]
         with router(tmp_path, meeting):
             told(daemon, "router_found", 1)
         told(daemon, "router_missing", 1)
@@ -96,24 +98,24 @@ def test_two_directly_connected_daemons_report_it_and_a_wildcard_stop_reaches_on
 
     So a stop for all robots reaches only the daemon to which the operator is connected.
     """
-    one = Daemon(tmp_path, config={"robot": {"id": "one"}}, name="one")
+    first = Daemon(tmp_path, config={"robot": {"id": "one"}}, name="one")
     config: Tables = {
         "robot": {"id": "two"},
-        "bus": {"connect": [one.endpoint]},
+        "bus": {"connect": [first.endpoint]},
         "ros": {"namespace": "two"},
     }
-    with one, Daemon(tmp_path, config=config, name="two", endpoint=free_endpoint()) as two:
-        assert one.endpoint in told(two, "not_a_router", 1)
+    with first, Daemon(tmp_path, config=config, name="two", endpoint=free_endpoint()) as two:
+        assert first.endpoint in told(two, "not_a_router", 1)
         with Bus(two.endpoint, robot_id="two") as bus:
             until(lambda: "is not a router" in row(bus)["message"], 2.0, "diagnostics say it")
         toml = f'[robot]\nid = "two"\n[bus]\nlisten = ["{two.endpoint}"]\n'
-        _, found = examined(tmp_path, toml + f'connect = ["{one.endpoint}"]\n')
-        (mend,) = (each["mend"] for each in found["router"] if "not a router" in each["text"])
+        _, findings = examined(tmp_path, toml + f'connect = ["{first.endpoint}"]\n')
+        (mend,) = (each["mend"] for each in findings["router"] if "not a router" in each["text"])
         assert "connect all robots to a Zenoh router" in mend
-        stopped = finish(acsard("call", "stop", "--id", "*", "--connect", one.endpoint), tmp_path)
+        stopped = finish(acsard("call", "stop", "--id", "*", "--connect", first.endpoint), tmp_path)
         assert stopped.out.startswith("one: stopped")
-        assert f"all robots visible at {one.endpoint}: 1 robot" in stopped.err
-        assert one.events("not_a_router") == []  # `one` has no router to connect to
+        assert f"all robots visible at {first.endpoint}: 1 robot" in stopped.err
+        assert first.events("not_a_router") == []  # `first` has no router to connect to
         with Bus(two.endpoint, robot_id="two") as bus:
             assert bus.state()["mode"] != "stopped"
 
@@ -136,8 +138,8 @@ def test_the_zeros_of_a_program_behind_routers_release_no_other_program(
     ends = [free_endpoint() for _ in range(routers)]
     with ExitStack() as stack:
         for place, endpoint in enumerate(ends):
-            one = Program(words(ROUTER, endpoint, *ends[:place][-1:]), tmp_path)
-            stack.enter_context(one).says("routing")
+            program = Program(words(ROUTER, endpoint, *ends[:place][-1:]), tmp_path)
+            stack.enter_context(program).says("routing")
         daemon = stack.enter_context(Daemon(tmp_path, config={"bus": {"connect": ends[-1:]}}))
         bus = stack.enter_context(Bus(daemon.endpoint))
         zeros, speeds = [stack.enter_context(zenoh.open(client_config(ends[0]))) for _ in range(2)]
@@ -165,5 +167,7 @@ def test_the_zeros_of_a_program_behind_routers_release_no_other_program(
         while time.monotonic() < begun + 4.0:
             assert sends()["mode"] != "driving"
             time.sleep(0.05)
-        state = until(lambda: (found := sends())["mode"] == "driving" and found, 10.0, "it drives")
+        state = until(
+            lambda: (status := sends())["mode"] == "driving" and status, 10.0, "it drives"
+        )
         assert state["sender"].startswith("session ")

@@ -42,10 +42,10 @@ def examined(
     env = environment(**variables)
     done = subprocess.run(words, capture_output=True, text=True, timeout=60, check=False, env=env)
     assert done.stderr == ""
-    found: dict[str, list[dict[str, str]]] = {}
+    findings: dict[str, list[dict[str, str]]] = {}
     for finding in json.loads(done.stdout):
-        found.setdefault(finding["subject"], []).append(finding)
-    return done.returncode, found
+        findings.setdefault(finding["subject"], []).append(finding)
+    return done.returncode, findings
 
 
 def toml(port: str = "sim", more: str = "") -> str:
@@ -53,7 +53,7 @@ def toml(port: str = "sim", more: str = "") -> str:
 
 
 def worst(findings: list[dict[str, str]]) -> dict[str, str]:
-    return max(findings, key=lambda one: ("ok", "warning", "failure").index(one["level"]))
+    return max(findings, key=lambda finding: ("ok", "warning", "failure").index(finding["level"]))
 
 
 @pytest.fixture
@@ -65,17 +65,17 @@ def terminal() -> Iterator[str]:
 
 
 def test_a_machine_with_the_simulator_and_no_daemon_has_warnings_only(tmp_path: Path) -> None:
-    code, found = examined(tmp_path, toml())
+    code, findings = examined(tmp_path, toml())
     assert code == 0
-    assert found["configuration"][0]["level"] == "ok"
-    assert "simulator" in worst(found["port"])["text"]
-    assert "acsard run" in worst(found["daemon"])["mend"]
+    assert findings["configuration"][0]["level"] == "ok"
+    assert "simulator" in worst(findings["port"])["text"]
+    assert "acsard run" in worst(findings["daemon"])["mend"]
 
 
 def test_every_mistake_in_the_configuration_is_a_failure(tmp_path: Path) -> None:
-    code, found = examined(tmp_path, "[mcu]\nbaud = 1\n[robot]\nid = 3\n")
+    code, findings = examined(tmp_path, "[mcu]\nbaud = 1\n[robot]\nid = 3\n")
     assert code == 1
-    assert [one["level"] for one in found["configuration"]] == ["failure", "failure"]
+    assert [finding["level"] for finding in findings["configuration"]] == ["failure", "failure"]
 
 
 @each(
@@ -85,10 +85,10 @@ def test_every_mistake_in_the_configuration_is_a_failure(tmp_path: Path) -> None
 def test_an_invalid_port_is_a_failure_that_refers_to_acsard_ports(
     tmp_path: Path, port: str, words: str
 ) -> None:
-    code, found = examined(tmp_path, toml(port))
+    code, findings = examined(tmp_path, toml(port))
     assert code == 1
-    assert words in worst(found["port"])["text"]
-    assert "acsard ports" in worst(found["port"])["mend"]
+    assert words in worst(findings["port"])["text"]
+    assert "acsard ports" in worst(findings["port"])["mend"]
 
 
 def test_the_process_that_holds_the_port_is_named_with_its_pid(
@@ -102,24 +102,24 @@ def test_the_process_that_holds_the_port_is_named_with_its_pid(
     try:
         assert holder.stdout is not None
         assert holder.stdout.readline() == "held\n"
-        code, found = examined(tmp_path, toml(terminal))
+        code, findings = examined(tmp_path, toml(terminal))
     finally:
         holder.terminate()
         holder.wait(5)
     assert code == 1
-    held = [one for one in found["port"] if f"(pid {holder.pid})" in one["text"]]
-    assert [one["level"] for one in held] == ["failure"]
-    assert f"kill {holder.pid}" in held[0]["mend"]
+    failures = [finding for finding in findings["port"] if f"(pid {holder.pid})" in finding["text"]]
+    assert [finding["level"] for finding in failures] == ["failure"]
+    assert f"kill {holder.pid}" in failures[0]["mend"]
 
 
 def test_doctor_reports_the_mode_of_a_running_daemon(tmp_path: Path) -> None:
     with FarPeer(tmp_path) as peer, Daemon(tmp_path, peer.path) as daemon, Bus(daemon.endpoint):
         peer.awaits(b"ap00.00")
         listen = f'[bus]\nlisten = ["{daemon.endpoint}"]\n'
-        code, found = examined(tmp_path, f'[mcu]\nport = "{peer.path}"\n{listen}')
-        assert found["daemon"][0]["level"] == "ok"
-        assert found["daemon"][0]["text"].startswith("ready: ")
-        assert all(one["level"] != "failure" for one in found["daemon"])
+        code, findings = examined(tmp_path, f'[mcu]\nport = "{peer.path}"\n{listen}')
+        assert findings["daemon"][0]["level"] == "ok"
+        assert findings["daemon"][0]["text"].startswith("ready: ")
+        assert all(finding["level"] != "failure" for finding in findings["daemon"])
     assert code in (0, 1)  # the far peer itself holds the pty
 
 
@@ -128,19 +128,23 @@ def test_doctor_uses_the_running_daemon_s_values_and_reports_where_the_file_diff
 ) -> None:
     with FarPeer(tmp_path) as peer, Daemon(tmp_path, words=("--port", str(peer.path))) as daemon:
         peer.awaits(b"ap00.00")
-        kept = tmp_path / "daemon.states"
-        file = f'[bus]\nlisten = ["{daemon.endpoint}"]\n[control]\nstate_directory = "{kept}"\n'
-        _, found = examined(tmp_path, file)
-        (other,) = [one for one in found["configuration"] if "other values" in one["text"]]
+        directory = tmp_path / "daemon.states"
+        file = (
+            f'[bus]\nlisten = ["{daemon.endpoint}"]\n[control]\nstate_directory = "{directory}"\n'
+        )
+        _, findings = examined(tmp_path, file)
+        (other,) = [
+            finding for finding in findings["configuration"] if "other values" in finding["text"]
+        ]
         assert other["level"] == "ok"  # it is intentional: the README says so
         assert f'[mcu] port = "{peer.path}"' in other["mend"]
         # A long value is cut in the text.
         assert f'mcu.port = "{str(peer.path)[:40]}' in other["text"]
         assert 'not "sim"' in other["text"]
         assert f"pid {daemon.pid}" in other["text"]
-        assert not any("simulator" in one["text"] for one in found["port"])
-        assert any(str(peer.path) in one["text"] for one in found["port"])
-        assert worst(found["link"])["level"] == "ok"
+        assert not any("simulator" in finding["text"] for finding in findings["port"])
+        assert any(str(peer.path) in finding["text"] for finding in findings["port"])
+        assert worst(findings["link"])["level"] == "ok"
 
 
 @pytest.mark.nightly
@@ -152,15 +156,19 @@ def test_doctor_finds_a_daemon_with_another_endpoint_and_id_by_the_same_options(
         file = daemon.config.read_text()
         _, blind = examined(tmp_path, file)
         _, nameless = examined(tmp_path, file, "--connect", where)
-        _, found = examined(tmp_path, file, "--connect", where, "--id", "other")
+        _, findings = examined(tmp_path, file, "--connect", where, "--id", "other")
     assert blind["daemon"][-1]["text"] == f"no program listens at {daemon.endpoint}"
     assert "--connect" in blind["daemon"][-1]["mend"]
     assert nameless["daemon"][-1]["level"] == "failure"
     assert "--id" in nameless["daemon"][-1]["mend"]
-    (told,) = [one["text"] for one in found["configuration"] if "other values" in one["text"]]
-    assert 'robot.id = "other", not "acsar"' in told
-    assert f"pid {daemon.pid}" in told
-    assert {"link", "daemon"} <= set(found)
+    (difference,) = [
+        finding["text"]
+        for finding in findings["configuration"]
+        if "other values" in finding["text"]
+    ]
+    assert 'robot.id = "other", not "acsar"' in difference
+    assert f"pid {daemon.pid}" in difference
+    assert {"link", "daemon"} <= set(findings)
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="makes a process namespace")
@@ -171,10 +179,10 @@ def test_doctor_does_not_check_the_local_port_for_a_daemon_on_another_machine(
     with FarPeer(tmp_path) as peer, Daemon(tmp_path, peer.path, before=apart) as daemon:
         peer.awaits(b"ap00.00")
         text = f'[mcu]\nport = "/dev/acsar_that_is_not"\n[bus]\nlisten = ["{daemon.endpoint}"]\n'
-        _, found = examined(tmp_path, text)
-    assert "runs on another machine" in found["daemon"][0]["text"]
-    assert "port" not in found
-    assert [one["level"] for one in found["configuration"]] == ["ok"]
+        _, findings = examined(tmp_path, text)
+    assert "runs on another machine" in findings["daemon"][0]["text"]
+    assert "port" not in findings
+    assert [finding["level"] for finding in findings["configuration"]] == ["ok"]
 
 
 @each(
@@ -209,8 +217,8 @@ def test_doctor_reports_the_faulty_board_of_a_running_daemon(
             linked = fault.startswith("lost")
             until(lambda: bus.state()["mode"] == "ready" if linked else "received" in
                   bus.state()["reason"], 10.0, "the diagnosis")  # fmt: skip
-            code, found = examined(tmp_path, f'[bus]\nlisten = ["{daemon.endpoint}"]\n')
-    finding = worst(found["link"])
+            code, findings = examined(tmp_path, f'[bus]\nlisten = ["{daemon.endpoint}"]\n')
+    finding = worst(findings["link"])
     assert words in finding["text"]
     assert f"acsard mcu check --port {port}" in finding["mend"]
     assert finding["level"] == ("warning" if linked else "failure")
@@ -222,10 +230,10 @@ def test_an_address_at_which_another_program_listens_is_a_failure(tmp_path: Path
     with socket.create_server(("127.0.0.1", 0)) as other:
         endpoint = f"tcp/127.0.0.1:{other.getsockname()[1]}"
         began = time.monotonic()
-        code, found = examined(tmp_path, f'[bus]\nlisten = ["{endpoint}"]\n')
+        code, findings = examined(tmp_path, f'[bus]\nlisten = ["{endpoint}"]\n')
         assert time.monotonic() - began < 25
     assert code == 1
-    assert worst(found["daemon"])["level"] == "failure"
+    assert worst(findings["daemon"])["level"] == "failure"
 
 
 def with_certificates(where: Path, days: float) -> str:
@@ -236,8 +244,8 @@ def with_certificates(where: Path, days: float) -> str:
 
 
 def test_a_certificate_that_has_expired_is_a_failure(tmp_path: Path) -> None:
-    code, found = examined(tmp_path, with_certificates(tmp_path, -3))
-    finding = worst(found["certificates"])
+    code, findings = examined(tmp_path, with_certificates(tmp_path, -3))
+    finding = worst(findings["certificates"])
     assert (code, finding["level"]) == (1, "failure")
     assert "expired 3 days ago" in finding["text"]
 
@@ -245,9 +253,9 @@ def test_a_certificate_that_has_expired_is_a_failure(tmp_path: Path) -> None:
 def test_certificates_that_are_missing_are_named(tmp_path: Path) -> None:
     text = with_certificates(tmp_path, 400)
     (tmp_path / "tls" / "ca.pem").unlink()
-    code, found = examined(tmp_path, text)
+    code, findings = examined(tmp_path, text)
     assert code == 1
-    assert "ca.pem is missing" in worst(found["certificates"])["text"]
+    assert "ca.pem is missing" in worst(findings["certificates"])["text"]
 
 
 @pytest.mark.nightly
@@ -257,22 +265,22 @@ def test_the_certificate_of_the_options_or_the_environment_is_looked_at(tmp_path
     Authority.make(tmp_path / "other", "test", 10).issue(tmp_path / "other", "me", [], 10)
     other = str(tmp_path / "other")
     option = examined(tmp_path, text, "--connect", "tls/127.0.0.1:1", "--tls", other)[1]
-    assert sorted(one["level"] for one in option["certificates"]) == ["ok", "warning"]
+    assert sorted(finding["level"] for finding in option["certificates"]) == ["ok", "warning"]
     variable = examined(tmp_path, text.partition("tls =")[0], ACSARD_TLS=other)[1]
-    assert [one["level"] for one in variable["certificates"]] == ["warning"]
+    assert [finding["level"] for finding in variable["certificates"]] == ["warning"]
 
 
 def test_a_key_that_others_may_read_is_a_failure(tmp_path: Path) -> None:
     text = with_certificates(tmp_path, 400)
     (tmp_path / "tls" / "key.pem").chmod(0o644)
-    code, found = examined(tmp_path, text)
+    code, findings = examined(tmp_path, text)
     assert code == 1
-    assert "chmod 600" in worst(found["certificates"])["mend"]
+    assert "chmod 600" in worst(findings["certificates"])["mend"]
 
 
 def test_a_router_on_a_plain_endpoint_is_a_warning(tmp_path: Path) -> None:
-    _, found = examined(tmp_path, toml(more='connect = ["tcp/127.0.0.1:7447"]\n'))
-    assert "every program that is connected to that router" in worst(found["bus"])["text"]
+    _, findings = examined(tmp_path, toml(more='connect = ["tcp/127.0.0.1:7447"]\n'))
+    assert "every program that is connected to that router" in worst(findings["bus"])["text"]
 
 
 def test_the_text_output_has_a_line_for_each_finding_and_one_for_its_remedy(tmp_path: Path) -> None:
@@ -288,9 +296,9 @@ def test_the_text_output_has_a_line_for_each_finding_and_one_for_its_remedy(tmp_
 def test_ports_lists_the_serial_ports_or_refers_to_dmesg() -> None:
     words = [sys.executable, "-m", "acsard", "ports", "--json"]
     done = subprocess.run(words, capture_output=True, text=True, timeout=30, check=False)
-    found: list[dict[str, Any]] = json.loads(done.stdout)
-    assert done.returncode == (0 if found else 1)
-    assert all(os.path.exists(port["device"]) for port in found)
+    ports: list[dict[str, Any]] = json.loads(done.stdout)
+    assert done.returncode == (0 if ports else 1)
+    assert all(os.path.exists(port["device"]) for port in ports)
     plain = subprocess.run(words[:-1], capture_output=True, text=True, timeout=30, check=False)
     assert plain.returncode == done.returncode
-    assert any(port["usb_id"] for port in found) or "dmesg" in plain.stderr
+    assert any(port["usb_id"] for port in ports) or "dmesg" in plain.stderr

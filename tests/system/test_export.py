@@ -43,9 +43,9 @@ def bag(path: Path) -> Told:
     data: dict[str, list[bytes]] = {}
     times: dict[str, list[int]] = {}
     with Reader(path) as reader:
-        types = {one.topic: one.msgtype for one in reader.connections}
-        for one in reader.connections:
-            store.register(get_types_from_msg(one.msgdef.data, one.msgtype))
+        types = {channel.topic: channel.msgtype for channel in reader.connections}
+        for channel in reader.connections:
+            store.register(get_types_from_msg(channel.msgdef.data, channel.msgtype))
         for connection, time_ns, raw in reader.messages():
             data.setdefault(connection.topic, []).append(raw)
             times.setdefault(connection.topic, []).append(time_ns)
@@ -64,13 +64,13 @@ class Live:
         """Number of messages of all topics that the daemon never sent, because newer ones came."""
 
 
-def _take(got: list[bytes], sample: Any) -> None:
-    got.append(sample.payload.to_bytes())
+def _take(payloads: list[bytes], sample: Any) -> None:
+    payloads.append(sample.payload.to_bytes())
 
 
-def _take_numbered(got: list[tuple[int, bytes]], sample: Any) -> None:
+def _take_numbered(items: list[tuple[int, bytes]], sample: Any) -> None:
     number = int.from_bytes(sample.attachment.to_bytes()[:8], "little")
-    got.append((number, sample.payload.to_bytes()))
+    items.append((number, sample.payload.to_bytes()))
 
 
 @contextmanager
@@ -79,8 +79,8 @@ def heard(bus: Bus) -> Iterator[Live]:
     live = Live()
     with ExitStack() as stack:
         for key in (*ROS, f"{bus.root}/state", f"{bus.root}/events"):
-            got = live.data.setdefault(key.rpartition("/")[2], [])
-            subscriber = bus.session.declare_subscriber(key, partial(_take, got))
+            payloads = live.data.setdefault(key.rpartition("/")[2], [])
+            subscriber = bus.session.declare_subscriber(key, partial(_take, payloads))
             stack.callback(subscriber.undeclare)
         for topic in ROS:
             numbered = live.numbered.setdefault(topic, [])
@@ -92,22 +92,28 @@ def heard(bus: Bus) -> Iterator[Live]:
         yield live
 
 
-def places(live: Sequence[Any], told: Sequence[Any], topic: str) -> list[int]:
+def places(live: Sequence[Any], entries: Sequence[Any], topic: str) -> list[int]:
     """Return the index of each live message in the file.
 
     Fails if one is missing or in the wrong order.
     """
-    at = iter(enumerate(told))
-    found = [next((n for n, other in at if other == one), None) for one in live]
-    if None in found:
-        missing = live[found.index(None)]
-        stamped = [one for one in told if not isinstance(one, bytes) and one[0] == missing[0]]
-        pytest.fail(f"{topic}: {found.index(None)} of {len(found)}: {missing}, written: {stamped}")
-    return [n for n in found if n is not None]
+    at = iter(enumerate(entries))
+    indexes = [next((n for n, other in at if other == message), None) for message in live]
+    if None in indexes:
+        missing = live[indexes.index(None)]
+        stamped = [
+            message
+            for message in entries
+            if not isinstance(message, bytes) and message[0] == missing[0]
+        ]
+        pytest.fail(
+            f"{topic}: {indexes.index(None)} of {len(indexes)}: {missing}, written: {stamped}"
+        )
+    return [n for n in indexes if n is not None]
 
 
 def assert_published(
-    numbered: Sequence[tuple[int, Any]], told: Sequence[Any], displaced: int, topic: str
+    numbered: Sequence[tuple[int, Any]], entries: Sequence[Any], displaced: int, topic: str
 ) -> None:
     """Check the number of messages in the file against the publisher's sequence numbers.
 
@@ -115,14 +121,14 @@ def assert_published(
     published.
     """
     assert len(numbered) > 50, topic
-    found = places([message for _, message in numbered], told, topic)
+    indexes = places([message for _, message in numbered], entries, topic)
     published = numbered[-1][0] - numbered[0][0]
-    assert published <= found[-1] - found[0] <= published + displaced, topic
+    assert published <= indexes[-1] - indexes[0] <= published + displaced, topic
 
 
 def since_driving(live: Sequence[Any], reason: Callable[[Any], str]) -> Sequence[Any]:
     """Return the messages from the first one whose reason is "driving"."""
-    first = next(n for n, one in enumerate(live) if reason(one).startswith("driving"))
+    first = next(n for n, message in enumerate(live) if reason(message).startswith("driving"))
     assert len(live) - first > 50
     return live[first:]
 
@@ -145,7 +151,7 @@ def both(tmp_path_factory: pytest.TempPathFactory) -> Any:
             before = len(live.data["odom"])
             until(lambda: len(live.data["odom"]) > before + 150, 5.0, "odometry")
         bus.get("srv/stop")
-        until(lambda: any(b"stop" in one for one in live.data["events"]), 5.0, "the stop")
+        until(lambda: any(b"stop" in payload for payload in live.data["events"]), 5.0, "the stop")
         static = bus.get("tf_static")
         daemon.process.terminate()
         assert daemon.ended(5.0) == 0
@@ -162,28 +168,28 @@ def both(tmp_path_factory: pytest.TempPathFactory) -> Any:
 def test_every_exported_message_has_the_bytes_that_a_ros_node_received(
     topic: str, both: Any
 ) -> None:
-    live, _, told = both
+    live, _, export = both
     assert len(live.data[topic]) > 50
-    assert places(live.data[topic], told.data[f"/{topic}"], topic)
-    assert_published(live.numbered[topic], told.data[f"/{topic}"], live.displaced, topic)
+    assert places(live.data[topic], export.data[f"/{topic}"], topic)
+    assert_published(live.numbered[topic], export.data[f"/{topic}"], live.displaced, topic)
 
 
 def test_the_exported_static_transforms_are_those_that_were_published(both: Any) -> None:
-    _, static, told = both
-    (raw,) = told.data["/tf_static"]
-    message = told.decode("/tf_static", raw)
-    for one, other in zip(static["transforms"], message.transforms, strict=True):
+    _, static, export = both
+    (raw,) = export.data["/tf_static"]
+    message = export.decode("/tf_static", raw)
+    for transform, other in zip(static["transforms"], message.transforms, strict=True):
         stamp = other.header.stamp
-        assert one["header"]["stamp"] == {"sec": stamp.sec, "nanosec": stamp.nanosec}
-        assert one["child_frame_id"] == other.child_frame_id
-        assert one["transform"]["translation"]["x"] == other.transform.translation.x
+        assert transform["header"]["stamp"] == {"sec": stamp.sec, "nanosec": stamp.nanosec}
+        assert transform["child_frame_id"] == other.child_frame_id
+        assert transform["transform"]["translation"]["x"] == other.transform.translation.x
 
 
 def test_every_exported_diagnostics_message_has_the_rows_that_were_published(both: Any) -> None:
-    live, _, told = both
+    live, _, export = both
 
     def rows(raw: bytes) -> Any:
-        message = told.decode("/diagnostics", raw)
+        message = export.decode("/diagnostics", raw)
         stamp = message.header.stamp.sec, message.header.stamp.nanosec
         return stamp, [
             (row.level, row.name, row.message, [(v.key, v.value) for v in row.values])
@@ -194,11 +200,11 @@ def test_every_exported_diagnostics_message_has_the_rows_that_were_published(bot
     def why(row: Any) -> str:
         return str(row[1][0][2])
 
-    written = [rows(raw) for raw in told.data["/diagnostics"]]
-    came = since_driving([rows(raw) for raw in live.data["diagnostics"]], why)
-    assert places(came, written, "diagnostics")
+    written = [rows(raw) for raw in export.data["/diagnostics"]]
+    live_rows = since_driving([rows(raw) for raw in live.data["diagnostics"]], why)
+    assert places(live_rows, written, "diagnostics")
     numbered = [(number, rows(raw)) for number, raw in live.numbered["diagnostics"]]
-    numbered = list(since_driving(numbered, lambda one: why(one[1])))
+    numbered = list(since_driving(numbered, lambda item: why(item[1])))
     assert_published(numbered, written, live.displaced, "diagnostics")
 
 
@@ -218,57 +224,65 @@ ALIKE = (
 
 
 def test_every_exported_state_has_the_values_that_were_published(both: Any) -> None:
-    live, _, told = both
+    live, _, export = both
 
     def of_live(raw: bytes) -> Any:
-        one = msgspec.msgpack.decode(raw)
-        counters = {name: n for name, n in one["counters"].items() if not name.startswith("bus_")}
-        sources = [(s["name"], s["age"], s["waits_for"]) for s in one["sources"]]
-        plain = [one[name] for name in ALIKE]
-        return [tuple(one["stamp"].values()), plain, list(one["wheels"]), sources, counters]
+        record = msgspec.msgpack.decode(raw)
+        counters = {
+            name: n for name, n in record["counters"].items() if not name.startswith("bus_")
+        }
+        sources = [(s["name"], s["age"], s["waits_for"]) for s in record["sources"]]
+        plain = [record[name] for name in ALIKE]
+        return [tuple(record["stamp"].values()), plain, list(record["wheels"]), sources, counters]
 
     def of_file(raw: bytes) -> Any:
-        one = told.decode("/state", raw)
-        counters = {c.name: c.count for c in one.counters if not c.name.startswith("bus_")}
-        sources = [(s.name, s.age if s.age == s.age else None, s.waits_for) for s in one.sources]
-        stamp = one.header.stamp.sec, one.header.stamp.nanosec
-        plain = [getattr(one, name) for name in ALIKE]
-        return [stamp, plain, list(one.wheels), sources, counters]
+        record = export.decode("/state", raw)
+        counters = {c.name: c.count for c in record.counters if not c.name.startswith("bus_")}
+        sources = [(s.name, s.age if s.age == s.age else None, s.waits_for) for s in record.sources]
+        stamp = record.header.stamp.sec, record.header.stamp.nanosec
+        plain = [getattr(record, name) for name in ALIKE]
+        return [stamp, plain, list(record.wheels), sources, counters]
 
-    came = since_driving([of_live(raw) for raw in live.data["state"]], lambda one: one[1][1])
-    written = [of_file(raw) for raw in told.data["/state"]]
-    assert places(came, written, "state")
+    live_states = since_driving(
+        [of_live(raw) for raw in live.data["state"]], lambda record: record[1][1]
+    )
+    written = [of_file(raw) for raw in export.data["/state"]]
+    assert places(live_states, written, "state")
     # The daemon does not number this message. It publishes one with each of the diagnostics, which
     # it numbers, because both have the same rate.
-    rows = [told.decode("/diagnostics", raw).header.stamp for raw in told.data["/diagnostics"]]
-    assert [one[0] for one in written] == [(stamp.sec, stamp.nanosec) for stamp in rows]
+    rows = [export.decode("/diagnostics", raw).header.stamp for raw in export.data["/diagnostics"]]
+    assert [record[0] for record in written] == [(stamp.sec, stamp.nanosec) for stamp in rows]
 
 
 def test_every_published_event_is_in_the_exported_log(both: Any) -> None:
-    live, _, told = both
-    lines = [told.decode("/log", raw) for raw in told.data["/log"]]
-    lines = [one for one in lines if one.name not in ADDED]
-    written = [(one.stamp.sec, one.stamp.nanosec, plain(one.name)) for one in lines]
+    live, _, export = both
+    lines = [export.decode("/log", raw) for raw in export.data["/log"]]
+    lines = [entry for entry in lines if entry.name not in ADDED]
+    written = [(entry.stamp.sec, entry.stamp.nanosec, plain(entry.name)) for entry in lines]
     last = msgspec.msgpack.decode(live.data["events"][-1])
-    came = [(*one["stamp"].values(), plain(one["name"])) for one in last["events"]]
-    assert "stop" in {name for *_, name in came}
-    found = places(came, written, "log")
+    live_events = [(*entry["stamp"].values(), plain(entry["name"])) for entry in last["events"]]
+    assert "stop" in {name for *_, name in live_events}
+    indexes = places(live_events, written, "log")
     # Events of the same name that follow each other share a row in `events`.
-    others = [one for n, one in enumerate(written) if found[0] < n < found[-1] and n not in found]
+    others = [
+        entry
+        for n, entry in enumerate(written)
+        if indexes[0] < n < indexes[-1] and n not in indexes
+    ]
     assert {name for *_, name in others} <= {"missed_periods"}
 
 
 def test_the_export_has_each_command_under_its_source(both: Any) -> None:
-    _, _, told = both
-    sent = [told.decode("/cmd_vel_in/app", raw) for raw in told.data["/cmd_vel_in/app"]]
-    speeds = {(one.twist.linear.x, one.twist.angular.z) for one in sent}
+    _, _, export = both
+    sent = [export.decode("/cmd_vel_in/app", raw) for raw in export.data["/cmd_vel_in/app"]]
+    speeds = {(command.twist.linear.x, command.twist.angular.z) for command in sent}
     assert speeds >= {(0.3, 0.2)}
 
 
 def test_message_times_in_the_export_are_the_publication_stamps(both: Any) -> None:
-    _, _, told = both
-    for raw, time_ns in zip(told.data["/cmd_vel_out"], told.times["/cmd_vel_out"], strict=True):
-        stamp = told.decode("/cmd_vel_out", raw).header.stamp
+    _, _, export = both
+    for raw, time_ns in zip(export.data["/cmd_vel_out"], export.times["/cmd_vel_out"], strict=True):
+        stamp = export.decode("/cmd_vel_out", raw).header.stamp
         assert stamp.sec * 10**9 + stamp.nanosec == time_ns
 
 

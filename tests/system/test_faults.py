@@ -112,8 +112,8 @@ def far(one_robot: tuple[FarPeer, Daemon]) -> Iterator[tuple[FarPeer, Daemon]]:
 def last_put(program: Program) -> float:
     """Return when a commander that has ended sent its last command."""
     # A commander killed in the middle of a line has printed "put" and not yet the time.
-    said = [line.split() for line in program.out[-2:]]
-    return max(float(words[1]) for words in said if len(words) == 2)
+    rows = [line.split() for line in program.out[-2:]]
+    return max(float(words[1]) for words in rows if len(words) == 2)
 
 
 def puts_of(program: Program) -> list[float]:
@@ -160,7 +160,7 @@ def killed_commanders(peer: FarPeer, daemon: Daemon, count: int) -> list[Ramp]:
     source's age. So a command that was lost with the commander does not matter, and the travel time
     of commands does not count.
     """
-    rng, found = random.Random(1), []
+    rng, ramps = random.Random(1), []
     with (
         Bus(daemon.endpoint) as bus,
         bus.follow("state") as states,
@@ -183,28 +183,28 @@ def killed_commanders(peer: FarPeer, daemon: Daemon, count: int) -> list[Ramp]:
             accepted = seconds(state["stamp"]) - age
             # If the commander is killed early, its last command may still find the robot on its way
             # up.
-            rest_of_it = [seen.value for seen in steps.seen if stamp(seen.value) > accepted]
+            rest_of_it = [entry.value for entry in steps.seen if stamp(entry.value) > accepted]
             full = itertools.dropwhile(lambda step: speed(step) < 0.0999, rest_of_it)
             slower = next(step for step in full if speed(step) < 0.0999)
             until(lambda: peer.lines[-1].line == ZERO_TEXT, 5.0, "zero on the wire")
             line = next(h for h in peer.since(steady) if not h.line.startswith(text(0.1)))
             since, step = accepted - wall, stamp(slower) - wall
-            found.append(
+            ramps.append(
                 Ramp(step - since - lost(since, step), line.at - since - lost(since, line.at))
             )
-    took, lines = [ramp.step for ramp in found], [ramp.line for ramp in found]
+    took, lines = [ramp.step for ramp in ramps], [ramp.line for ramp in ramps]
     promised = TIMEOUT_S + TICK_S
-    late = [one - promised for one in took if one > promised]
+    late = [delay - promised for delay in took if delay > promised]
     print(
         f"SIGKILL of a commander, last accepted command -> first slower step: "
         f"{count - len(late)} of {count} within {promised * 1e3:.0f} ms, "
         f"{len(late)} by a late tick up to {max(late, default=0.0) * 1e3:.2f} ms over; "
         f"min {min(took) * 1e3:.1f} median {statistics.median(took) * 1e3:.1f} "
         f"max {max(took) * 1e3:.2f} ms; its line at the far end: "
-        f"{sum(one <= promised for one in lines)} within, "
+        f"{sum(delay <= promised for delay in lines)} within, "
         f"median {statistics.median(lines) * 1e3:.1f} max {max(lines) * 1e3:.2f} ms"
     )
-    return found
+    return ramps
 
 
 def stamp(step: Any) -> float:
@@ -223,9 +223,9 @@ LONG = (pytest.mark.soak, pytest.mark.timeout(1200))
 def test_when_a_commander_is_killed_the_ramp_starts_within_its_timeout_and_a_tick(
     far: tuple[FarPeer, Daemon], count: int
 ) -> None:
-    found = killed_commanders(*far, count)
-    assert max(ramp.step for ramp in found) <= TIMEOUT_S + TICK_S + LATE_S
-    assert max(ramp.line for ramp in found) <= TIMEOUT_S + TICK_S + SLACK_S
+    ramps = killed_commanders(*far, count)
+    assert max(ramp.step for ramp in ramps) <= TIMEOUT_S + TICK_S + LATE_S
+    assert max(ramp.line for ramp in ramps) <= TIMEOUT_S + TICK_S + SLACK_S
 
 
 TWO = [
@@ -297,7 +297,7 @@ def test_when_a_commander_is_killed_the_next_one_takes_over_from_its_own_command
         took = until(lambda: taken_over(peer, daemon, bus, successor), 30.0, "with the link up")
     sent, later = took
     slower = next(h for h in later if not h.line.startswith(text(0.3)))
-    ramp = [wheels(heard.line)[0] for heard in later]
+    ramp = [wheels(entry.line)[0] for entry in later]
     print(f"{successor} takes over {slower.at - sent:.3f} s after the last command")
     assert slower.at - sent <= TIMEOUT_S + TICK_S + SLACK_S + lost(sent, slower.at)
     assert ramp == sorted(ramp, reverse=True)
@@ -315,24 +315,24 @@ def kinds_of(pid: int) -> tuple[int, int]:
 @contextmanager
 def taken(name: str) -> Iterator[None]:
     """Occupy the pty of this name, so that the next program that opens a pty gets another name."""
-    kept: list[tuple[int, int]] = []
+    pairs: list[tuple[int, int]] = []
 
     def hold() -> bool:
         # The name is free once the daemon has closed its end, too. Others may be free before it.
         some = [pty.openpty() for _ in range(8)]
         for ends in some:
             if os.ttyname(ends[1]) == name:
-                kept.append(ends)
+                pairs.append(ends)
             else:
                 for end in ends:
                     os.close(end)
-        return bool(kept)
+        return bool(pairs)
 
     until(hold, 5.0, f"{name} is free")
     try:
         yield
     finally:
-        for end in kept[0]:
+        for end in pairs[0]:
             os.close(end)
 
 
@@ -412,19 +412,19 @@ def test_a_board_that_stops_reading_and_answering_is_sent_few_drive_lines_then_z
         with peer.deaf():
             begun, known = time.monotonic(), len(peer.lines)
             until(lambda: time.monotonic() > begun + 1.0, 5.0, "a second")
-            heard = time.monotonic()
-        until(lambda: peer.lines[-1].at > heard + 0.005, 5.0, "it has read what waited")
-        found = [one.line for one in peer.lines[known:] if one.at < heard + 0.005]
-        drive = [line for line in found if line != ZERO_LINE]
-        first_zero = found.index(ZERO_LINE)
+            end = time.monotonic()
+        until(lambda: peer.lines[-1].at > end + 0.005, 5.0, "it has read what waited")
+        lines = [entry.line for entry in peer.lines[known:] if entry.at < end + 0.005]
+        drive = [line for line in lines if line != ZERO_LINE]
+        first_zero = lines.index(ZERO_LINE)
         print(
-            f"deaf for 1 s: {len(found)} lines waited, {len(drive)} of them drive lines "
-            f"(quiet is 10 periods), all {len(found) - first_zero} behind them zeros"
+            f"deaf for 1 s: {len(lines)} lines waited, {len(drive)} of them drive lines "
+            f"(quiet is 10 periods), all {len(lines) - first_zero} behind them zeros"
         )
-        assert set(found[first_zero:]) == {ZERO_LINE}
+        assert set(lines[first_zero:]) == {ZERO_LINE}
         assert len(drive) <= 10 + 2
         # Zeros at 10 Hz.
-        assert len(found) - first_zero <= 10 * (heard - begun) + 2
+        assert len(lines) - first_zero <= 10 * (end - begun) + 2
 
 
 @pytest.mark.slow
@@ -448,7 +448,7 @@ def test_no_line_waits_in_the_daemon_while_the_serial_line_is_full(
                 return noise[-3:] == [0, 0, 0]
 
             until(no_room, 5.0, "no room is left")
-            taken, begun = sum(noise), time.monotonic()
+            size, begun = sum(noise), time.monotonic()
             before, lost_links = bus.state(), len(daemon.events("link_stale"))
             driver.wish = twist(0.2)
             spoke, silent = begun, 0.0
@@ -458,12 +458,12 @@ def test_no_line_waits_in_the_daemon_while_the_serial_line_is_full(
                 time.sleep(TICK_S)
             after = bus.state()
             ended = time.monotonic()
-        until(lambda: len(peer.lines) > known + taken // 2 + 1, 5.0, "it reads again")
-        reads, heard = time.monotonic(), [one.line for one in peer.lines if one.line.strip()]
+        until(lambda: len(peer.lines) > known + size // 2 + 1, 5.0, "it reads again")
+        reads, lines = time.monotonic(), [entry.line for entry in peer.lines if entry.line.strip()]
         later = bus.state()
         full, freed = Periods.between(before, after), Periods.between(after, later)
         print(
-            f"full for {ended - begun:.2f} s: the kernel held {taken} bytes of noise and took "
+            f"full for {ended - begun:.2f} s: the kernel held {size} bytes of noise and took "
             f"{full.sent} lines, {full.superseded} superseded, link {after['link']}; then "
             f"{freed.sent} lines in {freed.elapsed:.1f} periods"
         )
@@ -471,12 +471,12 @@ def test_no_line_waits_in_the_daemon_while_the_serial_line_is_full(
         starved = silent > 0.05 or full.latest > 5.0 or lost(begun, ended) > 0.02
         assert after["link"] == "up" or starved or ended - stuffed > GIVEN_UP_S
         # While the link is lost, even for a moment, the daemon makes no lines for it.
-        kept = len(daemon.events("link_stale")) == lost_links
-        assert kept or starved or reads - stuffed > GIVEN_UP_S
-        assert not kept or full.superseded + full.missed >= 15
-        assert not kept or full.are_all_accounted_for()
+        linked = len(daemon.events("link_stale")) == lost_links
+        assert linked or starved or reads - stuffed > GIVEN_UP_S
+        assert not linked or full.superseded + full.missed >= 15
+        assert not linked or full.are_all_accounted_for()
         # A line counts as sent when the kernel takes it. One more than these may be torn.
-        assert len(heard) <= later["counters"]["lines_sent"] + 1
+        assert len(lines) <= later["counters"]["lines_sent"] + 1
         # The kernel moves bytes on while the daemon waits, but these make room for few lines.
         assert full.sent <= 4
         # Of the lines of all these periods only the newest follows. A line goes out for each
@@ -514,9 +514,9 @@ def unheard(states: Following, since: float, to: float) -> float:
     """
     ages = [
         source["age"] or 0.0
-        for seen in states.seen
-        if since <= seen.at <= to
-        for source in seen.value["sources"]
+        for entry in states.seen
+        if since <= entry.at <= to
+        for source in entry.value["sources"]
         if source["name"] == "app"
     ]
     return max(ages, default=0.0)
@@ -599,7 +599,7 @@ def no_burst(lines: list[Heard]) -> float:
     """
     for first in lines:
         most = 10 + 4
-        if (count := sum(first.at <= heard.at < first.at + 0.1 for heard in lines)) > most:
+        if (count := sum(first.at <= entry.at < first.at + 0.1 for entry in lines)) > most:
             # The line that waited longest was written that much earlier. A process that reads all
             # the time waits longer than one that only checks the clock.
             most += 2 + round(3 * lost(first.at - 0.5, first.at + 0.1) / TICK_S)
@@ -623,7 +623,7 @@ def test_after_half_a_second_s_stall_no_speed_is_resumed_for_a_commander_that_ha
             woken = time.monotonic()
         until(lambda: len(peer.since(woken)) > 30, 5.0, "30 lines")
         print(f"stall: smallest gap after it {no_burst(peer.since(woken)) * 1e3:.2f} ms")
-        assert {heard.line for heard in peer.since(woken)} == {ZERO_TEXT}
+        assert {entry.line for entry in peer.since(woken)} == {ZERO_TEXT}
 
 
 @pytest.mark.slow
@@ -645,7 +645,7 @@ def test_after_half_a_second_s_stall_a_commander_that_goes_on_drives_from_zero_b
         after = peer.since(woken, steady.at)
         assert no_burst(after) >= 0.0
         assert after[0].line == ZERO_TEXT
-        ramp = [wheels(heard.line)[0] for heard in after]
+        ramp = [wheels(entry.line)[0] for entry in after]
         assert max(b - a for a, b in itertools.pairwise(ramp)) <= 20 * 0.05 + 0.01
         # The machine may keep the commander or the link waiting as well, which causes another ramp.
         puts = [woken, *(at for at in puts_of(driver) if at > woken), steady.at]
@@ -670,7 +670,7 @@ def test_after_a_stall_of_seconds_a_commander_that_goes_on_must_be_neutral_first
             until(lambda: "send a zero first" in bus.state()["reason"], 5.0, "what it waits for")
             until(lambda: len(peer.since(woken)) > 30, 5.0, "30 lines")
             assert no_burst(peer.since(woken)) >= 0.0
-            assert {heard.line for heard in peer.since(woken)} == {ZERO_TEXT}
+            assert {entry.line for entry in peer.since(woken)} == {ZERO_TEXT}
             driver.process.send_signal(signal.SIGUSR1)
             peer.awaits(text(0.3), after=woken)
 

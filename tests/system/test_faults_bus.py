@@ -118,12 +118,12 @@ class Proxy:
     def __exit__(self, *error: object) -> None:
         self._open = False
         self.turn("fast")
-        for one in [self._listener, *self._sockets]:
+        for sock in [self._listener, *self._sockets]:
             try:
-                one.shutdown(socket.SHUT_RDWR)
+                sock.shutdown(socket.SHUT_RDWR)
             except OSError:
                 pass  # closed by the other side
-            one.close()
+            sock.close()
 
     def turn(self, way: Way) -> None:
         """Switch the relay: let no bytes through, or all at once, or `pace` bytes per 10 ms."""
@@ -138,8 +138,8 @@ class Proxy:
                 daemon = socket.create_connection(("127.0.0.1", self._target))
             except OSError:
                 return
-            for one in (client, daemon):
-                one.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            for sock in (client, daemon):
+                sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             self._sockets += [client, daemon]
             for source, sink, counted in ((client, daemon, True), (daemon, client, False)):
                 buffer = bytearray()
@@ -230,16 +230,16 @@ class Numbered:
             if self._leave.wait(0.02):
                 return
 
-    def age(self, heard: Heard) -> float | None:
+    def age(self, entry: Heard) -> float | None:
         """Return the age in s that the command of this line had when the line appeared.
 
         Returns None if the line has no command's speed.
         """
-        number = round(wheels(heard.line)[0] * 100) - 200
+        number = round(wheels(entry.line)[0] * 100) - 200
         if not 0 <= number < self.COUNT:
             return None
-        before = [at for at in self.sent[number] if at <= heard.at + 0.05]
-        return heard.at - before[-1] if before else None
+        before = [at for at in self.sent[number] if at <= entry.at + 0.05]
+        return entry.at - before[-1] if before else None
 
 
 class Hole(NamedTuple):
@@ -266,7 +266,7 @@ def holes(where: Path, ways: list[tuple[Way, float]]) -> list[Hole]:
     `ways` has for each how the stored bytes are delivered, and the length in s.
     """
     where.mkdir(exist_ok=True)
-    found: list[Hole] = []
+    results: list[Hole] = []
     with (
         FarPeer(where) as peer,
         Daemon(where, peer.path, {"limits": PROMPT, "feedback": PROMPT_FEEDBACK}) as daemon,
@@ -287,9 +287,9 @@ def holes(where: Path, ways: list[tuple[Way, float]]) -> list[Hole]:
             proxy.turn("hole")
             begun = time.monotonic()
             until(lambda: time.monotonic() > begun + length, length + 5, "a hole")  # noqa: B023
-            held = proxy.held
+            backlog = proxy.held
             # The drain is twice as fast as the sender, so it takes as long as the hole did.
-            proxy.pace = max(1, round(2 * held / length * 0.01))
+            proxy.pace = max(1, round(2 * backlog / length * 0.01))
             healed = time.monotonic()
             proxy.turn("slow" if way == "slow" else "fast")
             again = until(lambda: driving(healed), 20.0, "it drives again")  # noqa: B023
@@ -300,11 +300,11 @@ def holes(where: Path, ways: list[tuple[Way, float]]) -> list[Hole]:
             ages = [age for _, age in known]
             bound = TIMEOUT_S + TICK_S + SLACK_S
             stale = [(h, age) for h, age in known if age > bound]
-            found.append(
+            results.append(
                 Hole(
                     way,
                     length,
-                    held,
+                    backlog,
                     bus.count("command_stale") - refused,
                     len(ages),
                     sum(age > bound + HANDS * lost(h.at - age, h.at) for h, age in stale),
@@ -312,12 +312,12 @@ def holes(where: Path, ways: list[tuple[Way, float]]) -> list[Hole]:
                     again.at - healed,
                 )
             )
-    return found
+    return results
 
 
-def told(found: list[Hole]) -> None:
+def told(results: list[Hole]) -> None:
     for way in ("fast", "slow"):
-        these = [hole for hole in found if hole.way == way]
+        these = [hole for hole in results if hole.way == way]
         print(
             f"{len(these)} holes of {min(h.length for h in these):.1f} to "
             f"{max(h.length for h in these):.1f} s drained {way}: "
@@ -338,11 +338,11 @@ def test_after_a_partition_heals_fast_or_slowly_no_stale_command_is_obeyed(
         both = pool.map(
             lambda way: holes(tmp_path / way, [(way, 0.6)]), tuple[Way, Way](("fast", "slow"))
         )
-        found = list(itertools.chain.from_iterable(both))
-    told(found)
-    assert [hole.stale for hole in found] == [0, 0]
-    assert all(hole.held > 3000 for hole in found), "a backlog came back"
-    assert all(hole.refused > 0 for hole in found), "and was refused"
+        results = list(itertools.chain.from_iterable(both))
+    told(results)
+    assert [hole.stale for hole in results] == [0, 0]
+    assert all(hole.held > 3000 for hole in results), "a backlog came back"
+    assert all(hole.refused > 0 for hole in results), "and was refused"
 
 
 @pytest.mark.soak
@@ -354,10 +354,10 @@ def test_over_200_partitions_no_stale_command_is_obeyed(tmp_path: Path) -> None:
     ]
     with ThreadPoolExecutor(3) as pool:
         lots = pool.map(holes, [tmp_path / str(n) for n in range(3)], plans)
-        found = list(itertools.chain.from_iterable(lots))
-    told(found)
-    assert len(found) >= 200
-    assert sum(hole.stale for hole in found) == 0
+        results = list(itertools.chain.from_iterable(lots))
+    told(results)
+    assert len(results) >= 200
+    assert sum(hole.stale for hole in results) == 0
 
 
 # a flood
@@ -391,10 +391,10 @@ class Flooded(NamedTuple):
 
     def __str__(self) -> str:
         return "; ".join(
-            f"{name} p50 {statistics.median(found) * 1e3:.1f} "
-            f"p99 {sorted(found)[int(0.99 * len(found))] * 1e3:.1f} max {max(found) * 1e3:.1f} ms, "
-            f"{sum(one > 0.02 for one in found)} of {len(found)} over 20 ms"
-            for name, found in zip(self._fields[:3], self[:3], strict=True)
+            f"{name} p50 {statistics.median(times) * 1e3:.1f} "
+            f"p99 {sorted(times)[int(0.99 * len(times))] * 1e3:.1f} max {max(times) * 1e3:.1f} ms, "
+            f"{sum(delay > 0.02 for delay in times)} of {len(times)} over 20 ms"
+            for name, times in zip(self._fields[:3], self[:3], strict=True)
         )
 
 
@@ -433,10 +433,10 @@ def flooded(where: Path, length: float) -> Flooded:
             (seconds(step.value["header"]["stamp"]) - start, step.value["twist"]["linear"]["x"])
             for step in applied.seen
         ]
-    stale = sum(seen.value["link"] == "stale" and seen.at > begun for seen in states.seen)
-    written, put = [one[0] for one in sent], [one[1] for one in sent]
+    stale = sum(entry.value["link"] == "stale" and entry.at > begun for entry in states.seen)
+    written, put = [pair[0] for pair in sent], [pair[1] for pair in sent]
     stood = 0.0
-    found = Flooded([], [], [], [])
+    result = Flooded([], [], [], [])
 
     def by_itself(age: float, at: float) -> float:
         return age - lost(begun + at - age, begun + at) if age > 0.02 else age
@@ -448,65 +448,65 @@ def flooded(where: Path, length: float) -> Flooded:
             code = (speed - BASE) / SLOPE
             # The margin is 0.1 ms: a code holds 0.02 ms, and commands are 0.5 ms apart.
             newer = bisect.bisect(written, code + 0.0001)
-            found.age.append(by_itself(at - code, at))
+            result.age.append(by_itself(at - code, at))
             late = at - put[newer] if newer < len(put) else 0.0
-            found.overtaken.append(by_itself(late, at))
+            result.overtaken.append(by_itself(late, at))
     # Until its first command counts, the last command is the zero with which it opened.
     flooding = [state for state in asked if seconds(state["stamp"]) > start + 0.1]
-    found.arrived.extend(
+    result.arrived.extend(
         by_itself(source["age"], seconds(state["stamp"]) - start)
         for state in flooding
         for source in state["sources"]
         if source["name"] == "app" and state["mode"] == "driving"
     )
     waits = [b - a for a, b in [*sent, *itertools.pairwise(written)]]
-    found.held_up.extend(wait for wait in waits if wait > 0.005)
+    result.held_up.extend(wait for wait in waits if wait > 0.005)
     periods = Periods.between(before, after)
-    taken = after["counters"]["commands"] - before["counters"].get("commands", 0)
+    total = after["counters"]["commands"] - before["counters"].get("commands", 0)
     print(
-        f"flood of {count / length:.0f}/s for {length:g} s, {taken} commands taken; "
+        f"flood of {count / length:.0f}/s for {length:g} s, {total} commands taken; "
         f"{periods.missed} of {periods.elapsed:.0f} periods missed, memory {grown:+d} kB, "
         f"{stale} states with a stale link; the flooder was held up over 5 ms "
-        f"{len(found.held_up)} times; {found}"
+        f"{len(result.held_up)} times; {result}"
     )
     assert count > 10_000 * length
     assert periods.missed <= 0.03 * periods.elapsed + 1 + waited / TICK_S
     during = sum(0.0 <= at < length for at, _ in steps)
     assert during > 90 * length - waited / TICK_S
     # While the machine keeps the link down, the robot stands.
-    assert len(found.age) > (10 if stale else 50)
+    assert len(result.age) > (10 if stale else 50)
     assert grown < 10_000
     assert after["mode"] != "fault", after["reason"]
-    return found
+    return result
 
 
 @pytest.mark.slow
 def test_in_a_flood_the_command_obeyed_is_a_fresh_one(tmp_path: Path) -> None:
-    found = flooded(tmp_path, 1.0)
-    assert len(found.arrived) > 20
-    assert statistics.median(found.age) <= 0.02
+    result = flooded(tmp_path, 1.0)
+    assert len(result.arrived) > 20
+    assert statistics.median(result.age) <= 0.02
     # A loop that the machine delayed for a while obeys one older command, once, when it goes on.
-    for late in (found.overtaken, found.arrived):
-        assert sum(one > 0.02 + SLACK_S for one in late) <= 0.05 * len(late)
+    for late in (result.overtaken, result.arrived):
+        assert sum(delay > 0.02 + SLACK_S for delay in late) <= 0.05 * len(late)
 
 
 @pytest.mark.soak
 @pytest.mark.timeout(600)
 def test_in_a_minute_of_floods_the_command_obeyed_is_a_fresh_one(tmp_path: Path) -> None:
-    found, quiet = Flooded([], [], [], []), 0
+    totals, quiet = Flooded([], [], [], []), 0
     for number in range(7):
         where = tmp_path / str(number)
         where.mkdir()
         these = flooded(where, 9.0)
-        for all_of_it, more in zip(found, these, strict=True):
+        for all_of_it, more in zip(totals, these, strict=True):
             all_of_it.extend(more)
         if len(these.held_up) <= 1:  # about once in 9 s even on an idle machine
             quiet += 1
             assert max(these.overtaken) <= 0.02
             assert max(these.arrived) <= 0.02
-    print(f"all, {quiet} of 7 floods with cores to be had throughout: {found}")
+    print(f"all, {quiet} of 7 floods with cores to be had throughout: {totals}")
     # The other floods measure the machine: the flood takes all it can get of its 2 cores.
-    for ages in found[:3]:
+    for ages in totals[:3]:
         assert sum(age > 0.02 for age in ages) <= 0.01 * len(ages)
         assert max(ages) <= 0.02 + SLACK_S
 
@@ -547,23 +547,25 @@ def hoarded(where: Path, rounds: int, length: float) -> tuple[list[float], list[
 
         endpoint = f"{daemon.endpoint}#so_rcvbuf=4096"
         four = [stack.enter_context(Program(words(HOARDER, endpoint), where)) for _ in range(4)]
-        for one in four:
-            one.says("listening")
+        for listener in four:
+            listener.says("listening")
         filler = stack.enter_context(Bus(daemon.endpoint))
         for _ in range(rounds):
             without.append(longest())
-            for one in four:
-                one.signal(signal.SIGSTOP)
+            for listener in four:
+                listener.signal(signal.SIGSTOP)
             begun = time.monotonic()
-            held = until(lambda: filled(daemon, filler), 60.0, "the kernel takes no more for them")
+            backlog = until(
+                lambda: filled(daemon, filler), 60.0, "the kernel takes no more for them"
+            )
             took = time.monotonic() - begun
             stopped.append(longest())
             with Bus(daemon.endpoint) as healthy, healthy.follow("odom") as odom:
                 odom.find(lambda _: True, 2.0, "odometry for one that listens")
-            for one in four:
-                one.signal(signal.SIGCONT)
+            for listener in four:
+                listener.signal(signal.SIGCONT)
     print(
-        f"4 stopped subscribers, {held} bytes unsent after {took:.1f} s; longest gap "
+        f"4 stopped subscribers, {backlog} bytes unsent after {took:.1f} s; longest gap "
         f"between lines in {rounds} x {length:g} s: without median "
         f"{statistics.median(without) * 1e3:.2f} max {max(without) * 1e3:.2f}, "
         f"with median {statistics.median(stopped) * 1e3:.2f} max {max(stopped) * 1e3:.2f} ms"
@@ -593,7 +595,7 @@ def rerouted(where: Path, cycles: int) -> list[float]:
 
     Returns the times from its return until a client behind it receives odometry, in s.
     """
-    routed, found, worst = free_endpoint(), [], 0.0
+    routed, times, worst = free_endpoint(), [], 0.0
     with ExitStack() as stack:
         peer = stack.enter_context(FarPeer(where))
         router = stack.enter_context(Program(words(ROUTER, routed), where))
@@ -615,18 +617,18 @@ def rerouted(where: Path, cycles: int) -> list[float]:
                     "acsard/acsar/odom", zenoh.handlers.FifoChannel(100)
                 )
                 until(samples.try_recv, 10.0, "odometry behind the new router")
-                found.append(time.monotonic() - back - lost(back))
+                times.append(time.monotonic() - back - lost(back))
         lines = peer.since(steady)
         worst = max(gaps(lines))
-        told = {heard.line[:7] for heard in lines}
-        assert told == {b"ap04.00"} or broken(states, steady), "it drove on all the time"
+        speeds = {entry.line[:7] for entry in lines}
+        assert speeds == {b"ap04.00"} or broken(states, steady), "it drove on all the time"
     print(
         f"router killed {cycles} times: back -> odometry behind it median "
-        f"{statistics.median(found):.2f} max {max(found):.2f} s; longest gap between lines of the "
+        f"{statistics.median(times):.2f} max {max(times):.2f} s; longest gap between lines of the "
         f"local drive {worst * 1e3:.1f} ms"
     )
     assert worst <= 0.06  # without the time that the machine took
-    return found
+    return times
 
 
 @pytest.mark.slow
@@ -637,6 +639,6 @@ def test_a_router_that_dies_and_returns_does_not_touch_local_driving(tmp_path: P
 @pytest.mark.soak
 @pytest.mark.timeout(600)
 def test_local_driving_continues_while_a_router_dies_and_returns_50_times(tmp_path: Path) -> None:
-    found = rerouted(tmp_path, 50)
-    assert statistics.median(found) <= 0.5
-    assert max(found) <= 2.0
+    times = rerouted(tmp_path, 50)
+    assert statistics.median(times) <= 0.5
+    assert max(times) <= 2.0

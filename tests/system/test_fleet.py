@@ -141,8 +141,8 @@ def _queries() -> Iterator[Try]:
     for key in ("state", "odom", "tf_static"):
         yield Try(f"acsard/*/{key}", NOBODY)
     yield Try(f"{ONE}/config", KEEPERS)
-    for role, who in (("viewer", ANYBODY), ("operator", DRIVERS), ("maintainer", KEEPERS)):
-        yield Try(f"{ONE}/whoami/{role}", who)
+    for role, identities in (("viewer", ANYBODY), ("operator", DRIVERS), ("maintainer", KEEPERS)):
+        yield Try(f"{ONE}/whoami/{role}", identities)
     yield Try(f"{TWO}/whoami/operator", DRIVERS | ITSELF)
     yield Try(f"{TWO}/config", KEEPERS | ITSELF)
     for key in ("*", "**", "srv/*", "srv/**", "srv/ghost", "cmd/app"):
@@ -154,8 +154,8 @@ def _queries() -> Iterator[Try]:
         "set_pose": KEEPERS,
         "set": KEEPERS,
     }
-    for verb, who in least.items():
-        yield Try(f"{ONE}/srv/{verb}", who, {"set_pose": POSE, "set": SET}.get(verb, b""))
+    for verb, identities in least.items():
+        yield Try(f"{ONE}/srv/{verb}", identities, {"set_pose": POSE, "set": SET}.get(verb, b""))
     yield Try(f"{TWO}/srv/stop", ANYBODY | ITSELF)
 
 
@@ -200,14 +200,16 @@ class Member(Bus):
         encoding of the published message.
         """
         data = self.payload(key, payload)
-        found = []
+        answers = []
         for reply in self.session.get(
             f"{self.root}/{key}", payload=data, consolidation=EVERY_REPLY, timeout=5.0
         ):
             if reply.ok is not None and str(reply.ok.encoding).startswith("application/json"):
                 sample, where = reply.ok, str(reply.ok.key_expr).removeprefix(self.root + "/")
-                found.append(Answered(where, True, str(sample.encoding), sample.payload.to_bytes()))
-        return found
+                answers.append(
+                    Answered(where, True, str(sample.encoding), sample.payload.to_bytes())
+                )
+        return answers
 
 
 class Fleet:
@@ -293,10 +295,10 @@ class Fleet:
         """
         here = self.robots[0]
         begun = here.count("lines_sent")
-        while not (found := look()):
+        while not (result := look()):
             if here.count("lines_sent") >= begun + steps:
                 return look()
-        return found
+        return result
 
     def restored(self) -> None:
         """Release both robots and switch them on."""
@@ -310,11 +312,11 @@ class Fleet:
             rows = ROWS[verb]
             if verb == "query":
                 calls = [row for row in rows if "/srv/" in row.key]
-                found = visitor.asked([row for row in rows if row not in calls])
+                outcome = visitor.asked([row for row in rows if row not in calls])
                 assert not any(robot.state()["mode"] == "stopped" for robot in self.robots)
-                found |= visitor.asked(calls)
+                outcome |= visitor.asked(calls)
                 self.restored()
-                return {row.label: found[row.label] for row in rows}
+                return {row.label: outcome[row.label] for row in rows}
             attempt = visitor.followed if verb == "subscribe" else partial(visitor.sent, verb)
             # Try all rows that should have no effect at once, and one by one only if something
             # happened.
@@ -350,8 +352,8 @@ class Visitor:
         def commands() -> list[int]:
             # A first command of a new clock passes the router, and the daemon does not believe it
             # yet.
-            heard = ("commands", "commands_of_new_senders", "command_out_of_range")
-            return [sum(map(robot.count, heard)) for robot in fleet.robots]
+            counters = ("commands", "commands_of_new_senders", "command_out_of_range")
+            return [sum(map(robot.count, counters)) for robot in fleet.robots]
 
         def obeyed() -> bool:
             stopped = any(robot.state()["mode"] == "stopped" for robot in fleet.robots)
@@ -382,22 +384,22 @@ class Visitor:
             )
         self._behind()
         mine = [row.label for row in rows if self._name in row.who]
-        found: dict[str, bool] = {}
+        outcome: dict[str, bool] = {}
 
         def all_mine() -> bool:
             for label in mine:
-                found[label] = found.get(label) or _answered(waiting[label])
-            return all(found.values())
+                outcome[label] = outcome.get(label) or _answered(waiting[label])
+            return all(outcome.values())
 
         self._fleet.comes(all_mine, 200)
-        return {label: found.get(label) or _answered(waiting[label]) for label in waiting}
+        return {label: outcome.get(label) or _answered(waiting[label]) for label in waiting}
 
     def followed(self, rows: Sequence[Try]) -> bool:
         """Return whether any of these subscriptions received a sample."""
-        came = threading.Event()
+        event = threading.Event()
 
         def on_sample(sample: zenoh.Sample) -> None:
-            came.set()
+            event.set()
 
         subscribers = [self._subscribed(row, on_sample) for row in rows]
         self._behind()
@@ -408,7 +410,7 @@ class Visitor:
         # Last values are sent again every 5 s, for clients that cannot ask for them.
         mine = [row for row in rows if self._name in row.who]
         late = any(row.how == "late" for row in mine)
-        done = self._fleet.comes(came.is_set, 700 if late else 50 if mine else 5)
+        done = self._fleet.comes(event.is_set, 700 if late else 50 if mine else 5)
         for subscriber in subscribers:
             subscriber.undeclare()
         return done
@@ -453,17 +455,17 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fleet]:
 def test_each_certificate_may_do_exactly_what_the_access_table_allows(
     fleet: Fleet, name: str, verb: Verb
 ) -> None:
-    found = fleet.tried(name, verb)
+    outcome = fleet.tried(name, verb)
     wrong = [
-        f"{row.label}: {'let through' if found[row.label] else 'kept out'}"
+        f"{row.label}: {'let through' if outcome[row.label] else 'kept out'}"
         for row in ROWS[verb]
-        if found[row.label] != (name in row.who)
+        if outcome[row.label] != (name in row.who)
     ]
     assert not wrong
 
 
 def test_an_operator_drives_one_robot_and_a_viewer_stops_it(fleet: Fleet) -> None:
-    one, two = fleet.robots
+    first, two = fleet.robots
     with (
         fleet.member("operator") as operator,
         fleet.member("viewer") as viewer,
@@ -476,7 +478,7 @@ def test_an_operator_drives_one_robot_and_a_viewer_stops_it(fleet: Fleet) -> Non
         states.find(lambda state: state["mode"] == "stopped", 1.0, "the viewer stopped it")
         assert not viewer.ask("srv/clear")
         assert operator.get("srv/clear")["success"]
-    one.at_rest()
+    first.at_rest()
 
 
 @pytest.mark.parametrize("name", ["operator", "maintainer", "robot1"])
@@ -490,7 +492,9 @@ def test_the_python_client_drives_through_the_router_under_its_certificate_s_nam
         connect(fleet.endpoint, robot_id="robot1", tls=tls) as robot,
     ):
         robot.drive(0.2, seconds=0.3)
-        driven = {one.value["sender"] for one in states.seen if (one.value["linear"] or 0.0) > 0.1}
+        driven = {
+            entry.value["sender"] for entry in states.seen if (entry.value["linear"] or 0.0) > 0.1
+        }
         assert driven == {robot.sender}
         assert robot.sender.endswith(f" [{name}]")
 
@@ -507,19 +511,19 @@ def test_all_robots_are_seen_each_by_its_own_keys(fleet: Fleet) -> None:
 def test_a_robots_certificate_serves_its_own_tree_only(fleet: Fleet) -> None:
     with fleet.member("robot2") as forger, fleet.member("viewer") as viewer:
         session = forger.session
-        kept: list[object] = []
+        queryables: list[object] = []
         for root in (ONE, TWO):
             key = f"{root}/info"
 
             def answer(query: zenoh.Query, key: str = key) -> None:
                 query.reply(key, FORGED)
 
-            kept.append(session.declare_queryable(key, answer))
+            queryables.append(session.declare_queryable(key, answer))
         forger.root = TWO
         forger.ask("info")  # the router has all of the above
         forged = {root: _forged(viewer.session, f"{root}/info") for root in (ONE, TWO)}
         assert forged == {ONE: False, TWO: True}
-        del kept
+        del queryables
 
 
 def _forged(session: zenoh.Session, key: str) -> bool:
@@ -531,10 +535,10 @@ def _forged(session: zenoh.Session, key: str) -> bool:
 def test_on_a_robot_that_is_a_peer_programs_need_no_router_and_reach_no_other_robot(
     fleet: Fleet,
 ) -> None:
-    one, two = fleet.robots
+    first, two = fleet.robots
     with Bus(fleet.daemons[1].endpoint, "robot2") as here, here.commanding(0.1):
         until(lambda: (here.state()["linear"] or 0.0) > 0.05, 3.0, "robot2 drives")
-        before = one.count("commands")
+        before = first.count("commands")
         for key in ("cmd/app", "stop"):
             here.session.put(f"{ONE}/{key}", TWIST)
         replies = here.session.get(f"{ONE}/srv/stop", timeout=5.0)
@@ -545,8 +549,8 @@ def test_on_a_robot_that_is_a_peer_programs_need_no_router_and_reach_no_other_ro
         }
         two.ask("info")
         fleet.comes(lambda: False)
-        one.comes_to("ready")
-        assert one.count("commands") == before
+        first.comes_to("ready")
+        assert first.count("commands") == before
     two.at_rest()
 
 
@@ -578,9 +582,11 @@ async def test_a_page_over_tls_shows_its_own_robot_and_says_why_it_shows_no_othe
     with Page(fleet.daemons[0], tmp_path, *by_tls) as page:
         async with hands(page) as ours:
             await ours.say(subscribe="fleet")
-            seen = await ours.find(lambda said: said.get("fleet"))
-            assert [(one["robot"], one["mode"]) for one in seen["fleet"]] == [("robot1", "ready")]
-            assert "over TLS this page looks only for its own robot" in seen["note"]
+            message = await ours.find(lambda frame: frame.get("fleet"))
+            assert [(entry["robot"], entry["mode"]) for entry in message["fleet"]] == [
+                ("robot1", "ready")
+            ]
+            assert "over TLS this page looks only for its own robot" in message["note"]
 
 
 # the files
@@ -609,24 +615,24 @@ def test_the_router_names_the_keys_of_the_topic_table_and_the_default_sources(
     services = {f"srv/{verb}" for verb in SERVICES}
     commands = set(source_keys(SOURCES, "operator"))
     for robot in ROBOTS:
-        found = {
+        key_sets = {
             kind: {key.removeprefix(f"acsard/{robot}/") for key in keys[f"{kind}-{robot}"]}
             for kind in ("see", "stop", "operate", "slow", "keep", "sense")
         }
-        found["drive"] = {
+        key_sets["drive"] = {
             key.removeprefix(f"acsard/{robot}/")
             for key in keys["commands of operator"]
             if key.startswith(f"acsard/{robot}/")
         }
-        assert found["see"] | found["keep"] >= published | asked | {"alive"}
+        assert key_sets["see"] | key_sets["keep"] >= published | asked | {"alive"}
         inputs = {"stop", "imu", "speed_limit"}
-        assert set().union(*found.values()) == (
+        assert set().union(*key_sets.values()) == (
             published | asked | services | commands | inputs | {"alive", *least.values()}
         )
-        assert found["drive"] == commands
+        assert key_sets["drive"] == commands
         for kind, role in (("see", "viewer"), ("operate", "operator"), ("keep", "maintainer")):
-            assert {key for key in found[kind] if key.startswith("whoami/")} == {least[role]}
-        assert not found["see"] & (commands | services - {"srv/stop"})
+            assert {key for key in key_sets[kind] if key.startswith("whoami/")} == {least[role]}
+        assert not key_sets["see"] & (commands | services - {"srv/stop"})
 
 
 def test_no_ingress_rule_of_the_router_for_a_person_has_a_wildcard(tmp_path: Path) -> None:
@@ -641,6 +647,6 @@ def test_no_ingress_rule_of_the_router_for_a_person_has_a_wildcard(tmp_path: Pat
         if people & set(policy["subjects"])
         for name in policy["rules"]
     }
-    taken = [rules[name] for name in names if "ingress" in rules[name]["flows"]]
-    assert taken
-    assert not [key for rule in taken for key in rule["key_exprs"] if "*" in key]
+    ingress = [rules[name] for name in names if "ingress" in rules[name]["flows"]]
+    assert ingress
+    assert not [key for rule in ingress for key in rule["key_exprs"] if "*" in key]

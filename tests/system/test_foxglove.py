@@ -153,13 +153,13 @@ def driving(bus: Bus, faster_than: float = 0.2) -> Any:
     return until(look, 10.0, f"driving, {bus.state()['reason']}")
 
 
-def same(told: Any, value: Any) -> bool:
+def same(message: Any, value: Any) -> bool:
     """Return whether a ROS message, decoded by rosbags, equals a message of the bus."""
     if isinstance(value, Mapping):
-        return all(same(getattr(told, key), inner) for key, inner in value.items())
+        return all(same(getattr(message, key), inner) for key, inner in value.items())
     if isinstance(value, list):
-        return len(told) == len(value) and all(map(same, told, value))
-    return bool(told == value)
+        return len(message) == len(value) and all(map(same, message, value))
+    return bool(message == value)
 
 
 # the displayed data
@@ -182,11 +182,11 @@ def test_a_topic_shows_what_was_on_the_bus_at_the_time(
     with bus.follow(key) as on_bus:
         looked = viewer.show(topic)
         assert looked.channel["schemaName"] == type_name
-        messages = [looked.read(one.payload) for one in looked.first(count, 10.0)]
+        messages = [looked.read(sample.payload) for sample in looked.first(count, 10.0)]
 
         def found() -> int:
-            seen = [one.value for one in list(on_bus.seen)]
-            return sum(any(same(message, value) for value in seen) for message in messages)
+            values = [sample.value for sample in list(on_bus.seen)]
+            return sum(any(same(message, value) for value in values) for message in messages)
 
         # The bridge queried one, so that the viewer need not wait; that one is in no publication.
         until(lambda: found() >= count - 1, 5.0, f"{messages} on {key}")
@@ -195,18 +195,20 @@ def test_a_topic_shows_what_was_on_the_bus_at_the_time(
 def test_the_state_shows_what_was_on_the_bus_at_the_time(viewer: Viewer, bus: Bus) -> None:
     with bus.follow("state") as on_bus:
         looked = viewer.show("/state")
-        told = looked.read(looked.first(3)[-1].payload)
-        seen = on_bus.find(lambda v: same(told.header.stamp, v["stamp"]), 5.0, "that state")
-    shown = {k: v for k, v in seen.value.items() if hasattr(told, k) and v is not None}
-    assert set(shown) >= {"mode", "reason", "x", "y", "yaw", "wheels", "link", "source", "gyro"}
-    assert all(same(getattr(told, k), v) for k, v in shown.items() if k not in OURS.values())
-    assert {one.name: one.count for one in told.counters} == seen.value["counters"]
-    assert [one.name for one in told.sources] == [one["name"] for one in seen.value["sources"]]
+        message = looked.read(looked.first(3)[-1].payload)
+        entry = on_bus.find(lambda v: same(message.header.stamp, v["stamp"]), 5.0, "that state")
+    fields = {k: v for k, v in entry.value.items() if hasattr(message, k) and v is not None}
+    assert set(fields) >= {"mode", "reason", "x", "y", "yaw", "wheels", "link", "source", "gyro"}
+    assert all(same(getattr(message, k), v) for k, v in fields.items() if k not in OURS.values())
+    assert {item.name: item.count for item in message.counters} == entry.value["counters"]
+    assert [item.name for item in message.sources] == [
+        item["name"] for item in entry.value["sources"]
+    ]
 
 
 def test_foxglove_shows_the_topics_of_a_recording_and_no_others(viewer: Viewer) -> None:
     until(lambda: set(viewer.channels) >= set(TOPICS), 5.0, "all topics")
-    types = {topic: one["schemaName"] for topic, one in viewer.channels.items()}
+    types = {topic: channel["schemaName"] for topic, channel in viewer.channels.items()}
     assert types == {topic: type_name for topic, (type_name, _) in TOPICS.items()}
 
 
@@ -234,9 +236,9 @@ def test_a_source_s_command_is_shown_on_its_topic(viewer: Viewer, bus: Bus) -> N
         return bool(looked.came)
 
     until(put, 5.0, "a command")
-    told = looked.read(looked.came[0].payload)
-    assert (told.twist.linear.x, told.twist.angular.z) == (0.0, 0.0)
-    assert told.header.stamp.sec > 0
+    message = looked.read(looked.came[0].payload)
+    assert (message.twist.linear.x, message.twist.angular.z) == (0.0, 0.0)
+    assert message.header.stamp.sec > 0
 
 
 Sent = tuple[str, float, Callable[[], None]]
@@ -297,8 +299,8 @@ def test_commands_of_every_type_and_transport_are_shown_as_in_an_export(tmp_path
         read: dict[str, list[Any]] = {source: [] for source in sources}
 
         def shown(source: str) -> list[tuple[str, float, float]]:
-            one, known = looked[source], read[source]
-            known += [one.read(came.payload) for came in one.came[len(known) :]]
+            stream, known = looked[source], read[source]
+            known += [stream.read(came.payload) for came in stream.came[len(known) :]]
             return asked(known)
 
         with session_at(daemon.endpoint) as session:
@@ -316,25 +318,25 @@ def test_commands_of_every_type_and_transport_are_shown_as_in_an_export(tmp_path
     (path,) = (tmp_path / "record").glob("*.mcap")
     ended = finish(acsard("recording", "export", str(path), str(tmp_path / "new.mcap")), tmp_path)
     assert ended.code == 0, ended
-    told = exported(tmp_path / "new.mcap")
+    messages = exported(tmp_path / "new.mcap")
     for source in sources:
-        live, written = shown(source), asked(told[f"/cmd_vel_in/{source}"])
+        live, written = shown(source), asked(messages[f"/cmd_vel_in/{source}"])
         # The first message may have come before the subscription.
         assert live == written[-len(live) :]
 
 
 def exported(path: Path) -> dict[str, list[Any]]:
     """Return the messages of each topic."""
-    found: dict[str, list[Any]] = {}
+    messages: dict[str, list[Any]] = {}
     store: Any = get_typestore(Stores.EMPTY)
     with path.open("rb") as stream:
         for schema, channel, message in make_reader(stream).iter_messages():
             assert schema is not None
             if schema.name not in store.types:
                 store.register(get_types_from_msg(schema.data.decode(), schema.name))
-            told = store.deserialize_cdr(message.data, schema.name)
-            found.setdefault(channel.topic, []).append(told)
-    return found
+            content = store.deserialize_cdr(message.data, schema.name)
+            messages.setdefault(channel.topic, []).append(content)
+    return messages
 
 
 @SLOW
@@ -346,21 +348,21 @@ def test_the_log_topic_has_each_event_of_the_daemon_once(viewer: Viewer, bus: Bu
     assert bus.get("srv/clear")["success"]
     until(lambda: any("stopped by unnamed" in line for line in lines(looked)), 5.0, "the stop")
     events = bus.get("events")["events"]
-    told = [(event["name"], event["text"].partition(" (")[0]) for event in events]
+    pairs = [(event["name"], event["text"].partition(" (")[0]) for event in events]
 
     def all_of_them() -> bool:
-        messages = [looked.read(one.payload) for one in list(looked.came)]
-        found = [(m.name, m.msg.partition(" (")[0]) for m in messages]
+        messages = [looked.read(entry.payload) for entry in list(looked.came)]
+        rows = [(m.name, m.msg.partition(" (")[0]) for m in messages]
         # More events may have happened since, because a busy machine keeps a link waiting.
-        return any(found[at : at + len(told)] == told for at in range(len(found)))
+        return any(rows[at : at + len(pairs)] == pairs for at in range(len(rows)))
 
-    until(all_of_them, 5.0, f"{told} in {lines(looked)}")
-    payloads = [one.payload for one in looked.came]
+    until(all_of_them, 5.0, f"{pairs} in {lines(looked)}")
+    payloads = [entry.payload for entry in looked.came]
     assert len(payloads) == len(set(payloads))
 
 
 def lines(log: Looked) -> list[str]:
-    return [log.read(one.payload).msg for one in list(log.came)]
+    return [log.read(message.payload).msg for message in list(log.came)]
 
 
 def test_a_key_is_subscribed_only_while_a_viewer_shows_it(viewer: Viewer, bus: Bus) -> None:
@@ -496,10 +498,12 @@ def test_a_viewer_whose_commands_do_not_drive_sees_the_reason_until_they_do(
 ) -> None:
     bus.get("srv/stop")
     with Panel(viewer, speed(0.2)):
-        told = viewer.status("your commands do not drive the robot: stopped by unnamed (native) at")
+        status = viewer.status(
+            "your commands do not drive the robot: stopped by unnamed (native) at"
+        )
         assert bus.get("srv/clear")["success"]
         viewer.status("drive (release the button for two seconds, and press it again)")
-    until(lambda: told["id"] in viewer.removed, 5.0, "it is over")
+    until(lambda: status["id"] in viewer.removed, 5.0, "it is over")
 
 
 @SLOW
@@ -527,9 +531,9 @@ def test_a_viewer_that_reads_nothing_or_floods_does_not_delay_other_viewers(
     viewer: Viewer, shows: Shows, bus: Bus
 ) -> None:
     looked = viewer.show("/odom")
-    everything = [one["id"] for one in viewer.channels.values()]
+    everything = [channel["id"] for channel in viewer.channels.values()]
     with opened(shows.port) as mute, bus.follow("cmd/app") as commands:
-        asked = [{"id": number, "channelId": one} for number, one in enumerate(everything)]
+        asked = [{"id": number, "channelId": channel} for number, channel in enumerate(everything)]
         mute.send(json.dumps({"op": "subscribe", "subscriptions": asked}))
         looked.first(len(looked.came) + 50)
         flood = 5000
@@ -547,9 +551,9 @@ def followed(bus: Bus) -> Iterator[tuple[list[Any], list[Any]]]:
     asked: list[Any] = []
     applied: list[Any] = []
 
-    def keep(key: str, kept: list[Any]) -> Any:
+    def keep(key: str, points: list[Any]) -> Any:
         def take(sample: Any) -> None:
-            kept.append((time.monotonic(), read(sample)["twist"]["linear"]["x"]))
+            points.append((time.monotonic(), read(sample)["twist"]["linear"]["x"]))
 
         return bus.session.declare_subscriber(f"{bus.root}/{key}", take)
 
@@ -558,8 +562,8 @@ def followed(bus: Bus) -> Iterator[tuple[list[Any], list[Any]]]:
     try:
         yield asked, applied
     finally:
-        for one in subscribers:
-            one.undeclare()
+        for subscriber in subscribers:
+            subscriber.undeclare()
 
 
 TIMEOUT_S, TICKS_S = 0.25, 0.02
@@ -620,14 +624,14 @@ def test_a_daemon_that_is_gone_is_reported_and_waited_for(tmp_path: Path) -> Non
         looked = viewer.show("/odom")
         looked.first()
         daemon.signal(signal.SIGKILL)
-        gone = viewer.status("the daemon of robot acsar is gone; `acsard foxglove` waits for it")
+        status = viewer.status("the daemon of robot acsar is gone; `acsard foxglove` waits for it")
         with Viewer(own.port) as late:
             late.show("/odom")
             late.status("is gone")
         assert not viewer.call("/acsard/stop", {})["success"]
         with Daemon(tmp_path, endpoint=endpoint, name="again"):
             viewer.status("the daemon of robot acsar is back", 10.0)
-            until(lambda: gone["id"] in viewer.removed, 5.0, "it is not gone any more")
+            until(lambda: status["id"] in viewer.removed, 5.0, "it is not gone any more")
             count = len(looked.came)
             until(lambda: len(looked.came) > count + 10, 10.0, "odometry again")
             assert viewer.call("/acsard/stop", {})["success"]
@@ -635,10 +639,10 @@ def test_a_daemon_that_is_gone_is_reported_and_waited_for(tmp_path: Path) -> Non
 
 @SLOW
 def test_a_port_that_is_in_use_ends_with_75_and_the_remedy(shared: Daemon, tmp_path: Path) -> None:
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        taken.listen()
-        address = f"127.0.0.1:{taken.getsockname()[1]}"
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        listener.listen()
+        address = f"127.0.0.1:{listener.getsockname()[1]}"
         words = ("foxglove", "--config", str(shared.config), "--address", address)
         ended = finish(acsard(*words), tmp_path)
     assert ended.code == 75
@@ -662,8 +666,8 @@ def test_foxglove_without_shown_topics_costs_little_processor_time(
 
     alone = cost()
     looked = [viewer.show(topic) for topic in ("/odom", "/tf", "/joint_states")]
-    for one in looked:
-        one.first()
+    for view in looked:
+        view.first()
     assert alone < cost() / 2
 
 

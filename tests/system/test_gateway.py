@@ -127,8 +127,8 @@ def test_a_new_certificate_is_used_and_the_daemon_runs_on(tmp_path: Path) -> Non
         with Bus(robot.daemon.endpoint) as bus:
             until(lambda: bus.count("gateway_opened") == 2, 5.0, "it is counted")
             # The new certificate of this test ends after half a day.
-            told = "expires in 0 days"
-            until(lambda: bus.state()["certificate_expiry"] == told, 5.0, told)
+            expiry = "expires in 0 days"
+            until(lambda: bus.state()["certificate_expiry"] == expiry, 5.0, expiry)
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT, signal.SIGTERM])
@@ -269,5 +269,5 @@ def test_a_gateway_ends_in_order_if_its_daemon_ended_without_reading_signs_of_li
         theirs.close()
         until(lambda: select.select([ours], [], [], 0)[0], 10.0, "a sign of life")
         ours.close()
-        _, told = gateway.communicate(timeout=10.0)
-    assert (gateway.returncode, told) == (0, "")
+        _, output = gateway.communicate(timeout=10.0)
+    assert (gateway.returncode, output) == (0, "")

@@ -40,10 +40,12 @@ async def drives(guided: Guided, standing: Bus) -> None:
         await guided.begin("calibrate", method="umbmark")
         await guided.answer(await guided.asks("How wide"), 300)
         await guided.starts("1. Place the")
-        said = await guided.says(lambda said: said.get("progress", 0.0) > 0.15 or "ended" in said)
-        if "ended" not in said:
+        status = await guided.says(
+            lambda status: status.get("progress", 0.0) > 0.15 or "ended" in status
+        )
+        if "ended" not in status:
             break
-        await guided.says(lambda said: said.get("running") == "")
+        await guided.says(lambda status: status.get("running") == "")
     await beside(
         lambda: until(lambda: (standing.state()["linear"] or 0.0) > 0.25, 10.0, "the leg moves")
     )
@@ -57,7 +59,7 @@ async def test_a_board_is_checked_without_a_daemon_from_the_first_question_to_th
     with Page(alone, tmp_path) as served:
         async with guiding(served) as guided:
             await guided.begin("check", port="sim")
-            subject = await guided.says(lambda said: "subject" in said)
+            subject = await guided.says(lambda message: "subject" in message)
             assert subject["simulated"] is True
             question = await guided.asks("lifted")
             assert question["answers"] == ["lifted"]
@@ -68,16 +70,16 @@ async def test_a_board_is_checked_without_a_daemon_from_the_first_question_to_th
             assert question["wrong"] == "answer with one of: lifted"
             await guided.answer(question, "lifted")
             await guided.sees(("fl", "fr", "rl", "rr"))
-            result = await guided.says(lambda said: "result" in said)
+            result = await guided.says(lambda message: "result" in message)
             assert 'front_left = "+a"' in result["result"]
             await guided.answer(await guided.asks(str(alone.config)), "write")
             end = await guided.ended()
             assert (end["ended"], end["meaning"]) == (1, "failure")  # it was another map
-            heard = guided.ours.heard
-            found = [s["guide"]["finding"] for s in heard if "finding" in str(s)]
-            told = {"Subject", "Doing", "Progress", "Question", "Found", "Result"}
-            assert described.kinds(heard) >= told
-    names = [one["name"] for one in found]
+            frames = guided.ours.heard
+            findings = [s["guide"]["finding"] for s in frames if "finding" in str(s)]
+            kinds = {"Subject", "Doing", "Progress", "Question", "Found", "Result"}
+            assert described.kinds(frames) >= kinds
+    names = [finding["name"] for finding in findings]
     assert names[0] == "baud rate"
     assert "watchdog" in names
     written = tomllib.loads(alone.config.read_text())["mcu"]
@@ -91,11 +93,11 @@ async def test_a_key_stops_the_leg_and_other_clients_see_the_procedure_and_canno
     before = page.refused()
     async with guiding(page) as guided, guiding(page) as other:
         await drives(guided, standing)
-        about = await other.says(lambda said: said.get("running"))
+        about = await other.says(lambda message: message.get("running"))
         assert (about["running"], about["by"], about["yours"]) == ("calibrate", "here", False)
         # Only one runs at a time, and no other client answers, presses or ends it.
         await other.begin("check", port="sim")
-        refused = await other.ours.find(lambda said: said.get("refused") == "begin")
+        refused = await other.ours.find(lambda message: message.get("refused") == "begin")
         assert "a calibration is already running (started by here)" in refused["reason"]
         await other.ours.say(press="key")
         await other.ours.say(press="leave")
@@ -104,7 +106,7 @@ async def test_a_key_stops_the_leg_and_other_clients_see_the_procedure_and_canno
         # Answers without a question do nothing, however many come.
         for number in range(150):
             await guided.ours.say(reply=number, value="start")
-        refused = await guided.ours.find(lambda said: said.get("refused") == "reply")
+        refused = await guided.ours.find(lambda message: message.get("refused") == "reply")
         assert "is not open on this page" in refused["reason"]
         assert (standing.state()["linear"] or 0.0) > 0.25
         pressed = time.monotonic()
@@ -117,7 +119,7 @@ async def test_a_key_stops_the_leg_and_other_clients_see_the_procedure_and_canno
         assert (end["ended"], end["meaning"]) == (1, "failure")
         assert "a key was pressed" in end["text"]
         assert "did not change any file" in end["text"]
-        await other.says(lambda said: said.get("running") == "")
+        await other.says(lambda message: message.get("running") == "")
     none_left(page)
     assert page.refused()["malformed"] >= before.get("malformed", 0) + 200
 
@@ -162,7 +164,7 @@ async def test_a_guide_client_that_sends_no_signs_of_life_loses_its_procedure(
             end = await guided.ended()
             if "sent no sign of life" in end["text"]:
                 break
-            await guided.says(lambda said: said.get("running") == "")
+            await guided.says(lambda message: message.get("running") == "")
         assert f"page or program sent no sign of life for {MAX_INPUT_SILENCE_S:g} s" in end["text"]
         await beside(standing.at_rest)
 
@@ -196,16 +198,16 @@ async def test_a_network_that_fails_during_a_leg_stops_it_within_a_second(
 
     def fast(since: float) -> float:
         """Return the speed of a wheel if all of the last lines have it, else 0."""
-        said = [one.line for one in peer.since(since) if one.line != b"-"][-LINES:]
-        speeds = [abs(wheels(line)[0]) for line in said]
+        lines = [entry.line for entry in peer.since(since) if entry.line != b"-"][-LINES:]
+        speeds = [abs(wheels(line)[0]) for line in lines]
         steady = len(speeds) == LINES and len(set(speeds)) == 1
         return speeds[0] if steady else 0.0
 
-    def slower(gone: float, than: float) -> float | None:
-        """Return the time of the first line after `gone` that is slower than `than`, or None."""
-        for one in peer.since(gone):
-            if one.line != b"-" and abs(wheels(one.line)[0]) < than:
-                return one.at
+    def slower(start: float, than: float) -> float | None:
+        """Return the time of the first line after `start` that is slower than `than`, or None."""
+        for entry in peer.since(start):
+            if entry.line != b"-" and abs(wheels(entry.line)[0]) < than:
+                return entry.at
         return None
 
     with (
@@ -222,16 +224,16 @@ async def test_a_network_that_fails_during_a_leg_stops_it_within_a_second(
                 await guided.starts("1. Place the")
                 speed = await beside(lambda: until(lambda: fast(begun), 10.0, "the leg moves"))
                 hosts.cut()
-                gone = time.monotonic()
+                start = time.monotonic()
                 try:
                     at = await beside(
-                        lambda: until(lambda: slower(gone, speed), 5.0, "it slows down")
+                        lambda: until(lambda: slower(start, speed), 5.0, "it slows down")
                     )
                 finally:
                     hosts.heal()
-                print(f"slower after {at - gone:.2f} s")
+                print(f"slower after {at - start:.2f} s")
                 # The page's server, the command and the daemon. A busy machine delays each.
-                assert at - gone < 1.0 + 3 * lost(gone, at)
+                assert at - start < 1.0 + 3 * lost(start, at)
         none_left(served)
 
 
@@ -300,7 +302,7 @@ async def test_a_client_without_the_role_maintainer_begins_no_procedure(
         async with guiding(page, token=token) as theirs:
             for what in ("calibrate", "check"):
                 await theirs.begin(what)
-            refused = await theirs.ours.find(lambda said: said.get("refused") == "begin")
+            refused = await theirs.ours.find(lambda message: message.get("refused") == "begin")
             assert "for maintainers" in refused["reason"]
             url = f"{page.away}/api/guide"
             async with page.client(token) as session, session.get(url) as answer:
@@ -321,15 +323,15 @@ async def test_only_the_offered_procedures_can_begin(page: Page) -> None:
     async with guiding(page) as guided:
         for wish in INJECTED:
             await guided.ours.say(**wish)
-            said = await guided.ours.find(
-                lambda said: "refused" in said or "ended" in said.get("guide", {})
+            reply = await guided.ours.find(
+                lambda reply: "refused" in reply or "ended" in reply.get("guide", {})
             )
-            if "guide" in said:
-                assert said["guide"]["ended"] == 2, said
-                assert said["guide"]["text"], said
+            if "guide" in reply:
+                assert reply["guide"]["ended"] == 2, reply
+                assert reply["guide"]["text"], reply
             else:
                 await asyncio.sleep(1.0)  # a refusal is sent once a second
-        assert not any("question" in str(said) for said in guided.ours.heard)
+        assert not any("question" in str(reply) for reply in guided.ours.heard)
     assert commands(page) == []
 
 
@@ -348,9 +350,9 @@ async def test_a_port_that_the_daemon_holds_is_reported_with_the_way_to_end_it(
             assert end["meaning"] == "port, bus address or robot id in use"
             assert f"process {holder.pid}" in end["text"]
             assert "systemctl stop acsard" in end["text"]
-            told = json.loads(await text(f"{served.here}/api/guide"))
+            listing = json.loads(await text(f"{served.here}/api/guide"))
             # A pty counts as an ordinary port: the advice for the simulator does not apply to it.
-            assert (told["method"], told["advice"]) == ("", "")
+            assert (listing["method"], listing["advice"]) == ("", "")
 
 
 @pytest.mark.nightly
@@ -363,7 +365,7 @@ async def test_a_browser_that_disconnects_while_a_motor_turns_leaves_zeros_and_a
             async with guiding(served) as guided:
                 await guided.begin("check", port=port)
                 await guided.lifted()
-                await guided.says(lambda said: "motor a" in said.get("doing", ""))
+                await guided.says(lambda message: "motor a" in message.get("doing", ""))
                 gone(guided, served)
             await beside(lambda: none_left(served))
         # The next check finds the wheels at rest, and the port free.
@@ -372,10 +374,10 @@ async def test_a_browser_that_disconnects_while_a_motor_turns_leaves_zeros_and_a
 
 
 async def test_the_guide_lists_the_procedures_and_ports_that_it_offers(page: Page) -> None:
-    told = json.loads(await text(f"{page.here}/api/guide"))
-    assert sorted(told["methods"]) == ["gyro", "positions", "tape", "umbmark", "wall"]
-    assert told["method"] == "positions"
-    assert "no floor to measure with a tape" in told["advice"]
-    assert told["ports"][0]["port"] == "sim"  # the configured port
-    if len(told["ports"]) == 1:
-        assert "systemctl stop acsard" in told["note"]
+    offers = json.loads(await text(f"{page.here}/api/guide"))
+    assert sorted(offers["methods"]) == ["gyro", "positions", "tape", "umbmark", "wall"]
+    assert offers["method"] == "positions"
+    assert "no floor to measure with a tape" in offers["advice"]
+    assert offers["ports"][0]["port"] == "sim"  # the configured port
+    if len(offers["ports"]) == 1:
+        assert "systemctl stop acsard" in offers["note"]

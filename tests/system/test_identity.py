@@ -42,8 +42,8 @@ class Robot:
     @contextmanager
     def operator(self) -> Iterator[zenoh.Session]:
         """A plain Zenoh session that shows the operator's certificate."""
-        shown = self.certificates.shown(self.tls, self.certificates.own("operator"))
-        with zenoh.open(shown) as session:
+        config = self.certificates.shown(self.tls, self.certificates.own("operator"))
+        with zenoh.open(config) as session:
             until(
                 lambda: list(session.get("acsard/acsar/info", timeout=1.0)), 10.0, "the TLS gateway"
             )
@@ -106,7 +106,7 @@ def attacked(robot: Robot, victim: Client, sender: str = "") -> list[Any]:
         until(lambda: (bus.state()["linear"] or 0.0) > 0.15, 10.0, "the victim drives")
         begun = len(states.seen)
         attack(session, keys, sender or bus.state()["sender"])
-        return [seen.value for seen in states.seen[begun:]]
+        return [entry.value for entry in states.seen[begun:]]
 
 
 def test_the_published_sender_does_not_take_the_robot_from_another_program(robot: Robot) -> None:
@@ -137,7 +137,9 @@ def test_the_sender_of_a_client_over_tls_has_the_name_of_its_certificate(robot: 
     with connect(robot.tls, tls=tls) as client, Bus(robot.plain) as bus:
         with bus.follow("state") as states:
             client.drive(0.2, seconds=0.5)
-        senders = {one.value["sender"] for one in states.seen if (one.value["linear"] or 0.0) > 0.1}
+        senders = {
+            entry.value["sender"] for entry in states.seen if (entry.value["linear"] or 0.0) > 0.1
+        }
     assert senders == {client.sender}
     assert client.sender.endswith(" [operator]")
 
@@ -148,7 +150,7 @@ def test_a_page_server_connected_over_tls_drives_under_its_certificate_s_name(
     async def story() -> None:
         async with hands(page) as ours:
             hello = await ours.find(
-                lambda said: said.get("hello", {}).get("sender", "").endswith(" [operator]")
+                lambda frame: frame.get("hello", {}).get("sender", "").endswith(" [operator]")
             )
             await ours.say(subscribe="state", rate=50)
             await ours.until_driving(0.2)

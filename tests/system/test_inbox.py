@@ -26,7 +26,9 @@ def test_a_stop_query_counts_even_if_too_many_queries_are_open_to_answer_it() ->
     inbox = Inbox(prefix, Replies(prefix), (), Deaf())
     with zenoh.open(client_config(endpoint, "router")) as robot, Bus(endpoint) as bus:
         topics = ("info", "srv/stop")
-        held = [robot.declare_queryable(prefix + t, partial(inbox.on_query, t)) for t in topics]
+        queryables = [
+            robot.declare_queryable(prefix + t, partial(inbox.on_query, t)) for t in topics
+        ]
         asked = [
             bus.session.get(f"{prefix}info", timeout=60.0) for _ in range(MAX_OPEN_QUERIES + 1)
         ]
@@ -34,8 +36,8 @@ def test_a_stop_query_counts_even_if_too_many_queries_are_open_to_answer_it() ->
         assert list(bus.session.get(f"{prefix}info", timeout=60.0)) == []
         assert inbox.take(0).arrivals == ()
         assert list(bus.session.get(f"{prefix}srv/stop", timeout=60.0)) == []
-        assert [one.key for one in inbox.take(0).arrivals] == ["stop"]
-        del held, asked
+        assert [arrival.key for arrival in inbox.take(0).arrivals] == ["stop"]
+        del queryables, asked
 
 
 def test_a_step_takes_at_most_one_query_for_settings() -> None:
@@ -43,40 +45,44 @@ def test_a_step_takes_at_most_one_query_for_settings() -> None:
     inbox = Inbox(prefix, Replies(prefix), (), Deaf())
     with zenoh.open(client_config(endpoint, "router")) as robot, Bus(endpoint) as bus:
         topics = ("srv/set", "srv/clear")
-        held = [robot.declare_queryable(prefix + t, partial(inbox.on_query, t)) for t in topics]
+        queryables = [
+            robot.declare_queryable(prefix + t, partial(inbox.on_query, t)) for t in topics
+        ]
         asked = [bus.session.get(prefix + t, payload=b"{}", timeout=60.0) for t in topics * 5]
-        found: list[str] = []
+        names: list[str] = []
 
         def all_here() -> bool:
-            taken = [query.topic for query in inbox.take(8).queries]
-            assert taken.count("srv/set") <= 1
-            found.extend(taken)
-            return len(found) == 10
+            batch = [query.topic for query in inbox.take(8).queries]
+            assert batch.count("srv/set") <= 1
+            names.extend(batch)
+            return len(names) == 10
 
         until(all_here, 5.0, "all of them")
-        assert found.count("srv/set") == 5
-        del held, asked
+        assert names.count("srv/set") == 5
+        del queryables, asked
 
 
 def test_a_flood_under_two_certificates_displaces_no_command_of_other_senders() -> None:
     prefix, endpoint = "acsard/acsar/", free_endpoint()
     inbox = Inbox(prefix, Replies(prefix), ("app", "nav"), Deaf())
     with zenoh.open(client_config(endpoint, "router")) as robot, Bus(endpoint) as bus:
-        came: list[str] = []
+        keys: list[str] = []
 
         def take(sample: zenoh.Sample) -> None:
             inbox.on_sample(sample)
-            came.append(str(sample.key_expr).removeprefix(prefix))
+            keys.append(str(sample.key_expr).removeprefix(prefix))
 
-        held = [robot.declare_subscriber(f"{prefix}{key}", take) for key in ("cmd/*", "cmd/*/*")]
+        subscribers = [
+            robot.declare_subscriber(f"{prefix}{key}", take) for key in ("cmd/*", "cmd/*/*")
+        ]
         quiet = ["cmd/app", "cmd/nav", "cmd/nav/anna"]
         flood = [f"cmd/app/{name}" for name in ("anna", "ben")] * COMMAND_BUFFER
         for key in (*quiet, *flood):
             bus.session.put(prefix + key, b"", congestion_control=zenoh.CongestionControl.BLOCK)
-        until(lambda: len(came) == len(quiet) + len(flood), 5.0, "all of them")
-        taken = inbox.take(0)
-        kept = [one.key for one in taken.arrivals]
-        assert sorted(set(kept)) == sorted({*quiet, *flood})
-        assert [kept.count(key) for key in quiet] == [1, 1, 1]
-        assert (len(kept), taken.overrun) == (len(quiet) + COMMAND_BUFFER, COMMAND_BUFFER)
-        del held
+        until(lambda: len(keys) == len(quiet) + len(flood), 5.0, "all of them")
+        batch = inbox.take(0)
+        queue = [arrival.key for arrival in batch.arrivals]
+        assert sorted(set(queue)) == sorted({*quiet, *flood})
+        assert [queue.count(key) for key in quiet] == [1, 1, 1]
+        assert (len(queue), batch.overrun) == (len(quiet) + COMMAND_BUFFER, COMMAND_BUFFER)
+        del subscribers

@@ -140,7 +140,9 @@ class Robot:
         """Run a client on the robot's machine."""
         return Bus(self._plain, self._network.robot)
 
-    def attacked(self, form: str, who: Identity, seconds: float, reported: str = "") -> Figures:
+    def attacked(
+        self, form: str, identity: Identity, seconds: float, reported: str = ""
+    ) -> Figures:
         """Run an attack and return its effects.
 
         If `reported` is given, the attack ends when the daemon logs this event.
@@ -152,16 +154,16 @@ class Robot:
                 first = bus.state()
                 time.sleep(min(seconds, CALM_S))
                 begun, now = bus.state(), time.monotonic()
-                grown_kb, stops = self._under(form, who, seconds, reported, bus, driven)
+                grown_kb, stops = self._under(form, identity, seconds, reported, bus, driven)
                 back = self._back()
                 ended = bus.state()
                 self.counters = ended["counters"]
-            taken = lost(now)
+            lost_s = lost(now)
             if form in HALT:
                 assert ended["mode"] == "stopped"
                 until(lambda: self._cleared(bus), 5.0, "none of those stops waits to come")
         periods, calm = Periods.between(begun, ended), Periods.between(first, begun)
-        return Figures(periods, calm, stops, grown_kb, back, taken)
+        return Figures(periods, calm, stops, grown_kb, back, lost_s)
 
     @staticmethod
     def _cleared(bus: Bus) -> bool:
@@ -191,13 +193,13 @@ class Robot:
             time.sleep(seconds)
             # A query waits as long as the lock is held.
             until(lambda: bus.ask("info"), 30.0, "the bus is free again")
-            ended, taken = bus.state(), lost(now)
-        return Periods.between(begun, ended), ended["counters"], taken
+            ended, lost_s = bus.state(), lost(now)
+        return Periods.between(begun, ended), ended["counters"], lost_s
 
     def _under(
         self,
         form: str,
-        who: Identity,
+        identity: Identity,
         seconds: float,
         reported: str,
         bus: Bus,
@@ -209,7 +211,7 @@ class Robot:
         """
         memory_kb, most_kb = resident_kb(self.daemon.pid), 0
         network, text = self._network, HOSTILE.replace("acsard/acsar", self._root)
-        attack = words(text, form, network.tls, json.dumps(network.shown(who)), seconds)
+        attack = words(text, form, network.tls, json.dumps(network.shown(identity)), seconds)
         with Program(attack, self._where) as attacker:
             attacker.says("begun")
             end = time.monotonic() + seconds
@@ -237,17 +239,17 @@ class Robot:
     def _stopped(self) -> Stop:
         """Let a new local client stop the robot. Return the time until a slower line, s."""
         with self._joined() as other:
-            said = time.monotonic()
+            start = time.monotonic()
             before = wheels(self._peer.lines[-1].line)[0]
             other.put("stop", True)
             slower = until(
                 lambda: next(
-                    (h for h in self._peer.since(said) if wheels(h.line)[0] < before), None
+                    (h for h in self._peer.since(start) if wheels(h.line)[0] < before), None
                 ),
                 5.0,
                 "the stop is on the wire",
             )
-        return Stop(slower.at - said, lost(said, slower.at))
+        return Stop(slower.at - start, lost(start, slower.at))
 
     def _back(self) -> float:
         """Return the time until an operator over TLS gets an answer."""
@@ -256,8 +258,8 @@ class Robot:
         def answered() -> bool:
             try:
                 config = client_config(self._network.tls)
-                shown = json.dumps(self._network.shown("operator"))
-                config.insert_json5("transport/link/tls", shown)
+                settings = json.dumps(self._network.shown("operator"))
+                config.insert_json5("transport/link/tls", settings)
                 with zenoh.open(config) as session:
                     # The timeout is long, so that a late answer is timed and not requested again.
                     return any(r.ok for r in session.get(f"{self._root}/state", timeout=5.0))
@@ -277,7 +279,7 @@ class Gateway(NamedTuple):
         tls, own = free_tls_endpoint(), self.certificates
         bus: dict[str, object] = {"listen": [tls], "tls": str(own.robot)}
         tables: Tables = {"bus": bus, "access": {"wildcards": wildcards}}
-        return Network(tls, lambda who: own.settings(own.own(who)), tables)
+        return Network(tls, lambda identity: own.settings(own.own(identity)), tables)
 
 
 @pytest.fixture(scope="module")
@@ -297,7 +299,7 @@ def fleet(where: Path, router: Router) -> Iterator[Network]:
     tables: Tables = {"bus": bus, "access": {"maintainers": [ITS_NAME]}}
     with router(where, tls) as program:
         until(lambda: _answers(tls), 10.0, f"the router listens\n{program}")
-        yield Network(tls, lambda who: tls_settings(where / who), tables, "robot1")
+        yield Network(tls, lambda identity: tls_settings(where / identity), tables, "robot1")
 
 
 def _answers(endpoint: str) -> bool:
@@ -331,7 +333,7 @@ def attacks(half_a_minute: Forms, a_moment: Forms) -> list[Any]:
     Long runs try each attack of the first argument for half a minute. The attacks of the second
     argument run briefly: one in four in each run, and the others in the nightly job.
     """
-    brief = [(form, who) for who in a_moment for form in a_moment[who]]
+    brief = [(form, identity) for identity in a_moment for form in a_moment[identity]]
     nightly, soak = pytest.mark.nightly, pytest.mark.soak
     return [
         *(
@@ -339,15 +341,15 @@ def attacks(half_a_minute: Forms, a_moment: Forms) -> list[Any]:
             for n, attack in enumerate(brief)
         ),
         *(
-            pytest.param(form, who, 30.0, marks=soak)
-            for who in half_a_minute
-            for form in half_a_minute[who]
+            pytest.param(form, identity, 30.0, marks=soak)
+            for identity in half_a_minute
+            for form in half_a_minute[identity]
         ),
     ]
 
 
 @pytest.mark.parametrize(
-    ("form", "who", "seconds"),
+    ("form", "identity", "seconds"),
     attacks(
         {"viewer": (*FORMS, *LARGE), "unlisted": (*FORMS, *LARGE[:3])},
         {
@@ -360,16 +362,16 @@ def attacks(half_a_minute: Forms, a_moment: Forms) -> list[Any]:
     ),
 )  # fmt: skip
 def test_an_admitted_attacker_disturbs_neither_the_loop_nor_a_stop_nor_other_clients(
-    tmp_path: Path, gateway: Gateway, form: str, who: Identity, seconds: float
+    tmp_path: Path, gateway: Gateway, form: str, identity: Identity, seconds: float
 ) -> None:
-    figures = Robot(tmp_path, gateway.network()).attacked(form, who, seconds)
-    print(f"\n{form} by {who}: {figures}")
+    figures = Robot(tmp_path, gateway.network()).attacked(form, identity, seconds)
+    print(f"\n{form} by {identity}: {figures}")
     assert len(figures.stops) >= (0 if form in HALT else 1 if seconds < LONG_S else 3)
     undisturbed(figures, long=seconds >= LONG_S)
 
 
 @pytest.mark.parametrize(
-    ("form", "who", "seconds"),
+    ("form", "identity", "seconds"),
     attacks(
         {"viewer": (*FORMS, *LARGE), "unlisted": ("publish", "sessions", "come_and_go", "flood")},
         {
@@ -380,11 +382,11 @@ def test_an_admitted_attacker_disturbs_neither_the_loop_nor_a_stop_nor_other_cli
 )
 @pytest.mark.nightly
 def test_an_attack_on_the_fleets_router_does_not_disturb_the_robot_behind_it(
-    tmp_path: Path, form: str, who: Identity, seconds: float
+    tmp_path: Path, form: str, identity: Identity, seconds: float
 ) -> None:
     with fleet(tmp_path, watched_router) as network:
-        figures = Robot(tmp_path, network).attacked(form, who, seconds)
-    print(f"\n{form} by {who}: {figures}")
+        figures = Robot(tmp_path, network).attacked(form, identity, seconds)
+    print(f"\n{form} by {identity}: {figures}")
     undisturbed(figures, long=seconds >= LONG_S)
 
 
@@ -415,9 +417,9 @@ def test_a_bus_that_is_locked_costs_messages_and_no_period(
 
     The lock blocks every program that puts. The daemon loses messages then, but no period.
     """
-    periods, counters, taken = Robot(tmp_path, gateway.network()).locked(0.5)
-    print(f"\n{periods}, {counters}, {taken:.3f} s taken")
-    assert periods.missed <= 0.01 * periods.elapsed + 4 + 100.0 * taken
+    periods, counters, lost_s = Robot(tmp_path, gateway.network()).locked(0.5)
+    print(f"\n{periods}, {counters}, {lost_s:.3f} s taken")
+    assert periods.missed <= 0.01 * periods.elapsed + 4 + 100.0 * lost_s
     assert counters["bus_dropped"] > 20
     assert counters["bus_stuck"] >= 1
 

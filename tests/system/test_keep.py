@@ -40,11 +40,11 @@ def test_a_kept_setting_survives_a_restart_and_its_comments_stay(tmp_path: Path)
         file = daemon.config
         file.write_text(f"# the first line\n{file.read_text()}")
         ended = tool(daemon, KEY, VALUE, "--keep")
-        told = f"{KEY} = {VALUE} (was 0.5); written to {file}"
-        assert (ended.code, ended.out, ended.err) == (0, told, "")
+        output = f"{KEY} = {VALUE} (was 0.5); written to {file}"
+        assert (ended.code, ended.out, ended.err) == (0, output, "")
         assert file.read_text().startswith("# the first line\n")
         assert tomllib.loads(file.read_text())["limits"]["linear_speed"] == float(VALUE)
-        (event,) = [one for one in daemon.events("set") if "written" in one["text"]]
+        (event,) = [entry for entry in daemon.events("set") if "written" in entry["text"]]
         assert event["text"] == f"written: {KEY} to {file}"
         assert event["by"]
         with Bus(endpoint) as bus:
@@ -90,4 +90,4 @@ def test_keeping_settings_costs_no_control_period(tmp_path: Path) -> None:
     missed = [state.counters.get("missed_periods", 0) for state in (before, after)]
     assert (missed[1] - missed[0]) * PERIOD_S <= PERIOD_S + lost(began_s)
     changed = file.read_text().splitlines()
-    assert len([one for one in text.splitlines() if one not in changed]) <= 3
+    assert len([line for line in text.splitlines() if line not in changed]) <= 3

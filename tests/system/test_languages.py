@@ -53,8 +53,12 @@ def followed(words: Sequence[str], where: Path, bus: Bus) -> None:
 
             def moved() -> bool:
                 lines = [LINE.fullmatch(line) for line in list(follower.out)]
-                told = [match for match in lines if match]
-                return bool(told) and float(told[-1][1]) > begun + 0.1 and float(told[-1][3]) > 0.2
+                matches = [match for match in lines if match]
+                return (
+                    bool(matches)
+                    and float(matches[-1][1]) > begun + 0.1
+                    and float(matches[-1][3]) > 0.2
+                )
 
             until(moved, 20.0, f"the robot moves\n{follower}")
     bus.at_rest()
@@ -72,13 +76,13 @@ def driven(words: Sequence[str], where: Path, bus: Bus, **more: str) -> None:
     with Program(words, where, environment(**more)) as driver:
         until(lambda: bus.state()["source"] == "app", 30.0, f"it drives\n{driver}")
         assert driver.ended(20.0) == 0, driver
-        found = [LINE.fullmatch(line) for line in driver.out]
-    told = [match for match in found if match]
-    assert len(told) > 20, driver
-    assert len(told) == len(found), driver
-    assert float(told[-1][1]) - begun == pytest.approx(bus.state()["x"] - begun, abs=0.01)
-    assert 0.2 < float(told[-1][1]) - begun < 0.6
-    assert 0.15 < max(float(match[3]) for match in told) < 0.25
+        results = [LINE.fullmatch(line) for line in driver.out]
+    matches = [match for match in results if match]
+    assert len(matches) > 20, driver
+    assert len(matches) == len(results), driver
+    assert float(matches[-1][1]) - begun == pytest.approx(bus.state()["x"] - begun, abs=0.01)
+    assert 0.2 < float(matches[-1][1]) - begun < 0.6
+    assert 0.15 < max(float(match[3]) for match in matches) < 0.25
     bus.at_rest()
 
 
@@ -208,15 +212,15 @@ def npm() -> str:
 def bridge(kept: Path) -> str:
     """Return the path of the installed bridge, or build it with the command on the page."""
     words = next(line for line in commands() if line.startswith(f"cargo install {BRIDGE}"))
-    if (found := shutil.which(BRIDGE)) is None:
+    if (path := shutil.which(BRIDGE)) is None:
         program("cargo", "it builds the bridge")
         run(
             [*words.split(), "--quiet", "--root", str(kept)],
             kept,
             CARGO_TARGET_DIR=str(kept / "bridge"),
         )
-        found = str(kept / "bin" / BRIDGE)
-    return found
+        path = str(kept / "bin" / BRIDGE)
+    return path
 
 
 def commands() -> list[str]:
@@ -225,10 +229,10 @@ def commands() -> list[str]:
     return [line for block in blocks("sh") if block.page == page for line in block.commands()]
 
 
-def copied(language: str, kept: Path) -> Path:
+def copied(language: str, cache: Path) -> Path:
     """Copy the example of a language into the build directory, which keeps earlier builds."""
     built = shutil.ignore_patterns("target", "node_modules", "dist", "*lock*")
-    return shutil.copytree(CLIENTS / language, kept / language, ignore=built, dirs_exist_ok=True)
+    return shutil.copytree(CLIENTS / language, cache / language, ignore=built, dirs_exist_ok=True)
 
 
 @pytest.mark.languages
@@ -280,7 +284,7 @@ def schemas(shared: Daemon, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def heard(shared: Daemon) -> list[Said]:
     """Return a JSON message of every key that the daemon publishes or answers."""
-    found: list[Said] = []
+    results: list[Said] = []
     with Bus(shared.endpoint) as bus:
         bus.linked()
         for row in bus.get("topics")["topics"]:
@@ -290,26 +294,26 @@ def heard(shared: Daemon) -> list[Said]:
             by_itself = row["rate"] not in ("latched", "on change")
             if row["direction"] == "out" and by_itself:
                 with bus.follow(f"json/{key}") as messages:
-                    found.append((kind, messages.find(lambda _: True, 5.0, key).value))
+                    results.append((kind, messages.find(lambda _: True, 5.0, key).value))
             elif row["direction"] != "service":
-                found.append((kind, bus.get(key)))
-        found.append(("ServiceReply", bus.get("srv/activate")))
-    return found
+                results.append((kind, bus.get(key)))
+        results.append(("ServiceReply", bus.get("srv/activate")))
+    return results
 
 
-def wrong(heard: list[Said]) -> list[Said]:
+def wrong(messages: list[Said]) -> list[Said]:
     """Return messages that no daemon sends."""
-    of = dict(heard)
+    of = dict(messages)
     lacking = {name: value for name, value in of["Odometry"].items() if name != "twist"}
     return [("RobotState", of["RobotState"] | {"mode": "idle"}), ("Odometry", lacking)]
 
 
-def judged(words: Sequence[str], where: Path, said: list[Said]) -> list[str]:
+def judged(words: Sequence[str], where: Path, messages: list[Said]) -> list[str]:
     """Give these messages to a program that reads them with the generated types.
 
     Returns its output lines: the type of each message, and `read` or `refused`.
     """
-    text = "".join(json.dumps(one) + "\n" for one in said)
+    text = "".join(json.dumps(message) + "\n" for message in messages)
     done = subprocess.run(
         words, cwd=where, env=environment(), input=text, capture_output=True, text=True, check=False
     )
@@ -355,9 +359,9 @@ def test_types_made_by_quicktype_compile_and_parse_the_daemon_s_messages(
     tsc = ["npx", "--no-install", "tsc", "--strict", "--target", "es2022", "--module", "nodenext"]
     (here / "reader.ts").write_text(READER_TS)
     run([*tsc, "reader.ts"], here)
-    said, lies = [kind for kind, _ in heard], wrong(heard)
-    told = judged(["node", "reader.js"], here, heard + lies)
-    assert told == [f"{kind} read" for kind in said] + [f"{kind} refused" for kind, _ in lies]
+    kinds, lies = [kind for kind, _ in heard], wrong(heard)
+    results = judged(["node", "reader.js"], here, heard + lies)
+    assert results == [f"{kind} read" for kind in kinds] + [f"{kind} refused" for kind, _ in lies]
     (here / "reader.ts").write_text(READER_TS.replace("ready:", "idle:"))
     with pytest.raises(AssertionError, match="idle"):
         run([*tsc, "reader.ts"], here)
@@ -392,6 +396,6 @@ def test_types_made_by_datamodel_code_generator_compile_and_parse_the_daemon_s_m
     sent = ("Twist", {"linear": {"x": 1.0}, "angular": {}})
     misspelt = ("Twist", {"linear": {"X": 1.0}, "angular": {}})
     lies = [*wrong(heard), misspelt]
-    told = judged([python, "-c", READER_PY], schemas.parent, [*heard, sent, *lies])
+    results = judged([python, "-c", READER_PY], schemas.parent, [*heard, sent, *lies])
     good = [*(kind for kind, _ in heard), "Twist"]
-    assert told == [f"{kind} read" for kind in good] + [f"{kind} refused" for kind, _ in lies]
+    assert results == [f"{kind} read" for kind in good] + [f"{kind} refused" for kind, _ in lies]

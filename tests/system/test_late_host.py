@@ -63,8 +63,10 @@ def test_a_planted_cause_is_named_eight_of_eight_times(
         # Each further cause begins after the advice of the one before. Other tests may run beside
         # this one, so that other programs may really be a cause too.
         named = text.partition("because ")[2].split("), and ")
-        others = [one for one in named if words not in one]
-        assert all(one.startswith("other programs used the processor") for one in others), text
+        others = [reason for reason in named if words not in reason]
+        assert all(reason.startswith("other programs used the processor") for reason in others), (
+            text
+        )
 
 
 def shown(*words: str) -> str:
@@ -74,7 +76,7 @@ def shown(*words: str) -> str:
 
 
 def causes_of(daemon: Daemon) -> list[dict[str, Any]]:
-    return [one for one in daemon.events("missed_periods") if BECAUSE in one["text"]]
+    return [event for event in daemon.events("missed_periods") if BECAUSE in event["text"]]
 
 
 def test_log_recording_report_and_doctor_name_the_same_cause(tmp_path: Path) -> None:

@@ -39,8 +39,8 @@ def test_the_daemon_drives_checked_with_samples_and_leaves_with_a_stop(tmp_path:
             began = time.monotonic()
             before = drives(robot)
             until(lambda: robot.get("state").linear == 0.0, 3.0, "at rest")
-            gone = robot.pose().x - before
-            assert gone == pytest.approx(0.25, abs=0.05 + 0.5 * lost(began))
+            distance = robot.pose().x - before
+            assert distance == pytest.approx(0.25, abs=0.05 + 0.5 * lost(began))
 
         def told() -> bool:
             reason = bus.state()["reason"]

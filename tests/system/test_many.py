@@ -84,17 +84,17 @@ def messages(program: Program) -> list[Any]:
 
 def test_echo_of_all_robots_names_the_robot_of_each_message(robots: Robots) -> None:
     with Program(robots.words("echo", "state"), robots.where) as program:
-        until(lambda: {one["robot"] for one in messages(program)} >= {ONE, TWO}, 10.0, "both")
-    assert all(one["message"]["link"] for one in messages(program))
+        until(lambda: {entry["robot"] for entry in messages(program)} >= {ONE, TWO}, 10.0, "both")
+    assert all(entry["message"]["link"] for entry in messages(program))
     assert "following robot1, robot2" in program.stderr
 
 
 def test_get_of_named_robots_names_the_robot_of_each_answer(robots: Robots) -> None:
     ended = robots.tool("get", "info", who=f"{TWO},{ONE}")
     assert (ended.code, ended.err) == (0, "")
-    found = [json.loads(line) for line in ended.out.splitlines()]
-    assert [one["robot"] for one in found] == [TWO, ONE]
-    assert [one["message"]["id"] for one in found] == [TWO, ONE]
+    answers = [json.loads(line) for line in ended.out.splitlines()]
+    assert [answer["robot"] for answer in answers] == [TWO, ONE]
+    assert [answer["message"]["id"] for answer in answers] == [TWO, ONE]
 
 
 HOSTILE = "[2J\x1b]0;x\x07"
@@ -107,22 +107,22 @@ def fake(robots: Robots, answer: bytes | None) -> Iterator[None]:
 
     It sends `answer` to every query, or no answer if it is None.
     """
-    who = "acsard/fake"
+    prefix = "acsard/fake"
 
     def reply(query: zenoh.Query) -> None:
         if answer is None:
-            kept.append(query)
+            queries.append(query)
         else:
             query.reply(query.key_expr, answer, encoding="application/json")
 
-    kept: list[zenoh.Query] = []
+    queries: list[zenoh.Query] = []
     with zenoh.open(client_config(robots.endpoint)) as session:
-        token = session.liveliness().declare_token(f"{who}/alive")
-        asked = session.declare_queryable(f"{who}/**", reply)
+        token = session.liveliness().declare_token(f"{prefix}/alive")
+        asked = session.declare_queryable(f"{prefix}/**", reply)
         yield
         asked.undeclare()
         token.undeclare()
-        kept.clear()
+        queries.clear()
 
 
 @pytest.mark.parametrize("answer", [b'["x"]', json.dumps({"success": False, "message": HOSTILE})])
@@ -132,9 +132,9 @@ def test_a_stranger_s_answer_hides_no_robot_and_sends_no_control_codes_to_the_te
     with fake(robots, answer if isinstance(answer, bytes) else answer.encode()):
         ended = robots.tool("call", "stop")
     assert ended.code in (1, 69)
-    told = dict(line.split(": ", 1) for line in ended.out.splitlines())
-    assert told.keys() == {ONE, TWO, "fake"}
-    assert told[ONE].startswith("stopped and latched")
+    replies = dict(line.split(": ", 1) for line in ended.out.splitlines())
+    assert replies.keys() == {ONE, TWO, "fake"}
+    assert replies[ONE].startswith("stopped and latched")
     assert all(line.isprintable() for line in ended.out.splitlines())
     robots.tool("call", "clear", who=ONE)
     robots.tool("call", "clear", who=TWO)
@@ -180,18 +180,18 @@ def test_a_table_for_a_pipe_does_not_wait_for_the_connection_to_be_closed(
 ) -> None:
     near, far = os.pipe()
     os.set_blocking(near, False)
-    told = [b""]
+    chunks = [b""]
     really = synchronous.close
 
     def close(session: zenoh.Session) -> None:
         with suppress(BlockingIOError):
-            told.append(os.read(near, 65536))
+            chunks.append(os.read(near, 65536))
         really(session)
 
     monkeypatch.setattr(synchronous, "close", close)
     with os.fdopen(near, "rb"), os.fdopen(far, "w") as pipe, redirect_stdout(pipe):
         main(robots.words("fleet", "--once", who=f"{ONE},{TWO}")[3:])
-    assert b"ready" in told[-1]
+    assert b"ready" in chunks[-1]
 
 
 def test_fleet_stops_waiting_when_each_named_robot_has_reported(robots: Robots) -> None:
@@ -213,9 +213,9 @@ def test_fleet_at_a_terminal_is_live_and_says_which_robot_has_gone(robots: Robot
         program,
     ):
 
-        def line(of: str, says: str) -> bool:
+        def line(of: str, pattern: str) -> bool:
             rows = screens(terminal)[-1:]
-            return any(re.search(rf"{of} .*{says}", row) for row in "".join(rows).splitlines())
+            return any(re.search(rf"{of} .*{pattern}", row) for row in "".join(rows).splitlines())
 
         waits = "waiting for a command"
         until(lambda: line(ONE, waits) and line(TWO, waits), 10.0, "both")
@@ -253,7 +253,7 @@ def test_a_full_disk_and_a_certificate_that_ends_do_not_look_ready(tmp_path: Pat
             daemon = Daemon(tmp_path, config=own, name=name, words=words)
             daemons[name] = stack.enter_context(daemon)
         view = Robots(tmp_path, endpoint, daemons)
-        said = {
+        texts = {
             "full": "WARNING: recording fails; waiting for a command",
             "ends": "WARNING: certificate expires in 10 days; waiting for a command",
             "sound": "waiting for a command",
@@ -270,7 +270,7 @@ def test_a_full_disk_and_a_certificate_that_ends_do_not_look_ready(tmp_path: Pat
         until(lambda: len(lines()) == 3 and ready() and "fails" in lines()[1], 30.0, "each")
         assert [line.split()[0] for line in lines()] == ["ends", "full", "sound"]
         for line in lines():
-            assert said[line.split()[0]] in line
+            assert texts[line.split()[0]] in line
             assert f" {version()} " in line
         assert lines()[1].endswith("No space left on device")
         page = stack.enter_context(Page(daemons["full"], tmp_path, "--connect", endpoint))
@@ -295,8 +295,8 @@ def test_fleet_warns_of_the_robot_whose_settings_differ_from_its_file(robots: Ro
     assert differ in table()[ONE]
     assert "WARNING" not in table()[TWO]
     ended = robots.tool("fleet", "--json", who=f"{ONE},{TWO}")
-    told = {one["robot_id"]: one["state"]["settings_differ"] for one in json.loads(ended.out)}
-    assert (ended.code, told) == (0, {ONE: differ, TWO: ""})
+    warnings = {row["robot_id"]: row["state"]["settings_differ"] for row in json.loads(ended.out)}
+    assert (ended.code, warnings) == (0, {ONE: differ, TWO: ""})
     assert robots.tool("set", "rates.state", "10.0", "rates.odom", "0", who=ONE).code == 0
     until(lambda: "WARNING" not in table()[ONE], 10.0, "no warning")
 
@@ -337,11 +337,11 @@ def test_set_changes_named_robots_and_prints_a_line_for_each(robots: Robots) -> 
     for value in ("7.5", "10.0"):
         ended = robots.tool("set", "rates.state", value, who=f"{TWO},{ONE}")
         assert (ended.code, ended.err) == (0, "")
-        told = dict(line.split(": ", 1) for line in ended.out.splitlines())
-        assert list(told) == [TWO, ONE]
-        assert all(one.startswith(f"rates.state = {value} (was ") for one in told.values())
+        replies = dict(line.split(": ", 1) for line in ended.out.splitlines())
+        assert list(replies) == [TWO, ONE]
+        assert all(reply.startswith(f"rates.state = {value} (was ") for reply in replies.values())
         assert all(
-            one.endswith("; in force until the daemon's next start") for one in told.values()
+            reply.endswith("; in force until the daemon's next start") for reply in replies.values()
         )
     ended = robots.tool("set", "rates.state", "10.0", "--json")
     assert [json.loads(line)["robot"] for line in ended.out.splitlines()] == [ONE, TWO]
@@ -372,7 +372,9 @@ def test_only_stop_can_be_called_on_many_robots(robots: Robots) -> None:
 @pytest.mark.nightly
 @pytest.mark.slow
 def test_the_two_robots_of_the_fleet_page_are_in_one_view(tmp_path: Path) -> None:
-    (block,) = [one for one in blocks("json5") if "tcp/127.0.0.1:7447" in one.text]
+    (block,) = [
+        candidate for candidate in blocks("json5") if "tcp/127.0.0.1:7447" in candidate.text
+    ]
     endpoint = free_endpoint()
     (tmp_path / "two.json5").write_text(block.text.replace("tcp/127.0.0.1:7447", endpoint))
     with ExitStack() as stack:
@@ -384,8 +386,8 @@ def test_the_two_robots_of_the_fleet_page_are_in_one_view(tmp_path: Path) -> Non
         view = Robots(tmp_path, endpoint, {})
 
         def both() -> bool:
-            told = view.tool("fleet", "--once").out
-            return all(re.search(rf"^{name} +ready", told, re.M) for name in (ONE, TWO))
+            table = view.tool("fleet", "--once").out
+            return all(re.search(rf"^{name} +ready", table, re.M) for name in (ONE, TWO))
 
         until(both, 60.0, "both in one view")
         stopped = view.tool("call", "stop")

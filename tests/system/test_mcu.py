@@ -169,14 +169,16 @@ def test_each_planted_fault_is_found_on_a_pty_and_a_good_board_passes(tmp_path: 
     with ThreadPoolExecutor(BESIDE) as pool:
         results = dict(zip(FAULTS, pool.map(lambda n: checked(tmp_path, n), FAULTS), strict=True))
     for name, (_, failed, changes) in FAULTS.items():
-        code, found, text = results[name]
-        named = [one["name"] for one in found["findings"] if one["verdict"] == "FAIL"]
-        late = any(one["figure"] == "not judged" for one in found["findings"])
-        assert named == failed or (late and set(named) <= set(failed)), (name, found)
+        code, report, text = results[name]
+        named = [finding["name"] for finding in report["findings"] if finding["verdict"] == "FAIL"]
+        late = any(finding["figure"] == "not judged" for finding in report["findings"])
+        assert named == failed or (late and set(named) <= set(failed)), (name, report)
         assert code == (1 if named or late else 0)
-        assert late or changes.items() <= found["changes"].items(), name
+        assert late or changes.items() <= report["changes"].items(), name
         if name in ("spaces", "unpadded"):
-            form = next(one for one in found["findings"] if one["name"] == "reply form")
+            form = next(
+                finding for finding in report["findings"] if finding["name"] == "reply form"
+            )
             assert (form["verdict"], form["figure"]) == ("WARN", name)
         # Every line of the reference is still there, apart from the values of the keys that
         # changed.
@@ -184,7 +186,7 @@ def test_each_planted_fault_is_found_on_a_pty_and_a_good_board_passes(tmp_path: 
         pairs = zip(reference, text.splitlines(), strict=True)
         differing = [after for before, after in pairs if before != after]
         assert sorted(re.split(" =", line)[0] for line in differing) == sorted(
-            key.rpartition(".")[2] for key in found["changes"]
+            key.rpartition(".")[2] for key in report["changes"]
         )
 
 
@@ -204,16 +206,16 @@ def test_a_busy_computer_finds_no_fault_of_a_good_board(tmp_path: Path, loops: i
         with ThreadPoolExecutor(len(places)) as pool:
             results = list(pool.map(lambda place: checked(place, "good"), places))
     finally:
-        for one in spinning:
-            one.kill()
-            one.wait()
-    for code, found, _ in results:
-        told = [one for one in found["findings"] if one["verdict"] in ("FAIL", "WARN")]
-        print(*told, sep="\n")
-        assert code == (1 if told else 0), found
-        assert all("this computer ran the check" in one["text"] for one in told), found
-        assert found["changes"].keys() <= {"mcu.port", "mcu.link_check", "mcu.encoder_counts"}
-        assert found["changes"].get("mcu.encoder_counts", 3200) == 3200
+        for item in spinning:
+            item.kill()
+            item.wait()
+    for code, report, _ in results:
+        problems = [item for item in report["findings"] if item["verdict"] in ("FAIL", "WARN")]
+        print(*problems, sep="\n")
+        assert code == (1 if problems else 0), report
+        assert all("this computer ran the check" in item["text"] for item in problems), report
+        assert report["changes"].keys() <= {"mcu.port", "mcu.link_check", "mcu.encoder_counts"}
+        assert report["changes"].get("mcu.encoder_counts", 3200) == 3200
 
 
 @pytest.mark.network

@@ -281,8 +281,8 @@ def test_releasing_the_left_mouse_button_while_another_is_held_releases_the_stic
     x, y = browser.middle("stick")
 
     def mouse(kind: str, dy: float = 0.0, button: str = "none", buttons: int = 1) -> None:
-        told = {"type": f"mouse{kind}", "button": button, "buttons": buttons, "clickCount": 1}
-        browser.ask("Input.dispatchMouseEvent", x=x, y=y - dy, **told)
+        event = {"type": f"mouse{kind}", "button": button, "buttons": buttons, "clickCount": 1}
+        browser.ask("Input.dispatchMouseEvent", x=x, y=y - dy, **event)
 
     def drives() -> bool:
         """Return whether the robot drives. Press the stick again if the page has released it."""
@@ -340,9 +340,9 @@ def test_the_zero_of_a_released_stick_is_sent_twice_also_over_a_congested_socket
     page.browser.js(JAM)
     page.browser.touch("End")
     page.bus.at_rest()
-    sent = [json.loads(one) for one in page.browser.js("window.sent")]
-    commands = [one for one in sent if "cmd" in one]
-    assert [one["cmd"]["linear_x"] for one in commands] == [0, 0]
+    sent = [json.loads(message) for message in page.browser.js("window.sent")]
+    commands = [message for message in sent if "cmd" in message]
+    assert [message["cmd"]["linear_x"] for message in commands] == [0, 0]
     assert commands[1]["stamp"] - commands[0]["stamp"] >= 49.0
 
 
@@ -370,8 +370,8 @@ def test_a_page_releases_the_stick_before_the_browser_leaves_it(page: Phone) -> 
 
 def viewers(page: Phone) -> int:
     """Return the number of open pages that the page's server counts."""
-    _, told = asyncio.run(answer(f"{page.server.here}/metrics"))
-    return int(re.findall(r"^acsard_page_viewers\{.*\} (\d+)$", told, re.MULTILINE)[0])
+    _, text = asyncio.run(answer(f"{page.server.here}/metrics"))
+    return int(re.findall(r"^acsard_page_viewers\{.*\} (\d+)$", text, re.MULTILINE)[0])
 
 
 @pytest.mark.nightly
@@ -625,8 +625,8 @@ def test_a_page_opened_while_the_daemon_is_silent_waits_and_shows_no_measurement
         browser.open(page.server.here)
         page.shows("reason", "nothing is received from the daemon")
         browser.js("new Promise(done => setTimeout(done, 500))")  # more than one poll
-        said = [browser.text(one) for one in ("mode", "age", "speed", "turn", "who")]
-        assert said == ["WAITING", "waiting", "–", "–", "–"]
+        texts = [browser.text(name) for name in ("mode", "age", "speed", "turn", "who")]
+        assert texts == ["WAITING", "waiting", "–", "–", "–"]
         assert not browser.js("document.body.classList.contains('stale')")
     finally:
         page.daemon.signal(signal.SIGCONT)
@@ -707,7 +707,7 @@ def test_a_pulled_cable_is_red_and_greys_the_pose_until_it_is_back(
 def row(page: Phone, source: str) -> str:
     """Return the row of a source in the table."""
     rows = "[...document.querySelectorAll('#sources tr')].map(row => row.textContent)"
-    return next((str(one) for one in page.browser.js(rows) if one.startswith(source)), "")
+    return next((str(text) for text in page.browser.js(rows) if text.startswith(source)), "")
 
 
 SET = """(() => {
@@ -762,8 +762,8 @@ def test_the_map_zooms_in_and_out_and_can_follow_the_robot_again(page: Phone) ->
     browser = page.browser
     begun = drawing(browser)
 
-    def drawn(anew: bool, what: str) -> None:
-        until(lambda: (browser.js(DRAWN) != begun) is anew, 5.0, what)
+    def drawn(changed: bool, what: str) -> None:
+        until(lambda: (browser.js(DRAWN) != begun) is changed, 5.0, what)
 
     browser.tap("nearer")
     drawn(True, "nearer")
@@ -885,9 +885,9 @@ async def test_a_second_page_names_the_driver_and_its_stick_is_grey(
         assert greyed(browser)
         browser.push(0, 0, "Start")
         browser.push(0, 90)
-        held = browser.js(HELD)
+        active = browser.js(HELD)
         browser.touch("End")
-        assert held is False
+        assert active is False
 
     async with hands(page.server) as other:
         await other.say(subscribe="state", rate=10)
@@ -963,10 +963,10 @@ def test_stick_stop_speed_mode_and_path_fit_on_the_screen_beside_each_other(
         assert top >= 0, name
         assert right <= size[0], name
         assert bottom <= size[1], name
-    for one, other in itertools.combinations(boxes, 2):
-        a, b = boxes[one], boxes[other]
+    for first, other in itertools.combinations(boxes, 2):
+        a, b = boxes[first], boxes[other]
         apart = a[2] <= b[0] or b[2] <= a[0] or a[3] <= b[1] or b[3] <= a[1]
-        assert apart, (one, a, other, b)
+        assert apart, (first, a, other, b)
     for name in ("map", "stick"):
         left, top, right, bottom = boxes[name]
         assert min(right - left, bottom - top) >= PIECE_PX, name
@@ -995,13 +995,13 @@ def test_every_control_is_large_enough_for_a_finger(page: Phone) -> None:
 
 
 def test_words_at_the_stick_say_how_to_drive_while_it_is_released(page: Phone) -> None:
-    seen = "getComputedStyle(document.getElementById('hint')).visibility"
+    visibility = "getComputedStyle(document.getElementById('hint')).visibility"
     page.shows("hint", "Hold and push to drive; release to stop.")
-    assert page.browser.js(seen) == "visible"
+    assert page.browser.js(visibility) == "visible"
     page.hold()
-    assert page.browser.js(seen) == "hidden"
+    assert page.browser.js(visibility) == "hidden"
     page.browser.touch("End")
-    until(lambda: page.browser.js(seen) == "visible", 5.0, "the words again")
+    until(lambda: page.browser.js(visibility) == "visible", 5.0, "the words again")
 
 
 @pytest.mark.nightly
@@ -1052,19 +1052,19 @@ OFF_THE_MAP = """[...document.querySelectorAll('.tools button')]
 
 @pytest.mark.nightly
 def test_every_state_is_fit_for_a_screen_reader_and_the_map_keeps_its_buttons() -> None:
-    seen: list[str] = []
+    states: list[str] = []
 
     def look(browser: Browser, state: str) -> None:
         for size, dark in itertools.product((PHONE, SIDEWAYS, DESKTOP), (False, True)):
             browser.size(*size, touch=size != DESKTOP, dark=dark)
             # The two styles differ in their colours alone, so the second one needs that rule alone.
-            found = browser.obstacles("color-contrast" if dark else "")
-            assert found == [], (state, size, dark)
+            obstacles = browser.obstacles("color-contrast" if dark else "")
+            assert obstacles == [], (state, size, dark)
             assert browser.js(OFF_THE_MAP) == [], (state, size, dark)
-        seen.append(state)
+        states.append(state)
 
     pictures.states(look)
-    assert len(seen) == len(set(seen)) > 20
+    assert len(states) == len(set(states)) > 20
 
 
 @pytest.mark.nightly
@@ -1073,7 +1073,7 @@ def test_every_view_is_drawn_on_a_phone_in_both_orientations_and_on_a_desktop(
 ) -> None:
     written = pictures.write(tmp_path / "screens", both=False)
     sizes = [struct.unpack(">II", path.read_bytes()[16:24]) for path in written]
-    assert sizes == [one for one in (PHONE, SIDEWAYS, DESKTOP) for _ in VIEWS]
+    assert sizes == [size for size in (PHONE, SIDEWAYS, DESKTOP) for _ in VIEWS]
     assert len({path.read_bytes() for path in written}) == len(written)
 
 
@@ -1247,10 +1247,10 @@ SLOW = """let answer;
 def test_a_stop_is_repeated_until_it_arrives_and_never_sent_long_after_the_press(
     page: Phone, script: str, then: list[str]
 ) -> None:
-    told = list(page.browser.js(STOPPING.replace("SCRIPT", script)))
-    assert told[:2] == FAILS
-    assert len(told) == 2 + len(then), told
-    assert all(one.startswith(begun) for one, begun in zip(told[2:], then, strict=True))
+    entries = list(page.browser.js(STOPPING.replace("SCRIPT", script)))
+    assert entries[:2] == FAILS
+    assert len(entries) == 2 + len(then), entries
+    assert all(entry.startswith(begun) for entry, begun in zip(entries[2:], then, strict=True))
 
 
 def test_a_page_that_is_hidden_sends_its_zero_once(page: Phone) -> None:
@@ -1265,8 +1265,8 @@ def test_a_page_that_is_hidden_sends_its_zero_once(page: Phone) -> None:
         "document.dispatchEvent(new Event('visibilitychange'))"
     )
     page.bus.at_rest()
-    sent = [json.loads(one) for one in page.browser.js("window.sent")]
-    assert [one["cmd"]["linear_x"] for one in sent if "cmd" in one] == [0]
+    sent = [json.loads(message) for message in page.browser.js("window.sent")]
+    assert [message["cmd"]["linear_x"] for message in sent if "cmd" in message] == [0]
 
 
 def test_a_commander_opens_with_zeros_drives_at_20_hz_and_ends_with_one_zero(page: Phone) -> None:
@@ -1275,12 +1275,12 @@ def test_a_commander_opens_with_zeros_drives_at_20_hz_and_ends_with_one_zero(pag
         for (let now = 50; now < 260; now += 10) look(now, driving);
         out.push([commander.release()?.linear_x, null], [commander.release(), null]);
         look(270, driving);"""
-    told = commanded(page, script)
-    assert told[:4] == [[0, None], [None, None], [0, None], [0, None]]
-    sent = [one[0] for one in told[4:25]]
+    pairs = commanded(page, script)
+    assert pairs[:4] == [[0, None], [None, None], [0, None], [0, None]]
+    sent = [pair[0] for pair in pairs[4:25]]
     assert set(sent) == {0.2, None}
     assert sent.count(0.2) == 4
-    assert told[25:] == [[0, None], [None, None], [None, None]]
+    assert pairs[25:] == [[0, None], [None, None], [None, None]]
 
 
 @pytest.mark.parametrize(
@@ -1303,10 +1303,10 @@ def test_a_commander_opens_with_zeros_drives_at_20_hz_and_ends_with_one_zero(pag
 def test_a_commander_that_is_not_obeyed_sends_a_zero_and_says_why(
     page: Phone, script: str, why: str
 ) -> None:
-    told = commanded(page, script)
-    assert told[-1][0] == 0
-    assert why in json.dumps(told[-1][1])
-    assert all(one[1] is None for one in told[:-1])
+    pairs = commanded(page, script)
+    assert pairs[-1][0] == 0
+    assert why in json.dumps(pairs[-1][1])
+    assert all(pair[1] is None for pair in pairs[:-1])
 
 
 def test_a_robot_that_may_only_turn_is_turned_slowly(page: Phone) -> None:
@@ -1321,8 +1321,8 @@ READ = """import('/page/settings.js').then(({read}) => [
 
 
 def test_a_typed_comma_is_a_decimal_separator_except_between_several_values(page: Phone) -> None:
-    told = page.browser.js(READ)
-    assert told == [0.5, -1.5, "fast", "", "info", [1, 2.5, 3], [1, "", "x"]]
+    values = page.browser.js(READ)
+    assert values == [0.5, -1.5, "fast", "", "info", [1, 2.5, 3], [1, "", "x"]]
 
 
 def test_a_list_setting_is_shown_without_spaces_and_says_why(page: Phone) -> None:
@@ -1332,9 +1332,9 @@ def test_a_list_setting_is_shown_without_spaces_and_says_why(page: Phone) -> Non
     fields = "[...document.querySelectorAll('#settings input')]"
     lists = f"{fields}.filter(one => one.value.includes(',')).map(one => one.value)"
     until(lambda: len(browser.js(lists)) >= 2, 10.0, "the lists")
-    assert not any(" " in one for one in browser.js(lists))
+    assert not any(" " in text for text in browser.js(lists))
     labels = f"{fields}.filter(one => one.value.includes(',')).map(one => one.labels[0].innerText)"
-    assert all("because Space is STOP" in one for one in browser.js(labels))
+    assert all("because Space is STOP" in text for text in browser.js(labels))
     browser.js(f"{fields}.find(one => one.value.includes(',')).focus()")
     browser.key("Down", "Space", " ")
     browser.key("Up", "Space", " ")
@@ -1368,11 +1368,13 @@ def test_controls_that_a_viewer_may_not_use_are_disabled_and_say_why(tmp_path: P
             page.shows("role", "viewer")
             page.shows("mode", "READY")
             off = "one => [one.disabled || one.getAttribute('aria-disabled') === 'true', one.title]"
-            told = browser.js(f"[...document.querySelectorAll('[data-does]')].map({off})")
-            assert len(told) >= 6
-            assert {tuple(one) for one in told} == {(True, "for operators; your role is viewer")}
+            controls = browser.js(f"[...document.querySelectorAll('[data-does]')].map({off})")
+            assert len(controls) >= 6
+            assert {tuple(control) for control in controls} == {
+                (True, "for operators; your role is viewer")
+            }
             described = browser.js(f"[...document.querySelectorAll('[data-does]')].map({WORDS})")
-            assert all("for operators; your role is viewer" in one for one in described)
+            assert all("for operators; your role is viewer" in control for control in described)
             page.shows("barred", "for operators; your role is viewer")
             page.shows("hint", "You may watch and stop, but not drive")
             assert browser.js("document.getElementById('tab-set').checkVisibility()") is False
@@ -1421,10 +1423,10 @@ def test_a_recording_is_drawn_when_asked_for_and_its_report_has_neither_cookie_n
             browser.open(browser.js(f"{opened}.href"))
             drawn = "document.querySelectorAll('.js-plotly-plot').length"
             until(lambda: browser.js(drawn) == 7, 30.0, "pictures")
-            told = browser.js(REPORT.replace("API", f"{server.here}/api/whoami"))
-            assert told["cookie"] == "SecurityError"
-            assert told["fetched"] == "TypeError"
-            assert told["origin"] == "null"
+            result = browser.js(REPORT.replace("API", f"{server.here}/api/whoami"))
+            assert result["cookie"] == "SecurityError"
+            assert result["fetched"] == "TypeError"
+            assert result["origin"] == "null"
 
 
 @alone
@@ -1436,7 +1438,7 @@ def test_curves_that_overlap_are_distinguishable_and_show_their_values(page: Pho
     rows = "[...document.querySelectorAll('#plot-wheels + .legend > span')]"
     legend = f"{rows}.map(one => one.textContent)"
     values = r"^(front right|front left|rear left|rear right) .?\d+\.\d\d$"
-    until(lambda: all(re.match(values, one) for one in browser.js(legend)), 10.0, "values")
+    until(lambda: all(re.match(values, label) for label in browser.js(legend)), 10.0, "values")
     assert len(browser.js(legend)) == 4
     # At rest all four are zero: each has its colour somewhere on the line.
     until(lambda: browser.js(SEEN) == 4, 20.0, "four colours")

@@ -35,8 +35,8 @@ class Filmed:
 def filmed(tmp_path: Path) -> Iterator[Filmed]:
     stream = Stream()
     Authority.make(tmp_path / "tls", "test", 1, [NAME]).issue(tmp_path / "tls", "robot", [NAME], 1)
-    seen = {"web": {"camera": f"http://127.0.0.1:{stream.port}/stream"}}
-    with running(tmp_path, config=seen) as (daemon, _), Page(daemon, tmp_path) as server:
+    config = {"web": {"camera": f"http://127.0.0.1:{stream.port}/stream"}}
+    with running(tmp_path, config=config) as (daemon, _), Page(daemon, tmp_path) as server:
         yield Filmed(stream, server)
     stream.close()
 
@@ -91,8 +91,8 @@ def test_the_page_shows_the_camera_with_its_age_and_marks_a_frozen_picture_withi
 
 async def test_the_camera_needs_a_token_and_ends_with_it(filmed: Filmed) -> None:
     server = filmed.server
-    async with server.client() as stranger, stranger.get(f"{server.away}/api/camera") as told:
-        assert told.status == 401
+    async with server.client() as stranger, stranger.get(f"{server.away}/api/camera") as reply:
+        assert reply.status == 401
     async with server.client(server.invite("viewer", "tv")) as viewer:
         url = f"{server.away}/api/camera"
         first = await got(viewer, url)
@@ -122,7 +122,7 @@ async def test_pictures_that_no_client_reads_cost_little_memory(filmed: Filmed) 
         assert (await got(clients[0], url)).status == 200
         before = resident_kb(pid)
         # The streams of these answers are opened and not read.
-        asking = [asyncio.create_task(one.get(url)) for one in clients]
+        asking = [asyncio.create_task(client.get(url)) for client in clients]
         most, end = 0, time.monotonic() + 3.0
         while time.monotonic() < end:
             most = max(most, resident_kb(pid) - before)
@@ -175,9 +175,9 @@ async def got(viewer: aiohttp.ClientSession, url: str, tag: str = "") -> Any:
 
 def test_a_robot_without_a_camera_says_which_setting_names_one(tmp_path: Path) -> None:
     async def story(url: str) -> None:
-        async with aiohttp.ClientSession() as session, session.get(f"{url}/api/camera") as told:
-            assert told.status == 404
-            assert "web.camera" in (await told.json())["error"]
+        async with aiohttp.ClientSession() as session, session.get(f"{url}/api/camera") as response:
+            assert response.status == 404
+            assert "web.camera" in (await response.json())["error"]
 
     with Daemon(tmp_path) as daemon, Page(daemon, tmp_path) as server:
         asyncio.run(story(server.here))
@@ -187,12 +187,12 @@ def test_a_stream_that_cannot_be_read_is_named_with_the_reason(tmp_path: Path) -
     port = free_endpoint().rpartition(":")[2]
 
     async def story(url: str) -> None:
-        async with aiohttp.ClientSession() as session, session.get(f"{url}/api/camera") as told:
-            assert told.status == 503
-            error = (await told.json())["error"]
+        async with aiohttp.ClientSession() as session, session.get(f"{url}/api/camera") as response:
+            assert response.status == 503
+            error = (await response.json())["error"]
             assert "the camera's stream cannot be read" in error
             assert port in error
 
-    seen = {"web": {"camera": f"http://127.0.0.1:{port}/stream"}}
-    with Daemon(tmp_path, config=seen) as daemon, Page(daemon, tmp_path) as server:
+    config = {"web": {"camera": f"http://127.0.0.1:{port}/stream"}}
+    with Daemon(tmp_path, config=config) as daemon, Page(daemon, tmp_path) as server:
         asyncio.run(story(server.here))

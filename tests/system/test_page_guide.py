@@ -45,8 +45,8 @@ class Person:
         try:
             until(lambda: words in self.browser.text(name), within, f"{name} says {words!r}")
         except AssertionError as error:
-            told = [self.browser.text(f"guide-{one}") for one in ("note", "doing", "story")]
-            raise AssertionError(f"{error}: {told}") from None
+            texts = [self.browser.text(f"guide-{part}") for part in ("note", "doing", "story")]
+            raise AssertionError(f"{error}: {texts}") from None
 
     def begin(self, what: str, **chosen: str) -> None:
         for name, value in chosen.items():
@@ -133,7 +133,9 @@ def test_a_board_is_checked_without_a_daemon_and_the_lines_are_written(
         sound(browser)
         person.click("guide-close")
         assert not person.hidden("check")
-    assert [one for one in browser.said if "exception" in one.lower() or "Refused to" in one] == []
+    assert [
+        line for line in browser.said if "exception" in line.lower() or "Refused to" in line
+    ] == []
     written = tomllib.loads(alone.config.read_text())["mcu"]["wheels"]
     assert written == {"front_right": "+b", "front_left": "+a"}
 
@@ -168,7 +170,7 @@ def drives(person: Person, bus: Bus) -> None:
 
     If a busy machine ends the leg, it is started again.
     """
-    told: list[str] = []
+    texts: list[str] = []
     disturbed = 0
 
     def moves() -> bool:
@@ -184,16 +186,16 @@ def drives(person: Person, bus: Bus) -> None:
             person.asked("1. Place the", 30.0)
             person.press("start")
         elif not person.hidden("guide-close"):
-            told.append(person.browser.text("guide-story"))
+            texts.append(person.browser.text("guide-story"))
             person.click("guide-close")
         return bool((bus.state()["linear"] or 0.0) > 0.25)
 
     try:
         until(moves, 30.0, "the leg moves")
     except AssertionError as error:
-        now = [person.browser.text(one) for one in ("guide-doing", "guide-words", "guide-story")]
+        now = [person.browser.text(part) for part in ("guide-doing", "guide-words", "guide-story")]
         state = {name: bus.state()[name] for name in ("mode", "reason", "linear")}
-        raise AssertionError(f"{error}; it said {told}, now {now}, and {state}") from None
+        raise AssertionError(f"{error}; it said {texts}, now {now}, and {state}") from None
 
 
 WAYS = ("stop",)

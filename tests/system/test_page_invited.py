@@ -38,7 +38,7 @@ class Stranger:
     def tries(self) -> float:
         """The number of requests that the page has refused because they had no valid token."""
         counted = self.server.refused()
-        return sum(counted.get(one, 0) for one in ("no_token", "bad_token", "too_fast"))
+        return sum(counted.get(reason, 0) for reason in ("no_token", "bad_token", "too_fast"))
 
     def knocks_no_more(self, since: float, times: int) -> None:
         """Wait for `times` refusals since `since`, and check that the page then stops trying."""

@@ -95,8 +95,10 @@ class Field:
     def browse(self) -> None:
         """Start a browser that trusts the robot's certificate."""
         self._browsers.close()
-        held = x509.load_pem_x509_certificate((self._where / "tls/certificate.pem").read_bytes())
-        key = held.public_key().public_bytes(Encoding.DER, PublicFormat.SubjectPublicKeyInfo)
+        certificate = x509.load_pem_x509_certificate(
+            (self._where / "tls/certificate.pem").read_bytes()
+        )
+        key = certificate.public_key().public_bytes(Encoding.DER, PublicFormat.SubjectPublicKeyInfo)
         digest = base64.b64encode(hashlib.sha256(key).digest()).decode()
         trusting = (f"--ignore-certificate-errors-spki-list={digest}",)
         self.browser = self._browsers.enter_context(browsing(self.hosts.stranger, trusting))
@@ -120,8 +122,8 @@ class Field:
         try:
             until(self._live, 30.0, "the page is live")
         except AssertionError as error:
-            says = [self.browser.text(one) for one in ("mode", "reason", "age", "told", "alarm")]
-            raise AssertionError(f"{error}; the page says {says}") from None
+            texts = [self.browser.text(name) for name in ("mode", "reason", "age", "told", "alarm")]
+            raise AssertionError(f"{error}; the page says {texts}") from None
 
     def open(self) -> None:
         """Open the page with the invitation."""
@@ -145,7 +147,7 @@ class Field:
     def steady_since(self, at: float) -> bool:
         """Return whether the latest lines since `at` all have the full speed."""
         last = self.peer.since(at)[-LINES:]
-        return len(last) == LINES and all(one.line.startswith(STEADY) for one in last)
+        return len(last) == LINES and all(entry.line.startswith(STEADY) for entry in last)
 
     def settle(self) -> None:
         """Wait until all sent bytes have arrived, or the process that would send them has ended."""
@@ -162,46 +164,46 @@ class Field:
                 return True
         return False
 
-    def braking(self, gone: float) -> tuple[float, float]:
-        """Return the time from `gone` to the first slower line, and the allowed time, both in s.
+    def braking(self, release: float) -> tuple[float, float]:
+        """Return the time from `release` to the first slower line, and the allowed time, both in s.
 
         Waits until the robot is at rest.
         """
 
         def slower() -> Heard | None:
-            since = self.peer.since(gone)
-            return next((one for one in since if not one.line.startswith(STEADY)), None)
+            since = self.peer.since(release)
+            return next((entry for entry in since if not entry.line.startswith(STEADY)), None)
 
         at = until(slower, 5.0, "it slows down").at
-        allowed = self.allowed(gone, at)
+        allowed = self.allowed(release, at)
         self.peer.awaits(ZERO_LINE.strip(), after=at)
-        return at - gone, allowed
+        return at - release, allowed
 
-    def obeyed(self, gone: float) -> int:
+    def obeyed(self, release: float) -> int:
         """Return the number of lines whose speed grew after the allowed time.
 
         Until then the last command is still valid. On a busy machine the allowed time is longer.
         """
-        lines = [one for one in self.peer.since(gone) if one.line != EMPTY]
+        lines = [entry for entry in self.peer.since(release) if entry.line != EMPTY]
         grown = [
             after.at
             for before, after in itertools.pairwise(lines)
             if abs(wheels(after.line)[0]) > abs(wheels(before.line)[0])
         ]
-        return sum(at - gone > self.allowed(gone, at) for at in grown)
+        return sum(at - release > self.allowed(release, at) for at in grown)
 
-    def allowed(self, gone: float, at: float) -> float:
-        """Return the allowed time in s for a release at `gone` whose effect is seen at `at`."""
-        return TIMEOUT_S + 2 * TICK_S + HANDS * lost(gone, at)
+    def allowed(self, release: float, at: float) -> float:
+        """Return the allowed time in s for a release at `release` whose effect is seen at `at`."""
+        return TIMEOUT_S + 2 * TICK_S + HANDS * lost(release, at)
 
     def lets_go(self, way: Way, number: int) -> Round:
         """Drive, release the stick in this way, and wait until no more commands can arrive."""
         self.ready()
         self.hold()
-        with way(self, number) as gone:
-            took, allowed = self.braking(gone)
+        with way(self, number) as release:
+            took, allowed = self.braking(release)
         self.settle()
-        return Round(took, allowed, self.obeyed(gone))
+        return Round(took, allowed, self.obeyed(release))
 
 
 Way = Callable[[Field, int], AbstractContextManager[float]]
@@ -337,10 +339,10 @@ def network_gone(
     """
     length_s = 1.0 + (field.longest_s - 1.0) * ((number * GOLDEN) % 1.0)
     field.hosts.cut()
-    gone = time.monotonic()
+    cut = time.monotonic()
     try:
-        yield gone
-        wait_until(gone + length_s)
+        yield cut
+        wait_until(cut + length_s)
         before_return()
     finally:
         field.hosts.heal()
@@ -381,15 +383,15 @@ def wait_until(at: float) -> None:
 
 def renderers(pid: int) -> list[int]:
     """Return the processes of a browser that draw its pages."""
-    found = []
+    pids = []
     for place in Path("/proc").glob("[0-9]*"):
         try:
             group = int((place / "stat").read_text().rpartition(")")[2].split()[2])
             if group == pid and b"--type=renderer" in (place / "cmdline").read_bytes():
-                found.append(int(place.name))
+                pids.append(int(place.name))
         except (OSError, IndexError):
             continue  # it has ended meanwhile
-    return found
+    return pids
 
 
 @pytest.fixture(scope="module")
@@ -403,14 +405,14 @@ def field(hosts: Hosts, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fi
 
 def tell(what: str, rounds: list[Round]) -> None:
     """Print the delays of these rounds, and fail if a robot slowed down late or sped up again."""
-    ticks = sorted(one.took_s / TICK_S for one in rounds)
+    ticks = sorted(result.took_s / TICK_S for result in rounds)
     print(
         f"\n{what:16} {len(rounds):4} times  slower after {statistics.median(ticks):5.1f} ticks "
         f"(p50), {ticks[-1]:5.1f} (most; {TIMEOUT_S / TICK_S + 2:.0f} are allowed)  "
-        f"{sum(one.obeyed for one in rounds)} lines grew again"
+        f"{sum(result.obeyed for result in rounds)} lines grew again"
     )
-    assert [one for one in rounds if one.took_s > one.allowed_s] == []
-    assert sum(one.obeyed for one in rounds) == 0
+    assert [result for result in rounds if result.took_s > result.allowed_s] == []
+    assert sum(result.obeyed for result in rounds) == 0
 
 
 TIMES = pytest.mark.parametrize(
@@ -489,13 +491,13 @@ def goes_on(field: Field, number: int) -> Round:
     """
     with Program(field) as program:
         # After the network has returned, the program must not send a backward speed any more.
-        with network_gone(field, number, lambda: program.turn(SPEED)) as gone:
+        with network_gone(field, number, lambda: program.turn(SPEED)) as cut:
             program.turn(-SPEED)
-            took, allowed = field.braking(gone)
+            took, allowed = field.braking(cut)
         # There is one connection, so messages sent without a network arrive before later ones. They
         # need at most as long again as the network was cut.
-        wait_until(2 * time.monotonic() - gone + 1.0)
-    lines = [one.line for one in field.peer.since(gone) if one.line != EMPTY]
+        wait_until(2 * time.monotonic() - cut + 1.0)
+    lines = [entry.line for entry in field.peer.since(cut) if entry.line != EMPTY]
     return Round(took, allowed, sum(wheels(line)[0] < 0.0 for line in lines))
 
 

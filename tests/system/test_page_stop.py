@@ -218,8 +218,8 @@ def test_on_a_slow_network_stop_latches_before_the_page_shows_the_robot(impatien
             until(lambda: browser.text("mode") == "STOPPED", 10.0, "the page shows it")
             until(lambda: browser.text("age").startswith("live"), 5.0, "the page is complete")
             assert browser.js("window.before") == "CONNECTING"
-            shown = browser.js("performance.now()")
-            print(f"\nSTOP is red after {browser.js('window.red'):.0f} ms; now {shown:.0f} ms")
+            now_ms = browser.js("performance.now()")
+            print(f"\nSTOP is red after {browser.js('window.red'):.0f} ms; now {now_ms:.0f} ms")
     finally:
         fast = {"latency": 0, "downloadThroughput": -1, "uploadThroughput": -1}
         browser.ask("Network.emulateNetworkConditions", offline=False, **fast)

@@ -99,8 +99,8 @@ def test_the_stick_is_grey_while_a_source_with_higher_priority_drives(
     page: Page, browser: Browser, mode: str, source: str, others: str, words: str
 ) -> None:
     asked = STILL.replace("MODE", repr(mode)).replace("SOURCES", f"[{TELEOP}, {others}]")
-    told = browser.js(asked.replace("SOURCE", repr(source)))
-    assert told.startswith(words) if words else told == ""
+    reason = browser.js(asked.replace("SOURCE", repr(source)))
+    assert reason.startswith(words) if words else reason == ""
 
 
 def test_the_stick_is_grey_on_a_robot_that_has_no_source_for_it(
@@ -487,7 +487,7 @@ def test_a_pressed_emergency_stop_or_bumper_and_a_low_battery_are_shown_with_the
         board.reply = lambda speeds: PLAIN(speeds) + b"!status %b\r\n" % status
 
     low: Tables = {"battery": {"measure": "percent", "warning_below": 30.0}}
-    shown = SHOWN.format("estop")
+    visibility = SHOWN.format("estop")
     with (
         Peer(tmp_path / "mcu") as board,
         Daemon(tmp_path, board.path, config=low) as daemon,
@@ -510,13 +510,13 @@ def test_a_pressed_emergency_stop_or_bumper_and_a_low_battery_are_shown_with_the
         says(b"estop=pressed")
         shows(browser, "mode", "STOPPED")
         shows(browser, "reason", "emergency stop pressed at the robot")
-        assert browser.js(shown)
+        assert browser.js(visibility)
         assert browser.text("estop") == "⬢ E-STOP"
         shows(browser, "hint", "Emergency stop: release it at the robot first.")
         browser.release()
         shows(browser, "complaint", "release it at the robot, then")
         says(b"estop=ok")
-        until(lambda: not browser.js(shown), 5.0, "the button is released")
+        until(lambda: not browser.js(visibility), 5.0, "the button is released")
         shows(browser, "hint", "Stopped. Press Release STOP first.")
         browser.release()
         shows(browser, "mode", "READY")

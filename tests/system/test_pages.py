@@ -60,8 +60,8 @@ INSTALL_S = 300.0
 def find(page: str, *words: str) -> str:
     """Return the only command of a page that contains these words."""
     commands = [c for block in blocks() if block.page == page for c in block.commands()]
-    (found,) = {c for c in commands if all(word in c for word in words)}
-    return found
+    (match,) = {c for c in commands if all(word in c for word in words)}
+    return match
 
 
 def shell(place: Path, command: str, within: float = 60.0) -> Finished:
@@ -194,9 +194,9 @@ def test_the_laptop_of_the_fleet_page_does_what_its_role_may(fleet: Fleet) -> No
         (find(page, "call clear", "operator"), 0, "cleared"),
         (find(page, "call stop", "viewer"), 0, "stopped and latched"),
     ]
-    for command, code, says in story:
+    for command, code, text in story:
         done = shell(place, command.replace("tls/router.local:7447", fleet.endpoint))
-        assert (done.code, says in done.out) == (code, True), f"{command}\n{done}"
+        assert (done.code, text in done.out) == (code, True), f"{command}\n{done}"
 
 
 @pytest.mark.network

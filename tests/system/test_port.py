@@ -86,8 +86,8 @@ async def test_a_line_made_before_the_process_was_suspended_is_not_sent_after_it
 
 async def test_the_port_is_reopened_after_a_suspend(line: Line) -> None:
     """The clock simulates the suspend, because this machine cannot be suspended."""
-    slept, told = [0], list[Event]()
-    async with line.port(told.append, asleep=SuspendDetector(lambda: slept[0])) as port:
+    slept, events = [0], list[Event]()
+    async with line.port(events.append, asleep=SuspendDetector(lambda: slept[0])) as port:
         port.take()
         assert port.opened == 1
         slept[0] = 8 * 3600 * 10**9
@@ -100,15 +100,15 @@ async def test_the_port_is_reopened_after_a_suspend(line: Line) -> None:
         port.take()
         keeping.cancel()
         assert port.opened == 2
-    assert "suspended" in next(one.text for one in told if one.name == "port_lost")
+    assert "suspended" in next(event.text for event in events if event.name == "port_lost")
     assert GO not in os.read(line.board, 4096)
 
 
 async def test_a_port_is_opened_by_the_next_try_if_no_thread_could_start(line: Line) -> None:
-    told = list[Event]()
+    port_events = list[Event]()
     usual = threading.stack_size(1 << 46)  # for which no machine has room
     try:
-        port = await line.port(told.append).__aenter__()
+        port = await line.port(port_events.append).__aenter__()
     finally:
         threading.stack_size(usual)
     assert not port.is_open
@@ -118,7 +118,7 @@ async def test_a_port_is_opened_by_the_next_try_if_no_thread_could_start(line: L
             await asyncio.sleep(0.001)
     keeping.cancel()
     await port.__aexit__(None, None, None)
-    assert "cannot start another thread" in told[0].text
+    assert "cannot start another thread" in port_events[0].text
 
 
 async def test_a_late_step_reads_waiting_bytes_before_it_judges_a_silence(
@@ -133,7 +133,7 @@ async def test_a_late_step_reads_waiting_bytes_before_it_judges_a_silence(
         late = port.take(now)  # no reader has run: the event loop has not reached it
         while not late and clock.mono_ns() < end_ns:
             late = port.take(now)
-        assert [one.data for one in late] == [GO]
+        assert [chunk.data for chunk in late] == [GO]
         await asyncio.sleep(0.01)
         assert port.take() == ()
 
@@ -146,10 +146,10 @@ async def test_a_reader_called_after_a_late_step_reports_no_hang_up(
     The reader must not take this for a hang-up.
     """
     async with line.port() as port:
-        loop, taken = asyncio.get_running_loop(), list[bytes]()
+        loop, chunks = asyncio.get_running_loop(), list[bytes]()
 
         def late_step() -> None:
-            taken.extend(one.data for one in port.take(clock.now()))
+            chunks.extend(piece.data for piece in port.take(clock.now()))
 
         for _ in range(10):
             os.write(line.board, GO)
@@ -158,17 +158,17 @@ async def test_a_reader_called_after_a_late_step_reports_no_hang_up(
             # something to read.
             loop.call_soon(late_step)
             await asyncio.sleep(0.001)
-        assert (b"".join(taken).count(GO), port.is_open, port.trouble) == (10, True, "")
+        assert (b"".join(chunks).count(GO), port.is_open, port.trouble) == (10, True, "")
 
 
 async def test_a_line_sent_right_after_the_device_hung_up_is_lost_without_an_error() -> None:
     """The reader and the step can notice the hang-up in the same round of the event loop."""
-    loop, errors, told = asyncio.get_running_loop(), list[str](), list[str]()
+    loop, errors, names = asyncio.get_running_loop(), list[str](), list[str]()
     loop.set_exception_handler(lambda _, context: errors.append(str(context)))
     board, device = os.openpty()
     tty.setraw(board)
     unplugged = Line(board, device, os.ttyname(device))
-    async with unplugged.port(lambda event: told.append(event.name)) as port:
+    async with unplugged.port(lambda event: names.append(event.name)) as port:
         assert port.offer(STOP, clock.now()) == "sent"
         await asyncio.sleep(0.01)  # the wire is free again
         offered = list[str]()
@@ -178,7 +178,7 @@ async def test_a_line_sent_right_after_the_device_hung_up_is_lost_without_an_err
         time.sleep(0.005)  # both are due when the event loop looks next
         await asyncio.sleep(0.01)
         assert offered == ["down"]
-        assert told == ["port_open", "port_lost"]
+        assert names == ["port_open", "port_lost"]
     assert errors == []
 
 
@@ -190,7 +190,7 @@ async def test_a_device_that_vanishes_while_it_is_opened_is_opened_later(
 
     The port tries again after each failure until an attempt succeeds.
     """
-    real, attempts, said = getattr(termios, name), itertools.count(1), list[str]()
+    real, attempts, event_names = getattr(termios, name), itertools.count(1), list[str]()
     left = 1
 
     def vanishing(*arguments: object) -> object:
@@ -203,13 +203,13 @@ async def test_a_device_that_vanishes_while_it_is_opened_is_opened_later(
 
     with monkeypatch.context() as patch:
         patch.setattr(termios, name, vanishing)
-        async with line.port(lambda event: said.append(event.name)) as port:
+        async with line.port(lambda event: event_names.append(event.name)) as port:
             keeper = asyncio.create_task(port.keep_open())
             deadline_ns = clock.mono_ns() + 10 * 10**9
             while not port.is_open and not keeper.done() and clock.mono_ns() < deadline_ns:
                 await asyncio.sleep(0.01)
             assert port.is_open
-            assert (said[0], said[-1]) == ("port_waiting", "port_open")
+            assert (event_names[0], event_names[-1]) == ("port_waiting", "port_open")
             keeper.cancel()
             await asyncio.wait([keeper])
 

@@ -70,8 +70,8 @@ def test_a_driver_that_hangs_is_tried_once_and_another_device_is_opened(tmp_path
             bus.follow("state") as states,
         ):
             until(lambda: daemon.events("port_waiting"), 10.0, "the driver does not answer")
-            seen = len(states.seen)
-            until(lambda: len(states.seen) >= seen + TRIES, 10.0, "some more states")
+            count = len(states.seen)
+            until(lambda: len(states.seen) >= count + TRIES, 10.0, "some more states")
             assert book.read_text() == "."
             with Peer(other):
                 port.unlink()

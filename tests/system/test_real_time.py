@@ -29,7 +29,7 @@ def locked_kb(pid: int) -> int:
 
 def held(pid: int) -> set[str]:
     """Return the files that the process has open."""
-    return {os.readlink(one) for one in Path(f"/proc/{pid}/fd").iterdir()}
+    return {os.readlink(link) for link in Path(f"/proc/{pid}/fd").iterdir()}
 
 
 @pytest.mark.slow

@@ -43,10 +43,10 @@ def replayed(where: Path, path: Path) -> int:
     """Return the number of lines in a recording, and check that a replay reproduces all of them."""
     ended = finish(acsard("recording", "replay", str(path)), where)
     assert ended.code == 0, ended
-    found = re.match(r"([\d ]+) of ([\d ]+) lines are the same", ended.out)
-    assert found, ended
-    assert found[1] == found[2]
-    return int(found[1].replace(" ", ""))
+    match = re.match(r"([\d ]+) of ([\d ]+) lines are the same", ended.out)
+    assert match, ended
+    assert match[1] == match[2]
+    return int(match[1].replace(" ", ""))
 
 
 def last_s(where: Path, path: Path) -> float:
@@ -115,9 +115,9 @@ def test_a_fault_of_the_daemon_is_reported_and_the_input_of_that_step_is_recorde
     (path,) = files(tmp_path)
     assert path.name.endswith(".kept.mcap")
     for words in ((), ("show",)):
-        said = finish(acsard("recording", *words, "--directory", str(path.parent)), tmp_path).out
-        assert "an internal error ended the daemon: in step " in said
-        assert "ZeroDivisionError: a fault of our own" in said
+        output = finish(acsard("recording", *words, "--directory", str(path.parent)), tmp_path).out
+        assert "an internal error ended the daemon: in step " in output
+        assert "ZeroDivisionError: a fault of our own" in output
     assert replayed(tmp_path, path) > 3
     again = finish(acsard("recording", "replay", str(path)), tmp_path)
     assert "in which the recorded daemon failed, does not fail in this version" in again.out

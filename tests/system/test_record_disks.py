@@ -103,9 +103,9 @@ def misses_what_the_other_misses(name: str, bus: Bus, beside: Bus) -> None:
     """
     began, buses = time.monotonic(), (bus, beside)
     with bus.commanding(0.3), beside.commanding(0.3):
-        first = [one.state() for one in buses]
+        first = [client.state() for client in buses]
         time.sleep(SPAN_S)
-        last = [one.state() for one in buses]
+        last = [client.state() for client in buses]
     late = bystander.lost(began)
     bad, quiet = (Periods.between(a, b).missed for a, b in zip(first, last, strict=True))
     print(f"\n{name}: {bad} periods missed, {quiet} beside it, in {SPAN_S:g} s")
@@ -115,7 +115,7 @@ def misses_what_the_other_misses(name: str, bus: Bus, beside: Bus) -> None:
 def says(bus: Bus, text: str) -> None:
     """Wait until `recording_error` in the `state` contains the text, or is empty for ""."""
     until(
-        lambda: (told := bus.state()["recording_error"]) == text or (text and text in told),
+        lambda: (error := bus.state()["recording_error"]) == text or (text and text in error),
         30.0,
         text,
     )
@@ -123,9 +123,9 @@ def says(bus: Bus, text: str) -> None:
 
 def lived_again(where: Path, record: Path) -> None:
     """Check that all files next to the recording replay, and together have more than 50 lines."""
-    found = files(record.parent)
-    assert found
-    assert sum(replayed(where, path) for path in found) > 50
+    paths = files(record.parent)
+    assert paths
+    assert sum(replayed(where, path) for path in paths) > 50
 
 
 @pytest.mark.nightly
@@ -178,7 +178,7 @@ def test_a_ring_larger_than_its_disk_loses_the_oldest_and_records_on(tmp_path: P
     with disk(tmp_path, f"size={12 * len(recorded)}") as path:
         record = path / "record"
         record.mkdir()
-        kept, *_ = names = ["000001-20260101T000000Z.kept.mcap"] + [
+        kept_name, *_ = names = ["000001-20260101T000000Z.kept.mcap"] + [
             f"{number:06}-20260101T000000Z.mcap" for number in range(2, 30)
         ]
         fill(record, recorded, iter(names))
@@ -191,8 +191,8 @@ def test_a_ring_larger_than_its_disk_loses_the_oldest_and_records_on(tmp_path: P
         with records(tmp_path, record) as daemon:
             daemon.process.terminate()
             assert daemon.ended(5.0) == 0
-        left = sorted(one.name for one in record.glob("*.mcap*"))
-        assert left[0] == kept
+        left = sorted(entry.name for entry in record.glob("*.mcap*"))
+        assert left[0] == kept_name
         assert names[1] not in left, "the oldest went"
         whole, new = record / left[-2], record / left[-1]
         assert whole.name[:6] == cut.name[:6] < new.name[:6]
@@ -232,14 +232,14 @@ def test_a_lack_of_inodes_deletes_at_most_one_recording_if_that_does_not_help(
         about = About("acsar", "0.1.0", "3.11.0", 1, 2)
         run = Run()
         ring = RecordingDirectory(settings, run=run)
-        kept = [ring.end(ring.begin(about), "kept") for _ in range(4)]
+        recordings = [ring.end(ring.begin(about), "kept") for _ in range(4)]
         fill(path, b"", (f"{number}" for number in range(100)))
         for more in ("more", "most"):  # other writers use the space that is freed
             with pytest.raises(OSError, match="No space left on device"):
                 ring.begin(about)
             ring.close()
             ring = RecordingDirectory(settings, run=run, refused=True)
-            assert [one.exists() for one in kept] == [False, True, True, True]
+            assert [recording.exists() for recording in recordings] == [False, True, True, True]
             with suppress(OSError):
                 (path / more).touch()
         (path / "more").unlink()

@@ -82,8 +82,8 @@ class Robot(NamedTuple):
 
     def moved(self, since: float) -> bool:
         """Return whether a line after the time `since` turns a wheel."""
-        lines = (heard for session in self.peer.sessions for heard in list(session.lines))
-        return any(heard.at > since and heard.line.strip(b"\r\n") not in STILL for heard in lines)
+        lines = (entry for session in self.peer.sessions for entry in list(session.lines))
+        return any(entry.at > since and entry.line.strip(b"\r\n") not in STILL for entry in lines)
 
 
 STILL = (ZERO_LINE.strip(b"\r\n"), b"")

@@ -97,10 +97,10 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fleet]:
     with (
         two_robots(where, "one", "two") as (meeting, daemons),
         Sdk(meeting, where) as sdk,
-        over_router(meeting, "one") as one,
-        over_router(meeting, "two") as two,
+        over_router(meeting, "one") as first,
+        over_router(meeting, "two") as second,
     ):
-        yield Fleet(daemons, one, two, sdk)
+        yield Fleet(daemons, first, second, sdk)
 
 
 class Ground(NamedTuple):
@@ -137,11 +137,11 @@ def ground(
 
 def test_an_independent_client_decodes_the_odometry(ground: Ground) -> None:
     ground.sdk.do("follow", ground.prefix + "/odom", ODOMETRY)
-    got = ground.sdk.do("newest", ground.prefix + "/odom")
-    assert (got["header"]["frame_id"], got["child_frame_id"]) == ("odom", "base_link")
-    assert got["pose"]["pose"]["orientation"]["w"] == pytest.approx(1.0, abs=1e-3)
-    assert len(got["pose"]["covariance"]) == 36
-    stamp = got["header"]["stamp"]
+    odometry = ground.sdk.do("newest", ground.prefix + "/odom")
+    assert (odometry["header"]["frame_id"], odometry["child_frame_id"]) == ("odom", "base_link")
+    assert odometry["pose"]["pose"]["orientation"]["w"] == pytest.approx(1.0, abs=1e-3)
+    assert len(odometry["pose"]["covariance"]) == 36
+    stamp = odometry["header"]["stamp"]
     assert stamp["sec"] + stamp["nanosec"] / 1e9 == pytest.approx(time.time(), abs=5.0)
 
 
@@ -165,8 +165,8 @@ def _standing(state: Any) -> Any:
 def test_an_independent_client_that_comes_late_gets_the_static_transforms(ground: Ground) -> None:
     topic = ground.prefix + "/tf_static"
     ground.sdk.do("late", topic, TF)
-    got = until(lambda: ground.sdk.do("held", topic), 1.5, "tf_static")
-    frames = [(t["header"]["frame_id"], t["child_frame_id"]) for t in got["transforms"]]
+    message = until(lambda: ground.sdk.do("held", topic), 1.5, "tf_static")
+    frames = [(t["header"]["frame_id"], t["child_frame_id"]) for t in message["transforms"]]
     assert frames == [("base_link", "lidar_link")]
 
 
@@ -194,25 +194,27 @@ def test_an_independent_client_lists_topics_services_and_the_node(ground: Ground
     services = {f"{prefix}/{name}": [kind] for name, kind in SERVICES.items()}
     for what, expected in (("topics", topics), ("services", services)):
         until(partial(_lists, ground.sdk, what, expected), 5.0, f"all {what}")
-    who = [[prefix or "/", "acsard", "::,10:,:,:,,"]]
-    until(lambda: ground.sdk.do("nodes", ground.prefix + "/odom") == who, 5.0, "who publishes odom")
+    nodes = [[prefix or "/", "acsard", "::,10:,:,:,,"]]
+    until(
+        lambda: ground.sdk.do("nodes", ground.prefix + "/odom") == nodes, 5.0, "who publishes odom"
+    )
 
 
 def _lists(sdk: Sdk, what: str, expected: dict[str, list[str]]) -> bool:
-    found = dict(sdk.do(what))
-    return all(found.get(name) == types for name, types in expected.items())
+    listing = dict(sdk.do(what))
+    return all(listing.get(name) == types for name, types in expected.items())
 
 
 def test_an_independent_client_lists_and_gets_parameters(ground: Ground) -> None:
-    got = ground.sdk.do(
+    reply = ground.sdk.do(
         "call", ground.prefix + "/acsard/list_parameters", LIST, prefixes=[], depth=0
     )
-    names = got["result"]["names"]
+    names = reply["result"]["names"]
     assert {"drive.wheel_radius", "robot.id", "ros.domain"} <= set(names)
     wanted = ["drive.wheel_radius", "robot.id", "ros.domain", "ros.rmw", "no.such"]
-    got = ground.sdk.do("call", ground.prefix + "/acsard/get_parameters", GET, names=wanted)
+    reply = ground.sdk.do("call", ground.prefix + "/acsard/get_parameters", GET, names=wanted)
     prefix_id = ground.prefix.removeprefix("/") or "acsar"
-    radius, robot, domain, rmw, nothing = got["values"]
+    radius, robot, domain, rmw, nothing = reply["values"]
     assert (radius["type"], radius["double_value"]) == (3, 0.05)
     assert (robot["type"], robot["string_value"]) == (4, prefix_id)
     assert (domain["type"], domain["integer_value"]) == (2, 0)
@@ -277,8 +279,10 @@ def test_samples_carry_the_gid_of_their_publisher_s_token_and_count_without_gaps
                 samples.has(1 if name == "tf_static" else 2)
     for name, samples in following.items():
         attached = [Attached.read(sample.attachment) for sample in samples.seen]
-        assert {one.gid for one in attached} == {gid_of(by_topic[f"%{name}"])}
-        assert [one.sequence for one in attached] == list(range(1, len(attached) + 1)), name
+        assert {attachment.gid for attachment in attached} == {gid_of(by_topic[f"%{name}"])}
+        assert [attachment.sequence for attachment in attached] == list(
+            range(1, len(attached) + 1)
+        ), name
         assert abs(attached[-1].stamp_ns / 1e9 - time.time()) < 5.0
 
 
@@ -355,11 +359,11 @@ ATTACHED = {
 def test_a_command_with_a_wrong_attachment_is_counted_and_reported_and_moves_nothing(
     bus: Bus, ros: RmwClient, name: str
 ) -> None:
-    attachment, reason, said = ATTACHED[name]
+    attachment, reason, text = ATTACHED[name]
     ros.zeros(bus)
     key = ros.key("cmd_vel", TWIST)
     refused_without_motion(
-        bus, lambda: ros.session.put(key, GO, attachment=attachment or None), reason, said
+        bus, lambda: ros.session.put(key, GO, attachment=attachment or None), reason, text
     )
 
 
@@ -516,13 +520,13 @@ def test_a_topic_of_a_source_that_is_not_listed_is_refused(tmp_path: Path) -> No
         ros = RmwClient(bus.session)
         bus.linked()
         ros.heard(bus, "cmd_vel_teleop", TWIST, twist(0.0))
-        for topic, kind, said in (
+        for topic, kind, text in (
             ("cmd_vel", TWIST, "commands.sources"),
             ("joint_commands", JOINTS, "ros2_control"),
         ):
             payload = PAYLOADS[kind](0.5)
             send = partial(ros.put, topic, kind, payload)
-            refused_without_motion(bus, send, "unknown_source", said)
+            refused_without_motion(bus, send, "unknown_source", text)
 
 
 def test_no_ros_client_raised_an_exception_in_the_daemon(bus: Bus, shared: Daemon) -> None:
@@ -549,17 +553,17 @@ def test_a_command_to_one_robot_does_not_reach_the_other(fleet: Fleet, tree: str
 
 @pytest.mark.parametrize("tree", ["native", "bridge", "rmw"])
 def test_a_stop_of_one_robot_does_not_reach_the_other(fleet: Fleet, tree: str) -> None:
-    one, two = fleet.one, fleet.two
+    first, second = fleet.one, fleet.two
     if tree == "native":
-        assert one.get("srv/stop")["success"]
+        assert first.get("srv/stop")["success"]
     else:
-        assert TREES[tree](one.session, "one").call("acsard/stop").trigger()[0]
-    assert (one.state()["mode"], two.state()["mode"] != "stopped") == ("stopped", True)
-    assert one.get("srv/clear")["success"]
+        assert TREES[tree](first.session, "one").call("acsard/stop").trigger()[0]
+    assert (first.state()["mode"], second.state()["mode"] != "stopped") == ("stopped", True)
+    assert first.get("srv/clear")["success"]
 
 
 def test_no_key_is_published_by_two_robots(fleet: Fleet) -> None:
-    samples, heard = Samples(), dict[str, set[str]]()
+    samples, senders = Samples(), dict[str, set[str]]()
     session = fleet.one.session
     keys = {
         key
@@ -571,18 +575,18 @@ def test_no_key_is_published_by_two_robots(fleet: Fleet) -> None:
     subscribers = [session.declare_subscriber(key, samples.add) for key in keys]
 
     def all_topics() -> bool:
-        heard.clear()
+        senders.clear()
         for sample in samples.seen:
-            heard.setdefault(sample.key, set()).add(sample.origin)
+            senders.setdefault(sample.key, set()).add(sample.origin)
         # The static transforms come only now and then.
-        return len(heard) >= len(keys) - 4
+        return len(senders) >= len(keys) - 4
 
     until(all_topics, 5.0, "all topics of both")
     for subscriber in subscribers:
         subscriber.undeclare()
-    assert {len(origins) for origins in heard.values()} == {1}
+    assert {len(origins) for origins in senders.values()} == {1}
     by_robot = dict[str, set[str]]()
-    for key, origins in heard.items():
+    for key, origins in senders.items():
         by_robot.setdefault("one" if "one" in key.split("/") else "two", set()).update(origins)
     assert {len(origins) for origins in by_robot.values()} == {1}
     assert by_robot["one"] != by_robot["two"]

@@ -131,8 +131,8 @@ def test_a_late_subscriber_gets_the_static_transforms_immediately(ros: Client) -
     for _ in range(2):
         begun = time.monotonic()
         with ros.follow_late("tf_static", TF) as samples:
-            got = samples.first("tf_static", within=2.0)
-        assert [t.child_frame_id for t in decode(TF, got.payload).transforms] == ["lidar_link"]
+            sample = samples.first("tf_static", within=2.0)
+        assert [t.child_frame_id for t in decode(TF, sample.payload).transforms] == ["lidar_link"]
         assert time.monotonic() - begun < 1.0
 
 
@@ -155,8 +155,8 @@ def test_the_urdf_is_latched_and_sent_once(described: Daemon, transport: str) ->
         assert bus.get("robot_description") == {"data": URDF_TEXT}
         ros = EMULATED[transport](bus.session)
         with ros.follow_late("robot_description", STRING) as samples:
-            got = samples.first("the description", within=2.0)
-            assert decode(STRING, got.payload).data == URDF_TEXT
+            sample = samples.first("the description", within=2.0)
+            assert decode(STRING, sample.payload).data == URDF_TEXT
             with ros.follow_late("tf_static", TF) as repeated:
                 until(lambda: len(repeated.seen) >= 2, 7.0, "the transforms are repeated")
             assert len(samples.seen) == 1
@@ -265,9 +265,9 @@ WRONG = {
 def test_a_wrong_command_is_counted_and_reported_and_moves_nothing(
     bus: Bus, ros: Client, name: str
 ) -> None:
-    topic, kind, payload, reason, said = WRONG[name]
+    topic, kind, payload, reason, text = WRONG[name]
     ros.zeros(bus)
-    refused_without_motion(bus, lambda: ros.put(topic, kind, payload), reason, said)
+    refused_without_motion(bus, lambda: ros.put(topic, kind, payload), reason, text)
 
 
 class Bad(NamedTuple):
@@ -374,9 +374,9 @@ def test_the_parameters_are_listed_described_and_read(bus: Bus, ros: Client) -> 
     described = asked(ros, "describe_parameters", names=names).descriptors
     types = asked(ros, "get_parameter_types", names=names).types
     values = asked(ros, "get_parameters", names=names).values
-    assert [one.name for one in described] == names
-    assert [one.type for one in described] == list(types) == [one.type for one in values]
-    (limit,) = (one for one in described if one.name == "limits.linear_speed")
+    assert [entry.name for entry in described] == names
+    assert [entry.type for entry in described] == list(types) == [entry.type for entry in values]
+    (limit,) = (entry for entry in described if entry.name == "limits.linear_speed")
     assert (limit.floating_point_range[0].from_value, limit.read_only) == (0.0, False)
     value = values[names.index("limits.linear_speed")].double_value
     assert value == bus.get("config")["limits"]["linear_speed"]

@@ -49,9 +49,9 @@ def ros(bus: Bus) -> BridgeHalf:
 
 def test_the_odometry_comes_as_plain_cdr(ros: BridgeHalf) -> None:
     with ros.follow("odom", ODOMETRY) as samples:
-        got = samples.first("odometry")
-    message = decode(ODOMETRY, got.payload)
-    assert (len(got.payload), got.attachment) == (724, b"")
+        sample = samples.first("odometry")
+    message = decode(ODOMETRY, sample.payload)
+    assert (len(sample.payload), sample.attachment) == (724, b"")
     assert (message.header.frame_id, message.child_frame_id) == ("odom", "base_link")
     stamp = message.header.stamp
     assert stamp.sec + stamp.nanosec / 1e9 == pytest.approx(time.time(), abs=5.0)
@@ -88,17 +88,17 @@ BAD = {
 def test_a_payload_of_no_known_type_is_counted_and_reported_and_moves_nothing(
     bus: Bus, ros: BridgeHalf, name: str
 ) -> None:
-    topic, payload, reason, said = BAD[name]
+    topic, payload, reason, text = BAD[name]
     ros.zeros(bus)
-    refused_without_motion(bus, lambda: ros.session.put(topic, payload), reason, said)
+    refused_without_motion(bus, lambda: ros.session.put(topic, payload), reason, text)
 
 
 def test_the_bridge_keys_ignore_an_attachment(bus: Bus, ros: BridgeHalf) -> None:
     before = bus.state()
     for attachment in (b"rqh" + bytes(17), bytes(33), b"\xff" * 60_000):
-        heard = bus.count("commands")
+        count = bus.count("commands")
         bus.session.put("cmd_vel", twist(0.0), attachment=attachment)
-        _more(bus, heard)
+        _more(bus, count)
     assert changes(before, bus.state()) == {"commands": 3}
 
 
@@ -126,19 +126,19 @@ def announced(zid: str, namespace: str, twists: bool) -> set[str]:
     """Return the liveliness keys with which a bridge announces everything that it can announce."""
     head = f"@/{zid}/@ros2_lv"
     prefix = f"{namespace}§" if namespace else ""
-    found = {head}
+    keys = {head}
     for name, (kind, depth, late) in PUBLISHED.items():
         qos = f":1:{int(late)}:0,{depth}:typehash=RIHS01_{HASHES[kind]};"
-        found.add(f"{head}/MP/{prefix}{name}/{kind.replace('/', '§')}/{qos}")
-    taken = {"joint_commands": JOINTS, "speed_limit": SPEED_LIMIT}
+        keys.add(f"{head}/MP/{prefix}{name}/{kind.replace('/', '§')}/{qos}")
+    topics = {"joint_commands": JOINTS, "speed_limit": SPEED_LIMIT}
     if twists:
-        taken |= dict.fromkeys(TWISTS, TWIST)
-    for name, kind in taken.items():
+        topics |= dict.fromkeys(TWISTS, TWIST)
+    for name, kind in topics.items():
         qos = f":1:0:0,10:typehash=RIHS01_{HASHES[kind]};"
-        found.add(f"{head}/MS/{prefix}{name}/{kind.replace('/', '§')}/{qos}")
+        keys.add(f"{head}/MS/{prefix}{name}/{kind.replace('/', '§')}/{qos}")
     for name, kind in SERVICES.items():
-        found.add(f"{head}/SS/{prefix}{name.replace('/', '§')}/{kind.replace('/', '§')}")
-    return found
+        keys.add(f"{head}/SS/{prefix}{name.replace('/', '§')}/{kind.replace('/', '§')}")
+    return keys
 
 
 @pytest.mark.parametrize(

@@ -122,9 +122,9 @@ def test_announced_topics_have_routes_and_no_topic_is_sent_without_subscribers(
         quiet = relay.came
         sent = bus.count("lines_sent")
         until(lambda: bus.count("lines_sent") >= sent + 50, 5.0, "50 periods")
-        came = relay.came - quiet
-        print(f"announced and unheard: {came} bytes in 50 periods")
-        assert came < 2000
+        byte_count = relay.came - quiet
+        print(f"announced and unheard: {byte_count} bytes in 50 periods")
+        assert byte_count < 2000
         assert not [line for line in bridge.log if "WARN" in line or "ERROR" in line]
 
 
@@ -175,7 +175,7 @@ def speeds(bus: Bus) -> list[float]:
         sent = bus.count("lines_sent")
         until(lambda: bus.count("lines_sent") >= sent + 200, 10.0, "200 periods")
         last = states.seen[-1].at
-        return [seen.value["linear"] for seen in states.seen if seen.at > last - 1.0]
+        return [sample.value["linear"] for sample in states.seen if sample.at > last - 1.0]
 
 
 def test_two_publishers_are_one_sender_and_the_robot_follows_the_newest_message(
@@ -190,16 +190,21 @@ def test_two_publishers_are_one_sender_and_the_robot_follows_the_newest_message(
         with sending(other, 0.1, nav, 0.4):
             fast = speeds(driven)
         with sending(other, 0.0, nav, 0.4):
-            not_held = speeds(driven)
+            zeros_first = speeds(driven)
         with sending(nav, 0.4, other, 0.0):
-            held = speeds(driven)
+            zeros_last = speeds(driven)
         refused = [key for key in driven.state()["counters"] if key.startswith("command_")]
-    for name, got in {"slow": slow, "fast": fast, "not held": not_held, "held": held}.items():
-        print(f"{name}: {min(got):.3f} to {max(got):.3f} m/s")
+    for name, values in {
+        "slow": slow,
+        "fast": fast,
+        "not held": zeros_first,
+        "held": zeros_last,
+    }.items():
+        print(f"{name}: {min(values):.3f} to {max(values):.3f} m/s")
     assert 0.05 < min(slow) <= max(slow) < 0.2
     # The zeros of one publisher do not hold the robot if the other one's messages come last.
-    assert min(*fast, *not_held) > 0.3
-    assert max(held) < 0.05
+    assert min(*fast, *zeros_first) > 0.3
+    assert max(zeros_last) < 0.05
     assert refused == []
 
 
@@ -304,12 +309,12 @@ def fleet(
     meeting, daemons = robots
     with ExitStack() as stack:
         nodes = WAYS[request.param](stack, dds, tmp_path_factory.mktemp("fleet"), meeting)
-        found = []
+        pair = []
         for name, daemon in daemons.items():
             bus = stack.enter_context(over_router(meeting, name))
-            found.append(Robot(daemon, bus, nodes[name]))
-        one, two = found
-        yield one, two
+            pair.append(Robot(daemon, bus, nodes[name]))
+        first, second = pair
+        yield first, second
 
 
 def test_a_command_to_one_robot_drives_only_that_one(fleet: tuple[Robot, Robot]) -> None:
@@ -327,10 +332,10 @@ def test_a_command_to_one_robot_drives_only_that_one(fleet: tuple[Robot, Robot])
 
 
 def test_a_stop_of_one_robot_stops_only_that_one(fleet: tuple[Robot, Robot]) -> None:
-    one, two = fleet
-    assert one.node.call("acsard/stop").trigger()[0]
-    assert (one.bus.state()["mode"], two.bus.state()["mode"]) == ("stopped", "ready")
-    released(one.node)
+    first, second = fleet
+    assert first.node.call("acsard/stop").trigger()[0]
+    assert (first.bus.state()["mode"], second.bus.state()["mode"]) == ("stopped", "ready")
+    released(first.node)
 
 
 def test_each_robot_has_all_its_topics_and_its_own_static_transforms(
@@ -364,9 +369,9 @@ def test_the_command_line_of_the_pages_drives_the_robot(
         domain.bridge(daemon.endpoint),
     ):
         bus.linked()
-        given = {"WAY": "dds", "DOMAIN": str(domain.number)}
+        variables = {"WAY": "dds", "DOMAIN": str(domain.number)}
         paths = {"PYTHONPATH": f"{tmp_path}:{domain.environment['PYTHONPATH']}"}
-        with Program(line, ROOT, domain.environment | given | paths) as drive:
+        with Program(line, ROOT, domain.environment | variables | paths) as drive:
             if number is not None:
                 until(lambda: (bus.state()["linear"] or 0.0) > 0.1, 20.0, "it drives")
                 drive.signal(number)

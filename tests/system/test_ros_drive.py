@@ -25,10 +25,15 @@ def test_the_command_line_of_the_pages_drives_the_robot(tmp_path: Path, way: str
     rclpy_stand_in.write(tmp_path)
     with Daemon(tmp_path) as daemon, Bus(daemon.endpoint) as bus:
         until(lambda: bus.state()["link"] == "up", 5.0, "the link")
-        given = {"WAY": way, "ENDPOINT": daemon.endpoint, "PYTHONPATH": f"{tmp_path}:{ROOT}"}
+        variables = {"WAY": way, "ENDPOINT": daemon.endpoint, "PYTHONPATH": f"{tmp_path}:{ROOT}"}
         words = [sys.executable, *shlex.split(LINE)[1:]]
         done = subprocess.run(
-            words, cwd=ROOT, env=environment() | given, capture_output=True, text=True, timeout=60
+            words,
+            cwd=ROOT,
+            env=environment() | variables,
+            capture_output=True,
+            text=True,
+            timeout=60,
         )
         assert done.returncode == 0, done.stderr
         assert 0.4 < bus.state()["x"] < 0.7
@@ -51,11 +56,11 @@ def test_the_drive_program_sends_zeros_if_a_signal_ends_it(
     ):
         until(lambda: bus.state()["link"] == "up", 5.0, "the link")
         client = {"rmw": RmwClient, "bridge": BridgeHalf}[way](session)
-        given = {"WAY": way, "ENDPOINT": daemon.endpoint, "PYTHONPATH": f"{tmp_path}:{ROOT}"}
+        variables = {"WAY": way, "ENDPOINT": daemon.endpoint, "PYTHONPATH": f"{tmp_path}:{ROOT}"}
         words = [sys.executable, "deploy/ros2/drive.py", "0.2", "0.0", "60"]
         with (
             client.follow("cmd_vel", TWIST) as samples,
-            Program(words, ROOT, environment() | given) as drive,
+            Program(words, ROOT, environment() | variables) as drive,
         ):
             until(lambda: (bus.state()["linear"] or 0.0) > 0.1, 20.0, "it drives")
             drive.signal(number)

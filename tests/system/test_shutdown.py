@@ -41,12 +41,12 @@ SLOW_STOP = {
 
 def ramp_after(peer: Peer, at: float) -> list[Heard]:
     """Return the lines that the board received after this time."""
-    return [heard for heard in peer.lines if heard.at > at]
+    return [entry for entry in peer.lines if entry.at > at]
 
 
 def last_speed(ramp: list[Heard]) -> float:
     """Return the last wheel speed of the ramp that is not zero, rad/s."""
-    return next(wheels(heard.line)[0] for heard in reversed(ramp) if heard.line != ZERO_LINE)
+    return next(wheels(entry.line)[0] for entry in reversed(ramp) if entry.line != ZERO_LINE)
 
 
 @pytest.mark.variations(2)
@@ -61,7 +61,7 @@ def test_a_signal_while_driving_ramps_ends_with_stop_and_exits_0_within_1_s(
         code = daemon.ended(5.0)
         seconds = time.monotonic() - sent
     last = peer.last_line()
-    ramp = [wheels(heard.line)[0] for heard in ramp_after(peer, sent)]
+    ramp = [wheels(entry.line)[0] for entry in ramp_after(peer, sent)]
     print(f"{number.name} at 0.5 m/s: exit {code} after {seconds:.3f} s, ramp of {len(ramp)} lines")
     assert code == 0
     assert seconds < 1.0 + lost(sent, sent + seconds)
@@ -105,8 +105,8 @@ def test_a_ramp_longer_than_0_6_s_is_cut_there_with_stop_last(tmp_path: Path, pe
     assert last == ZERO_LINE, "STOP is the last line"
     # If the machine keeps the link waiting for a tenth of a second, the daemon stops at once
     # instead. The delayed process may also be the far end, which is this test.
-    heard = [sent, *(line.at for line in ramp)]
-    waited = max(b - a for a, b in itertools.pairwise(heard))
+    times = [sent, *(line.at for line in ramp)]
+    waited = max(b - a for a, b in itertools.pairwise(times))
     if machine_s < 0.1 and waited < 0.05:
         assert seconds > 0.55
         assert last_speed(ramp) > 20.0, "it was still fast when its time was up"
@@ -243,5 +243,5 @@ def test_daemons_that_are_ended_right_after_the_start_all_exit_0(
                 daemon.says("bus ")
                 daemon.signal((signal.SIGTERM, signal.SIGINT)[n % 2])
             codes = [daemon.ended(5.0) for daemon in daemons]
-            told = next((d.stderr for d, code in zip(daemons, codes, strict=True) if code), "")
-            assert codes == [0] * 8, told
+            output = next((d.stderr for d, code in zip(daemons, codes, strict=True) if code), "")
+            assert codes == [0] * 8, output

@@ -51,10 +51,10 @@ def test_the_true_pose_is_published_at_100_hz_with_the_stamp_of_each_sample(
 ) -> None:
     with skidding.follow("sim/pose") as poses:
         until(lambda: len(poses.seen) > 50, 5.0, "half a second of looks")
-        stamps = [seconds(seen.value["header"]["stamp"]) for seen in list(poses.seen)]
+        stamps = [seconds(sample.value["header"]["stamp"]) for sample in list(poses.seen)]
     apart = [b - a for a, b in itertools.pairwise(stamps)]
     assert apart == pytest.approx([0.01] * len(apart), abs=1e-4)
-    assert {seen.value["header"]["frame_id"] for seen in list(poses.seen)} == {"sim"}
+    assert {sample.value["header"]["frame_id"] for sample in list(poses.seen)} == {"sim"}
 
 
 @pytest.fixture(scope="module")
@@ -84,13 +84,13 @@ def test_the_simulated_gyro_corrects_the_odometry_and_is_published_as_imu(tmp_pa
     tables["sim"] = {"track_multiplier": 1.6, "gyro_bias": 0.02}
     with Daemon(tmp_path, config=tables) as daemon, Bus(daemon.endpoint) as bus:
         until(lambda: bus.state()["gyro"] == "waiting for turn", 10.0, "the gyro knows its bias")
-        with bus.follow("imu") as said, bus.commanding(0.0, 1.0):
+        with bus.follow("imu") as samples, bus.commanding(0.0, 1.0):
             until(lambda: bus.state()["yaw"] > 1.0, 10.0, "a turn")
         bus.at_rest()
         believed = yaw(bus.get("odom")["pose"]["pose"])
         assert yaw(bus.get("sim/pose")["pose"]) == pytest.approx(believed, rel=0.03)
         assert bus.state()["gyro"] == "used"
-        assert said.seen[0].encoding == "application/msgpack;acsard.Imu.v1"
+        assert samples.seen[0].encoding == "application/msgpack;acsard.Imu.v1"
 
 
 @pytest.mark.slow
@@ -104,8 +104,8 @@ def test_calibrate_reads_a_drive_that_echo_recorded_as_csv(tmp_path: Path) -> No
         assert min(len(run.t), len(run.gyro)) > 100
         # A robot that stood all the time gives no result; the calibration says so in its own words.
         (tmp_path / "drive.csv").write_text(ended.out)
-        told = finish(acsard("calibrate", "--log", "drive.csv"), tmp_path)
-        assert (told.code, "drive.csv: " in told.err) == (1, True)
+        result = finish(acsard("calibrate", "--log", "drive.csv"), tmp_path)
+        assert (result.code, "drive.csv: " in result.err) == (1, True)
 
 
 @pytest.mark.slow
@@ -179,7 +179,7 @@ def test_a_simulator_that_the_file_makes_mute_never_links_and_the_log_says_why(
     ):
         states.find(lambda state: "nothing was received" in state["reason"], 20.0, "no reply")
         assert bus.get("sim/pose")["header"]["frame_id"] == "sim"
-        assert "up" not in {seen.value["link"] for seen in list(states.seen)}
-        told = daemon.events("configuration")
-    assert [one["level"] for one in told] == ["warning"]
-    assert 'sim.faults = ["mute"]' in told[0]["text"]
+        assert "up" not in {sample.value["link"] for sample in list(states.seen)}
+        events = daemon.events("configuration")
+    assert [event["level"] for event in events] == ["warning"]
+    assert 'sim.faults = ["mute"]' in events[0]["text"]

@@ -73,8 +73,8 @@ def test_a_port_that_is_missing_at_the_start_is_reported_and_picked_up_when_it_a
             state = states.find(lambda state: True, 5.0, "a state").value
         assert (state["link"], state["mode"]) == ("down", "waiting")
         assert "port" in state["reason"]
-        said = until(lambda: daemon.events("port_waiting"), 5.0, "a word about the missing port")
-        assert str(path) in said[0]["text"]
+        events = until(lambda: daemon.events("port_waiting"), 5.0, "a word about the missing port")
+        assert str(path) in events[0]["text"]
         with Peer(path) as peer, bus.follow("state") as states:
             appeared = peer.session.plugged
             until(lambda: peer.lines, 5.0, "a line")
@@ -110,14 +110,14 @@ def test_a_second_daemon_on_the_port_ends_with_75_and_names_the_owner(
 ) -> None:
     with Daemon(tmp_path, peer.path) as first, Bus(first.endpoint) as bus:
         bus.linked()
-        opened, heard = len(peer.session.raw), len(peer.lines)
+        opened, count = len(peer.session.raw), len(peer.lines)
         with bus.commanding(0.5):
             until(lambda: peer.lines[-1].line.startswith(b"ap10.00"), 5.0, "steady driving")
             config: Tables = {"mcu": {"port": str(peer.path)}, "bus": {"listen": [free_endpoint()]}}
             path = write_config(tmp_path / "second.toml", config)
             second = finish(acsard("run", "--config", str(path)), tmp_path)
             peer.await_lines(10)
-            said = peer.session.said()[heard:]
+            lines = peer.session.said()[count:]
             assert bus.state()["mode"] == "driving"
     print(f"second daemon on the port: exit {second.code} after {second.seconds:.2f} s")
     assert second.code == 75
@@ -126,11 +126,11 @@ def test_a_second_daemon_on_the_port_ends_with_75_and_names_the_owner(
     assert "Traceback" not in second.err
     # Not a byte of the second daemon: no line end of a new session, no zero during the drive.
     assert opened
-    assert b"\r\n" not in said
+    assert b"\r\n" not in lines
     # A commander that waits for a core may fall silent. That causes a ramp, and no sudden zero. The
     # same holds without a link, which a daemon that waits for a core may lose.
     if not first.events("link_stale"):
-        for before, line in itertools.pairwise(said):
+        for before, line in itertools.pairwise(lines):
             assert line != ZERO_LINE or wheels(before)[0] < 1.0
 
 
@@ -199,7 +199,7 @@ def test_a_second_robot_with_the_ros_names_of_another_behind_one_router_ends_wit
     run = acsard("run", "--config", str(path))
     with (
         zenoh.open(client_config(endpoint, "router")),
-        Daemon(tmp_path, config=robot("one"), name="one") as one,
+        Daemon(tmp_path, config=robot("one"), name="one") as first,
     ):
         ended = finish(run, tmp_path)
         assert ended.code == 75
@@ -208,8 +208,8 @@ def test_a_second_robot_with_the_ros_names_of_another_behind_one_router_ends_wit
         assert peer.session.stream == b""
         with Program([*run, "--namespace", "two"], tmp_path) as named:
             named.says("bus ")
-            one.signal(signal.SIGKILL)
-            one.ended(5.0)
+            first.signal(signal.SIGKILL)
+            first.ended(5.0)
             # The daemon's own earlier tokens are not those of another daemon.
             with Daemon(tmp_path, config=robot("one"), name="one") as again:
                 assert again.process.poll() is None
@@ -291,8 +291,8 @@ def test_a_bad_configuration_ends_with_78_and_a_line_per_mistake(tmp_path: Path)
     assert ended.out == ""
     *lines, summary = ended.err.splitlines()
     assert len(lines) == len(MISTAKES), ended.err
-    for key, told in MISTAKES.items():
-        assert [line for line in lines if key in line and told in line], (key, ended.err)
+    for key, message in MISTAKES.items():
+        assert [line for line in lines if key in line and message in line], (key, ended.err)
     assert summary.startswith("acsard: 5 problems")
     assert ended.seconds < 2.0 + lost(begun)
 

@@ -48,12 +48,12 @@ def visit(
     host: str, where: Path, endpoints: list[str], tls: dict[str, object] | None = None
 ) -> dict[str, Any]:
     """Run a stranger on this host for a second, and return its report of all it found and did."""
-    said = [json.dumps(endpoints), json.dumps(tls)]
+    arguments = [json.dumps(endpoints), json.dumps(tls)]
     with inside(host):
-        done = finish(words(VISIT, 1.0, *said), where)
+        done = finish(words(VISIT, 1.0, *arguments), where)
     assert done.code == 0, done
-    found: dict[str, Any] = json.loads(done.out)
-    return found
+    report: dict[str, Any] = json.loads(done.out)
+    return report
 
 
 VISIT = """\
@@ -306,15 +306,15 @@ class Robot:
             with during() as going_on:
                 while not answered or going_on():
                     answered.append(_answered(operator))
-                    entered += [self._entered(who) for who in comers]
+                    entered += [self._entered(identity) for identity in comers]
                     grown = max(grown, resident_kb(self.daemon.pid) - memory)
             periods = Periods.between(before, bus.state())
             calm = Periods.between(calm_before, self._calm.state())
         return Figures(periods, calm, grown, max(answered), max(entered, default=0.0), len(entered))
 
-    def _entered(self, who: Identity) -> float:
+    def _entered(self, identity: Identity) -> float:
         """Connect as a new client, and return the time until the daemon answered it, s."""
-        config = self._certificates.config(who, self.plain, self.tls)
+        config = self._certificates.config(identity, self.plain, self.tls)
         begun = time.monotonic()
 
         def enter() -> bool:
@@ -325,7 +325,7 @@ class Robot:
                 return False
             return True
 
-        until(enter, 20.0, f"{who} gets in")
+        until(enter, 20.0, f"{identity} gets in")
         return time.monotonic() - begun
 
 

@@ -155,7 +155,7 @@ def test_zenoh_ignores_that_the_authority_has_expired_so_no_trouble_is_reported(
 
 
 @pytest.mark.parametrize(
-    ("shown", "sentence"),
+    ("client", "sentence"),
     [
         ("stranger", "did not sign the certificate of"),
         ("mixed", "the robot's authority did not sign this"),
@@ -163,9 +163,9 @@ def test_zenoh_ignores_that_the_authority_has_expired_so_no_trouble_is_reported(
     ],
 )
 def test_the_error_says_what_is_wrong_with_the_client_s_certificate(
-    tls: Path, robot: str, shown: str, sentence: str
+    tls: Path, robot: str, client: str, sentence: str
 ) -> None:
-    assert sentence in str(told(robot, str(tls / shown)))
+    assert sentence in str(told(robot, str(tls / client)))
 
 
 def test_a_tool_with_a_key_that_zenoh_refuses_names_the_key(tls: Path, robot: str) -> None:

@@ -23,8 +23,8 @@ FRAME = "\x1b[H"
 def top(daemon: Daemon) -> Iterator[tuple[Terminal, Program]]:
     """Run `acsard top` on a separate terminal of 80x24 characters."""
     words = ("top", "--config", str(daemon.config))
-    with at_terminal(daemon.config.parent, *words, term=SCREEN, piped="stderr") as found:
-        yield found
+    with at_terminal(daemon.config.parent, *words, term=SCREEN, piped="stderr") as session:
+        yield session
 
 
 def shown(terminal: Terminal) -> list[str]:
@@ -58,16 +58,16 @@ def test_top_shows_the_robot_in_a_pipe_and_at_a_terminal_and_outlives_its_daemon
 ) -> None:
     # Everything is in one test, because of the 2 s that a silence takes.
     with Daemon(tmp_path) as daemon, piped(daemon) as once, top(daemon) as (terminal, program):
-        told = shows(terminal, " READY ", 10.0)
-        assert len(told) == SIZE[1]
-        assert max(map(len, told)) <= SIZE[0]
-        shown = ("waiting for a command", "SIMULATOR", "teleop", "mcu_round_trip")
-        for text in (daemon.endpoint, *shown):
-            assert any(text in line for line in told), text
+        lines = shows(terminal, " READY ", 10.0)
+        assert len(lines) == SIZE[1]
+        assert max(map(len, lines)) <= SIZE[0]
+        texts = ("waiting for a command", "SIMULATOR", "teleop", "mcu_round_trip")
+        for text in (daemon.endpoint, *texts):
+            assert any(text in line for line in lines), text
 
         with Bus(daemon.endpoint) as bus, bus.commanding(0.5):
-            told = shows(terminal, " DRIVING ", 5.0)
-            assert any(line.startswith("▶ app") for line in told)
+            lines = shows(terminal, " DRIVING ", 5.0)
+            assert any(line.startswith("▶ app") for line in lines)
 
         assert (once.ended(10.0), once.stderr) == (0, "")
         assert re.match(r" [A-Z]+  ", once.out[1])
@@ -76,8 +76,8 @@ def test_top_shows_the_robot_in_a_pipe_and_at_a_terminal_and_outlives_its_daemon
 
         daemon.signal(signal.SIGKILL)
         daemon.ended(5.0)
-        told = shows(terminal, "s: is the daemon running?", 5.0)
-        assert len(told) == SIZE[1]
+        lines = shows(terminal, "s: is the daemon running?", 5.0)
+        assert len(lines) == SIZE[1]
         with Daemon(tmp_path, endpoint=daemon.endpoint, name="again"):
             shows(terminal, " READY ", 5.0)
             during = terminal.settings

@@ -55,19 +55,19 @@ def place(
 
 def test_top_says_how_long_ago_the_robot_was_seen_and_how_often_lines_come(place: Place) -> None:
     def rates() -> list[float]:
-        told = place.tool("top", "--once").out
-        assert re.search(r"seen \d+\.\d s ago", told), told
-        return [float(one) for one in re.findall(r"(\d+\.\d)/s of", told)]
+        output = place.tool("top", "--once").out
+        assert re.search(r"seen \d+\.\d s ago", output), output
+        return [float(rate) for rate in re.findall(r"(\d+\.\d)/s of", output)]
 
-    found = until(rates, 20.0, "how often lines come")
-    assert 1 < max(found) < 1000
+    values = until(rates, 20.0, "how often lines come")
+    assert 1 < max(values) < 1000
 
 
 def test_fleet_says_how_long_ago_the_robot_was_seen(place: Place) -> None:
-    told = place.tool("fleet", "--once").out
-    heard = re.search(r"^acsar .* (\d+\.\d) s ", told, re.M)
-    assert heard, told
-    assert "SILENT" not in told
+    output = place.tool("fleet", "--once").out
+    match = re.search(r"^acsar .* (\d+\.\d) s ", output, re.M)
+    assert match, output
+    assert "SILENT" not in output
 
 
 def test_hz_prints_the_rate_and_the_gaps_of_a_key(place: Place) -> None:

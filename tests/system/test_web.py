@@ -50,20 +50,20 @@ async def test_a_new_connection_gets_the_robot_s_description_and_can_follow_it(
     page: Page, bus: Bus
 ) -> None:
     async with hands(page) as ours:
-        hello = (await ours.find(lambda said: "hello" in said))["hello"]
+        hello = (await ours.find(lambda message: "hello" in message))["hello"]
         assert (hello["robot"], hello["role"]) == ("acsar", "maintainer")
         assert hello["limits"] == {"linear": 1.0, "angular": 4.0}
         assert hello["simulated"] is True
         assert hello["state_rate"] == 10.0
-        assert "path" in await ours.find(lambda said: "path" in said)
+        assert "path" in await ours.find(lambda message: "path" in message)
         await ours.say(ping=12.5)
-        assert (await ours.find(lambda said: "pong" in said))["pong"] == 12.5
+        assert (await ours.find(lambda message: "pong" in message))["pong"] == 12.5
         await ours.say(subscribe="odom", rate=50)
-        odom = await ours.find(lambda said: said.get("key") == "odom")
+        odom = await ours.find(lambda message: message.get("key") == "odom")
         assert odom["value"]["child_frame_id"] == "base_link"
         assert 0 <= odom["age"] < 1000 * PATIENCE_S
         await ours.say(subscribe="fleet")
-        await ours.find(lambda said: [r["robot"] for r in said.get("fleet", ())] == ["acsar"])
+        await ours.find(lambda message: [r["robot"] for r in message.get("fleet", ())] == ["acsar"])
 
 
 @pytest.mark.slow
@@ -73,7 +73,7 @@ async def test_a_new_connection_gets_the_last_minute_with_commands_sent_while_a_
     with Page(daemon, tmp_path) as page:
         async with hands(page) as ours:
             async with hands(page) as first:
-                alone = await first.find(lambda said: "minute" in said)
+                alone = await first.find(lambda message: "minute" in message)
             assert set(alone["minute"]["wished_linear"]) <= {None}
             await ours.say(subscribe="cmd_vel_out")
             await ours.say(subscribe="state", rate=50)
@@ -82,12 +82,12 @@ async def test_a_new_connection_gets_the_last_minute_with_commands_sent_while_a_
             await ours.drive(0.0)
             await asyncio.to_thread(bus.at_rest)
             async with hands(page) as later:
-                minute = (await later.find(lambda said: "minute" in said))["minute"]
+                minute = (await later.find(lambda message: "minute" in message))["minute"]
     # A late message leaves a gap.
-    assert max(one or 0.0 for one in minute["linear"]) > 0.25
-    assert max(one or 0.0 for one in minute["wished_linear"]) == pytest.approx(0.3)
+    assert max(entry or 0.0 for entry in minute["linear"]) > 0.25
+    assert max(entry or 0.0 for entry in minute["wished_linear"]) == pytest.approx(0.3)
     assert minute["age"] == sorted(minute["age"], reverse=True)
-    wheels = [max(speed or 0.0 for speed in one) for one in minute["wheels"]]
+    wheels = [max(speed or 0.0 for speed in entry) for entry in minute["wheels"]]
     assert len(wheels) == 4
     assert min(wheels) > 0.25 / 0.05
 
@@ -96,7 +96,7 @@ async def test_a_new_connection_gets_the_last_minute_with_commands_sent_while_a_
 async def test_every_message_of_the_socket_is_described_and_every_described_one_occurs(
     tmp_path: Path,
 ) -> None:
-    heard: list[Any] = []
+    messages: list[Any] = []
     (tmp_path / "robot.urdf").write_text('<robot name="acsar"/>')
     config: dict[str, dict[str, object]] = {
         "odometry": {"gyro": True},
@@ -108,46 +108,48 @@ async def test_every_message_of_the_socket_is_described_and_every_described_one_
         Page(daemon, tmp_path) as page,
     ):
         async with hands(page) as ours:
-            await ours.find(lambda said: "minute" in said)
+            await ours.find(lambda message: "minute" in message)
             for key in KEYS:
                 await ours.say(subscribe=key)
-                await ours.find(lambda said, key=key: said.get("key") == key and said["value"])  # type: ignore[misc]
+                await ours.find(
+                    lambda message, key=key: message.get("key") == key and message["value"]  # type: ignore[misc]
+                )
             await ours.say(subscribe="state", robot="nobody")
             await ours.say(subscribe="nothing")
-            await ours.find(lambda said: "refused" in said)
+            await ours.find(lambda message: "refused" in message)
             await ours.call("clear")
             await ours.say(ping=1)
-            await ours.find(lambda said: "pong" in said)
+            await ours.find(lambda message: "pong" in message)
             await ours.say(subscribe="fleet")
-            await ours.find(lambda said: said.get("fleet"))
+            await ours.find(lambda message: message.get("fleet"))
             await ours.say(begin="check", port="sim")
-            await ours.find(lambda said: "question" in said.get("guide", ()))
+            await ours.find(lambda message: "question" in message.get("guide", ()))
             await ours.say(press="leave")
-            await ours.find(lambda said: "ended" in said.get("guide", ()))
+            await ours.find(lambda message: "ended" in message.get("guide", ()))
             daemon.signal(signal.SIGSTOP)
             try:
-                await ours.find(lambda said: "gone" in said)
+                await ours.find(lambda message: "gone" in message)
             finally:
                 daemon.signal(signal.SIGCONT)
-            heard.extend(ours.heard)
-    found = described.kinds(heard)
-    assert found >= set(described.FRAMES), set(described.FRAMES) - found
-    assert found >= {"Running", "Subject", "Question", "Ended"}
-    for one in {frozenset(frame): frame for frame in heard}.values():
-        assert [spoilt for spoilt in described.spoilt(one) if described.taken(spoilt)] == []
+            messages.extend(ours.heard)
+    kinds = described.kinds(messages)
+    assert kinds >= set(described.FRAMES), set(described.FRAMES) - kinds
+    assert kinds >= {"Running", "Subject", "Question", "Ended"}
+    for example in {frozenset(frame): frame for frame in messages}.values():
+        assert [spoilt for spoilt in described.spoilt(example) if described.taken(spoilt)] == []
 
 
 @pytest.mark.network
 async def test_a_connection_that_ends_while_it_drives_sends_one_zero_and_then_no_command(
     page: Page, bus: Bus
 ) -> None:
-    with bus.follow("cmd/teleop") as heard:
+    with bus.follow("cmd/teleop") as samples:
         async with hands(page) as ours:
             await ours.say(subscribe="state", rate=50)
             await ours.until_driving(0.3)
         bus.at_rest()
-        commands = [seen.value for seen in heard.seen]
-    assert [one for one in commands[-3:-1] if one["linear"]["x"] == 0] == []
+        commands = [sample.value for sample in samples.seen]
+    assert [command for command in commands[-3:-1] if command["linear"]["x"] == 0] == []
     assert commands[-1]["linear"]["x"] == 0
 
 
@@ -196,7 +198,7 @@ async def first_recording(session: aiohttp.ClientSession) -> str:
 
 
 async def test_each_http_answer_is_as_described(page: Page, bus: Bus) -> None:
-    seen: dict[tuple[str, str], int] = {}
+    statuses: dict[tuple[str, str], int] = {}
     async with aiohttp.ClientSession(page.here) as session:
         name = await first_recording(session)
         for path, operations in described.DOCUMENT["paths"].items():
@@ -205,15 +207,17 @@ async def test_each_http_answer_is_as_described(page: Page, bus: Bus) -> None:
                 async with session.request(method, asked) as answer:
                     media = answer.content_type
                     body = await answer.json() if media == "application/json" else None
-                seen[method, path] = answer.status
-                told = path, method, answer.status, media, body
-                assert described.answers(*told), told
+                statuses[method, path] = answer.status
+                response = path, method, answer.status, media, body
+                assert described.answers(*response), response
                 if path in TYPED:
-                    assert not described.answers(*told[:4], {"of": "nothing"}), path
-    assert {one for one in seen if seen[one] == 200} > {("get", path) for path in TYPED}
-    assert seen["post", "/api/recordings/{name}/report"] == 202
-    assert seen["post", "/api/srv/stop"] == 200
-    assert seen["post", "/api/srv/set"] == 409
+                    assert not described.answers(*response[:4], {"of": "nothing"}), path
+    assert {endpoint for endpoint in statuses if statuses[endpoint] == 200} > {
+        ("get", path) for path in TYPED
+    }
+    assert statuses["post", "/api/recordings/{name}/report"] == 202
+    assert statuses["post", "/api/srv/stop"] == 200
+    assert statuses["post", "/api/srv/set"] == 409
 
 
 async def test_a_path_called_with_another_method_names_the_method_it_accepts(page: Page) -> None:
@@ -251,18 +255,18 @@ async def drawn(session: aiohttp.ClientSession) -> tuple[str, dict[str, Any]]:
     async with asyncio.timeout(2 * PATIENCE_S):
         while True:
             async with session.post(f"/api/recordings/{name}/report") as answer:
-                told = await answer.json()
+                reply = await answer.json()
             if answer.status != 202:
-                return name, {"status": answer.status, **told}
-            assert told["report"] == "drawing"
+                return name, {"status": answer.status, **reply}
+            assert reply["report"] == "drawing"
             await asyncio.sleep(0.1)
 
 
 @pytest.mark.slow
 async def test_a_recording_s_report_is_isolated_from_the_robot_s_page(page: Page, bus: Bus) -> None:
     async with aiohttp.ClientSession(page.here) as session:
-        name, told = await drawn(session)
-        assert told == {"status": 200, "report": "ready", "href": f"report/{name}"}
+        name, result = await drawn(session)
+        assert result == {"status": 200, "report": "ready", "href": f"report/{name}"}
         bodies = set()
         for packing in ("gzip", "identity"):
             asked = {"Accept-Encoding": packing}
@@ -284,9 +288,9 @@ async def test_a_report_without_plotly_is_refused_with_the_command_that_installs
     (tmp_path / "plotly.py").write_text("raise ImportError('not installed')")
     with Page(daemon, tmp_path, PYTHONPATH=str(tmp_path)) as without:
         async with aiohttp.ClientSession(without.here) as session:
-            _, told = await drawn(session)
-            assert (told["status"], told["report"]) == (503, "failed")
-            assert re.search("needs the library plotly; .*pip install.*report", told["text"])
+            _, outcome = await drawn(session)
+            assert (outcome["status"], outcome["report"]) == (503, "failed")
+            assert re.search("needs the library plotly; .*pip install.*report", outcome["text"])
 
 
 @pytest.mark.slow
@@ -336,10 +340,10 @@ class Terminal(Program):
 def test_a_daemon_in_a_terminal_serves_its_page_at_a_free_port_and_restarts_it(
     tmp_path: Path,
 ) -> None:
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        taken.listen()
-        port = taken.getsockname()[1]
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        listener.listen()
+        port = listener.getsockname()[1]
         config = write_config(
             tmp_path / "a.toml", {"web": {"address": [f"http://127.0.0.1:{port}"]}}
         )
@@ -352,8 +356,8 @@ def test_a_daemon_in_a_terminal_serves_its_page_at_a_free_port_and_restarts_it(
 
             def listed() -> bool:
                 """Return whether the page lists a recording."""
-                status, told = asyncio.run(answer(f"{url}api/recordings"))
-                return status == 200 and ".mcap" in told
+                status, content = asyncio.run(answer(f"{url}api/recordings"))
+                return status == 200 and ".mcap" in content
 
             until(listed, START_S, "what the option has recorded is listed")
             (first,) = daemon.page()
@@ -373,8 +377,8 @@ def test_a_daemon_without_a_terminal_or_with_the_page_disabled_serves_no_page(
     tmp_path: Path,
 ) -> None:
     config = write_config(tmp_path / "a.toml", {"web": {"page": False}})
-    with Terminal(tmp_path, "--config", str(config)) as told, Daemon(tmp_path) as piped:
-        told.shows("link_up")
+    with Terminal(tmp_path, "--config", str(config)) as terminal, Daemon(tmp_path) as piped:
+        terminal.shows("link_up")
         until(lambda: "link_up" in piped.stderr, START_S, "link up")
-        assert told.page() == []
+        assert terminal.page() == []
         assert children(piped.pid, "acsard web") == []

@@ -83,10 +83,10 @@ class Table:
         moved = math.hypot(after["x"] - before["x"], after["y"] - before["y"])
         turned = abs(math.remainder(after["yaw"] - before["yaw"], math.tau))
         assert max(moved, turned) < MOVED_M or not stands
-        told = f"{more:.0f} x {reason}"
+        refusals = f"{more:.0f} x {reason}"
         missed = Periods.between(before, after).missed
         self.rows.append(
-            f"{what:44} {answer:22} {told:28} "
+            f"{what:44} {answer:22} {refusals:28} "
             f"{f'{1000 * moved:.0f} mm' if stands else 'driven':>6} {missed:6}"
         )
 
@@ -225,16 +225,16 @@ async def test_a_client_that_floods_requests_is_limited_and_can_still_stop(
                 async with session.get(f"{table.page.away}/api/state") as answer:
                     return answer.status
 
-            seen = set[int]()
+            statuses = set[int]()
             for _ in range(16):
-                seen |= set(await asyncio.gather(*map(one, range(50))))
+                statuses |= set(await asyncio.gather(*map(one, range(50))))
             async with session.get(f"{table.page.away}/api/whoami") as answer:
                 assert answer.status == 200  # a page that reconnects is not locked out
             async with session.post(f"{table.page.away}/api/srv/stop") as answer:
                 stopped = answer.status
         assert bus.get("srv/clear")["success"]
-    assert seen <= {200, 429, 503}
-    assert {200, 429} <= seen
+    assert statuses <= {200, 429, 503}
+    assert {200, 429} <= statuses
     assert stopped == 200
 
 
@@ -278,7 +278,7 @@ async def test_a_viewer_moves_nothing_with_any_message(
             for _ in range(20):
                 await theirs.drive(0.5)
                 await asyncio.sleep(0.02)
-            refused = await theirs.find(lambda said: said.get("refused") == "cmd")
+            refused = await theirs.find(lambda frame: frame.get("refused") == "cmd")
             assert "viewer" in refused["reason"]
             assert not (await theirs.call("set", settings={"limits.linear_speed": 9.0}))["ok"]
     assert bus.count("commands") == commands
@@ -327,7 +327,7 @@ async def test_a_message_that_is_too_big_ends_its_connection_and_no_other(
                 while (await theirs.socket.receive()).type == aiohttp.WSMsgType.TEXT:
                     pass
             await ours.say(ping=1)
-            await ours.find(lambda said: "pong" in said)
+            await ours.find(lambda frame: "pong" in frame)
             assert resident_kb(page.pid) < before + 5_000
 
 
@@ -339,11 +339,11 @@ async def test_a_frame_that_is_not_a_message_is_reported_once_a_second_and_a_flo
             for _ in range(1200):
                 await ours.socket.send_str("{}")
             async with asyncio.timeout(PATIENCE_S):
-                told = []
+                frames = []
                 while (message := await ours.socket.receive()).type == aiohttp.WSMsgType.TEXT:
-                    told.append(message.data)
+                    frames.append(message.data)
             assert ours.socket.close_code == 1008
-            assert sum("refused" in one for one in told) < 50  # limited by the send rate
+            assert sum("refused" in entry for entry in frames) < 50  # limited by the send rate
 
 
 async def test_a_thousand_connections_do_not_disconnect_the_page_that_drives(
@@ -359,15 +359,15 @@ async def test_a_thousand_connections_do_not_disconnect_the_page_that_drives(
             holding = asyncio.create_task(ours.hold(0.3, PATIENCE_S))
             idle = await _idle(place[0], int(place[1]), 1000)
             await ours.say(ping=7)
-            await ours.find(lambda said: said.get("pong") == 7)
+            await ours.find(lambda frame: frame.get("pong") == 7)
             await ours.state(lambda s: s["mode"] == "driving")
             async with asyncio.timeout(PATIENCE_S):
                 while (left := sum(map(_waits, idle))) > MAX_TCP_OF_NETWORK:
                     await asyncio.sleep(0.01)
             assert left == MAX_TCP_OF_NETWORK
             holding.cancel()
-            for one in idle:
-                one.close()
+            for idle_socket in idle:
+                idle_socket.close()
             await ours.drive(0.0)
             bus.at_rest()
 
@@ -376,17 +376,17 @@ async def _idle(host: str, port: int, number: int) -> list[socket.socket]:
     """Open `number` connections that send nothing, and return their sockets."""
     idle: list[socket.socket] = []
     for _ in range(number):
-        one = socket.socket()
-        one.setblocking(False)
-        await asyncio.get_running_loop().sock_connect(one, (host, port))
-        idle.append(one)
+        connection = socket.socket()
+        connection.setblocking(False)
+        await asyncio.get_running_loop().sock_connect(connection, (host, port))
+        idle.append(connection)
     return idle
 
 
-def _waits(one: socket.socket) -> bool:
+def _waits(sock: socket.socket) -> bool:
     """Return whether the server still keeps this connection open."""
     try:
-        return one.recv(1) != b""
+        return sock.recv(1) != b""
     except BlockingIOError:
         return True
     except ConnectionError:
@@ -432,20 +432,20 @@ def test_answers_that_no_client_reads_cost_little_memory(
     request = f"GET /x HTTP/1.1\r\nHost: {place.host}:{place.port}\r\n" + "".join(
         f"X-{n}: {'x' * 200}\r\n" for n in range(headers)
     )
-    said = (request + "\r\n").encode() * 20
+    payload = (request + "\r\n").encode() * 20
     with ExitStack() as stack:
         greedy = []
         for _ in range(60):
-            one = socket.socket()
-            one.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-            one.connect(("127.0.0.1", place.port))
-            greedy.append(stack.enter_context(trusting.wrap_socket(one)))
+            client = socket.socket()
+            client.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+            client.connect(("127.0.0.1", place.port))
+            greedy.append(stack.enter_context(trusting.wrap_socket(client)))
             greedy[-1].setblocking(False)
         before, most, end = resident_kb(page.pid), 0, time.monotonic() + UNREAD_TIMEOUT_S - 1.0
         while time.monotonic() < end:
-            for one in greedy:
+            for client in greedy:
                 with suppress(OSError):
-                    one.send(said)
+                    client.send(payload)
             most = max(most, resident_kb(page.pid) - before)
             time.sleep(0.01)
     print(f"\n60 clients that read no answers, {headers} more headers: {most / 1000:+.1f} MB")
@@ -505,7 +505,7 @@ def test_a_client_that_does_not_read_its_answers_is_disconnected_soon(
             lines = Path("/proc/net/tcp").read_text().splitlines()
             (inode,) = [line.split()[9] for line in lines if ours in line.split()[2] + " "] or ["0"]
             with suppress(FileNotFoundError):  # the server closes another file meanwhile
-                return any(os.readlink(one) == f"socket:[{inode}]" for one in place.iterdir())
+                return any(os.readlink(link) == f"socket:[{inode}]" for link in place.iterdir())
             return True
 
         greedy.setblocking(False)
@@ -532,15 +532,15 @@ ENDLESS: dict[str, tuple[str, int, Rate, str]] = {
 async def test_a_client_that_pipelines_requests_without_end_is_delayed_and_not_refused(
     table: Table, bus: Bus, tokens: dict[str, str], what: str
 ) -> None:
-    said, clients, rate, status = ENDLESS[what]
+    request, clients, rate, status = ENDLESS[what]
     place, lasts_s = URL(table.page.away), 3.0
     headers = {"Host": f"{place.host}:{place.port}", "Content-Length": "0"}
     if rate != STRANGER_RATE:
         headers["Authorization"] = f"Bearer {tokens['viewer']}"
-    if said.endswith("/ws"):
+    if request.endswith("/ws"):
         headers |= UPGRADE
     lines = "".join(f"{name}: {value}\r\n" for name, value in headers.items())
-    words = f"{said} HTTP/1.1\r\n{lines}\r\n".encode()
+    words = f"{request} HTTP/1.1\r\n{lines}\r\n".encode()
     answers: Counter[str] = Counter()
 
     async def asks(end: float) -> None:
@@ -598,8 +598,8 @@ async def test_a_stop_beyond_the_rate_is_sent_immediately_and_only_its_answer_wa
                 assert early
                 break
         assert took >= REFUSAL_DELAY_S
-        for one in others:
-            one.cancel()
+        for task in others:
+            task.cancel()
 
 
 async def test_handshakes_from_one_network_are_delayed_beyond_their_rate(
@@ -642,8 +642,8 @@ async def test_a_connection_with_a_valid_cookie_is_kept_from_its_first_file_on(
 
         async def fetches(path: str) -> bytes:
             host = f"{place.host}:{place.port}"
-            said = f"GET {path} HTTP/1.1\r\nHost: {host}\r\nCookie: {cookie}\r\n\r\n"
-            writer.write(said.encode())
+            http_request = f"GET {path} HTTP/1.1\r\nHost: {host}\r\nCookie: {cookie}\r\n\r\n"
+            writer.write(http_request.encode())
             head = await reader.readuntil(b"\r\n\r\n")
             length = re.search(rb"(?i)content-length: (\d+)", head)
             await reader.readexactly(int(length[1]) if length else 0)
@@ -653,8 +653,8 @@ async def test_a_connection_with_a_valid_cookie_is_kept_from_its_first_file_on(
         idle = await _idle("127.0.0.1", place.port or 0, MAX_TCP_OF_NETWORK + 10)
         await asyncio.sleep(0.3)
         assert b" 200 " in await fetches("/page/main.js")
-        for one in idle:
-            one.close()
+        for tcp_socket in idle:
+            tcp_socket.close()
         writer.transport.abort()
 
 

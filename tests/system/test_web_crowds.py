@@ -143,13 +143,13 @@ class Scene:
         """Stop the robot by a new connection of the phone, and return how long that took, s."""
         with inside(self._hosts.stranger):
             place = self.page.away.removeprefix("https://")
-            told = {"Authorization": f"Bearer {self._token}"}
+            headers = {"Authorization": f"Bearer {self._token}"}
             return _stopped(
                 lambda: http.client.HTTPSConnection(
                     place, timeout=PATIENCE_S, context=self._trusted,
                     source_address=(STRANGER_AT, 0),
                 ),
-                told,
+                headers,
             )  # fmt: skip
 
     def clear(self) -> None:
@@ -158,11 +158,11 @@ class Scene:
             connection = http.client.HTTPConnection(
                 self.page.here.removeprefix("http://"), timeout=9
             )
-            told = {"Content-Type": "application/json"}
+            headers = {"Content-Type": "application/json"}
             connection.request("GET", "/api/state")
             latch = json.loads(connection.getresponse().read())["latch"]
             body = json.dumps({"latch": latch})
-            connection.request("POST", "/api/srv/clear", body, told)
+            connection.request("POST", "/api/srv/clear", body, headers)
             connection.getresponse().read()
             connection.close()
 
@@ -220,9 +220,9 @@ def test_a_page_that_runs_out_of_files_stops_the_robot_and_recovers(
     try:
         until(scene.reaches_the_daemon, 10.0, "the page reaches the daemon")
         alone = asyncio.run(_stops(scene.stop_here))
-        taken = len(list(Path(f"/proc/{server.pid}/fd").iterdir()))
+        open_files = len(list(Path(f"/proc/{server.pid}/fd").iterdir()))
         hard = resource.prlimit(server.pid, resource.RLIMIT_NOFILE)[1]
-        resource.prlimit(server.pid, resource.RLIMIT_NOFILE, (taken + FREE_FILES, hard))
+        resource.prlimit(server.pid, resource.RLIMIT_NOFILE, (open_files + FREE_FILES, hard))
         with inside(hosts.robot if near else hosts.stranger):
             crowd.__enter__()
         crowd.says("opened", PATIENCE_S)
@@ -265,17 +265,17 @@ async def _stops(stop: Callable[[], float]) -> list[float]:
     return took
 
 
-def _stopped(connect: Callable[[], http.client.HTTPConnection], told: dict[str, str]) -> float:
+def _stopped(connect: Callable[[], http.client.HTTPConnection], headers: dict[str, str]) -> float:
     begun = time.monotonic()
     connection = connect()
     try:
-        connection.request("POST", "/api/srv/stop", headers=told)
+        connection.request("POST", "/api/srv/stop", headers=headers)
         answer = connection.getresponse()
-        said = answer.read()
+        body = answer.read()
     finally:
         connection.close()
     took = time.monotonic() - begun
-    assert (answer.status, json.loads(said)["success"]) == (200, True), said
+    assert (answer.status, json.loads(body)["success"]) == (200, True), body
     return max(0.0, took - 4 * lost(begun, begun + took))
 
 
@@ -325,9 +325,9 @@ def _drive_and_stop(scene: Scene, crowd: str, most: int) -> None:
     try:
         asyncio.run(asyncio.wait_for(story(), 6 * PATIENCE_S))
     finally:
-        for one in crowds:
-            if hasattr(one, "process"):
-                one.__exit__()
+        for program in crowds:
+            if hasattr(program, "process"):
+                program.__exit__()
         scene.clear()
     assert page.process.poll() is None
     assert "Traceback" not in page.stderr

@@ -77,28 +77,30 @@ def bus(robot: Daemon) -> Iterator[Bus]:
 async def test_a_page_of_another_origin_sends_its_token_and_no_cookie(
     server: Page, origin: str
 ) -> None:
-    token, told = server.invite("operator", "panel"), {"Origin": origin}
+    token, site_headers = server.invite("operator", "panel"), {"Origin": origin}
     async with server.client() as browser:
         url = f"{server.away}/token"
         async with browser.post(url, data={"token": token}, allow_redirects=False) as answer:
             assert answer.status == 303
-        for headers, status in [({}, 200), (told, 401)]:
+        for headers, status in [({}, 200), (site_headers, 401)]:
             async with browser.get(f"{server.away}/api/state", headers=headers) as answer:
                 assert answer.status == status
         with pytest.raises(aiohttp.WSServerHandshakeError) as caught:
-            await browser.ws_connect(f"{server.away}/ws", headers=told)
+            await browser.ws_connect(f"{server.away}/ws", headers=site_headers)
         assert caught.value.status == 401
-        shown = {**told, "Authorization": f"Bearer {token}"}
-        async with browser.get(f"{server.away}/api/state", headers=shown) as answer:
+        token_headers = {**site_headers, "Authorization": f"Bearer {token}"}
+        async with browser.get(f"{server.away}/api/state", headers=token_headers) as answer:
             assert answer.status == 200
         mine = f"acsard.token.{token}"
-        opening = browser.ws_connect(f"{server.away}/ws", headers=told, protocols=("acsard", mine))
+        opening = browser.ws_connect(
+            f"{server.away}/ws", headers=site_headers, protocols=("acsard", mine)
+        )
         async with opening as opened:
             assert opened.protocol == "acsard"
             assert json.loads((await opened.receive()).data)["hello"]["role"] == "operator"
         for names in [["acsard", "acsard.token.wrong"], [mine]]:
             with pytest.raises(aiohttp.WSServerHandshakeError):
-                await browser.ws_connect(f"{server.away}/ws", headers=told, protocols=names)
+                await browser.ws_connect(f"{server.away}/ws", headers=site_headers, protocols=names)
     assert token not in server.stdout + server.stderr
 
 
@@ -114,9 +116,9 @@ async def test_the_proxy_of_the_manual_makes_requests_look_like_the_page_s_own(
     assert set(proxies) == {"/api", "/ws"}
     assert proxies["/ws"]["ws"] is True
     async with aiohttp.ClientSession() as session:
-        for told in proxies.values():
-            assert told["changeOrigin"] is True
-            written = json.dumps(told).replace("http://127.0.0.1:8080", server.here)
+        for proxy in proxies.values():
+            assert proxy["changeOrigin"] is True
+            written = json.dumps(proxy).replace("http://127.0.0.1:8080", server.here)
             headers = {"Sec-Fetch-Site": "same-origin", **json.loads(written)["headers"]}
             place = f"{server.here}/api/srv/stop"
             async with session.post(place, headers=headers) as answer:
@@ -149,7 +151,7 @@ async def test_a_program_that_names_an_unknown_source_is_refused(server: Page) -
     async with hands(server) as program:
         program.source = "nobody"
         await program.drive(0.1)
-        refused = await program.find(lambda said: said.get("refused") == "cmd")
+        refused = await program.find(lambda message: message.get("refused") == "cmd")
         assert "nobody is not one of the robot's sources: teleop, app" in refused["reason"]
 
 

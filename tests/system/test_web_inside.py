@@ -80,7 +80,7 @@ async def test_a_client_that_must_disconnect_drives_no_more_even_if_it_does_not_
     inside: Inside,
 ) -> None:
     async with inside.hands() as ours:
-        await ours.find(lambda said: "hello" in said)
+        await ours.find(lambda frame: "hello" in frame)
         await ours.drive(0.0)
         await eventually(lambda: inside.counts.all().get("commands_dropped"))
         (viewer,) = inside.page._viewers
@@ -109,7 +109,7 @@ async def test_a_client_that_stops_reading_later_gets_only_the_newest_message(
         inside.robots.client = Client(session, "acsar", "teleop")
         async with inside.hands() as ours:
             await ours.say(subscribe="odom", rate=50)
-            await ours.find(lambda said: "key" in said)
+            await ours.find(lambda frame: "key" in frame)
             assert left_out() == 0
             wire = cast(Any, ours.socket)._response.connection.transport
             wire.pause_reading()
@@ -121,11 +121,11 @@ async def test_a_client_that_stops_reading_later_gets_only_the_newest_message(
             wire.resume_reading()
             stamps = [0.0]
 
-            def leaps(said: Any) -> bool:
+            def leaps(frame: Any) -> bool:
                 """Return whether a message skips over most of those that were not read."""
-                if "key" not in said:
+                if "key" not in frame:
                     return False
-                stamps.append(seconds(said["value"]["header"]["stamp"]))
+                stamps.append(seconds(frame["value"]["header"]["stamp"]))
                 return 0 < stamps[-2] < stamps[-1] - 0.5 * MISSED / 50
 
             news = await ours.find(leaps)
@@ -138,7 +138,7 @@ async def test_a_stamp_too_large_to_sign_is_refused_and_the_next_command_is_acce
     async with inside.hands() as ours:
         wish = {"linear_x": 0.2, "angular_z": 0.0}
         await ours.say(cmd=wish, stamp=MAX_INT64 / 1e6)
-        refused = await ours.find(lambda said: said.get("refused") == "cmd")
+        refused = await ours.find(lambda frame: frame.get("refused") == "cmd")
         assert "ms since 1970" in refused["reason"]
         await ours.drive(0.0)
         await eventually(lambda: inside.counts.all().get("commands_dropped"))
@@ -166,7 +166,7 @@ async def test_a_key_that_is_unsubscribed_and_immediately_subscribed_again_is_fo
                 await ours.say(unsubscribe="state")
                 await ours.say(subscribe="state", rate=10)
             await ours.say(ping=1)
-            await ours.find(lambda said: "pong" in said)
+            await ours.find(lambda frame: "pong" in frame)
             await ours.state(lambda state: state["mode"])
             (viewer,) = inside.page._viewers
             assert list(viewer._out.following) == [("acsar", "state")]
@@ -179,7 +179,7 @@ async def test_a_client_that_unsubscribes_and_disconnects_leaves_no_subscription
         inside.robots.client = Client(session, "acsar", "teleop")
         async with inside.hands() as ours:
             await ours.say(subscribe="odom", rate=50)
-            await ours.find(lambda said: "key" in said)
+            await ours.find(lambda frame: "key" in frame)
             assert inside.robots.streams.followed("acsar", "odom") is not None
             # The server reads both messages at once.
             await ours.say(unsubscribe="odom")
@@ -192,7 +192,7 @@ async def test_a_client_that_pings_without_reading_gets_one_answer_to_all_pings(
     inside: Inside,
 ) -> None:
     async with inside.hands() as ours:
-        await ours.find(lambda said: "hello" in said)
+        await ours.find(lambda frame: "hello" in frame)
         wire = cast(Any, ours.socket)._response.connection.transport
         wire.pause_reading()
         (viewer,) = inside.page._viewers
@@ -219,7 +219,7 @@ async def test_a_bus_that_is_gone_is_reported_and_the_key_comes_when_it_is_back(
         inside.robots.client = Client(closed, "acsar", "teleop")
         async with inside.hands() as ours:
             await ours.say(subscribe="state", rate=10)
-            refused = await ours.find(lambda said: said.get("refused") == "subscribe")
+            refused = await ours.find(lambda frame: frame.get("refused") == "subscribe")
             assert "again" in refused["reason"]
             with client_session(daemon.endpoint, "") as session:
                 inside.robots.client = Client(session, "acsar", "teleop")
@@ -251,7 +251,7 @@ async def test_a_failed_command_outbox_ends_the_server(inside: Inside, tmp_path:
 async def test_a_client_on_the_robot_has_the_role_of_the_configuration(tmp_path: Path) -> None:
     inside = Inside(tmp_path, WebConfig(local="operator"))
     async with inside.hands() as ours:
-        hello = (await ours.find(lambda said: "hello" in said))["hello"]
+        hello = (await ours.find(lambda frame: "hello" in frame))["hello"]
         assert hello["role"] == "operator"
         assert {"set", "begin"} <= hello["barred"].keys()
         assert not (await ours.call("set", settings={}))["ok"]
@@ -280,10 +280,10 @@ async def test_only_a_page_of_a_listed_origin_may_send_requests_and_read_answers
             ("null", 403, None),
             (own, 409, None),
         ]:
-            told = {"Origin": origin, "Sec-Fetch-Site": "same-site"}
+            headers = {"Origin": origin, "Sec-Fetch-Site": "same-site"}
             if origin == own:
-                told["Sec-Fetch-Site"] = "same-origin"
-            async with session.post(place, headers=told) as answer:
+                headers["Sec-Fetch-Site"] = "same-origin"
+            async with session.post(place, headers=headers) as answer:
                 assert answer.status == status, origin
                 assert answer.headers.get("Access-Control-Allow-Origin") == readable
                 assert "Access-Control-Allow-Credentials" not in answer.headers
@@ -311,13 +311,13 @@ async def test_a_page_of_a_listed_origin_opens_the_socket_and_exchanges_no_link(
     shared: Inside,
 ) -> None:
     async with TestServer(shared.page.app) as server, aiohttp.ClientSession() as session:
-        place, told = server.make_url("/ws"), {"Origin": DASHBOARD}
-        async with session.ws_connect(place, headers=told) as opened:
+        place, site_headers = server.make_url("/ws"), {"Origin": DASHBOARD}
+        async with session.ws_connect(place, headers=site_headers) as opened:
             assert "hello" in (await opened.receive()).data
         with pytest.raises(aiohttp.WSServerHandshakeError) as caught:
             await session.ws_connect(place, headers={"Origin": "http://127.0.0.1:5174"})
         assert caught.value.status == 403
         url = server.make_url("/token")
-        async with session.post(url, json={"token": "x"}, headers=told) as answer:
+        async with session.post(url, json={"token": "x"}, headers=site_headers) as answer:
             assert answer.status == 403
             assert "another site" in (await answer.json())["error"]

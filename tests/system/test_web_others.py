@@ -58,21 +58,23 @@ def cleared(two: Two) -> None:
 async def test_another_robot_can_be_followed_and_stopped_and_nothing_else(two: Two) -> None:
     async with hands(two.page) as ours:
         await ours.say(subscribe="fleet")
-        seen = await ours.find(lambda said: len(said.get("fleet", ())) == 2)
-        assert [one["robot"] for one in seen["fleet"]] == [OURS, THEIRS]
-        assert seen["note"] == ""
+        fleet = await ours.find(lambda message: len(message.get("fleet", ())) == 2)
+        assert [entry["robot"] for entry in fleet["fleet"]] == [OURS, THEIRS]
+        assert fleet["note"] == ""
         await ours.say(subscribe="state", robot=THEIRS)
-        state = await ours.find(lambda said: said.get("robot") == THEIRS)
+        state = await ours.find(lambda message: message.get("robot") == THEIRS)
         assert state["value"]["mode"] == "ready"
         await ours.say(call="stop", id=1, robot=THEIRS)
-        assert (await ours.find(lambda said: said.get("answer") == 1))["ok"]
+        assert (await ours.find(lambda message: message.get("answer") == 1))["ok"]
         await ours.say(call="clear", id=2, robot=THEIRS)
-        refused = await ours.find(lambda said: said.get("answer") == 2)
+        refused = await ours.find(lambda message: message.get("answer") == 2)
         assert not refused["ok"]
         assert "own page" in refused["text"]
     assert two.theirs.state()["mode"] == "stopped"
     assert two.ours.state()["mode"] == "ready"
-    (stopped,) = [one for one in two.theirs.get("events")["events"] if one["name"] == "stop"][-1:]
+    (stopped,) = [entry for entry in two.theirs.get("events")["events"] if entry["name"] == "stop"][
+        -1:
+    ]
     assert stopped["by"].startswith("here@page")
 
 
@@ -93,7 +95,7 @@ async def test_a_stop_of_an_absent_robot_or_an_invalid_id_is_answered_with_an_er
         names = {"robot3": "no answer", "a/**": "not a robot's id"}
         for name, why in names.items():
             await ours.say(call="stop", robot=name)
-            answer = await ours.find(lambda said: "answer" in said)
+            answer = await ours.find(lambda message: "answer" in message)
             assert not answer["ok"]
             assert why in answer["text"]
 
@@ -104,10 +106,10 @@ async def test_a_page_connected_to_a_daemon_says_why_it_shows_no_other_robots(
     with Page(two.daemon, tmp_path) as beside:
         async with hands(beside) as ours:
             await ours.say(subscribe="fleet")
-            seen = await ours.find(lambda said: said.get("fleet"))
-            assert [one["robot"] for one in seen["fleet"]] == [OURS]
-            assert "daemons forward no messages" in seen["note"]
-            assert f"acsard web --connect ROUTER --id {OURS}" in seen["note"]
+            listing = await ours.find(lambda message: message.get("fleet"))
+            assert [row["robot"] for row in listing["fleet"]] == [OURS]
+            assert "daemons forward no messages" in listing["note"]
+            assert f"acsard web --connect ROUTER --id {OURS}" in listing["note"]
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="needs chromium-headless-shell")

@@ -58,7 +58,7 @@ async def test_a_phone_drives_and_is_named_and_a_stop_of_a_viewer_s_latches(
 ) -> None:
     async with hands(page, operator) as ours, hands(page, viewer) as theirs:
         await ours.say(subscribe="state", rate=50)
-        sender = (await ours.find(lambda said: "hello" in said))["hello"]["sender"]
+        sender = (await ours.find(lambda frame: "hello" in frame))["hello"]["sender"]
         assert sender.startswith("phone/")
         await ours.until_driving(0.3)
         state = bus.state()
@@ -78,12 +78,12 @@ async def test_a_phone_drives_and_is_named_and_a_stop_of_a_viewer_s_latches(
 
 
 async def test_an_invitation_prints_a_link_and_a_qr_code_that_give_access(page: Page) -> None:
-    told = page.tokens("--invite", "operator", "--name", "guest", "--days", "30")
-    assert "guest is operator until" in told
-    assert any(char in told for char in "▀▄█")  # the code
-    (link,) = re.findall(r"https://\S+:\d+/#token=(\S+)", told)
+    output = page.tokens("--invite", "operator", "--name", "guest", "--days", "30")
+    assert "guest is operator until" in output
+    assert any(char in output for char in "▀▄█")  # the code
+    (link,) = re.findall(r"https://\S+:\d+/#token=(\S+)", output)
     async with hands(page, link) as ours:
-        hello = (await ours.find(lambda said: "hello" in said))["hello"]
+        hello = (await ours.find(lambda frame: "hello" in frame))["hello"]
         assert hello["role"] == "operator"
     assert re.search(r"^guest +operator ", page.tokens("--tokens"), re.M)
 
@@ -95,7 +95,7 @@ async def test_a_new_certificate_is_used_and_open_connections_stay(
     before_ns = peer_ends_ns(endpoint, str(page.tls))
     assert before_ns is not None
     async with hands(page, operator) as ours:
-        await ours.find(lambda said: "hello" in said)
+        await ours.find(lambda frame: "hello" in frame)
         names = [NAME, "renamed.local"]
         Authority.load(page.tls, str).issue(page.tls, "robot", names, 0.5)
         while (peer_ends_ns(endpoint, str(page.tls)) or 0) >= before_ns:
@@ -143,8 +143,8 @@ async def test_a_link_with_fewer_permissions_replaces_a_cookie_only_if_asked_to(
             form = {"token": token[role], "replace": replace}
             url = f"{page.away}/token"
             async with phone.post(url, json=form, allow_redirects=False) as answer:
-                status, told = answer.status, await answer.text()
-            assert status == 303 or "already signed in as my-operator (operator)" in told
+                status, body = answer.status, await answer.text()
+            assert status == 303 or "already signed in as my-operator (operator)" in body
             async with phone.get(f"{page.away}/api/whoami") as answer:
                 return status, (await answer.json())["role"]
 
@@ -165,16 +165,16 @@ async def test_a_phone_can_use_two_pages_on_one_host_with_its_two_tokens(
     shutil.copytree(page.tls, tmp_path / "tls")
     with Page(daemon, tmp_path) as other:
         rooms = [(page, "first"), (other, "second")]
-        invited = [(one, one.invite("operator", name)) for one, name in rooms]
+        invited = [(server, server.invite("operator", name)) for server, name in rooms]
         async with page.client() as phone:
-            for one, token in invited:
+            for server, token in invited:
                 form = {"token": token}
                 async with phone.post(
-                    f"{one.away}/token", data=form, allow_redirects=False
+                    f"{server.away}/token", data=form, allow_redirects=False
                 ) as answer:
                     assert answer.status == 303
-            for one, name in rooms:
-                async with phone.get(f"{one.away}/api/whoami") as answer:
+            for server, name in rooms:
+                async with phone.get(f"{server.away}/api/whoami") as answer:
                     assert (await answer.json()).get("name") == name
 
 
@@ -220,7 +220,7 @@ async def test_a_connection_whose_token_was_revoked_is_cut_and_others_are_not(pa
         await reader.readuntil(b"}")
         return reader, writer
 
-    (borrowed, first), (owned, second) = [await opened(one) for one in tokens]
+    (borrowed, first), (owned, second) = [await opened(secret) for secret in tokens]
     page.vault.revoke(names[0])
     with suppress(ConnectionError):
         assert await asyncio.wait_for(borrowed.read(), 3 * TIDY_S + PATIENCE_S) == b""
@@ -241,18 +241,18 @@ async def test_a_client_with_too_many_connections_shuts_out_no_other_at_its_addr
     async def taken(stack: AsyncExitStack, token: str) -> int:
         """Open more connections than one client may have; return how many succeed."""
         session = await stack.enter_async_context(page.client(token))
-        got = 0
+        count = 0
         for _ in range(MAX_WEBSOCKETS_OF_NETWORK):
             with suppress(aiohttp.WSServerHandshakeError):
                 await stack.enter_async_context(session.ws_connect(f"{page.away}/ws"))
-                got += 1
+                count += 1
         async with session.get(f"{page.away}/api/whoami") as answer:
             assert "close some" in (await answer.json())["full"]
-        return got
+        return count
 
     async with AsyncExitStack() as stack:
         assert await taken(stack, broken) == MAX_WEBSOCKETS_OF_TOKEN_IN_NETWORK
-        rest = [await taken(stack, one) for one in others]
+        rest = [await taken(stack, invitation) for invitation in others]
         assert rest[:-1] == [MAX_WEBSOCKETS_OF_TOKEN_IN_NETWORK] * (few - 2)
         assert sum(rest) == MAX_WEBSOCKETS_OF_NETWORK - MAX_WEBSOCKETS_OF_TOKEN_IN_NETWORK
         for _ in range(MAX_LOCAL_WEBSOCKETS):
@@ -273,8 +273,8 @@ async def test_a_client_with_the_most_subscriptions_does_not_take_those_of_other
                 await greedy.say(subscribe="state", robot=f"r{n}_{k}", rate=1)
             await greedy.say(subscribe="state")
             await greedy.say(ping=n)
-            await greedy.find(lambda said: "pong" in said)
-            refused += any(one.get("refused") == "subscribe" for one in greedy.heard)
+            await greedy.find(lambda frame: "pong" in frame)
+            refused += any(reply.get("refused") == "subscribe" for reply in greedy.heard)
         # Of 50, the second connection had the last 20.
         assert refused == MAX_WEBSOCKETS_OF_TOKEN_IN_NETWORK - 1
         ours = await stack.enter_async_context(hands(page, operator))
@@ -282,20 +282,20 @@ async def test_a_client_with_the_most_subscriptions_does_not_take_those_of_other
         await ours.say(subscribe="state")
         await ours.state(lambda state: state["mode"])
         await ours.say(ping=1)
-        await ours.find(lambda said: "pong" in said)
-        assert not [one for one in ours.heard if "refused" in one]
+        await ours.find(lambda frame: "pong" in frame)
+        assert not [reply for reply in ours.heard if "refused" in reply]
 
 
 def test_bytes_that_are_not_a_request_get_a_json_error(page: Page, bus: Bus) -> None:
     counted = page.refused()
     port = int(page.here.rpartition(":")[2])
-    for said, reason, words in [
+    for request, reason, words in [
         (b"GET /api/state HTTP/1.1\r\n\r\n", "host", "no `Host`"),
         (b"\x16\x03\x01\x00\x00 hello\r\n\r\n", "malformed", "not an HTTP request"),
     ]:
-        with socket.create_connection(("127.0.0.1", port), 30.0) as held:
-            held.sendall(said)
-            head, _, body = held.makefile("rb").read().partition(b"\r\n\r\n")
+        with socket.create_connection(("127.0.0.1", port), 30.0) as connection:
+            connection.sendall(request)
+            head, _, body = connection.makefile("rb").read().partition(b"\r\n\r\n")
         assert head.split()[1] == b"400", head
         assert b"application/json" in head
         assert b"nosniff" in head
@@ -308,14 +308,14 @@ def test_refusals_are_logged_once_a_second_by_reason_and_without_tokens(
     page: Page, bus: Bus
 ) -> None:
     def lines() -> list[dict[str, Any]]:
-        told = [json.loads(line) for line in list(page.err) if line.startswith("{")]
-        return [one for one in told if one["event"] == "page_refused"]
+        records = [json.loads(line) for line in list(page.err) if line.startswith("{")]
+        return [record for record in records if record["event"] == "page_refused"]
 
     def counted(reason: str) -> int:
-        texts = " ".join(one["text"] for one in lines())
+        texts = " ".join(record["text"] for record in lines())
         return sum(int(count) for count in re.findall(rf"(\d+) {reason}", texts))
 
-    before, told, begun = counted("bad token"), len(lines()), time.monotonic()
+    before, line_count, begun = counted("bad token"), len(lines()), time.monotonic()
     guessed = "guessed-" + "x" * 35
 
     async def story() -> None:
@@ -331,7 +331,7 @@ def test_refusals_are_logged_once_a_second_by_reason_and_without_tokens(
         "all refusals are logged",
     )
     assert " from 127.0.0.1" in lines()[-1]["text"]
-    assert len(lines()) - told <= time.monotonic() - begun + 1.0
+    assert len(lines()) - line_count <= time.monotonic() - begun + 1.0
     assert "guessed" not in page.stderr
 
 
@@ -349,7 +349,7 @@ def test_the_log_of_a_refusal_names_the_address_and_the_token_s_name(
         async with hands(page, operator) as ours:
             for _ in range(2):
                 await ours.say(cmd={"linear_x": 0.1, "angular_z": 0}, stamp=1763700000000.0)
-            await ours.find(lambda said: said.get("reason", "").startswith("`stamp` must"))
+            await ours.find(lambda frame: frame.get("reason", "").startswith("`stamp` must"))
 
     run(story)
     until(lambda: told("from 127.0.0.1 (tv)") and told("from 127.0.0.1 (phone)"), 10.0, "named")
@@ -383,10 +383,10 @@ async def test_a_driving_program_that_is_disconnected_gets_a_close_code_and_a_re
 
     async def other(name: str) -> tuple[int | None, str | None]:
         """Drive by the library websockets, which answers pings. Return close code and reason."""
-        told = {"Authorization": f"Bearer {page.invite('operator', name)}"}
+        headers = {"Authorization": f"Bearer {page.invite('operator', name)}"}
         url = page.away.replace("https", "wss") + "/ws"
         async with websockets.connect(
-            url, ssl=trusted, host="127.0.0.1", additional_headers=told
+            url, ssl=trusted, host="127.0.0.1", additional_headers=headers
         ) as ours:
             driving = asyncio.create_task(drive(ours.send))
             vault.revoke(name)
@@ -400,5 +400,5 @@ async def test_a_driving_program_that_is_disconnected_gets_a_close_code_and_a_re
                 await send(next(wishes))
                 await asyncio.sleep(0.01)
 
-    told = await asyncio.gather(plain("trusted2"), other("trusted3"))
-    assert set(told) == {(1008, "your token has expired or was revoked: ask for a new one")}
+    results = await asyncio.gather(plain("trusted2"), other("trusted3"))
+    assert set(results) == {(1008, "your token has expired or was revoked: ask for a new one")}

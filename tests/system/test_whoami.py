@@ -46,8 +46,8 @@ class Robot:
         bus = {"listen": [self.plain, self.tls], "tls": str(self.certificates.robot)}
         self.daemon = Daemon(where, config={"bus": bus}, endpoint=self.plain)
 
-    def own(self, who: Identity) -> str:
-        return str(self.certificates.own(who))
+    def own(self, identity: Identity) -> str:
+        return str(self.certificates.own(identity))
 
     def tool(self, who: Identity, *words: str) -> Finished:
         link = ("--connect", self.tls, "--tls", self.own(who))
@@ -83,8 +83,8 @@ def test_the_verb_whoami_prints_the_role_the_certificate_and_its_permissions(rob
     assert (ended.code, ended.err) == (0, "")
     assert f"your certificate viewer has the role viewer: {VIEWER_MAY}" in ended.out
     assert re.search(r"^sender \S+/\d+/", ended.out, re.M)
-    found = json.loads(robot.tool("operator", "whoami", "--json").out)
-    assert (found["role"], found["certificate"]) == ("operator", "operator")
+    reply = json.loads(robot.tool("operator", "whoami", "--json").out)
+    assert (reply["role"], reply["certificate"]) == ("operator", "operator")
 
 
 @pytest.mark.slow
@@ -120,8 +120,8 @@ def test_a_command_to_many_robots_with_an_unlisted_certificate_says_that_it_is_u
 ) -> None:
     ended = robot.tool("unlisted", *words, "--id", "acsar,other")
     assert ended.code == 69
-    told = re.findall(SILENCE, ended.out + ended.err)
-    assert len(told) == (2 if words[0] == "call" else 1)
+    matches = re.findall(SILENCE, ended.out + ended.err)
+    assert len(matches) == (2 if words[0] == "call" else 1)
 
 
 @pytest.mark.slow
@@ -149,12 +149,12 @@ def test_the_error_suggests_a_wrong_id_before_an_unlisted_certificate(
     robot: Robot, words: tuple[str, ...], key: str
 ) -> None:
     ended = robot.tool("operator", *words, "--id", "robot1")
-    told = ended.out + ended.err
+    output = ended.out + ended.err
     assert ended.code != 0
-    assert f"no daemon answers as 'robot1' at {robot.tls}" in told
-    assert f"acsard/robot1/{key}" in told
-    assert told.index("is --id right") < told.index("role's list")
-    assert "add that name" not in told
+    assert f"no daemon answers as 'robot1' at {robot.tls}" in output
+    assert f"acsard/robot1/{key}" in output
+    assert output.index("is --id right") < output.index("role's list")
+    assert "add that name" not in output
 
 
 def followed_to_its_end(robot: Robot, own: Path, lasts: float) -> str | None:
@@ -164,19 +164,21 @@ def followed_to_its_end(robot: Robot, own: Path, lasts: float) -> str | None:
     """
     robot.certificates.issue(own, "viewer", lasts / 86400)
     words = acsard("echo", "state", "--connect", robot.tls, "--tls", str(own))
-    with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as one:
-        assert one.stdout is not None
-        assert one.stderr is not None
-        if '"mode"' not in one.stdout.readline():
+    with subprocess.Popen(
+        words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        if '"mode"' not in process.stdout.readline():
             return None
-        patience = Timer(lasts + 60.0, one.kill)
-        for thread in (patience, Thread(target=one.stdout.read, daemon=True)):
+        patience = Timer(lasts + 60.0, process.kill)
+        for thread in (patience, Thread(target=process.stdout.read, daemon=True)):
             thread.start()
         try:
-            return next((line for line in one.stderr if "has expired" in line), "")
+            return next((line for line in process.stderr if "has expired" in line), "")
         finally:
             patience.cancel()
-            one.kill()
+            process.kill()
 
 
 @pytest.mark.slow
@@ -184,13 +186,13 @@ def followed_to_its_end(robot: Robot, own: Path, lasts: float) -> str | None:
 def test_a_certificate_that_ends_while_a_client_follows_is_reported(
     robot: Robot, tmp_path: Path
 ) -> None:
-    told = None
+    message = None
     # the longer time is for a busy machine that takes the shorter one to start
     for lasts in (7.0, 60.0):
-        if told is None:
-            told = followed_to_its_end(robot, tmp_path / f"{lasts:g}", lasts)
-    assert told
-    assert "certificate.pem" in told
+        if message is None:
+            message = followed_to_its_end(robot, tmp_path / f"{lasts:g}", lasts)
+    assert message
+    assert "certificate.pem" in message
 
 
 @pytest.mark.slow
@@ -257,7 +259,7 @@ def test_an_async_drive_of_a_viewer_raises_not_permitted(robot: Robot) -> None:
 
 
 @pytest.mark.parametrize(
-    ("who", "code", "told"),
+    ("identity", "code", "text"),
     [
         ("viewer", 77, f"your certificate viewer has the role viewer: {VIEWER_MAY}"),
         pytest.param(
@@ -269,13 +271,13 @@ def test_an_async_drive_of_a_viewer_raises_not_permitted(robot: Robot) -> None:
     ],
 )
 def test_the_drive_verb_refuses_a_client_without_permission_before_a_key_is_pressed(
-    robot: Robot, who: Identity, code: int, told: str
+    robot: Robot, identity: Identity, code: int, text: str
 ) -> None:
-    link = ["--connect", robot.tls, "--tls", robot.own(who)]
+    link = ["--connect", robot.tls, "--tls", robot.own(identity)]
     where = robot.daemon.config.parent
     with at_terminal(where, "drive", *link, piped="stderr") as (_, program):
         assert program.ended(10.0) == code
-    assert told in program.stderr
+    assert text in program.stderr
 
 
 @pytest.mark.parametrize(

@@ -242,8 +242,8 @@ def test_every_refused_form_is_counted_and_only_zeros_are_sent_until_a_good_one_
         def counted() -> Any:
             state = bus.state()
             count = state["counters"].get
-            told = all(count(f"line_{reason}") == many for reason, many in wanted.items())
-            return state if told and count("line_too_long", 0) >= 2 else None
+            complete = all(count(f"line_{reason}") == many for reason, many in wanted.items())
+            return state if complete and count("line_too_long", 0) >= 2 else None
 
         # The daemon ignores these bytes, even with a commander that keeps sending.
         state = until(counted, 5.0, "each line is counted by its reason")
@@ -268,7 +268,7 @@ def test_a_silent_board_is_reported_gets_only_zeros_and_drives_on_after_a_short_
         assert "silent" in stale.value["reason"]
         pose = bus.state()["x"]
         zeros = peer.await_lines(2)
-        assert {heard.line for heard in zeros} == {ZERO_LINE}
+        assert {entry.line for entry in zeros} == {ZERO_LINE}
         assert bus.state()["x"] == pose
         # After a silence under a second the commander is still armed, and the ramp starts from
         # zero.
@@ -287,7 +287,7 @@ def test_after_a_silence_of_a_second_the_commander_must_be_neutral_first(
             _, stale, zeros_from = _fall_silent(peer, states)
             zeros = peer.await_lines(14)
             # The daemon sends at 10 Hz while no replies come, whatever the commander wants.
-            assert {heard.line for heard in zeros} == {ZERO_LINE}
+            assert {entry.line for entry in zeros} == {ZERO_LINE}
             took = zeros[-1].at - zeros[0].at
             assert 0.08 < took / 13 < 0.2 + lost(zeros[0].at, zeros[-1].at) / 13
             peer.reply = PLAIN
@@ -317,13 +317,13 @@ def _fall_silent(peer: Peer, states: Following) -> tuple[float, Seen, float]:
     muted = time.monotonic()
     stale = states.find(lambda state: state["link"] == "stale", 5.0, "stale", after=muted)
     until(lambda: peer.lines[-1].line == ZERO_LINE, 2.0, "zeros")
-    last = max(heard.at for heard in peer.lines if heard.line != ZERO_LINE)
+    last = max(entry.at for entry in peer.lines if entry.line != ZERO_LINE)
     return muted, stale, last
 
 
 def _moving_since(peer: Peer, after: float) -> bytes | None:
     """Return the first line after this time that is not zero."""
-    moving = (heard.line for heard in peer.lines if heard.at > after and heard.line != ZERO_LINE)
+    moving = (entry.line for entry in peer.lines if entry.at > after and entry.line != ZERO_LINE)
     return next(moving, None)
 
 

@@ -30,5 +30,5 @@ def typed(*words: str) -> Finished:
             code = end.code if isinstance(end.code, int) else 1
         finally:
             sys.stdin = before
-    said, wrong = (stream.getvalue().rstrip("\n") for stream in (out, err))
-    return Finished(code, said, wrong, time.monotonic() - begun)
+    output, wrong = (stream.getvalue().rstrip("\n") for stream in (out, err))
+    return Finished(code, output, wrong, time.monotonic() - begun)

@@ -95,23 +95,25 @@ class Viewer:
         except ConnectionClosed:
             pass
 
-    def _told(self, said: dict[str, Any]) -> None:
-        match said["op"]:
+    def _told(self, message: dict[str, Any]) -> None:
+        match message["op"]:
             case "serverInfo":
-                self.info = said
+                self.info = message
             case "advertise":
-                self.channels |= {one["topic"]: one for one in said["channels"]}
+                self.channels |= {entry["topic"]: entry for entry in message["channels"]}
             case "advertiseServices":
-                self.services |= {one["name"]: one for one in said["services"]}
+                self.services |= {entry["name"]: entry for entry in message["services"]}
             case "status":
-                self.statuses.append(said)
+                self.statuses.append(message)
             case "removeStatus":
-                self.removed += said["statusIds"]
+                self.removed += message["statusIds"]
             case "parameterValues":
-                self.parameters |= {one["name"]: one.get("value") for one in said["parameters"]}
-                self.replies[said.get("id", "")] = said
+                self.parameters |= {
+                    entry["name"]: entry.get("value") for entry in message["parameters"]
+                }
+                self.replies[message.get("id", "")] = message
             case "serviceCallFailure":
-                self._answers[said["callId"]] = False, said["message"]
+                self._answers[message["callId"]] = False, message["message"]
 
     def _data(self, frame: bytes) -> None:
         if frame[0] == MESSAGE:
@@ -142,7 +144,9 @@ class Viewer:
         """Wait for a status message that contains these words, and return it."""
 
         def look() -> dict[str, Any] | None:
-            return next((one for one in list(self.statuses) if words in one["message"]), None)
+            return next(
+                (status for status in list(self.statuses) if words in status["message"]), None
+            )
 
         return until(look, within, f"{words!r} among {[s['message'] for s in self.statuses]}")
 
@@ -188,8 +192,8 @@ class Viewer:
     def _asked(self, op: str, **fields: Any) -> dict[str, Any]:
         number = f"q{next(self._numbers)}"
         self._say(op, id=number, **fields)
-        said = until(lambda: self.replies.get(number), 5.0, f"an answer to {op}")
-        return {one["name"]: one.get("value") for one in said["parameters"]}
+        reply = until(lambda: self.replies.get(number), 5.0, f"an answer to {op}")
+        return {parameter["name"]: parameter.get("value") for parameter in reply["parameters"]}
 
 
 class Looked:

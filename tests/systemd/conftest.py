@@ -41,14 +41,14 @@ def rootfs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     missing = needs()
     if missing:
         unavailable(missing)
-    kept = os.environ.get("ACSARD_TEST_ROOTFS")
-    where = Path(kept) if kept else tmp_path_factory.mktemp("debian") / "rootfs"
+    directory = os.environ.get("ACSARD_TEST_ROOTFS")
+    where = Path(directory) if directory else tmp_path_factory.mktemp("debian") / "rootfs"
     try:
         yield build(where)
     except UnavailableError as why:
         unavailable(f"cannot make a root file system: {why}")
     finally:
-        if not kept:
+        if not directory:
             shutil.rmtree(where, ignore_errors=True)
 
 

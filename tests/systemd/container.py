@@ -393,9 +393,9 @@ class Board(Program):
     def since(self, at: float) -> list[Heard]:
         """Return the lines after this time without their line ends, and "-" for an empty line."""
         for text in self.out[1 + len(self._heard) :]:
-            came, _, line = text.partition(" ")
-            self._heard.append(Heard(float(came), line.encode()))
-        return [heard for heard in self._heard if heard.at > at]
+            stamp, _, line = text.partition(" ")
+            self._heard.append(Heard(float(stamp), line.encode()))
+        return [entry for entry in self._heard if entry.at > at]
 
     def awaits(self, line: bytes, after: float = 0.0, within: float = 5.0) -> Heard:
         """Wait for the first line after this time that starts with this prefix, and return it."""
@@ -466,8 +466,8 @@ class Driver(Program):
 
     def states(self, after: float) -> list[tuple[float, str]]:
         """Return the time and the mode of each state after this time."""
-        told = [line.split(" ", 1) for line in list(self.out)]
-        return [(float(at), mode) for at, mode in told if float(at) > after]
+        rows = [line.split(" ", 1) for line in list(self.out)]
+        return [(float(at), mode) for at, mode in rows if float(at) > after]
 
     def drives(self, board: Board, speed: float = 0.5) -> None:
         """Send zeros until the daemon obeys them, then the speed until the wheels reach it."""

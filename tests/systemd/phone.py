@@ -77,9 +77,9 @@ class Phone:
         the phone's namespace.
         """
         trusted = ssl.create_default_context(cafile=str(self.authority))
-        told = {"Authorization": f"Bearer {token}"} if token else {}
+        headers = {"Authorization": f"Bearer {token}"} if token else {}
         return aiohttp.ClientSession(
             connector=aiohttp.TCPConnector(ssl=trusted),
             cookie_jar=aiohttp.CookieJar(unsafe=True),  # cookies of an address, not only of a name
-            headers=told,
+            headers=headers,
         )

@@ -45,7 +45,7 @@ FILE = f"{STATES}/acsard/acsar.latches.json"
 
 def moves(board: Board, since: float) -> list[Heard]:
     """Return the lines after this time that turn a wheel."""
-    return [heard for heard in board.since(since) if heard.line not in (ZERO, b"-")]
+    return [entry for entry in board.since(since) if entry.line not in (ZERO, b"-")]
 
 
 def drives(board: Board) -> None:

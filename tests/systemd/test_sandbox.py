@@ -102,9 +102,9 @@ def test_with_lan_conf_the_gateway_reads_root_s_keys_and_listens_beyond_this_com
 ) -> None:
     opened(container)
     viewer = ("--connect", "tls/127.0.0.1:7449", "--tls", f"{TLS}/clients/viewer")
-    shown = container.run(ACSARD, "echo", "state", "-n", "1", *viewer)
-    assert shown.code == 0, shown.err
-    state = json.loads(shown.out)
+    result = container.run(ACSARD, "echo", "state", "-n", "1", *viewer)
+    assert result.code == 0, result.err
+    state = json.loads(result.out)
     assert state["mode"] == "ready"
     assert state["certificate_expiry"] == "valid for 730 days", (
         "the daemon may not read it: the gateway tells"
@@ -192,7 +192,7 @@ def test_lan_conf_without_its_key_fails_the_start_of_the_unit(
     container.drop_in("lan.conf", (DEPLOY / "lan.conf").read_text())
     assert container.start().code != 0
     # These are the lines of the stop script, which runs after any end.
-    assert {heard.line for heard in board.since(0.0)} <= {ZERO, b"-"}
+    assert {entry.line for entry in board.since(0.0)} <= {ZERO, b"-"}
 
 
 @pytest.mark.nightly
@@ -204,15 +204,15 @@ def test_without_its_key_the_gateway_or_page_stays_down_and_doctor_names_the_key
     container.drop_in("lan.conf", (DEPLOY / "lan.conf").read_text(), unit)
     container.run("systemctl", "stop", unit)
     key = container.path(f"{TLS}/key.pem")
-    kept = key.read_bytes()
+    contents = key.read_bytes()
     key.unlink()
     container.start(unit)
     until(lambda: container.show("ActiveState", unit) == "failed", 5.0, "it is left alone")
     assert container.show("ExecMainStatus", unit) == "243"
     assert container.show("NRestarts", unit) == "0"
-    told = container.run(ACSARD, "doctor", "--config", CONFIG).out
-    assert f"{TLS}/key.pem is missing" in told
-    key.write_bytes(kept)
+    output = container.run(ACSARD, "doctor", "--config", CONFIG).out
+    assert f"{TLS}/key.pem is missing" in output
+    key.write_bytes(contents)
     container.run("systemctl", "enable", unit)  # as installed
     container.run("systemctl", "restart", UNIT)
     until(lambda: container.show("SubState", unit) == "running", 10.0, "it is there again")

@@ -47,12 +47,12 @@ def bare(alone: Container) -> Iterator[Container]:
 
 def listing(container: Container) -> set[str]:
     """Return every file of acsard and of the administrator in the container, with its size."""
-    found = set()
+    files = set()
     for place in PLACES:
         for path in container.path(place).rglob("*"):
             size = path.lstat().st_size if path.is_file() else 0
-            found.add(f"{path.relative_to(container.path('/'))} {size}")
-    return found
+            files.add(f"{path.relative_to(container.path('/'))} {size}")
+    return files
 
 
 def written(out: str) -> list[str]:
@@ -89,8 +89,8 @@ def test_the_service_runs_after_install_and_leaves_no_file_after_uninstall(bare:
     assert f"wrong mode or owner  {STOP}" in status.out, status.out
     assert bare.run(ACSARD, "service", "install").code == 0
     assert bare.run("stat", "-c", "%a", STOP).out.strip() == "755"
-    gone = bare.run(ACSARD, "service", "uninstall")
-    assert gone.code == 0, gone.out + gone.err
+    result = bare.run(ACSARD, "service", "uninstall")
+    assert result.code == 0, result.out + result.err
     assert listing(bare) == before
     assert bare.show("LoadState") == "not-found"
     assert bare.run(ACSARD, "service", "status").code == 1
@@ -135,11 +135,13 @@ def test_the_page_runs_within_its_limits_and_its_end_does_not_end_the_daemon(
     assert bare.main_pid() == daemon
     Authority.make(bare.path(TLS), "test", 1).issue(bare.path(TLS), "robot", ["127.0.0.1"], 1)
     away = ("--address", "https://0.0.0.0:8443", "--tls", TLS)
-    told = bare.run(ACSARD, "web", "--invite", "viewer", *away)
-    assert told.code == 0, told.err
-    kept = bare.run("stat", "-L", "-c", "%a %u", "/var/lib/acsard-web/tokens.json").out.split()
+    result = bare.run(ACSARD, "web", "--invite", "viewer", *away)
+    assert result.code == 0, result.err
+    attributes = bare.run(
+        "stat", "-L", "-c", "%a %u", "/var/lib/acsard-web/tokens.json"
+    ).out.split()
     owner = bare.run("stat", "-L", "-c", "%u", "/var/lib/acsard-web").out.strip()
-    assert kept == ["600", owner]
+    assert attributes == ["600", owner]
 
 
 TLS = "/root/tls"
@@ -208,8 +210,8 @@ def drawn(container: Container) -> dict[str, object]:
     """Request a report of the recording of the earlier version, and return the result."""
 
     def ended() -> dict[str, object]:
-        told = json.loads(asks(container, f"/api/recordings/{FORMER}/report", "POST") or "{}")
-        return told if told.get("report") in ("ready", "failed") else {}
+        reply = json.loads(asks(container, f"/api/recordings/{FORMER}/report", "POST") or "{}")
+        return reply if reply.get("report") in ("ready", "failed") else {}
 
     return until(ended, 60.0, "a report, or why there is none")
 
@@ -225,8 +227,8 @@ def test_the_service_s_page_lists_serves_and_draws_recordings_and_cannot_change_
     until(lambda: FORMER in asks(bare, "/api/recordings"), 20.0, "what was recorded before")
     until(lambda: "being recorded" in asks(bare, "/api/recordings"), 20.0, "what is recorded now")
     fetched = f"http://127.0.0.1:8080/api/recordings/{FORMER}"
-    given = bare.run("python3", "-c", FETCHED, fetched).out.strip()
-    assert given == hashlib.sha256(recording).hexdigest()
+    digest = bare.run("python3", "-c", FETCHED, fetched).out.strip()
+    assert digest == hashlib.sha256(recording).hexdigest()
     assert drawn(bare) == {"report": "ready", "href": f"report/{FORMER}"}
     assert "Plotly" in asks(bare, f"/report/{FORMER}")
 
@@ -235,11 +237,11 @@ def test_the_service_s_page_lists_serves_and_draws_recordings_and_cannot_change_
     walls = f"ExecStartPre=/usr/bin/python3 /opt/acsard/probe.py {words}"
     bare.drop_in("probe.conf", f"[Service]\n{walls}\n", PAGE)
     bare.run("systemctl", "restart", PAGE)
-    told = [line for line in bare.messages(PAGE).splitlines() if line.startswith('{"read"')]
-    found = json.loads(told[-1])
-    assert found.pop("private") == ["acsard", "acsard-web"]
-    assert (found.pop("read"), found.pop("signal")) == ("done", "EPERM")
-    assert set(found.values()) <= {"EACCES", "EROFS", "ENOENT", "EPERM"}, found
+    lines = [line for line in bare.messages(PAGE).splitlines() if line.startswith('{"read"')]
+    report = json.loads(lines[-1])
+    assert report.pop("private") == ["acsard", "acsard-web"]
+    assert (report.pop("read"), report.pop("signal")) == ("done", "EPERM")
+    assert set(report.values()) <= {"EACCES", "EROFS", "ENOENT", "EPERM"}, report
 
     assert bare.run(ACSARD, "service", "uninstall", "--purge").code == 0
     assert not bare.path(STATE).exists()
@@ -250,9 +252,9 @@ def test_the_service_s_page_lists_serves_and_draws_recordings_and_cannot_change_
 def test_a_purge_after_an_uninstall_removes_what_the_uninstall_kept(bare: Container) -> None:
     bare.write(CONFIGURATION, "")  # the simulator
     assert bare.run(ACSARD, "service", "install").code == 0
-    kept = bare.run(ACSARD, "service", "uninstall").out
-    assert f"keep    {CONFIGURATION}" in kept
-    assert "keep    /var/lib/acsard  " in kept
+    output = bare.run(ACSARD, "service", "uninstall").out
+    assert f"keep    {CONFIGURATION}" in output
+    assert "keep    /var/lib/acsard  " in output
     done = bare.run(ACSARD, "service", "uninstall", "--purge")
     assert done.code == 0, done.out + done.err
     for place in (CONFIGURATION, STATE, f"{STATE}-web", f"/etc/systemd/system/{UNIT}"):
@@ -266,8 +268,8 @@ def test_a_foreign_file_is_not_overwritten_or_removed_without_force(bare: Contai
     assert refused.code == 1
     assert unit in refused.err
     assert not bare.path(CONFIGURATION).exists()
-    kept = bare.run(ACSARD, "service", "uninstall")
-    assert f"keep    {unit}" in kept.out
+    result = bare.run(ACSARD, "service", "uninstall")
+    assert f"keep    {unit}" in result.out
     assert bare.path(unit).read_text().endswith("/bin/true\n")
     assert bare.run(ACSARD, "service", "install", "--force").code == 0
     assert bare.show("ActiveState") == "active"

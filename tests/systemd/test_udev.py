@@ -79,8 +79,8 @@ def verdict(
     udevadm = ["udevadm", "test", f"--action={action}", f"{USB}/1-1:1.0/ttyUSB0/tty/ttyUSB0"]
     ran = container.run("umockdev-run", "-d", "/tmp/board", "--", *udevadm)
     assert ran.code == 0, ran.err
-    found = [line.strip() for line in ran.out.splitlines() if "=" in line]
-    return Verdict(dict(line.split("=", 1) for line in found), ran.err)
+    properties = [line.strip() for line in ran.out.splitlines() if "=" in line]
+    return Verdict(dict(line.split("=", 1) for line in properties), ran.err)
 
 
 @pytest.mark.variations(8)

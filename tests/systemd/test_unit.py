@@ -63,7 +63,7 @@ def fault(container: Container, board: Board, driver: Driver, number: signal.Sig
     again = time.monotonic()
     # The commander never stopped: neither the stop script nor the next daemon lets it drive on.
     until(lambda: driver.states(again), 5.0, "the next daemon publishes")
-    moving = [heard for heard in board.since(zero) if heard.line not in (ZERO, b"-")]
+    moving = [entry for entry in board.since(zero) if entry.line not in (ZERO, b"-")]
     assert not moving, moving[:3]
     return Fault(zero - began, waited, again - began)
 
@@ -73,9 +73,9 @@ def faults(
 ) -> list[Fault]:
     """Cause many faults, and return their times."""
     took = [fault(container, board, driver, number) for _ in range(times)]
-    report(f"{number.name} -> first zero", [one.zero for one in took])
-    report("  of it, waiting for a processor", [one.waited for one in took])
-    report(f"{number.name} -> ready again", [one.again for one in took])
+    report(f"{number.name} -> first zero", [trial.zero for trial in took])
+    report("  of it, waiting for a processor", [trial.waited for trial in took])
+    report(f"{number.name} -> ready again", [trial.again for trial in took])
     calm = undisturbed(took)
     if calm:
         report(f"{number.name} -> first zero, undisturbed", calm)
@@ -87,12 +87,12 @@ def undisturbed(took: list[Fault]) -> list[float]:
 
     Faults that other work of this machine disturbed for too long are left out.
     """
-    return [one.zero - one.waited for one in took if one.waited <= DISTURBED_S]
+    return [trial.zero - trial.waited for trial in took if trial.waited <= DISTURBED_S]
 
 
 def within(took: list[Fault], bound: float) -> bool:
     """Return whether the median delay to a zero and each undisturbed delay are within the bound."""
-    mostly = statistics.median_low(one.zero for one in took) <= bound
+    mostly = statistics.median_low(trial.zero for trial in took) <= bound
     return mostly and max(undisturbed(took), default=0.0) <= bound
 
 
@@ -176,12 +176,12 @@ def test_stop_ramps_down_ends_with_stop_and_exits_0(
         assert container.show("Result") == "success"
         assert container.show("ExecMainStatus") == "0"
         assert container.show("ActiveState") == "inactive"
-        lines = [heard for heard in board.since(began) if heard.line != b"-"]
-        ramp = [float(heard.line[2:7]) for heard in lines]
+        lines = [entry for entry in board.since(began) if entry.line != b"-"]
+        ramp = [float(entry.line[2:7]) for entry in lines]
         assert lines[-1].line == ZERO
         assert ramp == sorted(ramp, reverse=True), "a monotone fall"
         assert len({speed for speed in ramp if 0 < speed < 10}) > 5, "a ramp, not a cut"
-        zeros.append(next(heard.at for heard in lines if heard.line == ZERO) - began)
+        zeros.append(next(entry.at for entry in lines if entry.line == ZERO) - began)
         container.run("systemctl", "reset-failed", UNIT)
     report("systemctl stop at 0.5 m/s -> first zero (end of the ramp)", zeros)
     report("systemctl stop at 0.5 m/s -> stopped", ends)
@@ -199,9 +199,9 @@ def test_a_bad_configuration_ends_the_unit_with_78_and_it_stays_down(
     assert container.show("ExecMainStatus") == "78"
     assert (container.show("ActiveState"), container.show("SubState")) == ("failed", "failed")
     assert container.show("NRestarts") == "0"
-    told = "\n".join(str(entry["MESSAGE"]) for entry in container.journal())
-    assert "baud" in told
-    assert "rate" in told
+    text = "\n".join(str(entry["MESSAGE"]) for entry in container.journal())
+    assert "baud" in text
+    assert "rate" in text
 
 
 def test_a_forbidden_port_ends_the_unit_with_77_and_it_stays_down(

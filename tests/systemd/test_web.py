@@ -37,12 +37,12 @@ SERVED_S = 20.0
 
 def of_the_page(language: str, words: str) -> Block:
     """Return the only code block of the manual's page that contains these words."""
-    (found,) = (
+    (match,) = (
         block
         for block in blocks(language)
         if block.page == "deploy/web/README.md" and words in block.text
     )
-    return found
+    return match
 
 
 OPENING = of_the_page("console", "acsard-web.service.d").commands()
@@ -107,10 +107,10 @@ def here(robot: Container, path: str) -> str:
 
 def invited(robot: Container, *more: str) -> str:
     """Invite a client with the page's command, and return its token."""
-    told = robot.types(" ".join([OPENING[-1], *more])).out
-    found = LINK.search(told)
-    assert found, told
-    return found[1]
+    output = robot.types(" ".join([OPENING[-1], *more])).out
+    match = LINK.search(output)
+    assert match, output
+    return match[1]
 
 
 def on(phone: Phone, story: Callable[[], Awaitable[None]]) -> None:
@@ -125,8 +125,8 @@ async def let_in(browser: aiohttp.ClientSession, token: str) -> str:
     async with posted as answer:
         assert answer.status == 200, await answer.text()
         assert "<html" in await answer.text()
-        (gone,) = answer.history
-        return gone.headers["Set-Cookie"]
+        (redirect,) = answer.history
+        return redirect.headers["Set-Cookie"]
 
 
 def test_an_invited_phone_drives_and_stops_the_installed_robot_until_it_is_revoked(
@@ -146,14 +146,14 @@ def test_an_invited_phone_drives_and_stops_the_installed_robot_until_it_is_revok
                 assert answer.status == 401
 
     async def drives_until_revoked(ours: Hands) -> None:
-        hello = (await ours.find(lambda said: "hello" in said))["hello"]
+        hello = (await ours.find(lambda message: "hello" in message))["hello"]
         assert (hello["role"], hello["simulated"]) == ("operator", True)
         assert hello["sender"].startswith("phone/")
         await ours.say(subscribe="state", rate=50)
         await ours.until_driving(0.2)
         assert (await ours.call("stop"))["ok"]
-        seen = await ours.state(lambda state: state["mode"] == "stopped" and state["linear"] == 0)
-        assert (await ours.call("clear", latch=seen["latch"]))["ok"]
+        status = await ours.state(lambda state: state["mode"] == "stopped" and state["linear"] == 0)
+        assert (await ours.call("clear", latch=status["latch"]))["ok"]
         await ours.until_driving(0.2)
         holding = asyncio.create_task(ours.hold(0.2, 3 * PATIENCE_S))
         await asyncio.to_thread(robot.types, REVOKING)

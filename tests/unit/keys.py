@@ -52,8 +52,8 @@ def _numbers(kind: Any) -> Iterator[Bounded]:
         case inspect.Metadata(type=inner) | inspect.VarTupleType(item_type=inner):
             yield from _numbers(inner)
         case inspect.UnionType(types=types) | inspect.TupleType(item_types=types):
-            for one in types:
-                yield from _numbers(one)
+            for member in types:
+                yield from _numbers(member)
 
 
 KEYS = tuple(all_keys())

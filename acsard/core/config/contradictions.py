@@ -50,50 +50,54 @@ MAX_VOLTS = 99.99
 
 def warnings(config: Config) -> list[str]:
     """Return one warning for each setting that is allowed but has a surprising effect."""
-    found = []
+    messages = []
     count = config.mcu.line_bytes
     use = wire_use(config.rate_hz, config.mcu.baud_rate, count)
     if use > COMFORTABLE_USE:
         comfortable = highest_rate(config.mcu.baud_rate, count, COMFORTABLE_USE)
-        found.append(
+        messages.append(
             f"control.rate = {config.rate_hz:g} takes {use:.0%} of the wire at "
             f"{config.mcu.baud_rate} baud, so the daemon will replace some lines by newer ones "
             f"before they are sent; write {comfortable} or less"
         )
-    found += _count_warnings(config)
+    messages += _count_warnings(config)
     drive, limits = config.drive, config.limits
     needed = limits.linear_speed / drive.wheel_radius
     if needed > limits.wheel_speed:
-        found.append(
+        messages.append(
             f"limits.linear_speed = {limits.linear_speed:g} m/s needs wheels at {needed:.1f} "
             f"rad/s, but limits.wheel_speed = {limits.wheel_speed:g}, so the robot will stay "
             "slower; raise limits.wheel_speed or lower limits.linear_speed"
         )
     if config.safety.estop == "off":
-        found.append(
+        messages.append(
             'safety.estop = "off": the robot ignores an emergency stop that its board reports'
         )
     if config.safety.bumper == "off":
-        found.append('safety.bumper = "off": the robot ignores bumpers that its board reports')
+        messages.append('safety.bumper = "off": the robot ignores bumpers that its board reports')
     status_use = wire_use(STATUS_HZ, config.mcu.baud_rate, STATUS_BYTES)
     required = 'safety.estop = "required"' if config.safety.estop == "required" else ""
     if config.safety.bumpers and config.safety.bumper != "off":
         required = required or f"safety.bumpers = {show(config.safety.bumpers)}"
     if required and use + status_use > 1.0:
         left = highest_rate(config.mcu.baud_rate, count, COMFORTABLE_USE - status_use)
-        found.append(
+        messages.append(
             f"{required} needs status lines, which take {status_use:.0%} of the wire at "
             f"{config.mcu.baud_rate} baud. The replies at control.rate = {config.rate_hz:g} do "
             f"not fit beside them; write control.rate = {left} or less"
         )
     if config.bus.insecure:
-        found.append("bus.insecure = true: every program that reaches the bus can drive this robot")
+        messages.append(
+            "bus.insecure = true: every program that reaches the bus can drive this robot"
+        )
     if config.access.wildcards:
-        found.append("access.wildcards = true: every client with a certificate can stall the bus")
+        messages.append(
+            "access.wildcards = true: every client with a certificate can stall the bus"
+        )
     hosts = [_host(endpoint) for ends in _endpoints(config.bus).values() for endpoint in ends]
     outside = not all(_is_loopback(host) for host in hosts if host)
     if outside and config.robot.id == Config().robot.id:
-        found.append(
+        messages.append(
             f'robot.id = "{config.robot.id}" is the default id, but other machines reach the bus: '
             "a second robot with this id would use the same keys; give each robot its own id"
         )
@@ -102,32 +106,32 @@ def warnings(config: Config) -> list[str]:
         "that other machines reach" if outside else "with a router" if config.bus.connect else ""
     )
     if where and (ros.bridge or ros.rmw) and not ros.namespace:
-        found.append(
+        messages.append(
             f'ros.namespace = "" on a bus {where}: a second robot on this bus would use the same '
             "ROS topics; give each robot its own namespace"
         )
-    return found + named_faults.warnings(config)
+    return messages + named_faults.warnings(config)
 
 
 def _count_warnings(config: Config) -> list[str]:
     mcu = config.mcu
     if not mcu.encoder_counts:
         return []
-    found = []
+    messages = []
     if mcu.simulated and mcu.encoder_counts != config.sim.encoder_counts:
-        found.append(
+        messages.append(
             f"mcu.encoder_counts = {mcu.encoder_counts}, but the simulated robot's encoders have "
             f"sim.encoder_counts = {config.sim.encoder_counts}: distances may be wrong; write the "
             "same number for both keys"
         )
     coarse = mcu.encoder_counts < FEW_COUNTS and not mcu.wants_samples
     if coarse and config.rate_hz > FASTEST_HZ:
-        found.append(
+        messages.append(
             f"control.rate = {config.rate_hz:g} with mcu.encoder_counts = {mcu.encoder_counts}: "
             "lines follow each other so soon that a board repeats counts, and distances may be up "
             f"to 30 % wrong; write control.rate = {FASTEST_HZ:g} or less"
         )
-    return found
+    return messages
 
 
 def contradictions(config: Config) -> list[str]:
@@ -232,21 +236,21 @@ def _gyro_problems(config: Config) -> list[str]:
 
 
 def _battery_problems(config: Config) -> list[str]:
-    battery, found = config.battery, []
+    battery, errors = config.battery, []
     rows = [(f"battery.{level}_below", below) for level, below in battery.bounds.items()]
     for (name, below), (worse, lower) in pairwise(rows):
         if lower >= below:
-            found.append(
+            errors.append(
                 f"{worse} = {lower:g}: not lower than {name} = {below:g}; write a lower {worse}"
             )
     most = 100.0 if battery.measure == "percent" else MAX_VOLTS
     for name, below in rows:
         if below + battery.hysteresis > most:
-            found.append(
+            errors.append(
                 f"{name} = {below:g}: with battery.hysteresis = {battery.hysteresis:g} the level "
                 f"would end only above {most:g}, which no board reports; lower either value"
             )
-    return found
+    return errors
 
 
 def _repeated(
@@ -258,27 +262,27 @@ def _repeated(
     returns the part of a value to compare, such as the host and port of an endpoint.
     """
     first: dict[str, str] = {}
-    found = []
+    errors = []
     for key, name in names.items():
         same = part(name)
         if same in first:
-            found.append(
+            errors.append(
                 f"{key} = {show(name)}: {first[same]} already has this {noun}; write another"
             )
         first.setdefault(same, key)
-    return found
+    return errors
 
 
 def _source_problems(config: Config) -> list[str]:
     period = 1.0 / config.rate_hz
-    found = []
+    errors = []
     for i, source in enumerate(config.commands.sources):
         if source.timeout < 2 * period:
-            found.append(
+            errors.append(
                 f"commands.sources[{i}].timeout = {source.timeout:g}: shorter than two control "
                 f"periods, so the robot would stutter; write {2 * period:g} or more"
             )
-    return found
+    return errors
 
 
 def _bumper_problems(config: Config) -> list[str]:
@@ -292,49 +296,49 @@ def _bumper_problems(config: Config) -> list[str]:
 
 
 def _reachability_problems(config: Config) -> list[str]:
-    bus, found = config.bus, []
+    bus, errors = config.bus, []
     if bus.mode == "client" and not bus.connect:
-        found.append(
+        errors.append(
             'bus.mode = "client" needs an address to connect to; write bus.connect = '
             '["tcp/127.0.0.1:7447"] or bus.mode = "peer"'
         )
     if not bus.listen and bus.mode == "peer":
-        found.append(
+        errors.append(
             "bus.listen = []: no client could connect to the daemon; write bus.listen = "
             '["tcp/127.0.0.1:7448"]'
         )
     if bus.outside and not bus.plain:
-        found.append(
+        errors.append(
             f"bus.listen = {show(list(bus.listen))}: the TLS gateway needs a tcp address of this "
             'machine to reach the daemon, but the list has none; add "tcp/127.0.0.1:7448"'
         )
-    return found
+    return errors
 
 
 def _endpoint_problems(config: Config, key: str) -> list[str]:
-    bus, found = config.bus, []
+    bus, errors = config.bus, []
     for endpoint in _endpoints(bus).get(key, ()) if key == "listen" else bus.connect:
         where = f"bus.{key} = {show(endpoint)}"
         host = _host(endpoint)
         if host is None:
-            found.append(
+            errors.append(
                 f"{where}: not an endpoint; write it like "
                 '"tcp/127.0.0.1:7448", "tcp/[::1]:7448" or "tls/0.0.0.0:7449"'
             )
         elif endpoint.startswith("tls/"):
             if not bus.tls:
-                found.append(
+                errors.append(
                     f"{where}: needs certificates; `acsard tls init` makes them and prints the "
                     "bus.tls to write"
                 )
         elif not _is_loopback(host) and not bus.insecure:
-            found.append(
+            errors.append(
                 f"{where}: this endpoint is on the network, without encryption or access "
                 "control; choose one: (1) write 127.0.0.1, and connect a laptop through an "
                 'SSH tunnel; (2) run `acsard tls init`, then write "tls/…"; (3) if anyone on '
                 "the network may drive the robot, write bus.insecure = true"
             )
-    return found
+    return errors
 
 
 def _listen_twice_problems(config: Config) -> list[str]:
@@ -348,32 +352,32 @@ def _page_problems(config: Config) -> list[str]:
 
     `acsard/web/listen.py` applies the same rules when the page starts.
     """
-    addresses, found = config.web.address, []
+    addresses, errors = config.web.address, []
     for address in addresses:
         where = f"web.address = {show(address)}"
         scheme, _, place = address.partition("://")
         host, _, port = place.rpartition(":")
         if not 0 < int(port) < 65536:
-            found.append(f"{where}: a port is a number from 1 to 65535")
+            errors.append(f"{where}: a port is a number from 1 to 65535")
         elif scheme == "http" and not _is_loopback(host.strip("[]")):
-            found.append(
+            errors.append(
                 f"{where}: http is only for this machine; write 127.0.0.1, or https:// with the "
                 "robot's certificate, like https://0.0.0.0:8443"
             )
         elif scheme == "https" and not config.bus.tls:
-            found.append(
+            errors.append(
                 f"{where}: needs a certificate; `acsard tls init` makes it and prints the bus.tls "
                 "to write"
             )
     names = {f"web.address[{i}]": address for i, address in enumerate(addresses)}
-    return found + _repeated("host and port", names, lambda address: address.partition("://")[2])
+    return errors + _repeated("host and port", names, lambda address: address.partition("://")[2])
 
 
 def _access_problems(config: Config) -> list[str]:
     access = config.access
     lists = {"viewers": access.viewers, "operators": access.operators}
     lists |= {"maintainers": access.maintainers}
-    names = {f"access.{r}[{i}]": n for r, held in lists.items() for i, n in enumerate(held)}
+    names = {f"access.{r}[{i}]": n for r, members in lists.items() for i, n in enumerate(members)}
     return _repeated("certificate", names)
 
 

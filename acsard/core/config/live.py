@@ -150,7 +150,7 @@ class Difference(Struct, frozen=True):
         """
         # A command source may be in only one of the two configurations. Its keys have no value in
         # the other one.
-        its, ours = ("absent" if one is None else show(one) for one in (self.its, self.ours))
+        its, ours = ("absent" if value is None else show(value) for value in (self.its, self.ours))
         return f"{key} = {its}, not {ours}"
 
 

@@ -40,7 +40,7 @@ def lowered(file: LimitsConfig, now: LimitsConfig) -> dict[str, float]:
     }
 
 
-def with_lowered(config: Config, kept: Mapping[str, float]) -> tuple[Config, list[Event]]:
+def with_lowered(config: Config, saved_limits: Mapping[str, float]) -> tuple[Config, list[Event]]:
     """Return a pair: `config` with the lowered limits, and events that report the changes.
 
     A lowered limit is applied only if it is below the value in `config`. The configuration file
@@ -55,7 +55,7 @@ def with_lowered(config: Config, kept: Mapping[str, float]) -> tuple[Config, lis
     limits = config.limits
     wishes: dict[str, object] = {
         key: value
-        for key, value in kept.items()
+        for key, value in saved_limits.items()
         if survives_restart(key)
         and (name := key.removeprefix(LIMITS_PREFIX)) in limits.__struct_fields__
         and _rank(name, value) < _rank(name, getattr(limits, name))

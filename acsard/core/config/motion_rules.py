@@ -64,24 +64,24 @@ def _reach(config: Config) -> _Reach:
 
 
 def _braking_problems(config: Config, axis: str, speed: float, unit: str) -> list[str]:
-    found = []
+    errors = []
     softer = f"{axis}_deceleration"
     normal = getattr(config.limits, softer)
     for name, most_s in ((softer, MAX_RAMP_S), (f"{axis}_stop_deceleration", MAX_STOP_S)):
         value, least = getattr(config.limits, name), _rounded_up(speed / most_s)
         if name != softer and value < normal:
-            found.append(
+            errors.append(
                 f"limits.{name} = {value:g}: lower than limits.{softer}; a stop must brake at "
                 f"least as hard as the robot brakes when commands end: write "
                 f"{max(normal, least):.10g} or more"
             )
         elif value < least:
-            found.append(
+            errors.append(
                 f"limits.{name} = {value:g}: braking from full speed ({speed:g} {unit}) would "
                 f"take {speed / value:.1f} s, but at most {most_s:g} s are allowed; "
                 f"either write {least:g} or more, or lower limits.{axis}_speed"
             )
-    return found
+    return errors
 
 
 def _jerk_problems(config: Config, name: str) -> list[str]:

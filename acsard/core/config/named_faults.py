@@ -74,13 +74,13 @@ def named(text: str) -> NamedFault:
     Raises `ValueError` if the text is not valid. The error gives the mistake and the fix, but does
     not repeat `text`.
     """
-    name, _, given = text.partition("=")
+    name, _, arguments = text.partition("=")
     known = {RESET_FAULT: "n", **dict.fromkeys(FAULTS, ""), **ARGUMENTS}
     if name not in known:
         near = nearest(name, known)
-        meant = f"did you mean {_form(near[0], known[near[0]])}?" if near else _all()
-        raise ValueError(f"not a known fault; {meant}")
-    kinds, values = known[name], [word for word in given.split(":") if word]
+        hint = f"did you mean {_form(near[0], known[near[0]])}?" if near else _all()
+        raise ValueError(f"not a known fault; {hint}")
+    kinds, values = known[name], [word for word in arguments.split(":") if word]
     if len(values) != len(kinds):
         raise ValueError(f"write it as {_form(name, kinds)}")
     fault = NamedFault(
@@ -126,17 +126,17 @@ def warnings(config: Config) -> list[str]:
 
 
 def _problems(config: Config) -> list[str]:
-    found = []
+    errors = []
     for i, text in enumerate(config.sim.faults):
         where = f"sim.faults[{i}] = {show(text)}"
         try:
             if named(text).name == RESET_FAULT:
-                found.append(
+                errors.append(
                     f"{where}: works only as `acsard sim --fault {text}`; remove it from sim.faults"
                 )
         except ValueError as error:
-            found.append(f"{where}: {error}")
-    return found
+            errors.append(f"{where}: {error}")
+    return errors
 
 
 RULES: tuple[Rule, ...] = (_problems,)

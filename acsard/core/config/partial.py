@@ -33,13 +33,13 @@ def mistakes(rules: Iterable[Rule], config: Config) -> list[str]:
 
     A rule is skipped if it reads a key that has no valid value.
     """
-    found: list[str] = []
+    errors: list[str] = []
     for rule in rules:
         try:
-            found += rule(config)
+            errors += rule(config)
         except InvalidKeyError:
             continue
-    return found
+    return errors
 
 
 class _View:

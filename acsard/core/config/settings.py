@@ -246,12 +246,12 @@ class BatteryConfig(Struct, frozen=True):
 
         A level is left out if its threshold is 0.
         """
-        found: dict[BatteryLevel, float] = {
+        thresholds: dict[BatteryLevel, float] = {
             "warning": self.warning_below,
             "return": self.return_below,
             "stop": self.stop_below,
         }
-        return {level: below for level, below in found.items() if below}
+        return {level: below for level, below in thresholds.items() if below}
 
 
 class LimitsConfig(Struct, frozen=True):

@@ -73,10 +73,10 @@ def _adjusted(array: object, value: object) -> bool:
     for n in reversed(range(len(array))):
         if array[n] not in value:
             del array[n]
-    kept = len(array)
-    if list(array) != list(value[:kept]):
+    count = len(array)
+    if list(array) != list(value[:count]):
         return False
-    array.extend(value[kept:])
+    array.extend(value[count:])
     return True
 
 

@@ -208,19 +208,19 @@ class Receiver:
         )
 
     def _twist(self, arrival: Arrival) -> tuple[BodyTwist, Header | None, bool]:
-        got = _twist_payload(arrival)
+        message = _twist_payload(arrival)
         header = None
-        linear, angular = got.linear, got.angular
-        if not isinstance(got.twist, UnsetType):
+        linear, angular = message.linear, message.angular
+        if not isinstance(message.twist, UnsetType):
             if not (isinstance(linear, UnsetType) and isinstance(angular, UnsetType)):
                 raise DecodeError(
                     "wrong_shape",
                     "the message has velocities both inside and outside `twist`: send them in one "
                     "place only",
                 )
-            linear, angular = got.twist.linear, got.twist.angular
-            header = None if isinstance(got.header, UnsetType) else got.header
-        elif not isinstance(got.header, UnsetType):
+            linear, angular = message.twist.linear, message.twist.angular
+            header = None if isinstance(message.header, UnsetType) else message.header
+        elif not isinstance(message.header, UnsetType):
             raise DecodeError(
                 "wrong_shape",
                 "the message has `header` but no `twist`: put `linear` and `angular` into `twist`",
@@ -234,25 +234,25 @@ class Receiver:
         return twist, header, twist == REST and any(axes)
 
     def _wheel_speeds(self, arrival: Arrival) -> tuple[BodyTwist, Header | None, bool]:
-        got = _wheels.decode(arrival.encoding, arrival.payload)
-        named, count = [got.name.count(joint) for joint in self._joints], len(got.name)
-        if named != [1] * 4 or len(got.velocity) != count:
+        message = _wheels.decode(arrival.encoding, arrival.payload)
+        named, count = [message.name.count(joint) for joint in self._joints], len(message.name)
+        if named != [1] * 4 or len(message.velocity) != count:
             raise DecodeError(
                 "wrong_wheels",
                 f"the message needs one velocity for each of {', '.join(self._joints)}",
             )
-        places = [got.name.index(joint) for joint in self._joints]
+        places = [message.name.index(joint) for joint in self._joints]
         # Ignore the values of other joints, for example those of an arm.
         velocity, position, effort = (
             [values[place] for place in places] if len(values) == count else values
-            for values in (got.velocity, got.position, got.effort)
+            for values in (message.velocity, message.position, message.effort)
         )
         if not all(map(math.isfinite, (*velocity, *position, *effort))):
             raise DecodeError("not_finite", "the wheel speeds contain NaN or infinity")
         twist = self._kinematics.twist(WheelSpeeds(*velocity))
         if not (math.isfinite(twist.linear) and math.isfinite(twist.angular)):
             raise DecodeError("not_finite", "the wheel speeds are too large to compute a twist")
-        return twist, got.header, twist == REST and any(velocity)
+        return twist, message.header, twist == REST and any(velocity)
 
     @staticmethod
     def request(

@@ -75,26 +75,26 @@ class GyroFollower:
         """
         try:
             sample = reading(arrival)
-            anew = self._follow(claimed_identity(arrival).sender, arrival.arrived_ns)
+            changed = self._follow(claimed_identity(arrival).sender, arrival.arrived_ns)
         except DecodeError as error:
             counters[f"imu_{error.reason}"] = counters.get(f"imu_{error.reason}", 0) + 1
             events.append(Event("imu_refused", str(error), "warning", kind=error.reason))
             return None
-        return replace(sample, anew=True) if anew else sample
+        return replace(sample, anew=True) if changed else sample
 
-    def _follow(self, who: str, now_ns: int) -> bool:
-        """Use the gyro of the sender `who`. Return True if another gyro was used before.
+    def _follow(self, sender: str, now_ns: int) -> bool:
+        """Use the gyro of the sender `sender`. Return True if another gyro was used before.
 
         Raises `DecodeError` while another gyro sends, or if only the simulated gyro is allowed.
         """
-        other = who != self._followed
+        other = sender != self._followed
         if other and (self._own or now_ns - self._heard_ns < SILENCE_TIMEOUT_NS):
             raise DecodeError(
                 "second_sender",
-                f"{_named(who)} sends gyro samples, but the daemon already uses those of "
+                f"{_named(sender)} sends gyro samples, but the daemon already uses those of "
                 f"{_named(self._followed)}: end one of the two programs",
             )
-        before, self._followed, self._heard_ns = self._followed, who, now_ns
+        before, self._followed, self._heard_ns = self._followed, sender, now_ns
         return other and before is not None
 
 
@@ -109,12 +109,15 @@ def reading(arrival: Arrival) -> GyroSample:
         raise DecodeError("not_a_put", "a DELETE is not a sample: send a PUT")
     if len(arrival.payload) > MAX_COMMAND_BYTES:
         raise DecodeError("too_big", f"{len(arrival.payload)} bytes are too many for an Imu")
-    got: Imu | _Reading
+    message: Imu | _Reading
     if detect(arrival.encoding, arrival.payload) == "cdr":
-        got = decode_cdr(Imu, arrival.payload)
+        message = decode_cdr(Imu, arrival.payload)
     else:
-        got = _readings.decode(arrival.encoding, arrival.payload)
-    rate, variances = got.angular_velocity, got.angular_velocity_covariance or UNKNOWN_COVARIANCE
+        message = _readings.decode(arrival.encoding, arrival.payload)
+    rate, variances = (
+        message.angular_velocity,
+        message.angular_velocity_covariance or UNKNOWN_COVARIANCE,
+    )
     numbers = (rate.x, rate.y, rate.z, variances[8])
     if not all(map(math.isfinite, numbers)):
         raise DecodeError("not_finite", "the angular velocity contains NaN or infinity")
@@ -131,5 +134,5 @@ def reading(arrival: Arrival) -> GyroSample:
             f"the turn rate is over {MAX_RATE:g} rad/s, or its variance is over the square of "
             "this limit: send the turn rate in rad/s",
         )
-    stamp_ns = got.header.stamp.to_ns()
+    stamp_ns = message.header.stamp.to_ns()
     return GyroSample(arrival.arrived_ns, stamp_ns if stamp_ns > 0 else None, rate.z, variances[8])

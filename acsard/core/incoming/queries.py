@@ -229,9 +229,9 @@ class Queries:
             keys = {f"schema/{name}": value for name, value in SCHEMAS.items()}
             return [(key, "", value) for key, value in keys.items() if self._matches(query, key)]
         if topic == WHOAMI:
-            found = [role for role in ROLES if whoami_key(role) == query.asked]
+            roles = [role for role in ROLES if whoami_key(role) == query.asked]
             by = caller_name(query.via, query.attachment)
-            return [(query.asked, "WhoAmI", WhoAmI(role, by)) for role in found]
+            return [(query.asked, "WhoAmI", WhoAmI(role, by)) for role in roles]
         if topic == "interfaces":
             return [(topic, "Interfaces", interfaces(self._config, outputs))]
         if topic in self._fixed:

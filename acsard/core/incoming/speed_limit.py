@@ -68,19 +68,19 @@ def decode_limit(arrival: Arrival, configured: float) -> Limit:
         raise DecodeError("not_a_put", "a DELETE is not a speed limit: send a PUT")
     if len(arrival.payload) > MAX_COMMAND_BYTES:
         raise DecodeError("too_big", f"{len(arrival.payload)} bytes are too many for a speed limit")
-    got: SpeedLimit | _Payload
+    message: SpeedLimit | _Payload
     if detect(arrival.encoding, arrival.payload) == "cdr":
-        got = decode_cdr(SpeedLimit, arrival.payload)
+        message = decode_cdr(SpeedLimit, arrival.payload)
     else:
-        got = _decoder.decode(arrival.encoding, arrival.payload)
-    value = got.speed_limit
+        message = _decoder.decode(arrival.encoding, arrival.payload)
+    value = message.speed_limit
     if not math.isfinite(value):
         raise DecodeError("not_finite", "the speed limit is NaN or infinity; send 0.0 to lift it")
-    if value < 0.0 or (got.percentage and value > 100.0):
-        unit = " %" if got.percentage else " m/s"
-        most = " to 100 %" if got.percentage else " m/s or more"
+    if value < 0.0 or (message.percentage and value > 100.0):
+        unit = " %" if message.percentage else " m/s"
+        most = " to 100 %" if message.percentage else " m/s or more"
         raise DecodeError("out_of_range", f"{value:g}{unit}: send 0{most}; 0 lifts the limit")
-    speed = value / 100.0 * configured if got.percentage else value
+    speed = value / 100.0 * configured if message.percentage else value
     name = caller_name(arrival.via, arrival.attachment, arrival.sender)
     by = f"{name} on the key {SPEED_LIMIT}"
     return Limit(math.inf if value == NO_LIMIT_VALUE else speed, by, arrival.arrived_ns)
@@ -151,20 +151,20 @@ class SpeedLimiter:
         own = self._limit_request(now_ns)
         if self._limit is NO_LIMIT and not self._held:
             return (*own, *requests), []
-        found, refused, taken = list(own), list[Answer](), False
+        robot_requests, refused, has_set = list(own), list[Answer](), False
         waiting, self._held = [*self._held, *requests], []
         for request in waiting:
             if request.verb != "set" or self._limit is NO_LIMIT:
-                found.append(request)
-            elif taken:
+                robot_requests.append(request)
+            elif has_set:
                 self._held.append(request)
             else:
-                taken = True
+                has_set = True
                 try:
-                    found.append(self._limited(request))
+                    robot_requests.append(self._limited(request))
                 except ConfigError as error:
                     refused.append(Answer(request.id, False, str(error)))
-        return tuple(found), refused
+        return tuple(robot_requests), refused
 
     def _limited(self, request: Request) -> Request:
         """Return a client's `set` request, with the highest speed lowered to the limit in force.
@@ -208,7 +208,7 @@ class SpeedLimiter:
         asked, self._asked = self._asked, None
         if asked is not None:
             request, wanted = asked
-            answer = next((one for one in answers if one.id == request.id), None)
+            answer = next((reply for reply in answers if reply.id == request.id), None)
             if answer is not None and answer.success:
                 speed = wanted
                 if wanted > self._limit.speed:
@@ -216,8 +216,8 @@ class SpeedLimiter:
                     events.append(Event("set", text, by=request.by, kind="waits"))
                     if len(request.settings) > 1:
                         text = f"{answer.message}; {text}"
-                    told = replace(answer, message=text)
-                    answers = tuple([told if one is answer else one for one in answers])
+                    new_answer = replace(answer, message=text)
+                    answers = tuple([new_answer if reply is answer else reply for reply in answers])
         if robot is not self._robot or speed != self.settings.limits.linear_speed:
             self._robot = robot
             limited = self._limit is not NO_LIMIT

@@ -78,7 +78,9 @@ def as_text(status: BoardStatus) -> dict[str, str]:
     bumpers = status.bumpers
     values = {
         "emergency_stop": _word(status.estop, "pressed", "released"),
-        "bumpers": None if bumpers is None else "".join("X" if one else "." for one in bumpers),
+        "bumpers": None
+        if bumpers is None
+        else "".join("X" if bumper else "." for bumper in bumpers),
         "motor_driver": _word(status.driver_fault, "fault", "ok"),
         "volts": None if status.volts is None else f"{status.volts:.2f}",
         "amperes": None if status.amps is None else f"{status.amps:.2f}",
@@ -105,23 +107,23 @@ def decode_status(line: bytes, check: bool) -> BoardStatus:
             raise FrameError("status_without_crc", line)
     elif binascii.crc_hqx(line[:-5], 0) != int(crc, 16):
         raise FrameError("status_crc_error", line)
-    found: dict[bytes, bytes] = {}
+    fields: dict[bytes, bytes] = {}
     for field in body.split():
         name, _, value = field.partition(b"=")
         form = _FORMS.get(name)
-        if form is None or name in found or form.fullmatch(value) is None:
+        if form is None or name in fields or form.fullmatch(value) is None:
             raise FrameError("status_malformed", line)
-        found[name] = value
+        fields[name] = value
     return BoardStatus(
-        estop=_is(found, b"estop", b"pressed"),
-        bumpers=tuple([mark == 0x58 for mark in found[b"bumpers"]])
-        if b"bumpers" in found
+        estop=_is(fields, b"estop", b"pressed"),
+        bumpers=tuple([mark == 0x58 for mark in fields[b"bumpers"]])
+        if b"bumpers" in fields
         else None,
-        driver_fault=_is(found, b"driver", b"fault"),
-        volts=_number(found, b"volts"),
-        amps=_number(found, b"amps"),
-        charge=None if b"charge" not in found else int(found[b"charge"][:-1]) / 100,
-        temperature=_number(found, b"temp"),
+        driver_fault=_is(fields, b"driver", b"fault"),
+        volts=_number(fields, b"volts"),
+        amps=_number(fields, b"amps"),
+        charge=None if b"charge" not in fields else int(fields[b"charge"][:-1]) / 100,
+        temperature=_number(fields, b"temp"),
     )
 
 
@@ -129,9 +131,9 @@ def _word(value: bool | None, yes: str, no: str) -> str | None:
     return None if value is None else yes if value else no
 
 
-def _is(found: dict[bytes, bytes], name: bytes, word: bytes) -> bool | None:
-    return found[name] == word if name in found else None
+def _is(fields: dict[bytes, bytes], name: bytes, word: bytes) -> bool | None:
+    return fields[name] == word if name in fields else None
 
 
-def _number(found: dict[bytes, bytes], name: bytes) -> float | None:
-    return float(found[name]) if name in found else None
+def _number(fields: dict[bytes, bytes], name: bytes) -> float | None:
+    return float(fields[name]) if name in fields else None

@@ -120,7 +120,7 @@ class EchoDetector:
         self._last.append(wheels)
         if line not in self._sent:
             return False
-        found, sent, runs = False, self._sent, self._runs
+        is_echo, sent, runs = False, self._sent, self._runs
         # The newest line is first, so that a report makes each run longer by at most one line.
         for place in range(len(sent) - 1, max(0, len(sent) - COMPARED_LINES) - 1, -1):
             if sent[place] != line:
@@ -137,8 +137,8 @@ class EchoDetector:
                 # On a ramp only one report equals it.
                 known.report = self._reports
             enough = known.lines >= MIN_REPEATED_LINES and known.change >= MIN_TOTAL_CHANGE
-            found = found or (enough and known.corner > MIN_BEND)
-        return found
+            is_echo = is_echo or (enough and known.corner > MIN_BEND)
+        return is_echo
 
     def _continued(self, run: _Run | None, wheels: _Wheels) -> _Run:
         """Return `run` extended by the present reply, or a new run if the reply cannot continue it.
@@ -161,8 +161,8 @@ class EchoDetector:
         return _Run(self._reports, wheels, slope, lines, change + _largest(slope), corner)
 
 
-def _between(wheels: _Wheels, one: _Wheels, other: _Wheels) -> bool:
-    rows = zip(wheels, one, other, strict=True)
+def _between(wheels: _Wheels, first: _Wheels, other: _Wheels) -> bool:
+    rows = zip(wheels, first, other, strict=True)
     return all(min(a, b) <= speed <= max(a, b) for speed, a, b in rows)
 
 

@@ -160,7 +160,7 @@ class ReplyStyle:
         self._came += lines
         self._periods += periods
         self._asked += left
-        came, own, asked = (
+        line_count, own, asked = (
             self._came,
             abs(self._came - self._periods),
             abs(self._came - self._asked),
@@ -168,7 +168,7 @@ class ReplyStyle:
         apart = abs(self._periods - self._asked)
         if apart < DECISION_DIFFERENCE or abs(own - asked) < CLEAR_FRACTION * apart:
             return
-        if min(own, asked) <= max(1.5, NEAR_FRACTION * came):
+        if min(own, asked) <= max(1.5, NEAR_FRACTION * line_count):
             self.speaks = own < asked
         self._came = self._periods = self._asked = 0.0
         self._after = 0

@@ -297,8 +297,8 @@ class UnansweredLines:
         if lines < WINDOW_LINES:
             return None
         self._since = sent, good
-        told, self._told = self._told, answers < (1.0 - MAX_UNANSWERED_FRACTION) * lines
-        if told or not self._told:
+        warned, self._told = self._told, answers < (1.0 - MAX_UNANSWERED_FRACTION) * lines
+        if warned or not self._told:
             return None
         return Event(
             "lines_lost",
@@ -328,11 +328,11 @@ def words(
     setting `mcu.reply_period` may have, s.
     """
     if link.state in ("booting", "stale"):
-        heard = silence.heard
+        traffic = silence.heard
         if check.trouble:
             return ADVICE[check.trouble]
-        if heard is not None and not heard.good:
-            return heard.words
+        if traffic is not None and not traffic.good:
+            return traffic.words
         if damaged(link, check):
             return (
                 "the microcontroller's replies arrive damaged, so the daemon asks it for the "
@@ -340,8 +340,8 @@ def words(
             )
         if link.sparse_s:
             return _sparse(link.sparse_s, longest_reply)
-        if heard is not None:
-            return heard.words
+        if traffic is not None:
+            return traffic.words
     return lateness.words(link.state)
 
 

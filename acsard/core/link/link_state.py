@@ -92,18 +92,18 @@ class Link:
         """`_waits_until_ns` is the monotonic time until which the board may answer late, ns.
         `_waited` is true if `wait` was called since the last good line."""
 
-    def apply(self, given: Input) -> None:
-        """Change the state as `TRANSITIONS` says for the input `given`.
+    def apply(self, trigger: Input) -> None:
+        """Change the state as `TRANSITIONS` says for the input `trigger`.
 
         Every input except "trusted" resets the count of good lines in a row.
         """
-        self.state = TRANSITIONS.get((self.state, given), self.state)
-        if given == "trusted":
+        self.state = TRANSITIONS.get((self.state, trigger), self.state)
+        if trigger == "trusted":
             return
         self._good_in_row = 0
-        if given in ("closed", "opened", "restarted"):
+        if trigger in ("closed", "opened", "restarted"):
             self._heard_ns = None
-        if given in ("closed", "opened"):
+        if trigger in ("closed", "opened"):
             self._bad_in_row = 0
             self.reset_silences()
 

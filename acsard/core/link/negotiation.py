@@ -220,8 +220,8 @@ class Negotiation:
         # a plain stop here too.
         self._plain_turn = 0 if fresh else 1
 
-    def _apply(self, given: Input) -> None:
-        self.state = TRANSITIONS.get((self.state, given), self.state)
+    def _apply(self, trigger: Input) -> None:
+        self.state = TRANSITIONS.get((self.state, trigger), self.state)
 
     # Lines to the board.
 
@@ -258,17 +258,17 @@ class Negotiation:
         """Record that `line`, with its line end, was written to the port, to detect its echo."""
         self._echo.written(line)
 
-    def settle(self, went: bool, late_ns: int = 0) -> None:
+    def settle(self, was_written: bool, late_ns: int = 0) -> None:
         """Record whether the port wrote the line that `seal` or `question` returned last.
 
-        `went` is true if the port wrote this line. `late_ns` is the time from the making to the
-        writing of the line, ns.
+        `was_written` is true if the port wrote this line. `late_ns` is the time from the making to
+        the writing of the line, ns.
         """
-        if self._made is not None and went:
+        if self._made is not None and was_written:
             sequence, made_ns = self._made
             self._pending.append((sequence, made_ns + late_ns))
             self._open = self.asking
-        if self._just_asked and not went:
+        if self._just_asked and not was_written:
             self._asked.undo()
             self._plain_turn -= 1
         self._made, self._just_asked = None, False

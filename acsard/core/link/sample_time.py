@@ -251,13 +251,13 @@ class FreeRunningTimes:
         alone, self._alone = self._alone, lines == 1
         if self._batched:
             prompt = since < 1.1 * self._batch and lines - 1 < since
-            held = self._batch + 1.0  # 1.0: an adapter also holds back the last line of a backlog
+            delay = self._batch + 1.0  # 1.0: an adapter also holds back the last line of a backlog
         else:
-            held, prompt = 0.0, lines == 1
+            delay, prompt = 0.0, lines == 1
             if prompt and alone and since < COMPLETE_PERIODS:
                 return -1 if ahead > 1 else 0  # the delay grew line by line, so no line is missing
-        seen = ahead + 0.5 - 1.4 * lag if prompt else ahead - LATENESS_MARGIN - held
-        return math.floor(seen) if seen > 0.0 else 0
+        missing = ahead + 0.5 - 1.4 * lag if prompt else ahead - LATENESS_MARGIN - delay
+        return math.floor(missing) if missing > 0.0 else 0
 
     # Finding the clock and following it.
 
@@ -672,11 +672,13 @@ class PromptedTimes:
             judged, soonest = 0, max(soonest, self._base - MAX_USB_JITTER_NS)
         if since < 1.5 * self._batch:
             self._batch += FAST_GAIN * (since - self._batch)
-        given, self._given, again = self._given, [], False
+        old_commands, self._given, again = self._given, [], False
         # The first part of a reply can come sooner than a complete reply.
         earliest = self._soonest // 2 if cut else self._soonest
-        while given and (len(left) < began or at - left[began - 1] < earliest):
-            left.appendleft(given.pop())  # too soon: the replies answer commands that were given up
+        while old_commands and (len(left) < began or at - left[began - 1] < earliest):
+            left.appendleft(
+                old_commands.pop()
+            )  # too soon: the replies answer commands that were given up
             again = True
         if len(left) < lines or self._delay is None:
             return

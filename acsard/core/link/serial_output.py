@@ -90,18 +90,18 @@ class SerialOutput:
         # The additional line end ends a line of which the board has received only a part.
         return (b"\r\n" if self._torn else b"") + goes
 
-    def record_write(self, line: bytes, handed: bytes, taken: int, now_ns: int) -> Offered:
-        """Record that the kernel accepted `taken` bytes of `handed`, and return the result.
+    def record_write(self, line: bytes, handed: bytes, byte_count: int, now_ns: int) -> Offered:
+        """Record that the kernel accepted `byte_count` bytes of `handed`, and return the result.
 
         `handed` are the bytes that `prepare` returned for `line`. The result is "superseded" if the
         kernel did not accept all of these bytes, or if `prepare` replaced the line with a stop.
         Otherwise the result is "sent". Bytes that the kernel did not accept are dropped.
         """
-        whole = taken == len(handed)
+        whole = byte_count == len(handed)
         if whole:
             self._first = False
-        if taken:
+        if byte_count:
             self._torn = not whole
             self.sent_ns = now_ns
-            self._free_ns = now_ns + wire_ns(taken, self._baud_rate)
+            self._free_ns = now_ns + wire_ns(byte_count, self._baud_rate)
         return "sent" if whole and handed.endswith(line) else "superseded"

@@ -246,7 +246,7 @@ class McuSession:
 
     # sessions
 
-    def _settle(self, went: bool, port_open: bool, late_ns: int) -> None:
+    def _settle(self, was_written: bool, port_open: bool, late_ns: int) -> None:
         """Record whether the port wrote the line that `line()` returned last.
 
         `late_ns` is the time from the making to the writing of the line, ns.
@@ -255,9 +255,9 @@ class McuSession:
         if made is None:
             return
         blind, self._made, self._just_blind = self._just_blind, None, False
-        self.negotiation.settle(went, late_ns)
-        self._held_up = not went
-        if went:
+        self.negotiation.settle(was_written, late_ns)
+        self._held_up = not was_written
+        if was_written:
             line, left_ns = made[0], made[1] + late_ns
             self.negotiation.written(line)
             self._timeline.written(left_ns, moves=not line.startswith(self._rest))
@@ -369,25 +369,25 @@ class McuSession:
 
     def _read(self, piece: Received) -> list[Feedback]:
         lines, timeline, feedback = self._lines.feed(piece.data), self._timeline, []
-        link, came = self._link, piece.data
+        link, data = self._link, piece.data
         statuses = [line for line, _ in lines if line.startswith(STATUS)]
         if statuses:
             # A status line is not a reply, so it is not used for the sample times and the link.
             lines = [each for each in lines if not each[0].startswith(STATUS)]
             self._take_statuses(statuses, piece.at.mono_ns)
-            came = b"\n".join([line for line, _ in lines])
+            data = b"\n".join([line for line, _ in lines])
         if link.state != "up":
-            self._hearing.now.take(came)
+            self._hearing.now.take(data)
         if lines:
             timeline.read(piece.at, len(piece.data), len(lines), lines[-1][1])
         for line, following in lines:
-            got = self._line(line, piece.at, following)
-            if got is None:
+            reply = self._line(line, piece.at, following)
+            if reply is None:
                 timeline.skip_bad()
             else:
-                feedback.append(got)
+                feedback.append(reply)
             if link.state != "up":
-                self._hearing.now.line(line, got is not None)
+                self._hearing.now.line(line, reply is not None)
         return feedback
 
     def _take_statuses(self, lines: list[bytes], at_ns: int) -> None:

@@ -151,18 +151,18 @@ class WholeCounts:
             self.pause()
             return speeds if fastest == 0.0 else None
         expected_s = elapsed_s + self._apart
-        number, shown = self._number(speeds, fastest, expected_s)
+        number, confirmed = self._number(speeds, fastest, expected_s)
         if gap:
             longer_s = expected_s + gap
             longer, proved = self._number(speeds, fastest, longer_s)
             fits = self._fits(number, fastest, expected_s), self._fits(longer, fastest, longer_s)
-            if (proved and fits == (False, True)) or (shown and fits == (True, False)):
+            if (proved and fits == (False, True)) or (confirmed and fits == (True, False)):
                 self._cover += SHARE_GAIN * (fits[1] - self._cover)
                 self.covers_gap = fits[1]
             else:
                 self.covers_gap = self._cover > 0.5 and gap < 1.5 * elapsed_s
             if self.covers_gap:
-                number, shown, expected_s = longer, proved, longer_s
+                number, confirmed, expected_s = longer, proved, longer_s
         period = number * self.angle / fastest
         if (
             self.believed
@@ -176,17 +176,17 @@ class WholeCounts:
         ):
             self._apart = expected_s
             return 0.0, 0.0, 0.0, 0.0
-        if shown is not None:
+        if confirmed is not None:
             # Only the other wheels can prove or refute whole counts.
-            self._doubt += SHARE_GAIN * ((not shown) - self._doubt)
+            self._doubt += SHARE_GAIN * ((not confirmed) - self._doubt)
         if not self.believed:
             self.pause()
             self.covers_gap = False
             return None
-        if number and shown is None:
+        if number and confirmed is None:
             off = abs(expected_s - period) * fastest / self.angle
             self._unsure += MEAN_GAIN * (off - self._unsure)
-        if not number or (shown is None and self._unsure > MAX_MEAN_ERROR):
+        if not number or (confirmed is None and self._unsure > MAX_MEAN_ERROR):
             # Speed times time. The time includes the time carried from earlier lines.
             self.pause()
             self._period = expected_s
@@ -194,8 +194,8 @@ class WholeCounts:
         # After the first line, the error comes from two sample times in equal parts, so only half
         # of it is carried. With each further line the share grows.
         self._run += 1
-        kept = min(MAX_CARRIED_ERROR, self._run / (self._run + 1))
-        self._period, self._apart = period, kept * (expected_s - period)
+        share = min(MAX_CARRIED_ERROR, self._run / (self._run + 1))
+        self._period, self._apart = period, share * (expected_s - period)
         if abs(expected_s - period) <= period * ROUNDING / fastest:
             self._apart = 0.0  # the rounding of the speeds explains the difference
         size, count = self.angle, period / self.angle

@@ -73,10 +73,10 @@ class Cdr(Generic[T]):
                 f"{payload[:4].hex(' ')}"
             )
         source = _Source(payload, order)
-        found: list[object] = []
+        fields: list[object] = []
         for part in self._parts:
-            part.read(source, found)
-        return cast(T, self._build(iter(found)))
+            part.read(source, fields)
+        return cast(T, self._build(iter(fields)))
 
 
 class _Source:
@@ -198,15 +198,15 @@ class _Numbers:
             values = [math.nan if value is None else value for value in values]
         out += self._packs[(len(out) - len(HEADER)) & 7](*values)
 
-    def read(self, source: _Source, found: list[object]) -> None:
+    def read(self, source: _Source, fields: list[object]) -> None:
         values = source.take(self._codes)
         for index, low, high in self._limits:
             if not low <= values[index] <= high:
                 raise CdrError(f"{values[index]} is outside the range from {low:g} to {high:g}")
-        found += values
+        fields += values
         for index in self._nullable:
             if math.isnan(values[index]):
-                found[index - len(values)] = None
+                fields[index - len(values)] = None
 
 
 class _Text:
@@ -216,8 +216,8 @@ class _Text:
     def write(self, out: bytearray, message: object) -> None:
         _put_text(out, self._get(message))
 
-    def read(self, source: _Source, found: list[object]) -> None:
-        found.append(source.text())
+    def read(self, source: _Source, fields: list[object]) -> None:
+        fields.append(source.text())
 
 
 class _List:
@@ -262,19 +262,19 @@ class _List:
             for part in self._parts:
                 part.write(out, item)
 
-    def read(self, source: _Source, found: list[object]) -> None:
+    def read(self, source: _Source, fields: list[object]) -> None:
         least = SIZES[self._code] if self._code else 1
         count = source.count(least) if self._fixed is None else self._fixed
         if self._most is not None and count > self._most:
             raise CdrError(f"{count} items, but at most {self._most} are allowed")
         if self._array:
-            found.append(list(source.take(self._array)))
+            fields.append(list(source.take(self._array)))
         elif self._code:
-            found.append(source.take_many(self._code, count) if count else [])
+            fields.append(source.take_many(self._code, count) if count else [])
         elif self._text:
-            found.append([source.text() for _ in range(count)])
+            fields.append([source.text() for _ in range(count)])
         else:
-            found.append([self._item(source) for _ in range(count)])
+            fields.append([self._item(source) for _ in range(count)])
 
     def _item(self, source: _Source) -> object:
         inner: list[object] = []

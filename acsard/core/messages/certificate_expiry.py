@@ -62,4 +62,4 @@ def first_expiry(ends: Mapping[str, int]) -> tuple[str, int]:
     another owner has the same expiry time, the report is about the certificate of that owner.
     Therefore the result names that owner.
     """
-    return min(ends.items(), key=lambda one: (one[1], one[0] == ""))
+    return min(ends.items(), key=lambda pair: (pair[1], pair[0] == ""))

@@ -146,7 +146,7 @@ def _serial_link(config: Config, outputs: Outputs, snapshot: Snapshot) -> Row:
 
 def _control_loop(snapshot: Snapshot) -> Row:
     figures, missed = snapshot.figures, snapshot.missed_last_minute
-    kept = figures.get("period_lateness", Measured()).last_minute.count
+    on_time = figures.get("period_lateness", Measured()).last_minute.count
     values = {
         f"{name}{when}_{share}_us": f"{getattr(spread, share):.0f}"
         for name, figure in figures.items()
@@ -155,8 +155,8 @@ def _control_loop(snapshot: Snapshot) -> Row:
     }
     return Row(
         "control loop",
-        WARN if missed > MAX_MISSED_FRACTION * (kept + missed) else OK,
-        f"{missed} of {kept + missed} periods missed in the last minute",
+        WARN if missed > MAX_MISSED_FRACTION * (on_time + missed) else OK,
+        f"{missed} of {on_time + missed} periods missed in the last minute",
         values | _counted(snapshot.counters, "missed") | _counted(snapshot.counters, "bus"),
     )
 
@@ -200,21 +200,21 @@ def _board(config: Config, snapshot: Snapshot) -> list[Row]:
     required, needed = safety.estop == "required", safety.bumpers and safety.bumper != "off"
     if not (snapshot.board or required or needed):
         return []
-    found = [BOARD[snapshot.estop]]
+    findings = [BOARD[snapshot.estop]]
     if required and not snapshot.estop:
-        found = [(ERROR, MISSING_REASON)]
+        findings = [(ERROR, MISSING_REASON)]
     if snapshot.bumper:
-        found.append((ERROR if snapshot.bumper == SILENT_BUMPERS else WARN, snapshot.bumper))
+        findings.append((ERROR if snapshot.bumper == SILENT_BUMPERS else WARN, snapshot.bumper))
     elif bumpers is not None:
-        found.append((OK, f"{many(len(bumpers), 'bumper')} released"))
+        findings.append((OK, f"{many(len(bumpers), 'bumper')} released"))
     elif needed:
-        found.append((ERROR, missing_text(safety)))
+        findings.append((ERROR, missing_text(safety)))
     if snapshot.board.get("motor_driver") == "fault":
-        found.append((ERROR, DRIVER_FAULT_REASON))
+        findings.append((ERROR, DRIVER_FAULT_REASON))
     counted: dict[str, str] = {}
     for kind in ("line_status", "emergency", "bumper"):
         counted |= _counted(snapshot.counters, kind)
-    level, message = max(level for level, _ in found), "; ".join(text for _, text in found)
+    level, message = max(level for level, _ in findings), "; ".join(text for _, text in findings)
     return [Row("board", level, message, snapshot.board | counted)]
 
 
@@ -222,17 +222,17 @@ def _battery(config: Config, snapshot: Snapshot) -> list[Row]:
     status, bounds = snapshot.battery, config.battery.bounds
     if status is None:
         return [Row("battery", WARN, battery.MISSING_REASON, {})] if bounds else []
-    shown: dict[str, str] = {"level": status.level}
+    values: dict[str, str] = {"level": status.level}
     numbers = {
         "volts": status.volts,
         "percent": status.percent,
         "amperes": status.amps,
         "mean": status.mean if bounds else None,
     }
-    shown |= {name: f"{value:.2f}" for name, value in numbers.items() if value is not None}
-    shown |= {f"{level}_below": f"{below:g}" for level, below in bounds.items()}
+    values |= {name: f"{value:.2f}" for name, value in numbers.items() if value is not None}
+    values |= {f"{level}_below": f"{below:g}" for level, below in bounds.items()}
     return [
-        Row("battery", BATTERY_LEVELS[status.level], battery.words(config.battery, status), shown)
+        Row("battery", BATTERY_LEVELS[status.level], battery.words(config.battery, status), values)
     ]
 
 

@@ -162,8 +162,8 @@ class Report:
         now_ns = outputs.now.mono_ns
         if outputs.due and "cmd_vel_out" in wanted and self._rates["cmd_vel_out"].due(now_ns):
             yield "cmd_vel_out", self._cmd_vel_out(outputs)
-        if outputs.events and "events" in wanted and (told := self._happened.message()):
-            yield "events", told
+        if outputs.events and "events" in wanted and (event_list := self._happened.message()):
+            yield "events", event_list
         for key, build in (
             ("state", self._state),
             ("diagnostics", self._diagnostics),
@@ -282,8 +282,8 @@ class Report:
             certificate_expiry=self._certificate(outputs.now)[1],
             counters=snapshot.counters,
             latencies={
-                name: Latency(_spread(one.since_start), _spread(one.last_minute))
-                for name, one in snapshot.figures.items()
+                name: Latency(_spread(figure.since_start), _spread(figure.last_minute))
+                for name, figure in snapshot.figures.items()
             },
             gyro=snapshot.gyro.does,
             effective_track=tracks(snapshot.gyro, self._config.drive.wheel_separation_multiplier),

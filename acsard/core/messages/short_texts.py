@@ -52,9 +52,9 @@ def _odometry(odom: Odometry) -> list[str]:
 def _state(state: RobotState) -> list[str]:
     reason = state.reason.removeprefix(f"{state.mode}: ")
     mode = printable(f"{state.mode}: {reason}")
-    told = [*place(state.x, state.y, state.yaw), *speeds(state.linear, state.angular), mode]
+    parts = [*place(state.x, state.y, state.yaw), *speeds(state.linear, state.angular), mode]
     left = charge(state.battery)
-    return [*told, *filter(None, (left and f"battery {left}", brief(warnings(state))))]
+    return [*parts, *filter(None, (left and f"battery {left}", brief(warnings(state))))]
 
 
 def power(battery: BatterySummary) -> list[str]:

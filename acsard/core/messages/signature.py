@@ -91,8 +91,8 @@ def public_name(sender: str, certificate: str = "") -> str:
     """
     digits = sha256(sender.encode("utf-8", "surrogatepass")).hexdigest()[:HASH_DIGITS]
     name = _cleaned(sender.rpartition("/")[0][:MAX_NAME_LENGTH]).strip()
-    shown = f"{name}/{digits}" if name else digits
-    return f"{shown} [{_cleaned(certificate[:MAX_SENDER_LENGTH])}]" if certificate else shown
+    label = f"{name}/{digits}" if name else digits
+    return f"{label} [{_cleaned(certificate[:MAX_SENDER_LENGTH])}]" if certificate else label
 
 
 def _cleaned(text: str) -> str:

@@ -56,9 +56,9 @@ def warnings(state: RobotState) -> list[StateWarning]:
     return list(_warnings(state))
 
 
-def brief(found: Sequence[StateWarning]) -> str:
+def brief(state_warnings: Sequence[StateWarning]) -> str:
     """Return the warnings as one text, such as "WARNING: recording fails"; "" for no warnings."""
-    words = ", ".join(printable(one.brief) for one in found)
+    words = ", ".join(printable(warning.brief) for warning in state_warnings)
     return f"{WARNING}: {words}" if words else ""
 
 
@@ -78,7 +78,7 @@ def charge(battery: BatterySummary | None) -> str:
 def _warnings(state: RobotState) -> Iterator[StateWarning]:
     if state.emergency_stop in ESTOP:
         yield StateWarning("emergency_stop", ESTOP[state.emergency_stop])
-    if pressed := [str(n) for n, one in enumerate(state.bumpers or (), 1) if one]:
+    if pressed := [str(n) for n, bumper in enumerate(state.bumpers or (), 1) if bumper]:
         noun = "bumpers" if len(pressed) > 1 else "bumper"
         yield StateWarning("bumper", f"{noun} {' and '.join(pressed)} pressed")
     if state.battery is not None and state.battery.level in BATTERY:

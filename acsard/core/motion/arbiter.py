@@ -296,16 +296,16 @@ class Arbiter:
         known = self._sources.get(source)
         if known is None:
             return
-        one = known.senders.get(sender)
-        if one is not None:
-            one.noticed_ns = arrived_ns
+        known_sender = known.senders.get(sender)
+        if known_sender is not None:
+            known_sender.noticed_ns = arrived_ns
         if shared or not sender:
             known.cancel_zeros(arrived_ns)
 
     def choose(self, now_ns: int) -> Choice:
         """Return the command that the robot follows now, or the reason why it follows none."""
         first: tuple[_Source, Sender] | None = None
-        kept = self._followed
+        previous = self._followed
         for source in self._ranking:
             if not source.senders or not (present := source.present(now_ns)):
                 continue
@@ -315,14 +315,14 @@ class Arbiter:
             ):
                 first = source, present[0]
             if (
-                kept is not None
-                and kept in present
+                previous is not None
+                and previous in present
                 and source.priority == first[0].priority
-                and kept.holds(now_ns)
+                and previous.holds(now_ns)
             ):
-                # A sender that began to send before `kept` may have become armed just now. The
-                # robot still follows `kept`.
-                first = source, kept
+                # A sender that began to send before `previous` may have become armed just now. The
+                # robot still follows `previous`.
+                first = source, previous
                 break
         if first is None:
             self._holder = self._followed = None
@@ -332,7 +332,7 @@ class Arbiter:
             return IDLE
         source, sender = first
         armed = sender.armed(now_ns)
-        self._holder, self._followed = source, sender if armed or sender is kept else None
+        self._holder, self._followed = source, sender if armed or sender is previous else None
         if not (armed and sender.live(now_ns)):
             return Choice(source.name, None, source.wait_of(sender, now_ns), sender=sender.name)
         wait = NOTHING

@@ -67,9 +67,9 @@ def waiting(wait: Wait) -> str:
                 f"{lasts}{ROS_NEVER if wait.ros else ''}"
             )
         case "zeros":
-            kept = f"; the speeds of {wait.kept} have no effect" if wait.kept else ""
+            note = f"; the speeds of {wait.kept} have no effect" if wait.kept else ""
             zeros = f"only zeros for over {lasting(wait.lasts)}"
-            return f"{wait.source} keeps the robot at rest: it has sent {zeros}{kept}"
+            return f"{wait.source} keeps the robot at rest: it has sent {zeros}{note}"
         case "higher":
             return f"{wait.source} has priority: wait until it is silent"
         case "equal":
@@ -134,16 +134,16 @@ class CommandEvents:
         Either the sender of the speeds is not armed, or another sender keeps the robot at rest with
         zeros. The list is empty if there is no such source, or if the warning was already given.
         """
-        wait, kept = choice.wait, ""
+        wait, source = choice.wait, ""
         if mode not in (Mode.READY, Mode.DRIVING) or wait.what not in ("neutral", "zeros"):
             self._kept = ""
         elif wait.lasts:
-            kept = wait.source if wait.what == "neutral" else wait.kept
-        if not kept or kept == self._kept:
+            source = wait.source if wait.what == "neutral" else wait.kept
+        if not source or source == self._kept:
             return []
-        self._kept = kept
+        self._kept = source
         by = _name((choice.source, choice.sender))
-        return [Event("commands_without_effect", waiting(wait), "warning", by, kept)]
+        return [Event("commands_without_effect", waiting(wait), "warning", by, source)]
 
 
 def _name(commander: tuple[str, str]) -> str:

@@ -58,16 +58,16 @@ def words(config: BatteryConfig, status: BatteryStatus) -> str:
     values = [form.format(value) for value, form in forms if value is not None]
     if status.volts is None and status.percent is None:
         return SILENT_REASON
-    shown, level = ", ".join(values), status.level
+    text, level = ", ".join(values), status.level
     if level == "ok":
-        return shown
+        return text
     if level != "unknown":
-        return f"{shown}; the mean of the last seconds is below {_threshold(config, level)}"
+        return f"{text}; the mean of the last seconds is below {_threshold(config, level)}"
     if getattr(status, config.measure) is None:
         lacks = "voltage" if config.measure == "volts" else "charge"
-        return f'{shown}; battery.measure = "{config.measure}", but the board reports no {lacks}'
+        return f'{text}; battery.measure = "{config.measure}", but the board reports no {lacks}'
     settled = f"the board has reported for at least {SETTLE_S:g} s"
-    return f"{shown}; the level is not known until {settled}"
+    return f"{text}; the level is not known until {settled}"
 
 
 def _threshold(config: BatteryConfig, level: BatteryLevel) -> str:
@@ -213,14 +213,14 @@ class Battery:
         if self._mean is None:
             return "unknown"
         reached = LEVELS_BY_URGENCY.index(self._known)
-        found: BatteryLevel = "ok"
+        new_level: BatteryLevel = "ok"
         for level, below in self._bounds.items():
             rise = self._config.hysteresis if reached >= LEVELS_BY_URGENCY.index(level) else 0.0
             if self._mean < below + rise:
-                found = level
-        self.stopped_now = found == "stop" != self._known
-        self._known = found
-        return found
+                new_level = level
+        self.stopped_now = new_level == "stop" != self._known
+        self._known = new_level
+        return new_level
 
     def _summed(self, level: BatteryLevel) -> BatteryStatus:
         values = {name: value for name, (value, _) in self._values.items()}

@@ -97,9 +97,9 @@ class ConsistencyChecks:
             self.on_trial = gyro.owes
             by_gyro = None if turn is None else turn.wheels
         self.turn = turn
-        found = wheels.look(rolled.seen, line.speeds, rolled.seconds, by_gyro)
+        is_faulty = wheels.look(rolled.seen, line.speeds, rolled.seconds, by_gyro)
         self.slips = wheels.slips or (turn is not None and turn.slips)
-        return found
+        return is_faulty
 
     def undo_recomputation(self, turn: float) -> float:
         """Return the angle that the caller must subtract from the heading, rad.

@@ -73,17 +73,21 @@ class EventThrottle:
         if not (events or self._held):
             return ()
         for event in events:
-            held = self._held.setdefault(event.name, _Held())
-            held.add(event)
+            group = self._held.setdefault(event.name, _Held())
+            group.add(event)
             self._number += 1
-            held.number = self._number
-        told = [name for name, held in self._held.items() if self._may(name, held.news, now_ns)]
-        if "stop" in told or "clear" in told:
+            group.number = self._number
+        due_names = [
+            name for name, group in self._held.items() if self._may(name, group.news, now_ns)
+        ]
+        if "stop" in due_names or "clear" in due_names:
             # The lines of a stop and of a `clear` must be in the order of these events, so that the
             # end of the log shows whether the robot is stopped.
-            told += [name for name in ("stop", "clear") if name in self._held and name not in told]
-            told.sort(key=lambda name: self._held[name].number)
-        return tuple([self._held.pop(name).line() for name in told])
+            due_names += [
+                name for name in ("stop", "clear") if name in self._held and name not in due_names
+            ]
+            due_names.sort(key=lambda name: self._held[name].number)
+        return tuple([self._held.pop(name).line() for name in due_names])
 
     def _may(self, name: EventName, news: bool, now_ns: int) -> bool:
         """Return whether a line may be written now. If it may, count it as written.

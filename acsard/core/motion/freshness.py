@@ -443,16 +443,16 @@ class Freshness:
             return self._in_order(command, max(MAX_PAUSE_NS, timeout_ns))
         name, at_ns = command.clock or command.source, command.arrived_ns
         clock = None
-        for held in (self._clocks, self._newcomers, self._unproved):
-            clock = clock or held.pop(name, None)
+        for group in (self._clocks, self._newcomers, self._unproved):
+            clock = clock or group.pop(name, None)
         clock = clock or _Clock(at_ns)
         verdict = clock.judge(command, command.stamp_ns, timeout_ns)
         if verdict == "set":
             self.forgiven_ns += clock.forgiven_ns
-        held = self._unproved if command.steady else self._newcomers
+        group = self._unproved if command.steady else self._newcomers
         if clock.was_known:
-            held = self._clocks
-        held[name] = clock
+            group = self._clocks
+        group[name] = clock
         self._forget(at_ns)
         return verdict
 
@@ -481,17 +481,17 @@ class Freshness:
             (self._unproved, MEMORY_NS),
             (self._clocks, MEMORY_NS),
         )
-        for held, silent_ns in limits:
-            while held and now_ns - _oldest(held).at_ns > max(silent_ns, _oldest(held).gap_ns):
-                del held[next(iter(held))]
-        some = [held for held, _ in limits if held]
+        for group, silent_ns in limits:
+            while group and now_ns - _oldest(group).at_ns > max(silent_ns, _oldest(group).gap_ns):
+                del group[next(iter(group))]
+        some = [group for group, _ in limits if group]
         if sum(map(len, some)) > MAX_CLOCKS:
-            doubtful = [held for held in some if held is not self._clocks]
-            silent = [held for held in doubtful if now_ns - _oldest(held).at_ns > MAX_PAUSE_NS]
-            held = min(silent or some, key=lambda clocks: _oldest(clocks).at_ns)
-            del held[next(iter(held))]
+            doubtful = [group for group in some if group is not self._clocks]
+            silent = [group for group in doubtful if now_ns - _oldest(group).at_ns > MAX_PAUSE_NS]
+            group = min(silent or some, key=lambda clocks: _oldest(clocks).at_ns)
+            del group[next(iter(group))]
 
 
-def _oldest(held: dict[str, _Clock]) -> _Clock:
+def _oldest(clocks: dict[str, _Clock]) -> _Clock:
     # Each command moves its clock to the end of the dictionary.
-    return next(iter(held.values()))
+    return next(iter(clocks.values()))

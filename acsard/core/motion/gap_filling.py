@@ -161,10 +161,10 @@ class Rolling:
         speeds, dt, bridged = line.speeds.as_tuple(), line.dt, line.bridged + self._bridged
         if not (self._skipped or bridged or line.gap or line.turned is not None):
             # Nearly every line takes this shortcut. The code below would give the same result.
-            seen = times(speeds, dt)
-            moved = seen if line.counted is None else line.counted
+            angles = times(speeds, dt)
+            moved = angles if line.counted is None else line.counted
             arcs = () if moved == AT_REST else (moved,)
-            return Rolled(arcs, AT_REST, seen, dt, 0.0, 0.0, dt)
+            return Rolled(arcs, AT_REST, angles, dt, 0.0, 0.0, dt)
         # For implausible lines without counts, assume the speed of this line, unless those lines
         # last too long.
         guessed = self._lost <= MAX_LOST_S or self._skipped <= MAX_LOST
@@ -175,12 +175,12 @@ class Rolling:
         if self._skipped:
             self.forget()
         if line.turned is not None:
-            pieces, seen, seconds = _some(times(speeds, lost + filled)), line.turned, dt
+            pieces, angles, seconds = _some(times(speeds, lost + filled)), line.turned, dt
             turned, bridged = plus(turned, line.turned), 0.0
         else:
             unknown, seconds = unknown + line.gap, lost + filled + dt
-            seen = said = times(speeds, seconds - bridged)
-            pieces = _some(said)
+            angles = line_angles = times(speeds, seconds - bridged)
+            pieces = _some(line_angles)
             if line.counted is not None:
                 pieces = _some(line.counted, times(speeds, lost))
             if bridged:
@@ -194,9 +194,9 @@ class Rolling:
                 else:
                     on = min(bridged / 2, stops)
                     between = plus(times(first, on), times(second, bridged - on))
-                seen, pieces = plus(between, said), _some(between, *pieces)
+                angles, pieces = plus(between, line_angles), _some(between, *pieces)
         known = 0.0 if unknown else known
-        return Rolled(pieces, turned, seen, seconds, bridged, unknown, known, doubtful)
+        return Rolled(pieces, turned, angles, seconds, bridged, unknown, known, doubtful)
 
 
 def _some(*pieces: Motors) -> tuple[Motors, ...]:
@@ -282,30 +282,35 @@ class Confirmation:
             before: The wheel speeds in the last line that was used, rad/s.
             believed: The function that replaces the speeds of wheels that are known to be faulty.
         """
-        period, held, seconds = self._period, self._held, line.dt + line.gap + skipped
+        period, pending, seconds = self._period, self._held, line.dt + line.gap + skipped
         # A long time counts as two periods, so that a single gap changes the mean only a little.
         # A board with a longer period still changes it in the long run.
         self._period += PERIOD_GAIN * (min(seconds, 2 * period) - period) if period else seconds
-        if not held and (seconds <= 2 * period or not period or line.turned is not None):
+        if not pending and (seconds <= 2 * period or not period or line.turned is not None):
             return [line], []
-        self._seconds = seconds = seconds + (self._seconds if held else 0.0)
+        self._seconds = seconds = seconds + (self._seconds if pending else 0.0)
         # This change of one wheel's speed falsifies the motion of the whole time by as much as a
         # damaged line of the usual duration can.
         most = (self._acceleration * period + SPEED_MARGIN) * period / seconds
         used, now = believed(before.as_tuple()), believed(line.speeds.as_tuple())
-        lines, three = [*held, line], [*[believed(one.speeds.as_tuple()) for one in held], now]
-        kept = lines
+        lines, three = (
+            [*pending, line],
+            [*[believed(sample.speeds.as_tuple()) for sample in pending], now],
+        )
+        good_lines = lines
         if len(lines) == 3:
             nearest = [min(_alone(a, b, line.steps) for b in three if b is not a) for a in three]
             least = 2 * min(nearest) + most
-            kept = [one for one, off in zip(lines, nearest, strict=True) if off <= least]
-        elif _alone(now, three[0] if held else used, line.steps) > most:
-            if not held or _alone(now, used, line.steps) > most:
-                held.append(line)
+            good_lines = [
+                sample for sample, off in zip(lines, nearest, strict=True) if off <= least
+            ]
+        elif _alone(now, three[0] if pending else used, line.steps) > most:
+            if not pending or _alone(now, used, line.steps) > most:
+                pending.append(line)
                 return [], []
-            kept = [line]
-        held.clear()
-        return kept, [one for one in lines if one not in kept]
+            good_lines = [line]
+        pending.clear()
+        return good_lines, [sample for sample in lines if sample not in good_lines]
 
 
 def _alone(a: Motors, b: Motors, steps: Motors) -> float:
@@ -400,15 +405,15 @@ class Gaps:
                 odometry assumes the twist `after` for this time. With the probability 1/2, the
                 robot still had the twist `before`.
         """
-        bridged, given = self._bridged + seconds, self._given
+        bridged, previous = self._bridged + seconds, self._given
         along, yaw = self.unseen(bridged, before, after, commanded)
         self.interrupt(after)
-        self._bridged, self._given = bridged, (max(along, given[0]), max(yaw, given[1]))
+        self._bridged, self._given = bridged, (max(along, previous[0]), max(yaw, previous[1]))
         late = doubtful * (before.linear - after.linear)
         late_turn = doubtful * (before.angular - after.angular)
         return (
-            max(0.0, along - given[0]) + late**2 / 2,
-            max(0.0, yaw - given[1]) + late_turn**2 / 2,
+            max(0.0, along - previous[0]) + late**2 / 2,
+            max(0.0, yaw - previous[1]) + late_turn**2 / 2,
         )
 
     def unseen(

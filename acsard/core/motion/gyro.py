@@ -265,9 +265,9 @@ class Gyro:
             # not silent.
             age_ns = min(age_ns, at_ns - self._heard[0][0] + min(0, self._delay_ns))
         silent = age_ns >= SILENCE_TIMEOUT_NS
-        held = 0.0 if resting or silent else self._rate * max(0, ahead) / NS_PER_S
-        angle, variance = self._angle + held - self._given, self._variance
-        self._given, self._variance = self._angle + held, 0.0
+        prediction = 0.0 if resting or silent else self._rate * max(0, ahead) / NS_PER_S
+        angle, variance = self._angle + prediction - self._given, self._variance
+        self._given, self._variance = self._angle + prediction, 0.0
         # During a silence of the gyro, the wheels provide the turn. The samples that end the
         # silence cover the same turn again, so the wheels also provide the turn of the next line.
         lost, self._hole = silent or self._hole, silent
@@ -356,18 +356,18 @@ class Gyro:
 
     def _take(self, until_ns: int, resting: bool) -> None:
         """Process the samples until `until_ns`: learn the bias at rest, else add their turn."""
-        bias, heard = self._bias, self._heard
+        bias, samples = self._bias, self._heard
         until_ns += self._delay_ns
-        while heard and heard[0][0] <= until_ns:
-            jump = 0.0 if self._reading is None else heard[0][1].rate - self._reading
+        while samples and samples[0][0] <= until_ns:
+            jump = 0.0 if self._reading is None else samples[0][1].rate - self._reading
             if abs(jump) > MAX_JUMP:
-                if len(heard) == 1:
+                if len(samples) == 1:
                     break
-                remaining = jump + heard[1][1].rate - heard[0][1].rate
+                remaining = jump + samples[1][1].rate - samples[0][1].rate
                 if remaining / jump < CONFIRMED_FRACTION:
-                    heard.popleft()
+                    samples.popleft()
                     continue
-            time_ns, sample = heard.popleft()
+            time_ns, sample = samples.popleft()
             time_ns -= self._delay_ns
             span_ns = SILENCE_TIMEOUT_NS if self._told_ns is None else time_ns - self._told_ns
             self._hole |= span_ns >= SILENCE_TIMEOUT_NS

@@ -205,7 +205,7 @@ class Match:
         block = self._blocks[BLOCKS_BEFORE]
         wheels, gyro, change = block.wheels / block.time, block.gyro / block.time, block.change
         # The blocks before and after this block show whether the gyro's rate changes, too.
-        rates = [one.gyro / one.time for one in self._blocks]
+        rates = [neighbor.gyro / neighbor.time for neighbor in self._blocks]
         if max(rates) - min(rates) < MIN_RATE_CHANGE * BLOCK_S:
             change = 0.0
         if block.slips or (abs(wheels) < MIN_TURN_RATE and abs(change) < MIN_RATE_CHANGE):

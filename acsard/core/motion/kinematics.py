@@ -95,13 +95,13 @@ class Kinematics:
         speeds = self.wheel_speeds(twist)
         return max(abs(speeds.front_right), abs(speeds.front_left)) <= wheel_speed * (1.0 + 1e-12)
 
-    def room(self, kept: Twist, added: Twist, wheel_speed: float) -> float:
-        """Return the largest fraction of `added`, 0 to 1, that can be added to the twist `kept`.
+    def room(self, base: Twist, added: Twist, wheel_speed: float) -> float:
+        """Return the largest fraction of `added`, 0 to 1, that can be added to the twist `base`.
 
         With the sum of these twists, no wheel may turn faster than `wheel_speed` rad/s. The
-        fraction is 0 if `kept` alone exceeds this speed.
+        fraction is 0 if `base` alone exceeds this speed.
         """
-        first, second, share = self.wheel_speeds(kept), self.wheel_speeds(added), 1.0
+        first, second, share = self.wheel_speeds(base), self.wheel_speeds(added), 1.0
         sides = (first.front_right, second.front_right), (first.front_left, second.front_left)
         for speed, more in sides:
             if more:

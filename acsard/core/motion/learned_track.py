@@ -75,12 +75,12 @@ class LearnedTrack:
         self.use = _use(learned, before)
         self.used = learned if learned is not None and self.use == "used" else CONFIGURED
         if learned is not None and self.use != before:
-            told = (
+            text = (
                 "effective track, given as a value of wheel_separation_multiplier: "
                 f"{beside(learned, self._multiplier, self.use)}"
             )
             level: Level = "warning" if self.use == "too far off" else "info"
-            self.event = Event("learned_track", told, level, kind=self.use)
+            self.event = Event("learned_track", text, level, kind=self.use)
 
 
 def _use(learned: Track | None, before: TrackUse) -> TrackUse:

@@ -67,8 +67,8 @@ class Lifecycle:
         self._shutting_down = self._linked = self._commanded = False
         self._dormant = not active
         """Whether the robot waits for its first call `activate` (see `control.auto_activate`)."""
-        found = (latches.stop, latches.fault, latches.inactive)
-        self._number = max([latch.number for latch in found if latch is not None], default=0)
+        old_latches = (latches.stop, latches.fault, latches.inactive)
+        self._number = max([latch.number for latch in old_latches if latch is not None], default=0)
         self._numbered = False
         """Whether this run of the daemon has numbered a latch. `number_after_restart` returns the
         first number of a run."""
@@ -310,18 +310,18 @@ class Lifecycle:
     @property
     def why(self) -> str:
         """The reason of the mode `fault`, `stopped` or `inactive`, and the call that ends it."""
-        latches, held = self.latches, self._held
+        latches, reason = self.latches, self._held
         if latches.next is not None:
             fault, stop = latches.fault, latches.stop
             faults = () if fault is None else fault.causes
             parts = [f"{cause.why}, latched {_when(cause)}" for cause in faults]
             causes = () if stop is None else stop.causes
-            if held and held not in [latch.why for latch in (*faults, *causes)]:
+            if reason and reason not in [latch.why for latch in (*faults, *causes)]:
                 # The cause that lasts differs from all latched causes. For example, one of two
                 # pressed bumpers has been released.
-                parts.append(held)
+                parts.append(reason)
             parts += [_said(cause) for cause in causes]
-            before = f"{self._mend}, then " if held else ""
+            before = f"{self._mend}, then " if reason else ""
             twice = f" twice, {LATCH_REQUIRED_S:g} s apart" if fault and stop else ""
             return f"{'; also '.join(parts)}; {before}call srv/clear{twice}"
         if latches.inactive is not None:
@@ -376,14 +376,14 @@ class Lifecycle:
         if since >= LATCH_REQUIRED_S * NS_PER_S:
             return
         age_s = max(0.1, math.floor(since / NS_PER_S * 10) / 10)
-        came = f"{was} {age_s:.1f} s ago"
+        age_text = f"{was} {age_s:.1f} s ago"
         if set_ns < began_ns:
             # An earlier run set the latch. Its age is unknown, because the monotonic clock may have
             # restarted and the wall clock may have been set since.
-            came = f"the daemon started {age_s:.1f} s ago and the robot is still {still}"
+            age_text = f"the daemon started {age_s:.1f} s ago and the robot is still {still}"
         raise RefusedError(
-            f"{came}: look at the robot, then call {call} again when {LATCH_REQUIRED_S:g} s have "
-            "passed since then, or name the number of the latch that you have seen"
+            f"{age_text}: look at the robot, then call {call} again when {LATCH_REQUIRED_S:g} s "
+            "have passed since then, or name the number of the latch that you have seen"
         )
 
 
@@ -404,17 +404,17 @@ def _without_values(why: str) -> str:
     return _VALUES.split(why, maxsplit=1)[0]
 
 
-def number_after_restart(kept: int, now: Instant) -> int:
+def number_after_restart(last_number: int, now: Instant) -> int:
     """Return a latch number that no earlier run of the daemon has used.
 
-    `kept` is the largest number in the latch file. The result is the wall-clock time in ms if that
-    is above `kept`. Otherwise the wall clock was set back, and the result is `kept` + 1 plus the
-    time since the computer started, ms.
+    `last_number` is the largest number in the latch file. The result is the wall-clock time in ms
+    if that is above `last_number`. Otherwise the wall clock was set back, and the result is
+    `last_number` + 1 plus the time since the computer started, ms.
     """
-    # `kept` + 1 alone is not safe: an earlier latch, which is not in the file any more, may have
-    # had that number, and a late `clear` may still name it.
+    # `last_number` + 1 alone is not safe: an earlier latch, which is not in the file any more, may
+    # have had that number, and a late `clear` may still name it.
     number = now.wall_ns // 1_000_000
-    return number if number > kept else kept + 1 + now.mono_ns // 1_000_000
+    return number if number > last_number else last_number + 1 + now.mono_ns // 1_000_000
 
 
 def _not_in_force(number: int, still: str, call: str) -> str:

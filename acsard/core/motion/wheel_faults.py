@@ -121,30 +121,30 @@ class _Side:
         for part in (self.expected, *self.witnesses):
             part.forget()
 
-    def watch(self, seen: Motors, dt: float, most: float, count: float, still: bool) -> bool:
+    def watch(self, speeds: Motors, dt: float, most: float, count: float, still: bool) -> bool:
         """Check both wheels of this side, and return whether one of them may be faulty.
 
-        `seen` contains the reported speeds of all four wheels, rad/s. The other arguments are as in
-        `Witness.look`.
+        `speeds` contains the reported speeds of all four wheels, rad/s. The other arguments are as
+        in `Witness.look`.
         """
         i, j = self.wheels
         front, rear = self.witnesses
-        bad = front.look(seen[i], self.expected, dt, most, count, still)
-        bad = rear.look(seen[j], self.expected, dt, most, count, still) or bad
+        bad = front.look(speeds[i], self.expected, dt, most, count, still)
+        bad = rear.look(speeds[j], self.expected, dt, most, count, still) or bad
         self.late = (front.slow and self.out != 0) or (rear.slow and self.out != 1)
         return bad or self._out_s > 0.0
 
-    def fault(self, seen: Motors, limit: float) -> str:
+    def fault(self, speeds: Motors, limit: float) -> str:
         for i, witness in enumerate(self.witnesses):
             evidence = dict(witness.evidence)
             if i == self.out:
                 evidence[self._fault] = max(evidence[self._fault], self._out_s)
             for kind, lasted in evidence.items():
                 if lasted > limit:
-                    wheel, told = self.wheels[i], self.expected.commanded
+                    wheel, command = self.wheels[i], self.expected.commanded
                     return (
-                        f"{WHEELS[wheel]} wheel {WITNESS_TEXTS[kind]} (commanded {told:.1f}, "
-                        f"measured {seen[wheel]:.1f} rad/s)"
+                        f"{WHEELS[wheel]} wheel {WITNESS_TEXTS[kind]} (commanded {command:.1f}, "
+                        f"measured {speeds[wheel]:.1f} rad/s)"
                     )
         return ""
 
@@ -236,8 +236,8 @@ class _Side:
         if self.out is None:
             return False
         own, other = self.wheels[self.out], self.wheels[1 - self.out]
-        said = before.as_tuple()
-        return was_faulty(self._fault, said[own], said[other], now.as_tuple()[own])
+        speeds = before.as_tuple()
+        return was_faulty(self._fault, speeds[own], speeds[other], now.as_tuple()[own])
 
     def _pass(self, dt: float) -> None:
         self.slip_s = max(0.0, self.slip_s - dt)
@@ -302,12 +302,12 @@ class WheelFaults:
         """
         if not self._leaves_out:
             return wheels
-        said = list(wheels)
+        values = list(wheels)
         for side in self._sides:
             if side.out is not None:
                 share = side.residual.stand_in(front=side.out == 0)
-                said[side.wheels[side.out]] = share * said[side.wheels[1 - side.out]]
-        front_right, front_left, rear_left, rear_right = said
+                values[side.wheels[side.out]] = share * values[side.wheels[1 - side.out]]
+        front_right, front_left, rear_left, rear_right = values
         return front_right, front_left, rear_left, rear_right
 
     def forget(self) -> None:
@@ -315,20 +315,20 @@ class WheelFaults:
         for side in self._sides:
             side.forget()
 
-    def skip(self, seen: WheelSpeeds) -> None:
+    def skip(self, wheel_speeds: WheelSpeeds) -> None:
         """Process a feedback line that waited while this computer did not run the daemon.
 
         The line is not checked, because the board may have stopped the motors meanwhile. From now
-        on, the checks expect the wheels to start again from at most the speeds `seen`, rad/s. On a
-        side with a wheel that is already suspected, the expected speeds do not change.
+        on, the checks expect the wheels to start again from at most the speeds `wheel_speeds`,
+        rad/s. On a side with a wheel that is already suspected, the expected speeds do not change.
         """
-        self.pushed, speeds = "", seen.as_tuple()
+        self.pushed, speeds = "", wheel_speeds.as_tuple()
         for side in self._sides:
             front, rear = side.wheels
             if not any(witness.suspected for witness in side.witnesses):
                 side.expected.slow_down(speeds[front], speeds[rear])
 
-    def watch(self, commanded: WheelSpeeds | None, seen: WheelSpeeds, dt: float) -> str:
+    def watch(self, commanded: WheelSpeeds | None, wheel_speeds: WheelSpeeds, dt: float) -> str:
         """Compare the wheel speeds in a feedback line with their commands.
 
         If a wheel has contradicted its command for `feedback.fault_time`, return the reason of a
@@ -341,7 +341,7 @@ class WheelFaults:
             seen: the reported wheel speeds, rad/s.
             dt: the time since the previous line, s.
         """
-        self.pushed, speeds = "", seen.as_tuple()
+        self.pushed, speeds = "", wheel_speeds.as_tuple()
         if commanded is None:
             for side in self._sides:
                 side.forget()
@@ -499,5 +499,5 @@ class WheelFaults:
 
 def slow_text(slow: tuple[str, ...]) -> str:
     """Return a text that names the slow wheels. `slow` is the value of `WheelsStatus.slow`."""
-    wheels = [f"{one.replace(' ', ' reaches ')} of its expected speed" for one in slow]
+    wheels = [f"{wheel.replace(' ', ' reaches ')} of its expected speed" for wheel in slow]
     return f"wheels are slower than commanded: {', '.join(wheels)}"

@@ -153,23 +153,30 @@ class Witness:
         line."""
         self._seconds = self._went = self._way = 0.0
 
-    def coast(self, seen: float, dt: float, count: float) -> None:
-        """Process a feedback line with the speed `seen`, rad/s, while the motor may have no power.
+    def coast(self, raw_speed: float, dt: float, count: float) -> None:
+        """Process a feedback line with the speed `raw_speed`, rad/s, while the motor may have no
+        power.
 
         When the wheel comes to rest, `driven` becomes false: until the next command, only a push
         can turn the wheel. The arguments `dt` and `count` are as in `look`.
         """
-        self.driven = self.driven and not self._rests(seen, dt, count)
+        self.driven = self.driven and not self._rests(raw_speed, dt, count)
 
-    def _rests(self, seen: float, dt: float, count: float) -> bool:
+    def _rests(self, raw_speed: float, dt: float, count: float) -> bool:
         """Return whether the wheel is certainly not faster than `MIN_FAULT_SPEED`."""
         # An encoder with few counts often reports 0 although the wheel turns. Therefore the
         # reported speed must stay low for the time of one count at the speed `MIN_FAULT_SPEED`.
-        self._rested_s = 0.0 if abs(seen) > MIN_FAULT_SPEED else self._rested_s + dt
-        return self._rested_s >= count / MIN_FAULT_SPEED and abs(seen) <= MIN_FAULT_SPEED
+        self._rested_s = 0.0 if abs(raw_speed) > MIN_FAULT_SPEED else self._rested_s + dt
+        return self._rested_s >= count / MIN_FAULT_SPEED and abs(raw_speed) <= MIN_FAULT_SPEED
 
     def look(
-        self, seen: float, expected: Expected, dt: float, most: float, count: float, still: bool
+        self,
+        raw_speed: float,
+        expected: Expected,
+        dt: float,
+        most: float,
+        count: float,
+        still: bool,
     ) -> bool:
         """Check the wheel speed in a feedback line, and return whether it is evidence of a fault.
 
@@ -183,12 +190,12 @@ class Witness:
         """
         goal, command = expected.speed, expected.commanded
         if self._begins:
-            self._begins, self.speed = False, seen
+            self._begins, self.speed = False, raw_speed
         share = dt / (count / SMOOTHING_SPEED + dt)
-        speed = self.speed = self.speed + (seen - self.speed) * share
-        constant, self._seen = seen == self._seen, seen
+        speed = self.speed = self.speed + (raw_speed - self.speed) * share
+        constant, self._seen = raw_speed == self._seen, raw_speed
         size, wish, turns = abs(goal), abs(command), abs(speed)
-        rests = self._rests(seen, dt, count) and turns <= MIN_FAULT_SPEED
+        rests = self._rests(raw_speed, dt, count) and turns <= MIN_FAULT_SPEED
         driven = self.driven = not still or (self.driven and not rests)
         fastest, least = (size, wish) if size > wish else (wish, size)
         due = self._due + (fastest - self._due) * share
@@ -198,7 +205,7 @@ class Witness:
         against = moving and speed * goal < 0.0 and turns > 0.3 * size
         # A wheel that slows down sooner than according to `response_time` is not dead. Therefore
         # compare its speed with the smaller of command and expected speed.
-        dead = moving and least > MIN_FAULT_SPEED and abs(seen) < 0.1 * least
+        dead = moving and least > MIN_FAULT_SPEED and abs(raw_speed) < 0.1 * least
         wrong = fast or against or dead
         off = turns if fast else -math.copysign(1.0, command) * speed
         nearing = off < self._nearest - MIN_APPROACH
@@ -209,9 +216,12 @@ class Witness:
         self._wrong = wrong
         if moving and not wrong:
             self._compare(turns, size, dt)
-        stuck = constant and driven and seen != 0.0
+        stuck = constant and driven and raw_speed != 0.0
         if stuck:
-            stuck = min(abs(seen - goal), abs(seen - command)) > MIN_FAULT_SPEED + 0.4 * fastest
+            stuck = (
+                min(abs(raw_speed - goal), abs(raw_speed - command))
+                > MIN_FAULT_SPEED + 0.4 * fastest
+            )
         wrong = wrong and not nearing
         bad = wrong or stuck
         if bad or self.suspected:

@@ -99,12 +99,12 @@ name default`. `[]` after a type marks a sequence, and `[n]` an array of n items
 
 
 def _parsed(text: str) -> dict[str, tuple[tuple[str, str], ...]]:
-    found = {}
+    table = {}
     for line in text.strip().splitlines():
         name, _, declared = line.partition(":")
-        pairs = [one.split(maxsplit=1) for one in declared.split(",")]
-        found[name] = tuple((kind, rest) for kind, rest in pairs)
-    return found
+        pairs = [field.split(maxsplit=1) for field in declared.split(",")]
+        table[name] = tuple((kind, rest) for kind, rest in pairs)
+    return table
 
 
 _DECLARED = _parsed(_TEXT)
@@ -190,12 +190,14 @@ class Channel(Struct, frozen=True):
 
 
 def _published() -> dict[str, Channel]:
-    found = {}
+    channels = {}
     for row in PUBLISHED:
         topic = by_key(row.native)
         assert topic is not None, row.native
-        found[row.native] = Channel(row.name, row.native, row.type, MESSAGES[topic.type], row.qos)
-    return found
+        channels[row.native] = Channel(
+            row.name, row.native, row.type, MESSAGES[topic.type], row.qos
+        )
+    return channels
 
 
 TWIST_STAMPED = "geometry_msgs/msg/TwistStamped"

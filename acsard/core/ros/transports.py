@@ -189,7 +189,7 @@ def in_ros_words(text: str, ros: RosConfig) -> str:
 
     For example, `srv/clear` becomes `/acsard/clear`.
     """
-    return _NAMED.sub(lambda found: full_name(ros.namespace, f"{ros.node}/{found[1]}"), text)
+    return _NAMED.sub(lambda match: full_name(ros.namespace, f"{ros.node}/{match[1]}"), text)
 
 
 def endpoints(ros: RosConfig, zid: str, silent: Container[str] = ()) -> tuple[Endpoint, ...]:
@@ -201,12 +201,12 @@ def endpoints(ros: RosConfig, zid: str, silent: Container[str] = ()) -> tuple[En
         silent: the native keys to leave out, as `left_out` returns them.
     """
     names = ros_names(ros, silent)
-    found: list[Endpoint] = []
+    ros_endpoints: list[Endpoint] = []
     if ros.bridge:
-        found += _bridge(ros, zid, names)
+        ros_endpoints += _bridge(ros, zid, names)
     if ros.rmw:
-        found += _rmw(ros, zid, names)
-    return tuple(found)
+        ros_endpoints += _rmw(ros, zid, names)
+    return tuple(ros_endpoints)
 
 
 def node_tokens(ros: RosConfig, zid: str) -> tuple[str, ...]:

@@ -19,7 +19,7 @@ def garbled(data: bytes, sent: int, received: int) -> bytes:
         return data
     levels = [bit for byte in data for bit in (0, *(byte >> n & 1 for n in range(8)), 1)]
     step = sent / received
-    got, at, end = bytearray(), 0.0, len(levels)
+    output, at, end = bytearray(), 0.0, len(levels)
 
     def level(when: float) -> int:
         return levels[int(when)] if when < end else 1
@@ -33,8 +33,8 @@ def garbled(data: bytes, sent: int, received: int) -> bytes:
             at += step  # too short for a start bit
             continue
         byte = sum(bit << n for n, bit in enumerate(bits[1:9]))
-        got.append(byte if bits[9] else 0)
+        output.append(byte if bits[9] else 0)
         at += (BITS - 0.5) * step
         while at < end and not level(at):
             at = int(at) + 1.0  # a break: the next start bit comes after its end at the earliest
-    return bytes(got)
+    return bytes(output)

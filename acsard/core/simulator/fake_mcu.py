@@ -142,14 +142,14 @@ class FakeMcu(Faults):
 
         The bytes reach the board later, at the speed of the wire.
         """
-        start, taken = max(self._in_free_ns, now_ns), 0
+        start, offset = max(self._in_free_ns, now_ns), 0
         data = self._damaged(data)
         *lines, rest = data.split(b"\n")
         for piece in lines:
-            taken += len(piece) + 1
+            offset += len(piece) + 1
             line = (self._held + piece + b"\n")[-256:]
             self._held = b""
-            self._schedule(start + wire_ns(taken, self.baud_rate), "line", line)
+            self._schedule(start + wire_ns(offset, self.baud_rate), "line", line)
         self._held = (self._held + rest)[-256:]
         self._in_free_ns = start + wire_ns(len(data), self.baud_rate)
 
@@ -347,8 +347,8 @@ class FakeMcu(Faults):
             rows = zip(self._counted, moved, gains, strict=True)
             self._counted = [total + count * gain for total, count, gain in rows]
             self._window = (now_ns, counts)
-        seen = [speed * gain for speed, gain in zip(self._measured, gains, strict=True)]
-        return [speed if abs(speed) >= 0.005 else 0.0 for speed in seen]
+        speeds = [speed * gain for speed, gain in zip(self._measured, gains, strict=True)]
+        return [speed if abs(speed) >= 0.005 else 0.0 for speed in speeds]
 
     def _sample(self) -> tuple[int, ...]:
         """Return the time of the last encoder reading, ms since boot, and the four counts."""

@@ -271,7 +271,7 @@ class Faults:
         return max(now_ns, began_ns + self.stall_ns)
 
 
-def _swapped(order: list[int], one: int, other: int) -> list[int]:
+def _swapped(order: list[int], first: int, other: int) -> list[int]:
     swapped = list(order)
-    swapped[one], swapped[other] = order[other], order[one]
+    swapped[first], swapped[other] = order[other], order[first]
     return swapped

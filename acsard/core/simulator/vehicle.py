@@ -75,17 +75,17 @@ class Vehicle:
             right, left = push / self._right_radius, push / self._left_radius
             goals, lag = [right, left, left, right], PUSH_TIME_CONSTANT_S
         else:
-            given = 1.0 - self.load
-            goals, lag = [point * given for point in self.set_points], self._lag
+            fraction = 1.0 - self.load
+            goals, lag = [point * fraction for point in self.set_points], self._lag
         if not (any(goals) or any(self.speeds)):
             return
         rest = math.exp(-dt / lag) if lag else 0.0
-        gone, turned, speeds, angles = 1.0 - rest, [0.0] * 4, self.speeds, self.angles
+        progress, turned, speeds, angles = 1.0 - rest, [0.0] * 4, self.speeds, self.angles
         for i, goal in enumerate(goals):
             error = speeds[i] - goal
             # This is the exact integral of the exponential approach, so the path does not depend on
             # the size of dt.
-            angle = turned[i] = goal * dt + error * lag * gone
+            angle = turned[i] = goal * dt + error * lag * progress
             speed = goal + error * rest
             speeds[i] = speed if abs(speed) > 1e-9 else 0.0
             angles[i] += angle
@@ -99,7 +99,7 @@ class Vehicle:
 
     def _grip(self) -> float:
         """Return the fraction of a turn that remains although the wheels skid, 0 to 1."""
-        kept = 1.0 - self.turn_slip
+        grip = 1.0 - self.turn_slip
         if self._floor:
-            kept *= 1.0 - self._floor * uniform(self._seed, int(self._time / GRIP_CHANGE_S))
-        return kept
+            grip *= 1.0 - self._floor * uniform(self._seed, int(self._time / GRIP_CHANGE_S))
+        return grip

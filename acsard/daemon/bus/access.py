@@ -245,9 +245,9 @@ def _access(config: Config, local: tuple[str, ...], *, gateway: bool) -> dict[st
     # Zenoh compares the name of a certificate only on a link that has authenticated the client.
     subjects: dict[str, dict[str, list[str]]] = {"local": {"link_protocols": list(LOCAL_LINKS)}}
     subjects |= {
-        role: {"link_protocols": ["tls"], "cert_common_names": list(held)}
-        for role, held in names.items()
-        if held
+        role: {"link_protocols": ["tls"], "cert_common_names": list(members)}
+        for role, members in names.items()
+        if members
     }
     wide = WIDE_SUBSCRIPTIONS if access.wildcards else dict.fromkeys(GRANTS, ())
     granted: dict[str, tuple[str, ...]] = {"local": local}

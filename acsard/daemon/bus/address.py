@@ -78,9 +78,9 @@ def address_by_environment(endpoint: str | None, robot_id: str | None, tls: str 
 def _config_of_environment() -> Config:
     file = os.environ.get("ACSARD_CONFIG")
     tls = os.environ.get("ACSARD_TLS")
-    given: dict[str, dict[str, object]] = {} if tls is None else {"bus": {"tls": tls}}
+    overrides: dict[str, dict[str, object]] = {} if tls is None else {"bus": {"tls": tls}}
     try:
-        return parse(Path(file).read_bytes() if file else b"", given)
+        return parse(Path(file).read_bytes() if file else b"", overrides)
     except OSError as error:
         raise UsageError(
             f"cannot read {file}, which ACSARD_CONFIG names: {error.strerror}; set ACSARD_CONFIG "

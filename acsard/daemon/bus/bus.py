@@ -81,14 +81,14 @@ class ZenohBus:
         changes of the connections to routers, the number of messages that were dropped, and
         whether the bus has begun to block.
         """
-        taken = self._inbox.take(queries)
+        batch = self._inbox.take(queries)
         routers = self._links.changed()
         if routers is not None:
-            taken = replace(taken, routers=routers)
+            batch = replace(batch, routers=routers)
         if not self._outlets.behind:
-            return taken
+            return batch
         dropped, stuck = self._outlets.losses(clock.mono_ns())
-        return replace(taken, dropped=dropped, stuck=stuck) if dropped or stuck else taken
+        return replace(batch, dropped=dropped, stuck=stuck) if dropped or stuck else batch
 
     def publish(self, key: str, message: Message) -> None:
         """Queue a message for the subscribers of a topic. `flush` wakes the thread that sends it.
@@ -253,12 +253,12 @@ def _others(session: zenoh.Session, alive: str, claims: tuple[str, ...]) -> set[
         token: liveliness.declare_subscriber(token, history=True) for token in (alive, *claims)
     }
     deadline_ns = clock.now().mono_ns + int(TWIN_TIMEOUT_S * NS_PER_S)
-    held: set[str] = set()
+    tokens: set[str] = set()
     # Another daemon with this robot's id usually also has this robot's ROS names. The message about
     # the id is clearer, so wait for the token of the id until the deadline.
-    while alive not in held and clock.now().mono_ns < deadline_ns:
+    while alive not in tokens and clock.now().mono_ns < deadline_ns:
         time.sleep(0.01)
-        held |= {token for token, other in subscribers.items() if other.try_recv() is not None}
+        tokens |= {token for token, other in subscribers.items() if other.try_recv() is not None}
     for subscriber in subscribers.values():
         subscriber.undeclare()
-    return held
+    return tokens

@@ -73,7 +73,7 @@ class CertificateFiles:
             about = [file.stat() for file in self._files]
         except OSError:
             return ()
-        return tuple((one.st_ino, one.st_size, one.st_mtime_ns) for one in about)
+        return tuple((status.st_ino, status.st_size, status.st_mtime_ns) for status in about)
 
 
 EXPIRY_CHECK_PERIOD_S = 60.0
@@ -96,8 +96,8 @@ def router_expiry_times(routers: Iterable[str], directory: str) -> dict[str, int
         routers: the endpoints of the routers.
         directory: the directory with the certificate of this machine.
     """
-    found = {f"the router {one}": peer_ends_ns(one, directory) for one in routers}
-    return {whose: ends_ns for whose, ends_ns in found.items() if ends_ns is not None}
+    expiries = {f"the router {router}": peer_ends_ns(router, directory) for router in routers}
+    return {whose: ends_ns for whose, ends_ns in expiries.items() if ends_ns is not None}
 
 
 async def watch_certificates(bus: BusConfig, known: MutableMapping[str, int]) -> None:
@@ -116,19 +116,19 @@ async def watch_certificates(bus: BusConfig, known: MutableMapping[str, int]) ->
     routers = [endpoint for endpoint in bus.connect if endpoint.startswith(TLS_PREFIX)]
     answered, look = 0, 0
     while True:
-        found: dict[str, int] = {}
+        expiries: dict[str, int] = {}
         try:
             # Wait without a time limit. With a limit, each attempt to read from a disk that hangs
             # would leave one more blocked thread.
             if answered < len(routers) or look % ROUTER_CHECK_EVERY == 0:
-                found |= await in_thread(lambda: router_expiry_times(routers, bus.tls), None)
-                answered = len(found)
-            found |= await in_thread(lambda: expiry_times(bus.tls), None)
+                expiries |= await in_thread(lambda: router_expiry_times(routers, bus.tls), None)
+                answered = len(expiries)
+            expiries |= await in_thread(lambda: expiry_times(bus.tls), None)
         except NoThreadError:
             pass  # the next round tries again
         if bus.outside:
             # The TLS gateway reports the certificate that it uses.
-            found.pop("", None)
-        known.update(found)
+            expiries.pop("", None)
+        known.update(expiries)
         look += 1
         await asyncio.sleep(EXPIRY_CHECK_PERIOD_S)

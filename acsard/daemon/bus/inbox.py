@@ -88,10 +88,10 @@ class Replies:
     def _run(self, session: zenoh.Session) -> None:
         while (item := self._queue.get()) is not None:
             ticket = item if isinstance(item, int) else item.ticket
-            held = self._queries.get(ticket)
-            if held is None:
+            entry = self._queries.get(ticket)
+            if entry is None:
                 continue
-            query, key = held
+            query, key = entry
             try:
                 if isinstance(item, int):
                     del self._queries[ticket]
@@ -227,12 +227,12 @@ class Inbox:
                 sources.add(parts(key)[1])
         arrivals.sort(key=lambda arrival: arrival.arrived_ns)
         arrivals = self._stops.take() + arrivals
-        taken = _taken_of(self._services, queries) + _taken_of(self._slow, 1)
-        taken += _taken_of(self._others, queries - len(taken))
+        due_queries = _taken_of(self._services, queries) + _taken_of(self._slow, 1)
+        due_queries += _taken_of(self._others, queries - len(due_queries))
         if self._services or self._slow or self._others:
             # The other queries wait for the next step.
             self._any = True
-        return BusInput(tuple(arrivals), tuple(taken), overrun, tuple(sorted(sources - {""})))
+        return BusInput(tuple(arrivals), tuple(due_queries), overrun, tuple(sorted(sources - {""})))
 
     # Zenoh's threads call the methods below.
 

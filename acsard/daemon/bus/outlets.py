@@ -98,7 +98,7 @@ class Outlets:
             self.wanted = frozenset(
                 topic
                 for topic, outlets in list(self._outlets.items())
-                if any(one.wanted for one in outlets)
+                if any(sibling.wanted for sibling in outlets)
             )
 
     # The control loop calls the methods below. None of them waits or calls Zenoh.

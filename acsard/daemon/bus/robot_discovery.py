@@ -54,14 +54,16 @@ def running_robots(session: zenoh.Session, ids: Sequence[str], endpoint: str) ->
     The id "*" stands for all robots. Raises `NoAnswerError` if `ids` contains "*" and no robot is
     visible. The text of this error names `endpoint`, the client's endpoint.
     """
-    found = set()
+    running_ids = set()
     for robot_id in ids:
         replies = session.liveliness().get(full_key(robot_id, "alive"), timeout=DISCOVERY_S)
-        found |= {robot_of(str(reply.ok.key_expr)) for reply in replies if reply.ok is not None}
-    found.discard("")
-    if not found and ALL_ROBOTS in ids:
+        running_ids |= {
+            robot_of(str(reply.ok.key_expr)) for reply in replies if reply.ok is not None
+        }
+    running_ids.discard("")
+    if not running_ids and ALL_ROBOTS in ids:
         raise NoAnswerError(no_robot_text(endpoint))
-    return sorted(found)
+    return sorted(running_ids)
 
 
 def presence(session: zenoh.Session, robot_id: str, endpoint: str) -> Presence | None:

@@ -112,12 +112,12 @@ def _leads_there(endpoint: str, ends: set[str]) -> bool:
     if bare in ends:
         return True
     try:
-        found = socket.getaddrinfo(host.strip("[]"), int(port), type=socket.SOCK_STREAM)
+        entries = socket.getaddrinfo(host.strip("[]"), int(port), type=socket.SOCK_STREAM)
     except (OSError, ValueError):
         # The name no longer resolves, but a link to that host may still exist. So compare only the
         # protocol and the port.
         return bool(port) and any(
             end.startswith(f"{protocol}/") and end.endswith(f":{port}") for end in ends
         )
-    ips = (str(entry[4][0]) for entry in found)
+    ips = (str(entry[4][0]) for entry in entries)
     return any(f"{protocol}/{f'[{ip}]' if ':' in ip else ip}:{port}" in ends for ip in ips)

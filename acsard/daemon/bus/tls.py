@@ -161,13 +161,13 @@ def expiry_times(directory: str) -> dict[str, int]:
         return {}
     files = {"": CERTIFICATE, AUTHORITY: CA}
     try:
-        found = {
+        certificates = {
             whose: x509.load_pem_x509_certificate((Path(directory) / name).read_bytes())
             for whose, name in files.items()
         }
     except (OSError, ValueError, x509.InvalidVersion):
         return {}
-    return {whose: _ends_ns(one) for whose, one in found.items()}
+    return {whose: _ends_ns(certificate) for whose, certificate in certificates.items()}
 
 
 def peer_ends_ns(endpoint: str, directory: str) -> int | None:

@@ -194,8 +194,8 @@ def refusal(path: str, error: OSError) -> MendableError:
             return NotPermittedError(f"no permission to open {path}; {_JOIN}")
         case errno.EBUSY | errno.EAGAIN:
             holder = holder_of(path)
-            who = f"process {holder.pid}" if holder else "another process"
-            return InUseError(f"{path} is in use by {who}; {_FREE}")
+            owner = f"process {holder.pid}" if holder else "another process"
+            return InUseError(f"{path} is in use by {owner}; {_FREE}")
         case _:
             return MendableError(f"cannot open {path}: {error}")
 

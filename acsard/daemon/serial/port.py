@@ -122,9 +122,9 @@ class SerialPort:
                 self._received += [Received(late, data)] if data else []
         if not self._received:
             return ()
-        got = tuple(self._received)
+        pieces = tuple(self._received)
         self._received.clear()
-        return got
+        return pieces
 
     def offer(self, line: bytes, now: Instant) -> Offered:
         """Try to write a line immediately, and return the result.
@@ -143,14 +143,14 @@ class SerialPort:
         if data is None:
             return "superseded"
         try:
-            taken = os.write(self._fd, data)
+            byte_count = os.write(self._fd, data)
         except BlockingIOError:
-            taken = 0
+            byte_count = 0
         except OSError as error:
             self._leave(error)
             return "down"
         # The wire is busy from the moment of the write, not from the start of the step.
-        return self._output.record_write(line, data, taken, clock.mono_ns())
+        return self._output.record_write(line, data, byte_count, clock.mono_ns())
 
     # Opening and reopening.
 

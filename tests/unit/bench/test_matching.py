@@ -81,32 +81,32 @@ def test_a_command_without_a_line_in_time_is_left_out() -> None:
 
 
 def test_a_sample_is_timed_from_the_line_with_its_speed() -> None:
-    said = [(10, 0.25), (20, 0.251), (30, 0.252)]
-    assert lines_to_samples(said, [(15, 0.25), (25, 0.251)]) == [
+    lines = [(10, 0.25), (20, 0.251), (30, 0.252)]
+    assert lines_to_samples(lines, [(15, 0.25), (25, 0.251)]) == [
         MatchedLine(5, 0),
         MatchedLine(5, 0),
     ]
 
 
 def test_newer_lines_are_counted_as_waiting() -> None:
-    said = [(10, 0.25), (20, 0.251), (30, 0.252)]
-    assert lines_to_samples(said, [(35, 0.25), (36, 0.252)]) == [
+    lines = [(10, 0.25), (20, 0.251), (30, 0.252)]
+    assert lines_to_samples(lines, [(35, 0.25), (36, 0.252)]) == [
         MatchedLine(25, 2),
         MatchedLine(6, 0),
     ]
 
 
 def test_a_sample_that_repeats_a_line_or_matches_no_line_is_left_out() -> None:
-    said = [(10, 0.25), (20, 0.251)]
-    assert lines_to_samples(said, [(12, 0.25), (14, 0.25), (22, 0.7), (5, 0.251)]) == [
+    lines = [(10, 0.25), (20, 0.251)]
+    assert lines_to_samples(lines, [(12, 0.25), (14, 0.25), (22, 0.7), (5, 0.251)]) == [
         MatchedLine(2, 0)
     ]
 
 
 def test_the_same_speed_a_round_later_is_another_line() -> None:
-    said = [(number * 10, staircase(number) / 20) for number in range(2 * CYCLE_LENGTH)]
-    samples = [(at_ns + 3, speed) for at_ns, speed in said]
-    assert lines_to_samples(said, samples) == [MatchedLine(3, 0)] * (2 * CYCLE_LENGTH)
+    lines = [(number * 10, staircase(number) / 20) for number in range(2 * CYCLE_LENGTH)]
+    samples = [(at_ns + 3, speed) for at_ns, speed in lines]
+    assert lines_to_samples(lines, samples) == [MatchedLine(3, 0)] * (2 * CYCLE_LENGTH)
 
 
 def test_a_speed_is_recognised_in_spite_of_rounding() -> None:
@@ -150,14 +150,14 @@ def test_each_reply_has_the_next_speed_forward_on_every_wheel(wheels: WheelMap) 
 
 def test_only_lines_between_start_and_end_count() -> None:
     config = Config()
-    said = said_by_the_mcu(config, 10)
-    first_ns, last_ns = said[3][0], said[7][0]
+    lines = said_by_the_mcu(config, 10)
+    first_ns, last_ns = lines[3][0], lines[7][0]
     samples = [
         Sample(Instant(at_ns + 5, 0), 0, staircase(number) * config.drive.wheel_radius)
-        for number, (at_ns, _) in enumerate(said, 1)
+        for number, (at_ns, _) in enumerate(lines, 1)
     ]
-    record = Record(0, (first_ns, last_ns), Seen(to_daemon=said), [], samples)
-    assert record.feedback_lines == [(at_ns, line.strip()) for at_ns, line in said[3:7]]
+    record = Record(0, (first_ns, last_ns), Seen(to_daemon=lines), [], samples)
+    assert record.feedback_lines == [(at_ns, line.strip()) for at_ns, line in lines[3:7]]
     assert feedback_fates(config, record) == [MatchedLine(5, 0)] * 4
 
 
@@ -166,8 +166,8 @@ def test_a_command_is_found_on_the_wire() -> None:
         0, (0, 100), Seen(from_daemon=[(5, b"\r\nap"), (9, b"1\r\n")]), [Sent(4, b"x")], []
     )
     assert command_waits(record) == []
-    heard = Seen(from_daemon=[(5, b"\r\n"), (7, b"ap1,\r\n")])
-    assert command_waits(Record(0, (0, 100), heard, [Sent(4, b"ap1")], [])) == [3]
+    traffic = Seen(from_daemon=[(5, b"\r\n"), (7, b"ap1,\r\n")])
+    assert command_waits(Record(0, (0, 100), traffic, [Sent(4, b"ap1")], [])) == [3]
 
 
 def test_a_record_of_a_real_port_has_no_lines_and_no_delays() -> None:

@@ -28,5 +28,5 @@ def test_an_ended_daemon_is_reported_with_its_own_message_if_it_has_one(
 ) -> None:
     file = tmp_path / "log"
     file.write_text(log)
-    told = daemon_ended(code, file)
-    assert (told.code, str(told)) == (wanted, text)
+    error = daemon_ended(code, file)
+    assert (error.code, str(error)) == (wanted, text)

@@ -36,7 +36,7 @@ def message(topic: str, kind: str, at: float, *, came: float | None = None, **fi
 
 
 def joint_states(
-    seen: Drive, topic: str = "/joint_states", names: Sequence[str] = JOINTS, *,
+    drive: Drive, topic: str = "/joint_states", names: Sequence[str] = JOINTS, *,
     speeds: bool = False,
 ) -> Iterator[RosMessage]:  # fmt: skip
     """Yield the wheels' messages: angles at the end of each period, or speeds in its middle.
@@ -44,23 +44,23 @@ def joint_states(
     The first half of the joints are on the left.
     """
     half = len(names) // 2
-    sides = np.column_stack([seen.left] * half + [seen.right] * half)
+    sides = np.column_stack([drive.left] * half + [drive.right] * half)
     angles = np.cumsum(sides, axis=0) * PERIOD_S
-    for t, speed, angle in zip(seen.t, sides, angles, strict=True):
+    for t, speed, angle in zip(drive.t, sides, angles, strict=True):
         values = {"velocity": speed.tolist()} if speeds else {"position": angle.tolist()}
         at = float(t) if speeds else float(t) + PERIOD_S / 2
         yield message(topic, "JointState", at, name=list(names), **values)
 
 
-def imu(seen: Drive, topic: str = "/imu/data", axis: int = 2, sign: float = 1.0, late: float = 0.0
+def imu(drive: Drive, topic: str = "/imu/data", axis: int = 2, sign: float = 1.0, late: float = 0.0
         ) -> Iterator[RosMessage]:  # fmt: skip
     """Yield the messages of a gyro whose `axis` points up (`sign` 1) or down (`sign` -1).
 
     The gyro's clock is `late` seconds behind.
     """
     none = [0.0] * 9
-    noise = np.random.default_rng(0).normal(0.0, 0.01, (len(seen.gyro_t), 3))
-    for t, rate, other in zip(seen.gyro_t, seen.gyro, noise.tolist(), strict=True):
+    noise = np.random.default_rng(0).normal(0.0, 0.01, (len(drive.gyro_t), 3))
+    for t, rate, other in zip(drive.gyro_t, drive.gyro, noise.tolist(), strict=True):
         other[axis] = sign * float(rate)
         yield message(
             topic, "Imu", float(t) - late, came=float(t), orientation={},
@@ -75,10 +75,10 @@ def pose(place: complex, yaw: float | None) -> dict[str, object]:
     return {"position": {"x": place.real, "y": place.imag}, "orientation": turn}
 
 
-def poses(seen: Drive, topic: str = "/slam/pose", *, yaw: bool = False) -> Iterator[RosMessage]:
+def poses(drive: Drive, topic: str = "/slam/pose", *, yaw: bool = False) -> Iterator[RosMessage]:
     """Yield the positions of the drive as `PoseStamped`, with or without the true yaw."""
-    for t, place in zip(seen.place_t, seen.place, strict=True):
-        turn = float(np.interp(t, seen.t, seen.yaw)) + 0.7 if yaw else None
+    for t, place in zip(drive.place_t, drive.place, strict=True):
+        turn = float(np.interp(t, drive.t, drive.yaw)) + 0.7 if yaw else None
         yield message(topic, "PoseStamped", float(t), pose=pose(complex(place), turn))
 
 
@@ -94,17 +94,17 @@ def odometry(
         )  # fmt: skip
 
 
-def wheel_odometry(seen: Drive, track: float = 1.4, topic: str = "/odom") -> Iterator[RosMessage]:
+def wheel_odometry(drive: Drive, track: float = 1.4, topic: str = "/odom") -> Iterator[RosMessage]:
     """Yield the odometry that the robot's driver computes from its wheels."""
-    turn = (seen.right - seen.left) * RADIUS / (SEPARATION * track) * PERIOD_S
+    turn = (drive.right - drive.left) * RADIUS / (SEPARATION * track) * PERIOD_S
     yaw = np.cumsum(turn)
-    ahead = (seen.right + seen.left) / 2 * RADIUS * PERIOD_S
+    ahead = (drive.right + drive.left) / 2 * RADIUS * PERIOD_S
     where = np.cumsum(ahead * np.exp(1j * (yaw - turn / 2)))
-    return odometry(seen.t + PERIOD_S / 2, list(where), yaw, topic)
+    return odometry(drive.t + PERIOD_S / 2, list(where), yaw, topic)
 
 
 def in_order(*topics: Iterator[RosMessage]) -> list[RosMessage]:
-    return sorted((one for topic in topics for one in topic), key=lambda one: one.wall_ns)
+    return sorted((entry for topic in topics for entry in topic), key=lambda entry: entry.wall_ns)
 
 
 def write_mcap(
@@ -116,19 +116,19 @@ def write_mcap(
         writer.start("ros2", "libmcap")
         schemas: dict[str, int] = {}
         channels: dict[str, int] = {}
-        for one in messages:
-            if one.type not in schemas:
-                schemas[one.type] = writer.register_schema(one.type, "ros2msg", b"")
-            if one.topic not in channels:
-                channels[one.topic] = writer.register_channel(
-                    one.topic, one.encoding, schemas[one.type]
+        for entry in messages:
+            if entry.type not in schemas:
+                schemas[entry.type] = writer.register_schema(entry.type, "ros2msg", b"")
+            if entry.topic not in channels:
+                channels[entry.topic] = writer.register_channel(
+                    entry.topic, entry.encoding, schemas[entry.type]
                 )
-            writer.add_message(channels[one.topic], one.wall_ns, one.data, one.wall_ns)
+            writer.add_message(channels[entry.topic], entry.wall_ns, entry.data, entry.wall_ns)
         writer.finish()
     return path
 
 
-def write_bag(directory: Path, seen: Drive, *, sqlite: bool = False) -> Path:
+def write_bag(directory: Path, drive: Drive, *, sqlite: bool = False) -> Path:
     """Write the wheels, gyro and positions of a drive as a bag with the library rosbags.
 
     This function shares no code with acsard.
@@ -143,22 +143,22 @@ def write_bag(directory: Path, seen: Drive, *, sqlite: bool = False) -> Path:
     zero = types["geometry_msgs/msg/Vector3"](0.0, 0.0, 0.0)
     level = types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
     nothing = np.zeros(9)
-    angles = np.cumsum(np.column_stack((seen.left, seen.right)), axis=0) * PERIOD_S
+    angles = np.cumsum(np.column_stack((drive.left, drive.right)), axis=0) * PERIOD_S
     rows: list[tuple[int, str, Any]] = []
-    for t, both in zip(seen.t, angles, strict=True):
+    for t, both in zip(drive.t, angles, strict=True):
         at_ns = START_NS + round((float(t) + PERIOD_S / 2) * 1e9)
         state = types["sensor_msgs/msg/JointState"](
             header(at_ns), list(JOINTS), both, np.zeros(0), np.zeros(0)
         )
         rows.append((at_ns, "/joint_states", state))
-    for t, rate in zip(seen.gyro_t, seen.gyro, strict=True):
+    for t, rate in zip(drive.gyro_t, drive.gyro, strict=True):
         at_ns = START_NS + round(float(t) * 1e9)
         turn = types["geometry_msgs/msg/Vector3"](0.0, 0.0, float(rate))
         sample = types["sensor_msgs/msg/Imu"](
             header(at_ns), level, nothing, turn, nothing, zero, nothing
         )
         rows.append((at_ns, "/imu/data", sample))
-    for t, place in zip(seen.place_t, seen.place, strict=True):
+    for t, place in zip(drive.place_t, drive.place, strict=True):
         at_ns = START_NS + round(float(t) * 1e9)
         spot = types["geometry_msgs/msg/Point"](place.real, place.imag, 0.0)
         where = types["geometry_msgs/msg/Pose"](spot, level)

@@ -35,15 +35,15 @@ def usual(seed: int = 3, plan: Plan = GUIDED) -> Drive:
     return drive(Robot(rng=np.random.default_rng(seed)), plan)
 
 
-def table(seen: Drive, *, gyro: bool = True, places: bool = True) -> Table:
+def table(trip: Drive, *, gyro: bool = True, places: bool = True) -> Table:
     """Return the table that `read` would make of the drive's CSV text, without writing the text.
 
     `test_a_table_made_directly_equals_that_of_the_written_log` compares both tables.
     """
     sensors = [
-        (seen.t, {"left": seen.left, "right": seen.right}, 2, True),
-        (seen.gyro_t, {"yaw_rate": seen.gyro}, 6, gyro),
-        (seen.place_t, {"x": seen.place.real, "y": seen.place.imag}, 4, places),
+        (trip.t, {"left": trip.left, "right": trip.right}, 2, True),
+        (trip.gyro_t, {"yaw_rate": trip.gyro}, 6, gyro),
+        (trip.place_t, {"x": trip.place.real, "y": trip.place.imag}, 4, places),
     ]
     made = Table.joined(
         [
@@ -65,7 +65,7 @@ def log_of_runs(
     recorded: Callable[..., Table] = table,
 ) -> reading.Log:  # fmt: skip
     """Return a log in which each drive is a run. `recorded` converts a drive to a table."""
-    runs = [log_of(recorded(seen, gyro=gyro, places=places)).runs[0] for seen in drives]
+    runs = [log_of(recorded(trip, gyro=gyro, places=places)).runs[0] for trip in drives]
     named = [structs.replace(run, name=str(at + 1)) for at, run in enumerate(runs)]
     return reading.Log(tuple(named), ())
 
@@ -76,5 +76,5 @@ def ready(log: str | Table) -> Prepared:
 
 
 def calibrated(log: str | Table | reading.Log, tape: Tape | None = None) -> solve.Calibration:
-    found = log if isinstance(log, reading.Log) else log_of(log)
-    return solve.calibrate(found, DriveConfig(), tape)
+    data = log if isinstance(log, reading.Log) else log_of(log)
+    return solve.calibrate(data, DriveConfig(), tape)

@@ -39,22 +39,22 @@ def test_the_deviation_of_an_unmeasured_scale_is_not_written() -> None:
 
 
 def test_the_text_states_the_improvement_and_the_remaining_error() -> None:
-    told = plain(*parts(REPORT, FOUND, "acsard.toml", guided=False), width=MAX_TEXT_WIDTH)
-    assert "wheel_separation_multiplier   " in told
-    assert f"heading error after a turn of 360 deg: {REPORT.turn_error_before:.0f} deg now" in told
-    assert "remaining error: skidding changes the effective track. This log determines " in told
-    assert "with the new values\n(errors on drives that the fit did not use)\nrandom " in told
-    assert "give --distance METERS" in told
+    text = plain(*parts(REPORT, FOUND, "acsard.toml", guided=False), width=MAX_TEXT_WIDTH)
+    assert "wheel_separation_multiplier   " in text
+    assert f"heading error after a turn of 360 deg: {REPORT.turn_error_before:.0f} deg now" in text
+    assert "remaining error: skidding changes the effective track. This log determines " in text
+    assert "with the new values\n(errors on drives that the fit did not use)\nrandom " in text
+    assert "give --distance METERS" in text
 
 
 def test_a_guided_calibration_does_not_advise_an_option_that_needs_a_log() -> None:
-    told = plain(*parts(REPORT, FOUND, "acsard.toml", guided=True), width=9999)
-    assert "--distance" not in told
-    assert "calibrate with --method tape, or with --method gyro and type the distance" in told
+    text = plain(*parts(REPORT, FOUND, "acsard.toml", guided=True), width=9999)
+    assert "--distance" not in text
+    assert "calibrate with --method tape, or with --method gyro and type the distance" in text
 
 
 def test_the_notes_come_after_the_result() -> None:
     made = structs.replace(REPORT, notes=["one"])
-    told = plain(*parts(made, FOUND, "acsard.toml", guided=False), width=99)
-    assert told.rstrip().endswith("note: one")
-    assert told.index("wheel_separation_multiplier =") < told.index("note: one")
+    text = plain(*parts(made, FOUND, "acsard.toml", guided=False), width=99)
+    assert text.rstrip().endswith("note: one")
+    assert text.index("wheel_separation_multiplier =") < text.index("note: one")

@@ -35,12 +35,12 @@ def fitted(rng: np.random.Generator, shared: float, own: float, blocks: int = 20
     columns = rng.normal(size=(len(block), 3))
     noise = rng.normal(0, own, len(block))
     noise += (rng.normal(0, shared, (blocks, 3))[block] * columns).sum(axis=1)
-    seen = columns @ TRUTH + noise
+    values = columns @ TRUTH + noise
 
     def source(parameters):  # type: ignore[no-untyped-def]
         jacobian = np.zeros((len(block), PARAMETER_COUNT))
         jacobian[:, :3] = columns
-        residual = seen - columns @ parameters[:3]
+        residual = values - columns @ parameters[:3]
         return evidence_from_measurements(jacobian, residual, np.ones(len(block)), block, blocks)
 
     return fit([source], START, places=True)
@@ -58,8 +58,8 @@ def test_standard_deviations_cover_the_truth_however_errors_are_correlated(
     rng = np.random.default_rng(7)
     z = []
     for _ in range(60):
-        found = fitted(rng, shared, own)
-        z.append((found.parameters[:3] - TRUTH) / np.sqrt(np.diag(found.covariance()))[:3])
+        result = fitted(rng, shared, own)
+        z.append((result.parameters[:3] - TRUTH) / np.sqrt(np.diag(result.covariance()))[:3])
     assert np.mean(np.abs(z) < 2) > 0.93
     assert 0.6 < np.std(z) < 1.2
 
@@ -77,27 +77,27 @@ def test_errors_that_last_for_a_whole_run_widen_the_deviations_by_run() -> None:
         errors = np.random.default_rng(seed).normal(0.0, 0.02, (6, 3))[runs]
         mean = errors.mean(axis=0)
         score = np.pad(errors - mean, ((0, 0), (0, PARAMETER_COUNT - 3)))
-        found = Fit(START, normal, score, known, tuple(Parameter)[:3], True, {})
-        for by_run, told in z.items():
-            std = np.sqrt(np.diag(found.covariance(runs.tolist() if by_run else ())))
-            told += (mean / std[:3]).tolist()
+        result = Fit(START, normal, score, known, tuple(Parameter)[:3], True, {})
+        for by_run, scores in z.items():
+            std = np.sqrt(np.diag(result.covariance(runs.tolist() if by_run else ())))
+            scores += (mean / std[:3]).tolist()
     with_runs, alone = (float(np.sqrt(np.mean(np.square(z[key])))) for key in (True, False))
     assert 0.5 < with_runs < 1.0 < alone
 
 
 def test_removing_a_block_gives_the_parameters_of_a_fit_without_it() -> None:
-    found = fitted(np.random.default_rng(5), 0.01, 0.05)
+    result = fitted(np.random.default_rng(5), 0.01, 0.05)
     out = np.arange(20) == 4
-    normal = found.normal[~out].sum(axis=0)[:3, :3]
-    score = (found.score + found.normal @ found.parameters)[~out].sum(axis=0)[:3]
-    assert found.without(out)[
+    normal = result.normal[~out].sum(axis=0)[:3, :3]
+    score = (result.score + result.normal @ result.parameters)[~out].sum(axis=0)[:3]
+    assert result.without(out)[
         [Parameter.LEFT, Parameter.RIGHT, Parameter.INVERSE_TRACK]
     ] == pytest.approx(np.linalg.solve(normal, score))
 
 
 def test_the_normal_equations_of_the_three_parameters_are_well_conditioned() -> None:
-    found = fitted(np.random.default_rng(5), 0.0, 0.05)
-    assert np.linalg.cond(found.marginal()) < 3
+    result = fitted(np.random.default_rng(5), 0.0, 0.05)
+    assert np.linalg.cond(result.marginal()) < 3
 
 
 def fit_of(rate: float) -> Fit:

@@ -85,16 +85,16 @@ def test_a_gyro_with_a_constant_value_is_refused() -> None:
 def test_rows_add_up_to_the_turned_angle() -> None:
     drive = usual()
     runs, headings = headings_of(drive)
-    found = rows(headings, runs, blocks(runs, 4.0))
-    assert np.abs(found.turned).sum() == pytest.approx(np.abs(np.diff(drive.yaw)).sum(), rel=0.03)
+    result = rows(headings, runs, blocks(runs, 4.0))
+    assert np.abs(result.turned).sum() == pytest.approx(np.abs(np.diff(drive.yaw)).sum(), rel=0.03)
 
 
 def test_no_row_spans_a_gap_of_the_gyro() -> None:
     drive = usual()
-    kept = (drive.gyro_t < 30) | (drive.gyro_t > 40)
-    runs, headings = headings_of(replace(drive, gyro_t=drive.gyro_t[kept], gyro=drive.gyro[kept]))
-    found = rows(headings, runs, blocks(runs, 4.0))
-    assert 61 <= found.seconds.sum() <= 74
+    mask = (drive.gyro_t < 30) | (drive.gyro_t > 40)
+    runs, headings = headings_of(replace(drive, gyro_t=drive.gyro_t[mask], gyro=drive.gyro[mask]))
+    result = rows(headings, runs, blocks(runs, 4.0))
+    assert 61 <= result.seconds.sum() <= 74
 
 
 @pytest.mark.parametrize("wrapped", [True, False])

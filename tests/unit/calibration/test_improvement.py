@@ -26,20 +26,20 @@ from tests.unit.calibration.robots import GUIDED, Drive
 RATE = Rates(0.5, 1.0)
 
 
-def held(seen: Drive, *, places: bool = True) -> tuple[list[Fold], Improvement]:
+def held(drive: Drive, *, places: bool = True) -> tuple[list[Fold], Improvement]:
     """Fit this drive, and return its cross-validation folds and the measured improvement."""
-    log = table(seen, places=places)
+    log = table(drive, places=places)
     made, runs = ready(log), log_of(log).runs
     fitted = fit(made.sources, made.start, places=places)
-    found = folds(fitted, made.parts, drives(runs), RATE)
-    segments = [positions_of(fold.drive, runs) for fold in found]
-    return found, improvement(found, BASE.start(), BASE, made.rows, segments, made.steps)
+    cv_folds = folds(fitted, made.parts, drives(runs), RATE)
+    segments = [positions_of(fold.drive, runs) for fold in cv_folds]
+    return cv_folds, improvement(cv_folds, BASE.start(), BASE, made.rows, segments, made.steps)
 
 
 def test_every_part_of_one_run_is_left_out_in_turn() -> None:
-    found, _ = held(ideal(), places=False)
-    assert len(found) == 5
-    assert np.all(np.sum([fold.blocks for fold in found], axis=0) >= 1)
+    cv_folds, _ = held(ideal(), places=False)
+    assert len(cv_folds) == 5
+    assert np.all(np.sum([fold.blocks for fold in cv_folds], axis=0) >= 1)
 
 
 def test_with_three_runs_whole_runs_are_left_out() -> None:
@@ -49,8 +49,8 @@ def test_with_three_runs_whole_runs_are_left_out() -> None:
 
 def test_positions_of_a_drive_are_cut_at_gaps_of_the_wheels() -> None:
     run = log_of(table(ideal())).runs[0]
-    kept = (run.t < 20.0) | (run.t > 40.0)
-    torn = replace(run, t=run.t[kept], left=run.left[kept], right=run.right[kept])
+    mask = (run.t < 20.0) | (run.t > 40.0)
+    torn = replace(run, t=run.t[mask], left=run.left[mask], right=run.right[mask])
     begin, end = positions_of(drives([torn] * 3)[0], [torn])
     assert begin.t[-1] < 20.0 < 40.0 < end.t[0]
 

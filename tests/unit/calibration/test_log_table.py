@@ -68,7 +68,7 @@ def test_a_run_may_have_any_character_in_its_name(name: str, place: str) -> None
     header, row = b"t,left,right,yaw_rate", "{},2,3,4"
     cells = [f"{name},{row}" if place == "first" else f"{row},{name}"] * 3
     names = b"run," + header if place == "first" else header + b",run"
-    text = "\n".join(one.format(t) for t, one in enumerate(cells))
+    text = "\n".join(field.format(t) for t, field in enumerate(cells))
     table = read(names + b"\n" + text.encode())
     assert table.names == (name.strip('"'),)
     assert table.columns["t"].tolist() == [0.0, 1.0, 2.0]
@@ -175,8 +175,8 @@ FOREIGN: dict[str, bytes] = {
 @each("how", FOREIGN)
 def test_a_file_of_another_logger_gives_the_same_table(how: str) -> None:
     table = read(FOREIGN[how])
-    found = np.column_stack([table.columns[name] for name in NAMES])
-    assert found[:40] == pytest.approx(np.array(ROWS))
+    matrix = np.column_stack([table.columns[name] for name in NAMES])
+    assert matrix[:40] == pytest.approx(np.array(ROWS))
     assert not [note for note in table.notes if "not used" not in note]
 
 
@@ -364,10 +364,10 @@ def test_a_message_without_wheels_or_turns_is_not_a_row(message: Message) -> Non
 
 def test_a_table_made_directly_equals_that_of_the_written_log() -> None:
     """The other tests use `cut.table`, which makes the table without writing a log."""
-    seen = cut.usual()
+    drive = cut.usual()
     for gyro, places in ((False, True), (True, False), (True, True)):
-        direct = cut.table(seen, gyro=gyro, places=places)
-        written = read(seen.csv(gyro=gyro, places=places).encode())
+        direct = cut.table(drive, gyro=gyro, places=places)
+        written = read(drive.csv(gyro=gyro, places=places).encode())
         assert list(direct.columns) == list(written.columns)
         for name, values in direct.columns.items():
             assert np.allclose(values, written.columns[name], rtol=0, atol=1e-12, equal_nan=True)

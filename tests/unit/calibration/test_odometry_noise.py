@@ -72,15 +72,15 @@ LINKS = {"plain": (2, 3e-4), "checked": (2, 0.0), "counts": (9, 0.0)}
 """Decimals of the speeds and error of the sample times, s, by the kind of the link."""
 
 
-def stalled(seen: Drive, *, gyro: bool, places: bool) -> Table:
+def stalled(trip: Drive, *, gyro: bool, places: bool) -> Table:
     """Return the log of a computer that stalls for 50 to 250 ms, twelve times a minute.
 
     The computer stamps each sample when it reads it. It reads the samples of a stall when the stall
     ends.
     """
-    rng = np.random.default_rng(len(seen.t))
-    late = replace(seen, t=seen.t.copy(), gyro_t=seen.gyro_t.copy())
-    for begin in np.arange(2.0, seen.t[-1] - 5.0, 5.0):
+    rng = np.random.default_rng(len(trip.t))
+    late = replace(trip, t=trip.t.copy(), gyro_t=trip.gyro_t.copy())
+    for begin in np.arange(2.0, trip.t[-1] - 5.0, 5.0):
         end, lasts = begin + rng.uniform(1.0, 5.0), rng.uniform(0.05, 0.25)
         for times in (late.t, late.gyro_t):
             waiting = np.flatnonzero((times > end - lasts) & (times <= end))
@@ -88,27 +88,27 @@ def stalled(seen: Drive, *, gyro: bool, places: bool) -> Table:
     return table(late, gyro=gyro, places=places)
 
 
-def held(seen: Drive, *, gyro: bool, places: bool) -> Table:
+def held(trip: Drive, *, gyro: bool, places: bool) -> Table:
     """Return a log in rows of 20 Hz, which repeat each position until the next one arrives."""
     assert places
-    count = len(seen.t) // LINES * LINES
+    count = len(trip.t) // LINES * LINES
     t, left, right = (
-        column[:count].reshape(-1, LINES).mean(axis=1) for column in (seen.t, seen.left, seen.right)
+        column[:count].reshape(-1, LINES).mean(axis=1) for column in (trip.t, trip.left, trip.right)
     )
-    place = seen.place[np.maximum(0, np.searchsorted(seen.place_t, t, side="right") - 1)]
+    place = trip.place[np.maximum(0, np.searchsorted(trip.place_t, t, side="right") - 1)]
     rows = {"t": t, "left": left, "right": right, "x": place.real, "y": place.imag}
-    turns = [{"t": seen.gyro_t, "yaw_rate": seen.gyro}] if gyro else []
+    turns = [{"t": trip.gyro_t, "yaw_rate": trip.gyro}] if gyro else []
     return Table.joined([rows, *turns])
 
 
-def lying(seen: Drive, *, gyro: bool, places: bool) -> Table:
+def lying(trip: Drive, *, gyro: bool, places: bool) -> Table:
     """Return the log of a bag whose IMU lies on its side.
 
     The refusal of the bag proposes an axis, and the log is made with that axis.
     """
     assert gyro
     assert not places
-    messages = in_order(joint_states(seen), imu(seen, axis=0, sign=-1.0))
+    messages = in_order(joint_states(trip), imu(trip, axis=0, sign=-1.0))
     joints = JointsConfig().as_tuple()
     with pytest.raises(LogError, match="Give --yaw-axis=-x") as refused:
         ros_bag_log.table(messages, joints, Choice())
@@ -129,7 +129,7 @@ class Set(Struct, frozen=True):
     def log(self, rng: np.random.Generator, scale: float = 1.0) -> list[Drive]:
         """Return random drives for a log. The gyro's values are multiplied by `scale`."""
         made = [self.drive(rng, wander(rng, self.seconds)) for _ in range(self.drives)]
-        return [replace(one, gyro=one.gyro * scale) for one in made]
+        return [replace(trip, gyro=trip.gyro * scale) for trip in made]
 
     def calibration(self, log: Sequence[Drive], way: str) -> Calibration:
         gyro, places = WAYS[way]
@@ -144,7 +144,7 @@ class Set(Struct, frozen=True):
 
     def track(self, log: Sequence[Drive]) -> float:
         """Return the true multiplier of the separation: the constant that fits the log best."""
-        turns = np.abs(np.concatenate([np.diff(one.yaw) for one in log])) / 0.01
+        turns = np.abs(np.concatenate([np.diff(trip.yaw) for trip in log])) / 0.01
         return self.robot.chi * (1 + self.robot.rate * float(turns @ turns / turns.sum()))
 
 
@@ -214,11 +214,11 @@ A log of 90 s with a perfect sensor has 1.1. Positions with an error of 1 cm sho
 """
 
 
-def configs(found: Calibration) -> tuple[DriveConfig, OdometryConfig]:
+def configs(calibration: Calibration) -> tuple[DriveConfig, OdometryConfig]:
     """Return the configuration that `--write` makes from the defaults and this calibration."""
     drive_config: dict[str, object] = {}
     noise: dict[str, object] = {}
-    for key, value in keys(found).items():
+    for key, value in keys(calibration).items():
         section, _, name = key.partition(".")
         (drive_config if section == "drive" else noise)[name] = value
     return (
@@ -227,7 +227,7 @@ def configs(found: Calibration) -> tuple[DriveConfig, OdometryConfig]:
 
 
 def judged(
-    seen: Drive, begin: int, end: int, robot: tuple[DriveConfig, OdometryConfig], counts: int
+    trip: Drive, begin: int, end: int, robot: tuple[DriveConfig, OdometryConfig], counts: int
 ) -> tuple[float, float, float]:
     """Return the NEES of a part of a drive, and the normalized squares of two errors.
 
@@ -236,14 +236,14 @@ def judged(
     """
     odom = Odometry(robot[1], Kinematics(robot[0]), counts)
     end = begin + (end - begin) // LINES * LINES
-    sides = (side[begin:end].reshape(-1, LINES).mean(axis=1) for side in (seen.left, seen.right))
+    sides = (side[begin:end].reshape(-1, LINES).mean(axis=1) for side in (trip.left, trip.right))
     for left, right in zip(*sides, strict=True):
         line = Feedback(AT, WheelSpeeds(right, left, left, right), 0.01 * LINES)
         estimate = odom.fold(line)
-    start = 0j if begin == 0 else seen.where[begin - 1]
-    yaw = 0.0 if begin == 0 else seen.yaw[begin - 1]
-    moved = (seen.where[end - 1] - start) * np.exp(-1j * yaw)
-    truth = np.array([[moved.real], [moved.imag], [seen.yaw[end - 1] - yaw]])
+    start = 0j if begin == 0 else trip.where[begin - 1]
+    yaw = 0.0 if begin == 0 else trip.yaw[begin - 1]
+    moved = (trip.where[end - 1] - start) * np.exp(-1j * yaw)
+    truth = np.array([[moved.real], [moved.imag], [trip.yaw[end - 1] - yaw]])
     pose, p = estimate.pose, estimate.covariance
     e = errors(np.array([pose.x, pose.y, pose.yaw]), truth)[:, 0]
     c, s = math.cos(pose.yaw), math.sin(pose.yaw)
@@ -287,31 +287,31 @@ def measured(kind: Set, way: str, robots: int) -> Row:
         scale = 1.0 + rng.normal(0.0, GYRO_SCALE)
         log = kind.log(rng, scale)
         try:
-            found = kind.calibration(log, way)
+            calibration = kind.calibration(log, way)
         except RefusedError:
             refused += 1
             continue
-        robot, made, counts = configs(found), found.multipliers, kind.robot.counts
+        robot, made, counts = configs(calibration), calibration.multipliers, kind.robot.counts
         track, left, right = made.values
-        if TRACK not in found.stays_configured:
+        if TRACK not in calibration.stays_configured:
             tracks.append((track - kind.track(log)) / made.std[0])
-        if RATIO not in found.stays_configured:
+        if RATIO not in calibration.stays_configured:
             true = kind.robot.right / kind.robot.left
             ratios.append(math.log(right / left / true) / made.ratio_std)
         # No other sensor shows the scale of this gyro: the best odometry turns as far as it says.
-        shown = scale if way == "gyro" else 1.0
+        gyro_scale = scale if way == "gyro" else 1.0
         for _ in range(2):
-            seen = kind.drive(rng, wander(rng, 60.0))
-            last = len(seen.t)
-            whole.append(judged(seen, 0, last, robot, counts)[0])
-            default.append(judged(seen, 0, last, (robot[0], OdometryConfig()), counts)[0])
+            trip = kind.drive(rng, wander(rng, 60.0))
+            last = len(trip.t)
+            whole.append(judged(trip, 0, last, robot, counts)[0])
+            default.append(judged(trip, 0, last, (robot[0], OdometryConfig()), counts)[0])
             for at in range(200, last - PIECE + 1, PIECE):
-                pieces.append(judged(seen, at, at + PIECE, robot, counts)[1:])
-                rolled = (seen.left[at : at + PIECE].sum(), seen.right[at : at + PIECE].sum())
+                pieces.append(judged(trip, at, at + PIECE, robot, counts)[1:])
+                rolled = (trip.left[at : at + PIECE].sum(), trip.right[at : at + PIECE].sum())
                 a, b = (0.01 * RADIUS / SEPARATION * float(side) for side in rolled)
-                turned = float(seen.yaw[at + PIECE - 1] - seen.yaw[at - 1])
+                turned = float(trip.yaw[at + PIECE - 1] - trip.yaw[at - 1])
                 turns.append((a, b, turned))
-                off.append((right * b - left * a) / track / shown - turned)
+                off.append((right * b - left * a) / track / gyro_scale - turned)
     sides, true_turns = np.array(turns)[:, :2], np.array(turns)[:, 2]
     least = true_turns - sides @ np.linalg.lstsq(sides, true_turns, rcond=None)[0]
     heading, distance = np.mean(pieces, axis=0).tolist()
@@ -332,8 +332,8 @@ def test_the_noise_of_a_calibration_describes_drives_outside_of_its_log(
     name: str, way: str
 ) -> None:
     """With a gyro only the heading is compared, because a gyro shows no errors of distance."""
-    shown = (name, way) in SHOWN
-    row = measured(ROWS[name, way], way, ROBOTS if shown else FEWER)
+    in_table = (name, way) in SHOWN
+    row = measured(ROWS[name, way], way, ROBOTS if in_table else FEWER)
     print(
         f"\n| {name}; {way} | {row.nees:.1f} | {row.heading:.1f} | {row.distance:.1f} | "
         f"{row.default:.2g} | {row.error:.2f} | {row.best:.2f} | {row.error / row.best - 1:.0%} | "
@@ -344,7 +344,7 @@ def test_the_noise_of_a_calibration_describes_drives_outside_of_its_log(
     if way != "gyro":
         assert (1.0 if coarse else 1.5) < row.nees < 6.0
         assert (0.25 if coarse else 0.5) < row.distance < 2.0
-    if shown:
+    if in_table:
         fine = (name, way) in FINE
         assert row.error < (1.5 if fine else FURTHER[way]) * row.best
         assert 0.6 < row.track < 1.6
@@ -380,11 +380,11 @@ def test_noise_is_written_beside_the_geometry_and_reported(found: Calibration) -
     assert after.yaw_variance_per_radian < before.yaw_variance_per_radian / 10
     assert after.distance_variance_per_metre < before.distance_variance_per_metre
     made = report("a.csv", found, DriveConfig(), "")
-    told = plain(*parts(made, found, "f", guided=False), width=MAX_TEXT_WIDTH)
+    text = plain(*parts(made, found, "f", guided=False), width=MAX_TEXT_WIDTH)
     assert (
-        "random heading error after 10 m of driving, according to the odometry messages: " in told
+        "random heading error after 10 m of driving, according to the odometry messages: " in text
     )
-    assert "random distance error after 10 m of driving, according to the odometry" in told
+    assert "random distance error after 10 m of driving, according to the odometry" in text
 
 
 @pytest.mark.slow
@@ -417,15 +417,15 @@ def test_noise_of_a_robot_whose_geometry_is_right_is_written_alone(found: Calibr
 
 
 def test_positions_that_are_recorded_a_second_later_give_the_same_window() -> None:
-    seen = LOG[0]
-    run = log_of_runs([seen], gyro=False).runs[0]
+    trip = LOG[0]
+    run = log_of_runs([trip], gyro=False).runs[0]
     early = BASE.start()
     way = path(wheel_steps(run), BASE, early)
     times = np.linspace(2.0, 20.0, 6)
     within = (run.place_t >= 2.0) & (run.place_t <= 20.0)
     late = early.copy()
     late[Parameter.DELAY] = 1.0
-    one, other = (
+    first, other = (
         next(
             odometry_noise._by_places(
                 times + p[Parameter.DELAY], run.place_t[within] + p[Parameter.DELAY],
@@ -434,11 +434,11 @@ def test_positions_that_are_recorded_a_second_later_give_the_same_window() -> No
         )
         for p in (early, late)
     )  # fmt: skip
-    assert other.residual == pytest.approx(one.residual)
-    assert other.motion.distance == pytest.approx(one.motion.distance)
-    assert other.motion.turn == pytest.approx(one.motion.turn)
-    assert other.yaw == pytest.approx(one.yaw)
-    assert other.along == pytest.approx(one.along)
+    assert other.residual == pytest.approx(first.residual)
+    assert other.motion.distance == pytest.approx(first.motion.distance)
+    assert other.motion.turn == pytest.approx(first.motion.turn)
+    assert other.yaw == pytest.approx(first.yaw)
+    assert other.along == pytest.approx(first.along)
 
 
 def test_a_log_with_only_a_gyro_gives_no_distance_noise() -> None:

@@ -170,10 +170,10 @@ def test_multipliers_outside_of_the_configurable_range_are_refused() -> None:
 
 
 def test_unusual_values_are_reported() -> None:
-    told = list(
+    notes = list(
         remarks({"yaw_rate": 0.6}, 0.2, np.ones(5), np.array([5.0, 2, 2]), BASE, sized=True)
     )
-    assert len(told) == 5
+    assert len(notes) == 5
     assert not list(
         remarks({"x": 0.001}, 0.0, np.array([1.0, -1]), np.array([1.6, 1, 1]), BASE, sized=True)
     )
@@ -181,9 +181,9 @@ def test_unusual_values_are_reported() -> None:
 
 def test_sides_of_different_size_are_reported() -> None:
     turned = np.array([1.0, -1.0])
-    told = list(remarks({}, 0.0, turned, np.array([1.6, 0.75, 1.5]), BASE, sized=False))
-    assert [text for text in told if "the right wheels are 2 times as large" in text] == told
-    assert len(told) == 1
+    notes = list(remarks({}, 0.0, turned, np.array([1.6, 0.75, 1.5]), BASE, sized=False))
+    assert [text for text in notes if "the right wheels are 2 times as large" in text] == notes
+    assert len(notes) == 1
     assert not list(remarks({}, 0.0, turned, np.array([1.6, 0.96, 1.04]), BASE, sized=True))
 
 
@@ -204,8 +204,8 @@ def test_positions_from_another_time_are_refused() -> None:
 
 
 def rows(left: list[float], right: list[float]) -> Rows:
-    one = np.ones(len(left))
-    return Rows(one.astype(np.int64), one, np.array(left), np.array(right), one, one)
+    unit = np.ones(len(left))
+    return Rows(unit.astype(np.int64), unit, np.array(left), np.array(right), unit, unit)
 
 
 def test_turns_and_straight_drives_are_enough() -> None:
@@ -254,8 +254,8 @@ def test_an_uncertain_parameter_is_named_with_its_deviation() -> None:
 
 
 def test_the_text_names_the_deviation_and_its_limit_or_says_that_there_is_no_value() -> None:
-    told = inaccuracy({RATIO: 0.05, TRACK: np.inf}, (0.2, 0.03))
-    assert told.startswith(
+    sentence = inaccuracy({RATIO: 0.05, TRACK: np.inf}, (0.2, 0.03))
+    assert sentence.startswith(
         "this log is too inaccurate: the standard deviation of the ratio of the right to the left "
         "wheel radius is 5.0%, but at most 3% is accepted, and the effective track cannot be "
         "determined: record a drive of 60 s"

@@ -79,14 +79,14 @@ def test_the_search_uses_at_most_80_evenly_spaced_positions_of_a_segment(
     count: int, used: int
 ) -> None:
     t = np.arange(float(count))
-    (kept,) = positions._furthest([positions.Segment(0, 0, t, t.astype(np.complex128))], 1)
-    assert len(kept.t) == used
-    assert np.ptp(np.diff(kept.t)) == 0.0
-    assert np.array_equal(kept.place.real, kept.t)
+    (segment,) = positions._furthest([positions.Segment(0, 0, t, t.astype(np.complex128))], 1)
+    assert len(segment.t) == used
+    assert np.ptp(np.diff(segment.t)) == 0.0
+    assert np.array_equal(segment.place.real, segment.t)
 
 
-def begun(seen: Drive, base: Base = BASE, sides: Floats | None = None) -> StartingPoint:
-    runs = log_of(table(seen, gyro=False)).runs
+def begun(trip: Drive, base: Base = BASE, sides: Floats | None = None) -> StartingPoint:
+    runs = log_of(table(trip, gyro=False)).runs
     return search(segments(runs, blocks(runs, 8.0)), runs, base, sides)
 
 
@@ -94,25 +94,25 @@ def begun(seen: Drive, base: Base = BASE, sides: Floats | None = None) -> Starti
 @pytest.mark.parametrize("separation", [0.15, 0.3, 0.9])
 @pytest.mark.parametrize("radius", [0.02, 0.05, 0.2])
 def test_the_search_finds_a_starting_point_near_the_truth(separation: float, radius: float) -> None:
-    found = begun(usual(), Base(radius, separation, 1.0, 1.0, 1.0))
-    assert found.unexplained < 0.05
-    assert found.parameters[Parameter.LEFT] == pytest.approx(0.05 / radius, rel=0.1)
-    assert found.parameters[Parameter.INVERSE_TRACK] == pytest.approx(separation / 0.5, rel=0.15)
+    start = begun(usual(), Base(radius, separation, 1.0, 1.0, 1.0))
+    assert start.unexplained < 0.05
+    assert start.parameters[Parameter.LEFT] == pytest.approx(0.05 / radius, rel=0.1)
+    assert start.parameters[Parameter.INVERSE_TRACK] == pytest.approx(separation / 0.5, rel=0.15)
 
 
 @pytest.mark.slow
 def test_a_reversed_side_and_a_mirrored_path_show_in_the_signs() -> None:
-    seen = usual()
-    left, mirrored = replace(seen, left=-seen.left), replace(seen, place=seen.place.conj())
-    found = begun(left).parameters
-    one = np.sign(found[[Parameter.LEFT, Parameter.RIGHT]] * found[Parameter.INVERSE_TRACK])
-    assert one.tolist() == [-1.0, 1.0]
+    trip = usual()
+    left, mirrored = replace(trip, left=-trip.left), replace(trip, place=trip.place.conj())
+    values = begun(left).parameters
+    signs = np.sign(values[[Parameter.LEFT, Parameter.RIGHT]] * values[Parameter.INVERSE_TRACK])
+    assert signs.tolist() == [-1.0, 1.0]
     assert begun(mirrored).parameters[Parameter.INVERSE_TRACK] < 0
 
 
 def test_the_delay_of_late_positions_is_found() -> None:
-    seen = usual()
-    late = replace(seen, place_t=seen.place_t + 0.9)
+    trip = usual()
+    late = replace(trip, place_t=trip.place_t + 0.9)
     assert begun(late).parameters[Parameter.DELAY] == pytest.approx(0.9, abs=0.15)
 
 
@@ -133,9 +133,9 @@ def test_an_ambiguous_turn_in_place_is_taken_for_the_likeliest_angle(
 ) -> None:
     """Positions alone cannot distinguish turns of 90 deg left, 270 deg right and 450 deg left."""
     robot = Robot(chi=chi, rate=0.0, lever=lever, slip=0.02)
-    seen = drive(robot, squares(chi))
-    assert begun(seen).parameters[Parameter.INVERSE_TRACK] == pytest.approx(1 / chi, rel=0.05)
-    mirrored = replace(seen, place=seen.place.conj())
+    trip = drive(robot, squares(chi))
+    assert begun(trip).parameters[Parameter.INVERSE_TRACK] == pytest.approx(1 / chi, rel=0.05)
+    mirrored = replace(trip, place=trip.place.conj())
     sides = np.array([1.0, 1.0]) / chi
     assert begun(mirrored, sides=-sides).parameters[Parameter.INVERSE_TRACK] == pytest.approx(
         -1 / chi, rel=0.05

@@ -48,12 +48,12 @@ def finite(bag: Table, name: str) -> int:
 @pytest.mark.slow
 @pytest.mark.parametrize("speeds", [False, True])
 def test_a_bag_gives_the_same_calibration_as_the_csv_of_the_drive(speeds: bool) -> None:
-    seen = usual()
-    bag = of(joint_states(seen, speeds=speeds), imu(seen), poses(seen))
-    expected = calibrated(csv_table(seen))
-    found = result(bag)
-    assert found.reference == expected.reference == "yaw_rate and positions"
-    difference = found.multipliers.values - expected.multipliers.values
+    drive = usual()
+    bag = of(joint_states(drive, speeds=speeds), imu(drive), poses(drive))
+    expected = calibrated(csv_table(drive))
+    calibration = result(bag)
+    assert calibration.reference == expected.reference == "yaw_rate and positions"
+    difference = calibration.multipliers.values - expected.multipliers.values
     assert np.all(np.abs(difference) < expected.multipliers.std / 2)
 
 
@@ -94,8 +94,8 @@ def test_the_name_of_a_joint_shows_its_wheel(joint: str, column: str) -> None:
 def test_the_columns_follow_the_joints(names: tuple[str, ...], columns: set[str]) -> None:
     bag = of(joint_states(SHORT, names=names), imu(SHORT))
     assert set(bag.columns) == {"t", "yaw_rate", *columns}
-    found = runs(bag).runs[0]
-    angle = found.rolled[1][-1]
+    run = runs(bag).runs[0]
+    angle = run.rolled[1][-1]
     assert angle == pytest.approx(SHORT.right.sum() * 0.01, abs=0.2)
 
 
@@ -191,8 +191,8 @@ def test_odometry_beside_a_gyro_is_not_used_unless_it_is_named() -> None:
     assert "x" in of(*topics(), use=["/imu/data", "/odom"]).columns
 
 
-def true_odometry(seen: Drive) -> Iterator[RosMessage]:
-    return odometry(seen.t, list(seen.where), seen.yaw, "/lidar/odometry")
+def true_odometry(drive: Drive) -> Iterator[RosMessage]:
+    return odometry(drive.t, list(drive.where), drive.yaw, "/lidar/odometry")
 
 
 def test_odometry_of_a_sensor_gives_positions_and_yaw() -> None:
@@ -264,32 +264,32 @@ def test_stamps_of_another_clock_are_moved_to_the_clock_of_the_recording() -> No
 
 
 def test_messages_without_a_stamp_have_the_time_of_their_recording() -> None:
-    unstamped = (replace_stamp(one, 0, 0) for one in imu(SHORT))
+    unstamped = (replace_stamp(entry, 0, 0) for entry in imu(SHORT))
     bag = of(joint_states(SHORT), unstamped)
     gyro = bag.columns["t"][np.isfinite(bag.columns["yaw_rate"])]
     assert np.allclose(gyro - gyro[0], SHORT.gyro_t - SHORT.gyro_t[0], atol=1e-4)
 
 
-def replace_stamp(one: RosMessage, sec: int, nanosec: int) -> RosMessage:
+def replace_stamp(entry: RosMessage, sec: int, nanosec: int) -> RosMessage:
     stamp = sec.to_bytes(4, "little") + nanosec.to_bytes(4, "little")
-    return one._replace(data=one.data[:4] + stamp + one.data[12:])
+    return entry._replace(data=entry.data[:4] + stamp + entry.data[12:])
 
 
 # what is wrong
 
 
 def as_encoding(messages: Iterator[RosMessage], encoding: str) -> Iterator[RosMessage]:
-    return (one._replace(encoding=encoding) for one in messages)
+    return (entry._replace(encoding=encoding) for entry in messages)
 
 
 def cut(messages: Iterator[RosMessage]) -> Iterator[RosMessage]:
-    return (one._replace(data=one.data[:20]) for one in messages)
+    return (entry._replace(data=entry.data[:20]) for entry in messages)
 
 
-def again(seen: Drive) -> Iterator[RosMessage]:
-    yield from joint_states(seen)
-    for one in joint_states(seen):
-        yield one._replace(wall_ns=one.wall_ns + 60 * 10**9)
+def again(drive: Drive) -> Iterator[RosMessage]:
+    yield from joint_states(drive)
+    for entry in joint_states(drive):
+        yield entry._replace(wall_ns=entry.wall_ns + 60 * 10**9)
 
 
 @each(

@@ -253,8 +253,8 @@ def test_a_rest_is_an_interval_in_which_all_wheels_stand_long_enough() -> None:
     run = log_of(drive((0, 2, 0.0), (2, 4, 1.0), (4, 4.5, 0.0), (4.5, 6, 1.0), (6, 8, 0.01))).runs[
         0
     ]
-    found = rests(run, 1.0, 0.2)
-    assert np.allclose(found, [[0.2, 1.79], [6.2, 7.79]], atol=0.02)
+    intervals = rests(run, 1.0, 0.2)
+    assert np.allclose(intervals, [[0.2, 1.79], [6.2, 7.79]], atol=0.02)
 
 
 def test_blocks_leave_out_standstills_and_gaps() -> None:

@@ -64,12 +64,12 @@ def robots(way: str, count: int) -> list[tuple[Calibration, Drive]]:
     return made
 
 
-def off(seen: Drive, values: Floats) -> float:
+def off(trip: Drive, values: Floats) -> float:
     """Return the rms error of the heading after 10 s with these parameters, rad."""
     track, left, right = values
-    turns = (right * seen.right - left * seen.left) * RADIUS / (SEPARATION * track) * 0.01
+    turns = (right * trip.right - left * trip.left) * RADIUS / (SEPARATION * track) * 0.01
     ends = np.arange(0, len(turns), 1000)
-    error = np.diff(np.cumsum(turns)[ends]) - np.diff(seen.yaw[ends])
+    error = np.diff(np.cumsum(turns)[ends]) - np.diff(trip.yaw[ends])
     return float(np.sqrt(np.mean(error**2)))
 
 
@@ -117,19 +117,21 @@ def test_standard_deviations_are_as_wide_as_the_errors(kind: str, way: str) -> N
         rng = np.random.default_rng(seed)
         robot = Robot(chi=chi, rate=rate, slip=slip, left=0.99, right=1.01, rng=rng, outliers=0.0)
         scale = 1.0 + rng.normal(0.0, 0.005)  # of the gyro
-        seen = [drive(robot, wander(rng, 90.0))] if plan is None else []
+        drives = [drive(robot, wander(rng, 90.0))] if plan is None else []
         for side in (1, -1) * 3 if plan else ():
             apart = rng.normal(0.0, 0.004, 2)
             other = replace(robot, left=0.99 + apart[0], right=1.01 + apart[1])
-            seen.append(drive(other, [(s, v, side * w) for s, v, w in plan or ()]))
-        seen = [replace(one, gyro=one.gyro * scale) for one in seen]
-        found = calibrated(log_of_runs(seen, gyro=gyro, places=places))
-        turns = np.abs(np.concatenate([np.diff(one.yaw) for one in seen])) / 0.01
+            drives.append(drive(other, [(s, v, side * w) for s, v, w in plan or ()]))
+        drives = [replace(trip, gyro=trip.gyro * scale) for trip in drives]
+        calibration = calibrated(log_of_runs(drives, gyro=gyro, places=places))
+        turns = np.abs(np.concatenate([np.diff(trip.yaw) for trip in drives])) / 0.01
         true = chi * (1 + rate * float(turns @ turns / turns.sum()))
-        tracks.append((found.multipliers.values[0] - true) / found.multipliers.std[0])
-        if RATIO not in found.stays_configured:
-            off = np.log(found.multipliers.values[2] / found.multipliers.values[1] * 0.99 / 1.01)
-            ratios.append(off / found.multipliers.ratio_std)
+        tracks.append((calibration.multipliers.values[0] - true) / calibration.multipliers.std[0])
+        if RATIO not in calibration.stays_configured:
+            off = np.log(
+                calibration.multipliers.values[2] / calibration.multipliers.values[1] * 0.99 / 1.01
+            )
+            ratios.append(off / calibration.multipliers.ratio_std)
     track, ratio = (float(np.sqrt(np.mean(np.square(z)))) for z in (tracks, ratios))
     print(f"{kind}, {way}: rms z {track:.2f} of the track, {ratio:.2f} of left to right")
     least = 0.7 if way == "gyro" else 0.5
@@ -156,12 +158,12 @@ def away(drives: Sequence[Drive], values: Floats) -> float:
     The odometry starts at the true position and heading of each drive.
     """
     squares = []
-    for seen in drives:
+    for trip in drives:
         track, left, right = values
-        fast, quick = left * seen.left * RADIUS * 0.01, right * seen.right * RADIUS * 0.01
+        fast, quick = left * trip.left * RADIUS * 0.01, right * trip.right * RADIUS * 0.01
         yaw = np.cumsum((quick - fast) / (SEPARATION * track))
         where = np.cumsum((quick + fast) / 2 * np.exp(1j * yaw))
-        squares.append(np.mean(np.abs(where - seen.where) ** 2))
+        squares.append(np.mean(np.abs(where - trip.where) ** 2))
     return float(np.sqrt(np.mean(squares)))
 
 
@@ -213,33 +215,34 @@ def manoeuvres(seed: int, count: int, slip: float) -> list[Drive]:
 def turned_wrong(drives: Sequence[Drive], track: float) -> float:
     """Return the error of the heading divided by the turned angle."""
     off = angle = 0.0
-    for seen in drives:
-        turns = (seen.right - seen.left) * RADIUS / (SEPARATION * track) * 0.01
-        off, angle = off + abs(turns.sum() - seen.yaw[-1]), angle + abs(seen.yaw[-1])
+    for trip in drives:
+        turns = (trip.right - trip.left) * RADIUS / (SEPARATION * track) * 0.01
+        off, angle = off + abs(turns.sum() - trip.yaw[-1]), angle + abs(trip.yaw[-1])
     return off / angle
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_ten_manoeuvres_of_a_skidding_robot_give_its_track(seed: int) -> None:
     """The drives determine the ratio of the radii only to 6 to 8 %, so it stays as configured."""
-    found = calibrated(log_of_runs(manoeuvres(seed, 10, 0.1), places=False))
-    assert found.stays_configured == (RATIO,)
-    assert found.multipliers.values[1:].tolist() == pytest.approx([1.0, 1.0], abs=1e-6)
+    calibration = calibrated(log_of_runs(manoeuvres(seed, 10, 0.1), places=False))
+    assert calibration.stays_configured == (RATIO,)
+    assert calibration.multipliers.values[1:].tolist() == pytest.approx([1.0, 1.0], abs=1e-6)
     assert any(
-        "the right to the left wheel radius stays as configured" in note for note in found.notes
+        "the right to the left wheel radius stays as configured" in note
+        for note in calibration.notes
     )
     elsewhere = manoeuvres(seed + 1000, 40, 0.1)
     best = min(turned_wrong(elsewhere, track) for track in np.arange(1.0, 3.0, 0.02))
-    error = turned_wrong(elsewhere, found.multipliers.values[0])
+    error = turned_wrong(elsewhere, calibration.multipliers.values[0])
     print(f"{turned_wrong(elsewhere, 1.0):.1%} as configured, {error:.1%} found, {best:.1%} best")
     assert error < 1.15 * best
 
 
 def test_turns_on_the_spot_give_the_track_by_a_gyro() -> None:
-    seen = drive(Robot(rng=np.random.default_rng(0)), [(3, 0, 0), (20, 0, 1), (20, 0, -1)])
-    found = calibrated(table(seen, places=False))
-    assert found.stays_configured == (RATIO,)
-    assert found.multipliers.values[0] == pytest.approx(1.6 * (1 + 0.08 / 1.73), rel=0.02)
+    trip = drive(Robot(rng=np.random.default_rng(0)), [(3, 0, 0), (20, 0, 1), (20, 0, -1)])
+    calibration = calibrated(table(trip, places=False))
+    assert calibration.stays_configured == (RATIO,)
+    assert calibration.multipliers.values[0] == pytest.approx(1.6 * (1 + 0.08 / 1.73), rel=0.02)
 
 
 def test_a_log_is_refused_with_the_quantities_that_are_too_inaccurate(
@@ -250,52 +253,52 @@ def test_a_log_is_refused_with_the_quantities_that_are_too_inaccurate(
     plan: Plan = [(3, 0, 0), (20, 0, 1), (20, 0, -1)]
     with pytest.raises(RefusedError) as refused:
         calibrated(table(drive(Robot(rng=np.random.default_rng(0)), plan), places=False))
-    told = str(refused.value)
-    assert "this log is too inaccurate: " in told
-    assert f"{RATIO} cannot be determined" in told
-    assert "inf" not in told
+    text = str(refused.value)
+    assert "this log is too inaccurate: " in text
+    assert f"{RATIO} cannot be determined" in text
+    assert "inf" not in text
 
 
 def test_turns_on_the_spot_with_one_faster_side_give_the_track_by_a_gyro() -> None:
     """The left wheels always roll 1 % less than the right wheels."""
     plan: Plan = [(3, 0, 0), (20, 0.00075, 1), (20, -0.00075, -1)]
-    found = calibrated(table(drive(Robot(rng=np.random.default_rng(0)), plan), places=False))
-    assert found.stays_configured == (RATIO,)
-    assert found.multipliers.values[0] == pytest.approx(1.6 * (1 + 0.08 / 1.73), rel=0.02)
+    calibration = calibrated(table(drive(Robot(rng=np.random.default_rng(0)), plan), places=False))
+    assert calibration.stays_configured == (RATIO,)
+    assert calibration.multipliers.values[0] == pytest.approx(1.6 * (1 + 0.08 / 1.73), rel=0.02)
 
 
 def test_a_tape_measures_the_wheels_of_a_robot_whose_track_is_right() -> None:
-    seen = usual()
-    first = calibrated(table(seen, places=False)).multipliers.values
+    trip = usual()
+    first = calibrated(table(trip, places=False)).multipliers.values
     ahead = drive(Robot(rng=np.random.default_rng(1)), [(1, 0, 0), (10, 0.4, 0), (1, 0, 0)])
     right = DriveConfig(
         wheel_separation_multiplier=float(first[0]),
         left_wheel_radius_multiplier=float(first[1]), right_wheel_radius_multiplier=float(first[2]),
     )  # fmt: skip
-    log = log_of_runs([seen, ahead], places=False)
-    found = calibrate(log, right, Tape(1.1 * float(abs(ahead.where[-1])), "2"))
-    assert set(found.stays_configured) == {TRACK, RATIO}
-    assert found.multipliers.values / first == pytest.approx([1.1] * 3, rel=0.01)
-    given = keys(found)
-    assert given["odometry.distance_scale_std"] == pytest.approx(0.0025, abs=0.001)
-    assert "odometry.left_wheel_radius_multiplier_std" not in given
+    log = log_of_runs([trip, ahead], places=False)
+    calibration = calibrate(log, right, Tape(1.1 * float(abs(ahead.where[-1])), "2"))
+    assert set(calibration.stays_configured) == {TRACK, RATIO}
+    assert calibration.multipliers.values / first == pytest.approx([1.1] * 3, rel=0.01)
+    settings = keys(calibration)
+    assert settings["odometry.distance_scale_std"] == pytest.approx(0.0025, abs=0.001)
+    assert "odometry.left_wheel_radius_multiplier_std" not in settings
 
 
 @pytest.mark.slow
 def test_a_tape_measures_the_wheels_if_positions_are_too_coarse_to_improve_them() -> None:
     robot = Robot(place_noise=0.2, rng=np.random.default_rng(1))
-    seen, ahead = drive(robot, GUIDED), drive(robot, [(2, 0, 0), (8, 0.3, 0), (2, 0, 0)])
+    trip, ahead = drive(robot, GUIDED), drive(robot, [(2, 0, 0), (8, 0.3, 0), (2, 0, 0)])
     large = DriveConfig(
         wheel_separation_multiplier=1.688, left_wheel_radius_multiplier=1.02 * 0.998,
         right_wheel_radius_multiplier=1.02 * 1.002,
     )  # fmt: skip
-    found = calibrate(
-        log_of_runs([seen, ahead], gyro=False), large, Tape(abs(ahead.where[-1]), "2")
+    calibration = calibrate(
+        log_of_runs([trip, ahead], gyro=False), large, Tape(abs(ahead.where[-1]), "2")
     )
-    assert set(found.stays_configured) == {TRACK, RATIO}
-    assert found.multipliers.values[1:] == pytest.approx([0.998, 1.002], abs=0.01)
-    assert found.scale == "distance"
-    assert found.odometry["distance_scale_std"] == pytest.approx(0.004, abs=0.002)
+    assert set(calibration.stays_configured) == {TRACK, RATIO}
+    assert calibration.multipliers.values[1:] == pytest.approx([0.998, 1.002], abs=0.01)
+    assert calibration.scale == "distance"
+    assert calibration.odometry["distance_scale_std"] == pytest.approx(0.004, abs=0.002)
 
 
 def test_a_log_whose_sensors_have_no_value_is_refused() -> None:
@@ -316,10 +319,10 @@ def test_an_uncertain_bias_widens_the_deviation_of_left_to_right() -> None:
     z = []
     for seed in range(12):
         robot = Robot(gyro_noise=0.06, slip=0.003, rng=np.random.default_rng(seed))
-        found = calibrated(table(drive(robot, wander(robot.rng, 100.0)), places=False)).multipliers
-        logs = found.covariance / np.outer(found.values, found.values)
+        result = calibrated(table(drive(robot, wander(robot.rng, 100.0)), places=False)).multipliers
+        logs = result.covariance / np.outer(result.values, result.values)
         apart = np.array([0.0, -1.0, 1.0])
-        off = np.log(found.values) @ apart - np.log(1.002 / 0.998)
+        off = np.log(result.values) @ apart - np.log(1.002 / 0.998)
         z.append(off / np.sqrt(apart @ logs @ apart))
     assert np.sqrt(np.mean(np.square(z))) < 1.4
 
@@ -329,16 +332,16 @@ def test_coarse_encoders_at_a_high_rate_do_not_distort_the_track() -> None:
 
     The mean square of these speeds is therefore no measure of the true speed.
     """
-    seen = usual(plan=wander(np.random.default_rng(2), 100.0))
-    t = np.arange(seen.t[0], seen.t[-1], 0.001)
+    trip = usual(plan=wander(np.random.default_rng(2), 100.0))
+    t = np.arange(trip.t[0], trip.t[-1], 0.001)
     counted = [
-        np.floor(np.interp(t, seen.t, np.cumsum(side) * 0.01) * 20 / (2 * np.pi))
-        for side in (seen.left, seen.right)
+        np.floor(np.interp(t, trip.t, np.cumsum(side) * 0.01) * 20 / (2 * np.pi))
+        for side in (trip.left, trip.right)
     ]
     left, right = (np.diff(counts) * 2 * np.pi / 20 / 0.001 for counts in counted)
-    coarse = replace(seen, t=t[1:], left=left, right=right)
-    found = calibrated(table(coarse, places=False)).multipliers
-    assert found.values[0] == pytest.approx(1.6 * 1.05, rel=0.06)
+    coarse = replace(trip, t=t[1:], left=left, right=right)
+    result = calibrated(table(coarse, places=False)).multipliers
+    assert result.values[0] == pytest.approx(1.6 * 1.05, rel=0.06)
 
 
 @pytest.mark.variations(2)
@@ -346,19 +349,19 @@ def test_coarse_encoders_at_a_high_rate_do_not_distort_the_track() -> None:
 def test_the_deviation_of_the_track_covers_a_scale_error_of_the_gyro(places: bool) -> None:
     """A scale error of 1 % is normal for a gyro. Only positions reveal it."""
     robot = Robot(rate=0.0, slip=0.002, place_noise=0.003, rng=np.random.default_rng(1))
-    seen = drive(robot, wander(robot.rng, 300.0))
-    found = calibrated(table(replace(seen, gyro=seen.gyro * 1.01), places=places)).multipliers
-    assert abs(found.values[0] - 1.6) < 2.2 * found.std[0]
-    assert found.std[0] < 0.016
+    trip = drive(robot, wander(robot.rng, 300.0))
+    result = calibrated(table(replace(trip, gyro=trip.gyro * 1.01), places=places)).multipliers
+    assert abs(result.values[0] - 1.6) < 2.2 * result.std[0]
+    assert result.std[0] < 0.016
     if places:
-        assert found.values[0] == pytest.approx(1.6, rel=0.006)
+        assert result.values[0] == pytest.approx(1.6, rel=0.006)
 
 
 @pytest.mark.slow
 def test_the_remaining_turn_error_uses_the_gyro_with_its_scale_corrected() -> None:
     robot = Robot(rate=0.0, slip=0.002, place_noise=0.003, rng=np.random.default_rng(1))
-    seen = drive(robot, wander(robot.rng, 300.0))
-    worth = calibrated(table(replace(seen, gyro=seen.gyro * 1.02))).improvement
+    trip = drive(robot, wander(robot.rng, 300.0))
+    worth = calibrated(table(replace(trip, gyro=trip.gyro * 1.02))).improvement
     assert (worth.turn.after or math.inf) < 3.0  # deg in 360; 2 % of that are 7 deg
 
 
@@ -370,8 +373,8 @@ def test_positions_that_do_not_show_the_direction_do_not_contradict_the_gyro() -
     """
     side: Plan = [(4, 0.3, 0), (0.5, 0, 0), (4, 0, np.pi / 2 * 1.5 / 4), (0.5, 0, 0)]
     robot = Robot(chi=1.5, rate=0.0, outliers=0.0, lever=0j, rng=np.random.default_rng(3))
-    found = calibrated(table(drive(robot, [(3, 0, 0), *side * 4, (3, 0, 0)]))).multipliers
-    assert found.values[0] == pytest.approx(1.5, rel=0.05)
+    result = calibrated(table(drive(robot, [(3, 0, 0), *side * 4, (3, 0, 0)]))).multipliers
+    assert result.values[0] == pytest.approx(1.5, rel=0.05)
 
 
 AHEAD: Plan = [
@@ -411,16 +414,16 @@ def test_much_slip_widens_the_deviation_and_is_not_refused(way: str) -> None:
     gyro, places = WAYS[way]
     rng = np.random.default_rng(5)
     made = drive(Robot(slip=0.05, rng=rng), wander(rng, 120.0))
-    found = calibrated(table(made, gyro=gyro, places=places)).multipliers
-    assert abs(found.values[0] - 1.6 * 1.04) < 2 * found.std[0]
+    result = calibrated(table(made, gyro=gyro, places=places)).multipliers
+    assert abs(result.values[0] - 1.6 * 1.04) < 2 * result.std[0]
 
 
 @pytest.mark.slow
 def test_coarse_positions_are_compared_over_a_longer_time() -> None:
     rng = np.random.default_rng(5)
     made = drive(Robot(place_noise=0.7, outliers=0.0, rng=rng), wander(rng, 600.0))
-    found = calibrated(table(made, gyro=False)).multipliers
-    assert abs(found.values[0] - 1.6 * 1.045) < 2 * found.std[0]
+    result = calibrated(table(made, gyro=False)).multipliers
+    assert abs(result.values[0] - 1.6 * 1.045) < 2 * result.std[0]
 
 
 @pytest.mark.slow
@@ -436,13 +439,13 @@ def test_order_repetition_and_standstill_do_not_change_the_multipliers() -> None
 @pytest.mark.slow
 def test_gaps_and_jumps_are_reported_and_cost_little() -> None:
     made = usual()
-    kept = np.sin(made.t / 7) > -0.6
+    mask = np.sin(made.t / 7) > -0.6
     jumped = made.place + np.where(made.place_t > 40, 30 - 20j, 0)
-    torn = replace(made, t=made.t[kept], left=made.left[kept], right=made.right[kept], place=jumped)
-    found = calibrated(table(torn))
-    assert any("gaps" in note for note in found.notes)
-    assert any("jump" in note for note in found.notes)
-    assert found.multipliers.values[0] == pytest.approx(1.6 * 1.04, rel=0.03)
+    torn = replace(made, t=made.t[mask], left=made.left[mask], right=made.right[mask], place=jumped)
+    calibration = calibrated(table(torn))
+    assert any("gaps" in note for note in calibration.notes)
+    assert any("jump" in note for note in calibration.notes)
+    assert calibration.multipliers.values[0] == pytest.approx(1.6 * 1.04, rel=0.03)
 
 
 SPIN = [(3, 0, 0), (40, 0, 1)]

@@ -34,25 +34,25 @@ def followed(plan: Plan, seconds: float, fastest: float = 99.0) -> tuple[Drive, 
     v, w = (np.repeat([p[i] for p in plan], [round(p[0] * 100) for p in plan]) for i in (1, 2))
     sides = np.zeros((2, len(v)))
     for side, way in zip(sides, (-1.0, 1.0), strict=True):
-        told, speed = (v + way * w * SEPARATION / 2) / RADIUS, 0.0
-        for at, wanted in enumerate(np.clip(told, -fastest, fastest)):
+        command, speed = (v + way * w * SEPARATION / 2) / RADIUS, 0.0
+        for at, wanted in enumerate(np.clip(command, -fastest, fastest)):
             speed += (wanted - speed) * 0.01 / seconds
             side[at] = speed
     left, right = sides * RADIUS
     moves = [(0.01, (a + b) / 2, (b - a) / SEPARATION) for a, b in zip(left, right, strict=True)]
-    seen = drive(Robot(rng=np.random.default_rng(1), outliers=0.0), moves)
-    shown = [np.round(side[: len(seen.t)], 2) for side in sides]
-    return replace(seen, left=shown[0], right=shown[1]), v, w
+    trip = drive(Robot(rng=np.random.default_rng(1), outliers=0.0), moves)
+    speeds = [np.round(side[: len(trip.t)], 2) for side in sides]
+    return replace(trip, left=speeds[0], right=speeds[1]), v, w
 
 
 def log(plan: Plan, seconds: float, fastest: float = 99.0) -> Log:
-    seen, v, w = followed(plan, seconds, fastest)
+    trip, v, w = followed(plan, seconds, fastest)
     return runs(
         Table.joined(
             [
-                {"t": seen.t, "left": seen.left, "right": seen.right, "applied_linear": v,
+                {"t": trip.t, "left": trip.left, "right": trip.right, "applied_linear": v,
                  "applied_angular": w},
-                {"t": seen.gyro_t, "yaw_rate": seen.gyro},
+                {"t": trip.gyro_t, "yaw_rate": trip.gyro},
             ]
         )
     )  # fmt: skip
@@ -99,8 +99,8 @@ def test_if_no_response_time_leaves_a_reserve_the_sentence_names_the_fault_time(
     rest, ahead = (3.0, 0.0, 0.0), (4.0, 0.5, 0.0)
     (run,) = log([rest, ahead, (1.5, 0.0, 0.0), ahead, rest], 0.2).runs
     (wished,) = log([rest, ahead, (1.5, 0.5, 0.0), ahead, rest], 0.2).runs
-    held = structs.replace(run, linear=wished.linear, angular=wished.angular)
-    made = response([held], DriveConfig(), FeedbackConfig())
+    stall_run = structs.replace(run, linear=wished.linear, angular=wished.angular)
+    made = response([stall_run], DriveConfig(), FeedbackConfig())
     assert made is not None
     assert (made.false_fault, made.proposed, made.settings()) == (True, None, {})
     assert "if the wheels are healthy, raise feedback.fault_time" in made.sentences()[0]

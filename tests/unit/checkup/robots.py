@@ -99,8 +99,8 @@ class Busy(Robot):
     def listen(self, until_ns: int) -> list[tuple[int, bytes]]:
         if not self.wakes_late():
             return super().listen(until_ns)
-        got = super().listen(until_ns + self._late_ns)
-        return [(self.now_ns(), b"".join(data for _, data in got))] if got else []
+        chunks = super().listen(until_ns + self._late_ns)
+        return [(self.now_ns(), b"".join(data for _, data in chunks))] if chunks else []
 
 
 class Starved(Busy):
@@ -127,8 +127,8 @@ class Starved(Busy):
             self._now_ns = min(until_ns, self._runs_ns)
             if until_ns < self._runs_ns:
                 return []
-            self._waited_ns, held, self._held = self._late_ns, self._held, []
-            for data in held:
+            self._waited_ns, backlog, self._held = self._late_ns, self._held, []
+            for data in backlog:
                 super().send(data)
         return VirtualWire.listen(self, until_ns)
 
@@ -176,15 +176,15 @@ class Person(Nobody):
     def ask(self, question: str, answers: Sequence[str]) -> str | None:
         assert not any(abs(v) > 0.5 for v in self._robot.mcu.vehicle.speeds), "asked at speed"
         self._robot.listen(self._robot.now_ns() + 20_000 * MS)  # people are slow to answer
-        seen = self._robot.turned
+        turns = self._robot.turned
         if len(answers) == 1:
             return answers[0]
         if "ready" in answers:
             return "ready"
         if "forward" in answers:
-            return "forward" if next(iter(seen.values())) else "back"
+            return "forward" if next(iter(turns.values())) else "back"
         names = list(SHORT)
-        return names[next(iter(seen))] if seen else "none"
+        return names[next(iter(turns))] if turns else "none"
 
 
 class Checked:

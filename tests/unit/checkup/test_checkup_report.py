@@ -39,8 +39,8 @@ def test_a_check_with_a_step_not_judged_or_not_tried_has_not_passed(
 
 def test_the_summary_counts_the_steps_not_judged_and_advises_to_repeat() -> None:
     late = [lateness.finding(name, 0.08) for name in ("watchdog", "lost lines")]
-    told = summary(report("sim", [RATE, *late], {}, "", ""), "acsard.toml").splitlines()
-    assert told[1:3] == [
+    lines = summary(report("sim", [RATE, *late], {}, "", ""), "acsard.toml").splitlines()
+    assert lines[1:3] == [
         "1 PASS, 2 WARN",
         "for 2 of the steps there is no result, so the check has not passed: repeat it when this "
         "computer is idle",
@@ -48,9 +48,9 @@ def test_the_summary_counts_the_steps_not_judged_and_advises_to_repeat() -> None
 
 
 def test_the_summary_counts_the_verdicts_and_has_the_lines_of_toml() -> None:
-    found = report("sim", [RATE, Finding("watchdog", "FAIL")], {"mcu.baud_rate": 57600}, "", "")
-    told = "\n1 PASS, 1 FAIL\n\nfor acsard.toml:\n[mcu]\nbaud_rate = 57600"
-    assert summary(found, "acsard.toml") == told
+    result = report("sim", [RATE, Finding("watchdog", "FAIL")], {"mcu.baud_rate": 57600}, "", "")
+    text = "\n1 PASS, 1 FAIL\n\nfor acsard.toml:\n[mcu]\nbaud_rate = 57600"
+    assert summary(result, "acsard.toml") == text
     assert "nothing to change" in summary(report("sim", [RATE], {}, "", ""), "acsard.toml")
 
 

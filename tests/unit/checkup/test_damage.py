@@ -48,8 +48,8 @@ def test_firmware_that_obeys_parts_of_lines_is_reported(fault: str, verdict: str
 def test_firmware_that_reads_a_last_number_that_is_cut_is_reported() -> None:
     def scanned(line: bytes) -> protocol.Command | None:
         """Parse as `sscanf` does: accept a last number whose end is missing."""
-        got = re.match(rb"ap(\d\d\.\d\d),bp(\d\d\.\d\d),cp(\d\d\.\d\d),dp([\d.]+),?\r\n\Z", line)
-        return got and protocol.Command({m: float(got[m + 1]) for m in range(4)})
+        match = re.match(rb"ap(\d\d\.\d\d),bp(\d\d\.\d\d),cp(\d\d\.\d\d),dp([\d.]+),?\r\n\Z", line)
+        return match and protocol.Command({m: float(match[m + 1]) for m in range(4)})
 
     robot = Robot()
     with robot.board() as board:

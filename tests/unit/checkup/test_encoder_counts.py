@@ -17,12 +17,12 @@ from tests.unit.checkup.robots import Robot
 
 
 def replies(per_turn: float, speed: float = 3.0, start: int = 65000) -> list[Reply]:
-    found = []
+    series = []
     for n in range(100):
         turned = round(n * 0.02 * speed / math.tau * per_turn)
         reading = Reading((65500 + 20 * n) % 65536, ((start + turned) % 65536, 0, 0, 0))
-        found.append(Reply(n * 0.02, (speed, 0.0, 0.0, 0.0), b"", reading))
-    return found
+        series.append(Reply(n * 0.02, (speed, 0.0, 0.0, 0.0), b"", reading))
+    return series
 
 
 @each("per_turn", [64, 3200, 40000])

@@ -28,11 +28,11 @@ def checked(
     front: Place = "front"
     places = (front,) * reports
     robot = Robot(*faults, config=Config(safety=SafetyConfig(bumpers=places)))
-    shown: list[str] = []
+    texts: list[str] = []
 
     class Watched(Person):
         def doing(self, text: str) -> None:
-            shown.append(text)
+            texts.append(text)
             super().doing(text)
 
     operator = Nobody() if presses is None else Watched(robot)
@@ -40,7 +40,7 @@ def checked(
         operator.presses = dict(presses)
     with robot.board() as board:
         board.listen(0.5)
-        return inputs.finding(board, operator, safety), shown
+        return inputs.finding(board, operator, safety), texts
 
 
 ALL = {"emergency stop": 0, "front bumper": 1, "rear bumper": 2}
@@ -48,16 +48,19 @@ SAFETY = SafetyConfig(estop="required", bumpers=TWO)
 
 
 def test_a_board_without_inputs_has_nothing_to_press() -> None:
-    found, _ = checked(presses={})
-    assert (found.verdict, found.text) == (
+    finding, _ = checked(presses={})
+    assert (finding.verdict, finding.text) == (
         "SKIPPED", "no emergency stop and no bumpers are reported or configured",
     )  # fmt: skip
 
 
 def test_each_input_is_pressed_in_turn_and_passes() -> None:
-    found, shown = checked("estop", "bumpers", presses=ALL, safety=SAFETY)
-    assert (found.verdict, found.figure) == ("PASS", "emergency stop, front bumper, rear bumper")
-    assert shown == [f"press the {name} and release it, within 20 s" for name in ALL]
+    finding, texts = checked("estop", "bumpers", presses=ALL, safety=SAFETY)
+    assert (finding.verdict, finding.figure) == (
+        "PASS",
+        "emergency stop, front bumper, rear bumper",
+    )
+    assert texts == [f"press the {name} and release it, within 20 s" for name in ALL]
 
 
 def test_an_emergency_stop_that_is_reported_but_not_configured_is_pressed_too() -> None:
@@ -69,14 +72,16 @@ def test_an_emergency_stop_that_is_reported_but_not_configured_is_pressed_too() 
 def test_bumpers_that_are_reported_but_not_configured_are_pressed_by_number() -> None:
     presses = {"bumper 1": 1, "bumper 2": 2}
     assert checked("bumpers", presses=presses)[0].figure == "bumper 1, bumper 2"
-    found, _ = checked("bumpers", presses={"bumper 1": 2, "bumper 2": 2})
-    assert found.text == "bumper 1: no press was reported; instead the board reported the bumper 2"
+    finding, _ = checked("bumpers", presses={"bumper 1": 2, "bumper 2": 2})
+    assert (
+        finding.text == "bumper 1: no press was reported; instead the board reported the bumper 2"
+    )
 
 
 def test_without_a_person_the_check_names_what_it_did_not_check() -> None:
-    found, _ = checked("estop", "bumpers", safety=SAFETY)
-    assert (found.verdict, found.figure) == ("SKIPPED", "not checked")
-    assert found.text.endswith(": emergency stop, front bumper, rear bumper")
+    finding, _ = checked("estop", "bumpers", safety=SAFETY)
+    assert (finding.verdict, finding.figure) == ("SKIPPED", "not checked")
+    assert finding.text.endswith(": emergency stop, front bumper, rear bumper")
 
 
 @pytest.mark.parametrize(
@@ -85,9 +90,9 @@ def test_without_a_person_the_check_names_what_it_did_not_check() -> None:
 def test_a_configured_input_that_is_not_reported_fails(
     faults: tuple[str, ...], reports: int
 ) -> None:
-    found, shown = checked(*faults, presses=ALL, safety=SAFETY, reports=reports)
-    assert (found.verdict, found.figure, shown) == ("FAIL", "not reported", [])
-    assert "`!status estop=ok bumpers=..`" in found.mend
+    finding, texts = checked(*faults, presses=ALL, safety=SAFETY, reports=reports)
+    assert (finding.verdict, finding.figure, texts) == ("FAIL", "not reported", [])
+    assert "`!status estop=ok bumpers=..`" in finding.mend
 
 
 @pytest.mark.parametrize(
@@ -101,22 +106,22 @@ def test_a_configured_input_that_is_not_reported_fails(
 )  # fmt: skip
 def test_swapped_and_dead_inputs_are_named(presses: Mapping[str, int], text: str) -> None:
     safety = SafetyConfig(bumpers=TWO)
-    found, _ = checked("bumpers", presses=presses, safety=safety)
-    assert (found.verdict, found.text) == ("FAIL", text)
+    finding, _ = checked("bumpers", presses=presses, safety=safety)
+    assert (finding.verdict, finding.text) == ("FAIL", text)
 
 
 def test_an_input_that_stays_pressed_or_also_reports_another_input_is_named() -> None:
     safety, presses = SafetyConfig(bumpers=TWO), {"front bumper": 1, "rear bumper": 2}
-    found, _ = checked("bumper_pressed=2:0:0", presses=presses, safety=safety)
-    assert found.text == (
+    finding, _ = checked("bumper_pressed=2:0:0", presses=presses, safety=safety)
+    assert finding.text == (
         "front bumper: the board also reported the rear bumper; "
         "rear bumper: no release was reported"
     )
-    assert found.figure == "0 of 2 right"
+    assert finding.figure == "0 of 2 right"
 
 
 def test_two_bumpers_at_one_place_have_numbers() -> None:
     safety = SafetyConfig(bumpers=("front", "front"))
     presses = {"front bumper (1)": 1, "front bumper (2)": 2}
-    found, _ = checked("bumpers", presses=presses, safety=safety)
-    assert (found.verdict, found.figure) == ("PASS", "front bumper (1), front bumper (2)")
+    finding, _ = checked("bumpers", presses=presses, safety=safety)
+    assert (finding.verdict, finding.figure) == ("PASS", "front bumper (1), front bumper (2)")

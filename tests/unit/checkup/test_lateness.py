@@ -46,21 +46,21 @@ def test_the_largest_lateness_since_a_time_is_reported() -> None:
 def test_only_outcomes_that_a_late_computer_can_cause_are_doubted(
     outcome: str, late_s: float, doubted: bool
 ) -> None:
-    seen: dict[str, Any] = dict.fromkeys(
+    fields: dict[str, Any] = dict.fromkeys(
         ("figure", "seconds", "rate", "way", "gap", "quiet", "period", "lines", "here"), 1.0
     )
-    seen |= {"error": 1.0, "tolerance": 0.25, "speed": 3.0}
-    seen["margin_s"] = 0.5 if outcome == "motor: size" else 0.0
-    found = find(outcome, **seen)
-    assert (isinstance(found, TimingFinding) and is_doubtful(found, late_s)) is doubted
+    fields |= {"error": 1.0, "tolerance": 0.25, "speed": 3.0}
+    fields["margin_s"] = 0.5 if outcome == "motor: size" else 0.0
+    result = find(outcome, **fields)
+    assert (isinstance(result, TimingFinding) and is_doubtful(result, late_s)) is doubted
 
 
 def test_a_step_that_is_not_judged_is_a_warning_without_keys() -> None:
-    found = finding("watchdog", 0.085)
-    assert (found.name, found.verdict, found.keys) == ("watchdog", "WARN", {})
-    told = "this computer ran the check up to 85 ms too late, so the check does not judge this step"
-    assert found.text == told
-    assert not judged(found)
+    result = finding("watchdog", 0.085)
+    assert (result.name, result.verdict, result.keys) == ("watchdog", "WARN", {})
+    text = "this computer ran the check up to 85 ms too late, so the check does not judge this step"
+    assert result.text == text
+    assert not judged(result)
     assert judged(find("baud rate: right", rate=9600))
 
 

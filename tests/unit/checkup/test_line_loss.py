@@ -39,10 +39,10 @@ def test_lost_lines_are_counted_and_other_reply_styles_are_not_losses(
 ) -> None:
     with Robot(*faults).board() as board:
         known(board)
-        found = line_loss.finding(board)
-        assert found.verdict == outcome
+        finding = line_loss.finding(board)
+        assert finding.verdict == outcome
         assert board.lost == pytest.approx(share, abs=0.03)
-        assert bool(found.mend) is (outcome == "FAIL")
+        assert bool(finding.mend) is (outcome == "FAIL")
 
 
 @pytest.mark.parametrize(("every", "verdict"), [(25, "FAIL"), (40, "FAIL"), (70, "PASS")])
@@ -67,9 +67,11 @@ def test_a_board_whose_plain_lines_arrive_damaged_ends_the_check_before_motors_t
         pieces = 0
 
         def listen(self, until_ns: int) -> list[tuple[int, bytes]]:
-            got = super().listen(until_ns)
-            self.pieces += len(got)
-            return [(at, d[:9] + b"\xae" + d[10:] if self.pieces % 9 == 0 else d) for at, d in got]
+            chunks = super().listen(until_ns)
+            self.pieces += len(chunks)
+            return [
+                (at, d[:9] + b"\xae" + d[10:] if self.pieces % 9 == 0 else d) for at, d in chunks
+            ]
 
     robot = Noisy("plain_only")
     with robot.board() as board:
@@ -84,10 +86,10 @@ def test_a_board_whose_plain_lines_arrive_damaged_ends_the_check_before_motors_t
 def test_a_silence_is_reported_as_a_silence() -> None:
     with Robot("stalls=1:0.2").board() as board:
         known(board)
-        found = line_loss.finding(board)
-    assert found.verdict == "WARN"
-    assert "but nothing arrived for" in found.figure
-    assert "USB" in found.mend
+        finding = line_loss.finding(board)
+    assert finding.verdict == "WARN"
+    assert "but nothing arrived for" in finding.figure
+    assert "USB" in finding.mend
 
 
 @pytest.mark.variations(3)

@@ -15,14 +15,14 @@ def course(
     speed: float, per_turn: int, period_ms: int = 20, seconds: float = 1.0, sampled: bool = False
 ) -> list[Reply]:
     """Return replies in which the speed of motor b follows from its whole counts."""
-    found, before = [], 0
+    series, before = [], 0
     for n in range(1, int(seconds * 1000 / period_ms)):
         counts = math.floor(speed * n * period_ms / 1000 / math.tau * per_turn)
-        seen = (counts - before) / per_turn * math.tau / period_ms * 1000
+        velocity = (counts - before) / per_turn * math.tau / period_ms * 1000
         reading = Reading(n * period_ms, (0, counts % 65536, 0, 0)) if sampled else None
-        found.append(Reply(n * period_ms / 1000, (0.0, seen, 0.0, 0.0), b"", reading))
+        series.append(Reply(n * period_ms / 1000, (0.0, velocity, 0.0, 0.0), b"", reading))
         before = counts
-    return found
+    return series
 
 
 @pytest.mark.variations(4)
@@ -36,10 +36,10 @@ def test_a_coarse_encoder_is_not_a_runaway_but_a_real_runaway_is_found(
         good = course(speed, per_turn, period_ms, 3.0, sampled)
         for n in range(1, len(good)):
             assert motion.fastest(good[:n], 6.0) is None
-    found = motion.fastest(course(-9.0, per_turn, period_ms, 1.0, sampled), 6.0)
-    assert found is not None
-    assert found[0] == 1
-    assert -10.0 < found[1] < -6.0
+    runaway = motion.fastest(course(-9.0, per_turn, period_ms, 1.0, sampled), 6.0)
+    assert runaway is not None
+    assert runaway[0] == 1
+    assert -10.0 < runaway[1] < -6.0
 
 
 @pytest.mark.parametrize("sampled", [False, True])

@@ -195,34 +195,34 @@ def test_a_wheel_mounted_the_other_way_round_changes_its_sign_in_the_map(motor: 
 
 
 @pytest.mark.variations(3)
-@pytest.mark.parametrize(("one", "other"), list(combinations(range(4), 2)))
-def test_two_swapped_wheels_give_a_changed_wheel_map(one: int, other: int) -> None:
-    checked = check("plain_only", f"swapped_wheels={MOTORS[one]}:{MOTORS[other]}", person=True)
+@pytest.mark.parametrize(("first", "other"), list(combinations(range(4), 2)))
+def test_two_swapped_wheels_give_a_changed_wheel_map(first: int, other: int) -> None:
+    checked = check("plain_only", f"swapped_wheels={MOTORS[first]}:{MOTORS[other]}", person=True)
     assert checked.failed == ["wheel map"]
-    assert checked.changes[f"mcu.wheels.{WHEELS[one]}"] == f"+{MOTORS[other]}"
-    assert checked.changes[f"mcu.wheels.{WHEELS[other]}"] == f"+{MOTORS[one]}"
+    assert checked.changes[f"mcu.wheels.{WHEELS[first]}"] == f"+{MOTORS[other]}"
+    assert checked.changes[f"mcu.wheels.{WHEELS[other]}"] == f"+{MOTORS[first]}"
 
 
 @pytest.mark.variations(3)
 @pytest.mark.parametrize("what", ["motors", "encoders"])
-@pytest.mark.parametrize(("one", "other"), ["ab", "ac", "bd", "cd"])
+@pytest.mark.parametrize(("first", "other"), ["ab", "ac", "bd", "cd"])
 def test_crossed_leads_are_named_if_a_person_sees_the_wheels(
-    what: str, one: str, other: str
+    what: str, first: str, other: str
 ) -> None:
-    checked = check("plain_only", f"swapped_{what}={one}:{other}", person=True)
+    checked = check("plain_only", f"swapped_{what}={first}:{other}", person=True)
     assert [name.partition(" (")[0] for name in checked.failed] == [
-        f"motor {one}",
+        f"motor {first}",
         f"motor {other}",
     ]
-    assert f"{what} {one} and {other}" in checked[f"motor {one}"].mend
+    assert f"{what} {first} and {other}" in checked[f"motor {first}"].mend
 
 
 def test_the_wheel_map_of_any_wiring_is_found() -> None:
     wired = WheelMap(front_right="-c", front_left="+d", rear_left="-a", rear_right="+b")
     robot = Robot(config=Config(mcu=McuConfig(wheels=wired)), wheels=WheelMap())
     checked = Checked(robot, person=True)
-    found = {w: checked.changes[f"mcu.wheels.{w}"] for w in WHEELS}
-    assert found == {w: getattr(wired, w) for w in WHEELS}
+    mapping = {w: checked.changes[f"mcu.wheels.{w}"] for w in WHEELS}
+    assert mapping == {w: getattr(wired, w) for w in WHEELS}
 
 
 @pytest.mark.variations(3)
@@ -233,8 +233,8 @@ def test_a_person_who_sees_the_wheel_separates_a_dead_motor_from_a_dead_encoder(
 ) -> None:
     checked = check("plain_only", f"{part}={letter}", person=True)
     assert len(checked.failed) == 1
-    says = "does not turn" if part == "dead_motor" else "the encoder is dead"
-    assert says in checked[f"motor {letter}"].text
+    text = "does not turn" if part == "dead_motor" else "the encoder is dead"
+    assert text in checked[f"motor {letter}"].text
 
 
 def test_an_encoder_that_moves_while_no_wheel_turns_fails_its_motor() -> None:
@@ -413,11 +413,11 @@ def test_a_check_that_stalled_while_a_motor_turned_turns_no_motor_again(
             questions.append(question)
             return super().ask(question, answers)
 
-    found: list[Finding] = []
-    procedure.run(robot, Away(robot), robot.config, found.append, lambda: robot.asleep_ns)
+    findings: list[Finding] = []
+    procedure.run(robot, Away(robot), robot.config, findings.append, lambda: robot.asleep_ns)
     assert robot.stalled
     assert robot.turned_after == []
-    stopped, rest = found[-2:]
+    stopped, rest = findings[-2:]
     assert (stopped.name, stopped.verdict) == ("stall", "FAIL")
     assert stopped.figure == "stood still for 60.0 s"
     assert "suspended or overloaded" in stopped.mend
@@ -443,16 +443,16 @@ def test_after_a_stall_of_the_terminal_the_check_sends_no_line_that_turns_a_moto
         if text.startswith(at) and not robot.stalled:
             robot.stall()
 
-    found: list[Finding] = []
+    findings: list[Finding] = []
 
     def tell(finding: Finding) -> None:
-        found.append(finding)
+        findings.append(finding)
         shows(finding.name)
 
     procedure.run(robot, Watches(robot), robot.config, tell, lambda: robot.asleep_ns)
     assert robot.stalled
     assert robot.turned_after == []
-    assert [finding.name for finding in found[-2:]] == ["stall", SKIPPED_STEPS]
+    assert [finding.name for finding in findings[-2:]] == ["stall", SKIPPED_STEPS]
 
 
 @pytest.mark.parametrize("asleep", [False, True], ids=["stopped", "suspended"])
@@ -460,10 +460,10 @@ def test_after_a_stall_of_the_terminal_the_check_sends_no_line_that_turns_a_moto
 def test_before_a_wheel_has_turned_only_a_long_stall_ends_the_check(
     seconds: float, ends: bool, asleep: bool
 ) -> None:
-    robot, found = Stalls(seconds, asleep=asleep, turning=0), list[Finding]()
-    procedure.run(robot, Nobody(), robot.config, found.append, lambda: robot.asleep_ns)
+    robot, findings = Stalls(seconds, asleep=asleep, turning=0), list[Finding]()
+    procedure.run(robot, Nobody(), robot.config, findings.append, lambda: robot.asleep_ns)
     assert robot.stalled
-    failed = [finding.name for finding in found if finding.verdict in ("FAIL", "WARN")]
+    failed = [finding.name for finding in findings if finding.verdict in ("FAIL", "WARN")]
     assert failed == (["stall"] if ends else [])
     assert bool(robot.turned_after) != ends
 
@@ -476,21 +476,21 @@ def test_a_step_spoilt_by_a_suspend_before_a_wheel_has_turned_is_repeated() -> N
 
         def listen(self, until_ns: int) -> list[tuple[int, bytes]]:
             self.waits += self.counts
-            got = self.stall(until_ns) if self.waits == 60 else super().listen(until_ns)
-            return [] if 60 <= self.waits < 80 else got
+            chunks = self.stall(until_ns) if self.waits == 60 else super().listen(until_ns)
+            return [] if 60 <= self.waits < 80 else chunks
 
     class Reads(Nobody):
         def doing(self, text: str) -> None:
             robot.counts |= text.startswith("counting lost lines")
 
-    robot, found = Loses(2.0, asleep=True), dict[str, Finding]()
+    robot, findings = Loses(2.0, asleep=True), dict[str, Finding]()
 
     def tell(finding: Finding) -> None:
-        found[finding.name] = finding
+        findings[finding.name] = finding
 
     procedure.run(robot, Reads(), robot.config, tell, lambda: robot.asleep_ns)
     assert robot.stalled
-    assert found["lost lines"].figure.startswith("none of ")
+    assert findings["lost lines"].figure.startswith("none of ")
 
 
 class Trouble(Robot):
@@ -588,11 +588,11 @@ def test_a_runaway_ends_the_check_before_any_faster_command() -> None:
     assert "watchdog" in checked[SKIPPED_STEPS].text
     motors = "motor b (front left), motor c (rear left), motor d (rear right)"
     assert f"not finished: {motors}, trailing comma, " in checked[SKIPPED_STEPS].text
-    told = [max(float(token[2:7]) for token in line.split(b",")[:4])
+    speeds = [max(float(token[2:7]) for token in line.split(b",")[:4])
             for _, line in robot.mcu.heard if line.startswith(b"a")]  # fmt: skip
     # Motor a was commanded its 3 rad/s. Motor b got no command above the speed that already looked
     # like a runaway.
-    assert max(told) <= 3.0
+    assert max(speeds) <= 3.0
     assert not checked.left_turning
 
 
@@ -615,20 +615,20 @@ class Regulates(Robot):
         command = protocol.reference(line)
         if command is None:
             return None
-        for motor, told in command.values.items():
+        for motor, target in command.values.items():
             sign = 0 if self.mcu.stuck == motor else self.mcu.encoder_signs[motor]
             speed = self.mcu.vehicle.speeds[motor]
-            error = told - sign * speed
+            error = target - sign * speed
             if sign != 1 and abs(error) > 0.1:
                 command.values[motor] = math.copysign(self.FULL, error)
         return command
 
     def listen(self, until_ns: int) -> list[tuple[int, bytes]]:
-        got, step_ns = [], 5 * MS
+        chunks, step_ns = [], 5 * MS
         while self.now_ns() < until_ns:
-            got += super().listen(min(until_ns, self.now_ns() + step_ns))
+            chunks += super().listen(min(until_ns, self.now_ns() + step_ns))
             self.full_s += 0.005 * any(abs(v) > 6.0 for v in self.mcu.vehicle.speeds)
-        return got
+        return chunks
 
 
 @pytest.mark.slow
@@ -713,7 +713,7 @@ def test_an_mcu_without_a_valid_line_is_never_driven_and_its_bytes_are_reported(
     assert checked.failed == ["baud rate"]
     assert mend in checked["baud rate"].mend
     assert text in checked["baud rate"].text
-    (rest,) = [found for found in checked.findings if found.verdict == "SKIPPED"]
+    (rest,) = [finding for finding in checked.findings if finding.verdict == "SKIPPED"]
     assert rest is checked.findings[-1]
     assert all(step in rest.text for step in procedure.STEPS[1:])
     assert robot.mcu.vehicle.angles == [0.0] * 4
@@ -743,17 +743,17 @@ def test_neither_a_heavy_wheel_nor_a_coarse_encoder_is_a_weak_motor(
 
 
 def test_each_step_is_announced_before_it_takes_time() -> None:
-    said: list[str] = []
+    texts: list[str] = []
 
     class Listener(Nobody):
         def doing(self, text: str) -> None:
-            said.append(text)
+            texts.append(text)
 
     robot = Robot()
-    procedure.run(robot, Listener(), robot.config, lambda finding: said.append(finding.name))
-    told = [n for n, text in enumerate(said) if text in ("baud rate", "lost lines", "watchdog")]
-    assert all(said[n - 1] not in procedure.STEPS for n in told)
-    turned = [text.split()[1] for text in said if " turns: briefly" in text]
+    procedure.run(robot, Listener(), robot.config, lambda finding: texts.append(finding.name))
+    indices = [n for n, text in enumerate(texts) if text in ("baud rate", "lost lines", "watchdog")]
+    assert all(texts[n - 1] not in procedure.STEPS for n in indices)
+    turned = [text.split()[1] for text in texts if " turns: briefly" in text]
     assert turned == list(MOTORS)
 
 
@@ -902,8 +902,8 @@ def test_a_fault_that_lateness_cannot_cause_is_reported(fault: str, name: str) -
 def test_a_board_that_falls_silent_fails_despite_small_delays_of_the_host() -> None:
     class Pulled(Busy):
         def listen(self, until_ns: int) -> list[tuple[int, bytes]]:
-            got = super().listen(until_ns)
-            return [] if self.turned else got
+            chunks = super().listen(until_ns)
+            return [] if self.turned else chunks
 
     robot = Pulled("plain_only", late_s=0.03, every=5)
     checked = Checked(robot)
@@ -918,11 +918,11 @@ def test_no_motor_is_turned_again_after_a_silence() -> None:
         silent_ns = 0
 
         def listen(self, until_ns: int) -> list[tuple[int, bytes]]:
-            got = super().listen(until_ns)
+            chunks = super().listen(until_ns)
             if any(abs(speed) > 1.0 for speed in self.mcu.vehicle.speeds):
                 self.silences += self.now_ns() > self.silent_ns
                 self.silent_ns = self.now_ns() + 400 * MS
-            return [] if self.now_ns() < self.silent_ns else got
+            return [] if self.now_ns() < self.silent_ns else chunks
 
     verdicts = []
     turned = []
@@ -931,7 +931,7 @@ def test_no_motor_is_turned_again_after_a_silence() -> None:
         checked = Checked(robot)
         turned.append(robot.silences)
         verdicts.append(checked["link"].verdict)
-        assert "watchdog" not in [found.name for found in checked.findings]
+        assert "watchdog" not in [finding.name for finding in checked.findings]
     assert turned[0] == turned[1]
     assert verdicts == ["FAIL", "WARN"]
 
@@ -986,10 +986,10 @@ def test_a_later_step_reports_a_fault_that_an_earlier_step_could_not_judge() -> 
 
     robot = Refuses("plain_only", late_s=0.05, every=3)
     robot.mcu.understand = obeys
-    found: list[Finding] = []
+    findings: list[Finding] = []
     with robot.faulty():
         robot.mcu.understand = obeys
-        procedure.run(robot, Sees(), robot.config, found.append)
-    told = [one for one in found if one.name == "trailing comma"]
-    assert [one.figure for one in told] == ["not judged", "needed"]
-    assert told[1].keys == {"mcu.trailing_comma": True}
+        procedure.run(robot, Sees(), robot.config, findings.append)
+    matches = [finding for finding in findings if finding.name == "trailing comma"]
+    assert [finding.figure for finding in matches] == ["not judged", "needed"]
+    assert matches[1].keys == {"mcu.trailing_comma": True}

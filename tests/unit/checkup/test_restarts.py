@@ -32,7 +32,7 @@ class Restarting(Robot):
 
     def __init__(self, at_s: Sequence[float], *faults: str) -> None:
         super().__init__(*faults)
-        self._due_ns = [int(one * 1e9) for one in at_s]
+        self._due_ns = [int(time_s * 1e9) for time_s in at_s]
 
     def listen(self, until_ns: int) -> list[tuple[int, bytes]]:
         if self._due_ns and self.now_ns() >= self._due_ns[0]:
@@ -61,9 +61,9 @@ def test_a_restart_of_the_board_fails_and_changes_no_other_finding(
 ) -> None:
     checked, sound = Checked(Restarting([at_s], *faults)), check(*faults)
     assert checked.failed == ["restarts"]
-    assert [(one.name, one.verdict) for one in checked.findings if one.name != "restarts"] == (
-        [(one.name, one.verdict) for one in sound.findings]
-    )
+    assert [
+        (result.name, result.verdict) for result in checked.findings if result.name != "restarts"
+    ] == ([(result.name, result.verdict) for result in sound.findings])
     assert checked.changes == sound.changes
     assert checked["restarts"].figure == "restarted"
     assert f"while {when}" in checked["restarts"].text
@@ -115,10 +115,10 @@ def test_a_supply_that_drops_each_time_a_motor_turns_is_named_after_few_tries() 
     assert checked.failed == ["restarts"]
     assert checked["motor a"].verdict == "PASS"
     assert robot.starts == 1 + AGAIN
-    found = checked["restarts"]
-    assert found.figure == "restarted, twice"
-    assert "twice while motor b (front left) turned" in found.text
-    assert found.mend.startswith("use a separate supply for the board")
+    result = checked["restarts"]
+    assert result.figure == "restarted, twice"
+    assert "twice while motor b (front left) turned" in result.text
+    assert result.mend.startswith("use a separate supply for the board")
 
 
 class Resetting(Robot):
@@ -132,11 +132,11 @@ class Resetting(Robot):
         super().send(data)
 
     def listen(self, until_ns: int) -> list[tuple[int, bytes]]:
-        got, due_ns = [], self.spoken_ns + self.silence_ns
+        chunks, due_ns = [], self.spoken_ns + self.silence_ns
         if self.now_ns() < due_ns <= until_ns:
-            got = super().listen(due_ns)
+            chunks = super().listen(due_ns)
             self.mcu.reset(self.now_ns(), 200 * MS)
-        return got + super().listen(until_ns)
+        return chunks + super().listen(until_ns)
 
 
 def test_a_watchdog_that_restarts_the_whole_board_is_named() -> None:
@@ -174,16 +174,16 @@ def test_a_board_that_does_not_come_back_is_reported() -> None:
 def test_the_boot_cause_that_the_board_states_decides_the_remedy(cause: str, mend: str) -> None:
     restarts = heard(reply(0.0, 0))
     name = NAME + b" trips=0 reset=" + cause.encode()
-    seen = restarts.look(name, 9.0, None)
-    assert seen is not None
-    assert seen.cause == cause
-    found = finding(Config().mcu, [seen])
-    assert found.mend.startswith(mend)
-    assert f"(reset={cause})" in found.text
+    restart = restarts.look(name, 9.0, None)
+    assert restart is not None
+    assert restart.cause == cause
+    result = finding(Config().mcu, [restart])
+    assert result.mend.startswith(mend)
+    assert f"(reset={cause})" in result.text
 
 
 def test_restarts_with_different_causes_get_the_general_remedy() -> None:
-    starts = [Restart("a sign", cause=one) for one in ("pin", "watchdog")]
+    starts = [Restart("a sign", cause=cause) for cause in ("pin", "watchdog")]
     assert finding(Config().mcu, starts).mend.startswith("is the supply weak")
 
 
@@ -194,13 +194,13 @@ def reply(at_s: float, mcu_ms: int) -> Reply:
 def heard(*replies: Reply) -> Restarts:
     """Return a restart detector that has received these replies."""
     restarts = Restarts()
-    for one in replies:
-        assert restarts.look(b"", one.at_s, one) is None
+    for answer in replies:
+        assert restarts.look(b"", answer.at_s, answer) is None
     return restarts
 
 
-def sign(seen: Restart | None) -> str:
-    return "" if seen is None else seen.sign
+def sign(restart: Restart | None) -> str:
+    return "" if restart is None else restart.sign
 
 
 def test_the_name_sent_when_the_port_was_opened_is_not_a_restart() -> None:
@@ -253,15 +253,15 @@ def test_a_clock_that_restarted_is_a_restart_of_the_board(before_ms: int) -> Non
 
 def test_a_restart_has_the_last_turning_command_and_the_time_since_the_last_line() -> None:
     restarts = heard(reply(10.0, 0))
-    seen = restarts.look(NAME, 20.0, None)
-    assert seen is not None
-    assert (seen.turned, seen.silent_s) == (ZERO, 0.0)
+    restart = restarts.look(NAME, 20.0, None)
+    assert restart is not None
+    assert (restart.turned, restart.silent_s) == (ZERO, 0.0)
     restarts.sent((3.0, 0.0, 0.0, 0.0), 10.1)
     restarts.sent(ZERO, 11.0)
-    seen = restarts.look(NAME, 11.5, None)
-    assert seen is not None
-    assert seen.turned == (3.0, 0.0, 0.0, 0.0)
-    assert seen.silent_s == pytest.approx(0.9)
+    restart = restarts.look(NAME, 11.5, None)
+    assert restart is not None
+    assert restart.turned == (3.0, 0.0, 0.0, 0.0)
+    assert restart.silent_s == pytest.approx(0.9)
 
 
 def test_restarts_after_the_end_of_the_check_are_not_reported() -> None:

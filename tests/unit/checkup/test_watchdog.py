@@ -55,9 +55,9 @@ def measured(robot: Robot) -> tuple[str, str]:
 def test_a_watchdog_time_within_the_contract_is_measured_and_passes(
     kind: tuple[str, ...], time_ms: int, robot: type[Robot]
 ) -> None:
-    one = robot(*kind)
-    one.mcu.watchdog_ns = time_ms * 1_000_000
-    verdict, figure = measured(one)
+    instance = robot(*kind)
+    instance.mcu.watchdog_ns = time_ms * 1_000_000
+    verdict, figure = measured(instance)
     value, _, about = figure.partition(" ms")
     assert int(value) == pytest.approx(time_ms, abs=60 if about else 20)
     assert verdict == "PASS"
@@ -112,8 +112,8 @@ def test_firmware_that_obeys_broken_lines_never_gets_more_than_the_commanded_spe
     robot = Robot("comma_latched", trailing_comma=True)
     with robot.board() as board:
         assert watchdog.finding(board, ALL).figure.endswith("damaged lines keep it from acting")
-    told = [protocol.latched(line).values.values() for _, line in robot.mcu.heard]
-    assert max(abs(value) for values in told for value in values) == SPEED
+    commands = [protocol.latched(line).values.values() for _, line in robot.mcu.heard]
+    assert max(abs(value) for values in commands for value in values) == SPEED
 
 
 @pytest.mark.slow

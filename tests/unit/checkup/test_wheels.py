@@ -105,10 +105,10 @@ def test_the_speed_is_ramped() -> None:
     with robot.board() as board:
         before = len(robot.sent)
         wheels.run_up(board, wheels.only_motor(0, SPEED))
-        told = [float(line[2:7]) for line in robot.sent[before:]]
-    assert told[:9] == sorted(told[:9])
-    assert told[0] <= SPEED / 5
-    assert max(told) == SPEED
+        speeds = [float(line[2:7]) for line in robot.sent[before:]]
+    assert speeds[:9] == sorted(speeds[:9])
+    assert speeds[0] <= SPEED / 5
+    assert max(speeds) == SPEED
 
 
 def test_a_motor_without_measured_speed_is_driven_only_briefly() -> None:
@@ -121,9 +121,9 @@ def test_a_motor_without_measured_speed_is_driven_only_briefly() -> None:
 
 def test_every_motor_that_turns_as_commanded_is_right() -> None:
     with Robot("plain_only").board() as board:
-        found = [wheels.channel(board, motor) for motor in range(4)]
-        comma = dialect.comma(board, found[-1].kind == "dead")
-    assert [channel.kind for channel in found] == ["right"] * 4
+        channels = [wheels.channel(board, motor) for motor in range(4)]
+        comma = dialect.comma(board, channels[-1].kind == "dead")
+    assert [channel.kind for channel in channels] == ["right"] * 4
     assert (comma.verdict, comma.figure) == ("PASS", "not needed")
 
 
@@ -132,9 +132,9 @@ def test_a_probe_is_short_and_commands_a_dead_motor_at_most_3_rad_s() -> None:
     with robot.board() as board:
         began, before = robot.now_ns(), len(robot.sent)
         assert wheels.probe(board, 1) == (0.0, 0.0, 0.0, 0.0)
-        told = [line for line in robot.sent[before:] if b"bp00.00" not in line]
-        assert {line[8:15] for line in told} == {b"bp01.50", b"bp03.00"}
-        assert len(told) <= 2 * (SHORT_MEASUREMENT_S / board.period_s + 1)
+        lines = [line for line in robot.sent[before:] if b"bp00.00" not in line]
+        assert {line[8:15] for line in lines} == {b"bp01.50", b"bp03.00"}
+        assert len(lines) <= 2 * (SHORT_MEASUREMENT_S / board.period_s + 1)
         assert robot.now_ns() - began < 3e9
         assert wheels.probe(board, 0) is None
 
@@ -148,10 +148,10 @@ def test_a_probe_distinguishes_a_motor_that_follows_from_a_reversed_encoder(
     for fault, follows in ((), True), (("reversed_encoder=c",), False):
         robot = Robot("plain_only", *fault, config=config)
         with robot.board() as board:
-            seen = wheels.probe(board, 2)
-            assert (seen is None) is follows
-            if seen is not None:
-                channel = Channel(2, seen, (0.0, 0.0, 0.0, 0.0), probed=True)
+            speeds = wheels.probe(board, 2)
+            assert (speeds is None) is follows
+            if speeds is not None:
+                channel = Channel(2, speeds, (0.0, 0.0, 0.0, 0.0), probed=True)
                 assert channel.kind == "reversed"
 
 

@@ -37,8 +37,14 @@ def called(where: Path, log: str, *words: str, text: str = "# mine\n") -> int:
     """Return the exit code of `acsard calibrate --log drive.csv` with these further arguments."""
     (where / "acsard.toml").write_text(text)
     (where / "drive.csv").write_text(log)
-    given = ["calibrate", "--log", str(where / "drive.csv"), "--config", str(where / "acsard.toml")]
-    args = parser(["calibrate"]).parse_args([*given, *words])
+    options = [
+        "calibrate",
+        "--log",
+        str(where / "drive.csv"),
+        "--config",
+        str(where / "acsard.toml"),
+    ]
+    args = parser(["calibrate"]).parse_args([*options, *words])
     return int(args.main(args))
 
 
@@ -54,9 +60,9 @@ def test_the_result_is_printed_as_text_and_the_file_stays(
 
 def test_json_is_one_object(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert called(tmp_path, GOOD, "--json") == 0
-    found = json.loads(capsys.readouterr().out)
-    assert 1.5 < found["wheel_separation_multiplier"] < 1.8
-    assert found["reference"] == "yaw_rate"
+    result = json.loads(capsys.readouterr().out)
+    assert 1.5 < result["wheel_separation_multiplier"] < 1.8
+    assert result["reference"] == "yaw_rate"
 
 
 @pytest.mark.slow
@@ -64,15 +70,15 @@ def test_write_keeps_the_comments_and_a_second_time_finds_nothing_to_improve(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert called(tmp_path, GOOD, "--write", "--json") == 0
-    found = json.loads(capsys.readouterr().out)
+    result = json.loads(capsys.readouterr().out)
     text = (tmp_path / "acsard.toml").read_text()
     assert text.startswith("# mine\n")
     config = parse(text.encode())
     for name in ("wheel_separation", "left_wheel_radius", "right_wheel_radius"):
         key = f"{name}_multiplier"
-        assert getattr(config.drive, key) == pytest.approx(found[key], abs=1e-5)
-    assert "yaw_variance_per_metre" in found["odometry"]
-    for name, value in found["odometry"].items():
+        assert getattr(config.drive, key) == pytest.approx(result[key], abs=1e-5)
+    assert "yaw_variance_per_metre" in result["odometry"]
+    for name, value in result["odometry"].items():
         assert getattr(config.odometry, name) == value
     with pytest.raises(MendableError, match="not clearly better") as end:
         called(tmp_path, GOOD, "--json", "--write", text=text)
@@ -102,14 +108,14 @@ def test_a_distance_measures_the_wheels(tmp_path: Path, capsys: pytest.CaptureFi
     log += straight.csv(places=False, run="straight").partition("\n")[2]
     words = ["--distance", "straight=" + f"{metres:.3f}", "--write", "--json"]
     assert called(tmp_path, log, *words) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert found["scale"] == "distance"
-    assert found["left_wheel_radius"] == pytest.approx(0.055, rel=0.02)
+    result = json.loads(capsys.readouterr().out)
+    assert result["scale"] == "distance"
+    assert result["left_wheel_radius"] == pytest.approx(0.055, rel=0.02)
     written = parse((tmp_path / "acsard.toml").read_bytes())
     assert written.drive.left_wheel_radius_multiplier == pytest.approx(1.1, rel=0.02)
     # The tape's common uncertainty of all distances is stated apart, because it does not affect the
     # heading.
-    deviations = found["odometry"]
+    deviations = result["odometry"]
     assert written.odometry.distance_scale_std == deviations["distance_scale_std"] > 0.0
 
 
@@ -126,8 +132,8 @@ def test_in_two_joined_logs_the_distance_belongs_to_the_straight_drive(
     ]
     log = "\n".join([GOOD.rstrip("\n"), header, *later, ""])
     assert called(tmp_path, log, "--distance", f"{metres:.3f}", "--json") == 0
-    found = json.loads(capsys.readouterr().out)
-    assert found["left_wheel_radius"] == pytest.approx(0.055, rel=0.02)
+    result = json.loads(capsys.readouterr().out)
+    assert result["left_wheel_radius"] == pytest.approx(0.055, rel=0.02)
 
 
 def test_a_refusal_ends_with_failure_and_an_object(
@@ -162,8 +168,8 @@ def test_a_missing_log_is_reported(tmp_path: Path) -> None:
 def of_bag(where: Path, log: Path, *words: str) -> int:
     """Return the exit code of `acsard calibrate --json --log` with a bag."""
     (where / "acsard.toml").write_text("")
-    given = ["calibrate", "--json", "--log", str(log), "--config", str(where / "acsard.toml")]
-    args = parser(["calibrate"]).parse_args([*given, *words])
+    options = ["calibrate", "--json", "--log", str(log), "--config", str(where / "acsard.toml")]
+    args = parser(["calibrate"]).parse_args([*options, *words])
     return int(args.main(args))
 
 
@@ -176,10 +182,10 @@ def test_a_bag_that_another_library_wrote_is_read(
     if form == "file":
         (log,) = log.glob("*.mcap")
     assert of_bag(tmp_path, log) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert found["reference"] == "yaw_rate and positions"
-    assert found["wheel_separation_multiplier"] == pytest.approx(1.6 * 1.06, abs=0.05)
-    assert found["notes"][0].startswith("used: the wheels from /joint_states (JointState)")
+    result = json.loads(capsys.readouterr().out)
+    assert result["reference"] == "yaw_rate and positions"
+    assert result["wheel_separation_multiplier"] == pytest.approx(1.6 * 1.06, abs=0.05)
+    assert result["notes"][0].startswith("used: the wheels from /joint_states (JointState)")
 
 
 @pytest.mark.slow
@@ -198,8 +204,8 @@ def test_the_options_of_a_bag_choose_its_sensor(
 def test_a_bag_that_was_cut_off_is_read_up_to_the_cut(
     compression: CompressionType, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    seen = usual(plan=GUIDED[:10])
-    log = write_mcap(tmp_path / "bag.mcap", in_order(joint_states(seen), imu(seen)), compression)
+    drive = usual(plan=GUIDED[:10])
+    log = write_mcap(tmp_path / "bag.mcap", in_order(joint_states(drive), imu(drive)), compression)
     log.write_bytes(log.read_bytes()[: log.stat().st_size * 8 // 10])
     assert of_bag(tmp_path, log) == 0
     assert "bag.mcap is cut off" in json.loads(capsys.readouterr().out)["notes"][0]
@@ -208,8 +214,8 @@ def test_a_bag_that_was_cut_off_is_read_up_to_the_cut(
 def test_a_bag_with_an_impossible_time_is_read_up_to_that_time(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    seen = usual(plan=GUIDED[:10])
-    messages = in_order(joint_states(seen), imu(seen))
+    drive = usual(plan=GUIDED[:10])
+    messages = in_order(joint_states(drive), imu(drive))
     last = messages[-1]._replace(wall_ns=1 << 63)
     log = write_mcap(tmp_path / "bag.mcap", [*messages, last])
     assert of_bag(tmp_path, log) == 0
@@ -219,17 +225,17 @@ def test_a_bag_with_an_impossible_time_is_read_up_to_that_time(
 
 @pytest.mark.slow
 def test_the_files_of_a_bag_are_one_log(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    seen = usual(plan=GUIDED[:10])
-    messages = in_order(joint_states(seen), imu(seen))
+    drive = usual(plan=GUIDED[:10])
+    messages = in_order(joint_states(drive), imu(drive))
     bag = tmp_path / "bag"
     bag.mkdir()
     for number in range(12):
         part = messages[number * len(messages) // 12 : (number + 1) * len(messages) // 12]
         write_mcap(bag / f"bag_{number}.mcap", part)
     assert of_bag(tmp_path, bag) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert found["runs"] == 1
-    assert found["seconds"] == pytest.approx(seen.t[-1], abs=0.1)
+    result = json.loads(capsys.readouterr().out)
+    assert result["runs"] == 1
+    assert result["seconds"] == pytest.approx(drive.t[-1], abs=0.1)
 
 
 @pytest.mark.parametrize(
@@ -282,31 +288,31 @@ def test_the_page_s_converter_makes_a_log_of_a_bag(
 ) -> None:
     write_bag(tmp_path / "drive", usual(), sqlite=sqlite)
     assert called(tmp_path, converted("bag_to_csv.py", tmp_path, "drive"), "--json") == 0
-    found = json.loads(capsys.readouterr().out)
-    assert found["reference"] == "yaw_rate and positions"
-    assert found["wheel_separation_multiplier"] == pytest.approx(1.6 * 1.06, abs=0.05)
+    result = json.loads(capsys.readouterr().out)
+    assert result["reference"] == "yaw_rate and positions"
+    assert result["wheel_separation_multiplier"] == pytest.approx(1.6 * 1.06, abs=0.05)
 
 
 @pytest.mark.slow
 def test_the_page_s_converter_makes_a_log_of_counts(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    seen = usual()
-    rows = [(t, f"{t:.6f},,,{rate:.6f}") for t, rate in zip(seen.gyro_t, seen.gyro, strict=True)]
+    drive = usual()
+    rows = [(t, f"{t:.6f},,,{rate:.6f}") for t, rate in zip(drive.gyro_t, drive.gyro, strict=True)]
     per_rad = 1440 / math.tau
     left, right = (
         (65000 + np.floor(np.cumsum(side) * PERIOD_S * per_rad)) % 65536
-        for side in (seen.left, seen.right)
+        for side in (drive.left, drive.right)
     )
     rows += [
         (t, f"{t + PERIOD_S / 2:.6f},{a:.0f},{b:.0f},")
-        for t, a, b in zip(seen.t, left, right, strict=True)
+        for t, a, b in zip(drive.t, left, right, strict=True)
     ]
     text = "\n".join(["t,left_counts,right_counts,yaw_rate", *(row for _, row in sorted(rows))])
     (tmp_path / "counts.csv").write_text(text + "\n")
     assert called(tmp_path, converted("counts_to_csv.py", tmp_path, "counts.csv"), "--json") == 0
-    found = json.loads(capsys.readouterr().out)
-    assert found["wheel_separation_multiplier"] == pytest.approx(1.6 * 1.06, abs=0.05)
+    result = json.loads(capsys.readouterr().out)
+    assert result["wheel_separation_multiplier"] == pytest.approx(1.6 * 1.06, abs=0.05)
 
 
 @pytest.mark.parametrize("word", ["0", "nan", "a=b", "-3", "1e9"])

@@ -21,10 +21,10 @@ def test_a_call_that_is_not_for_several_robots_is_refused_with_alternatives(
     words: list[str], instead: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["call", *words]) == Exit.USAGE
-    told = capsys.readouterr().err
-    assert "only stop can be called on several robots at once" in told
-    assert "a person must look at each" in told
-    assert all(one in told for one in instead)
+    output = capsys.readouterr().err
+    assert "only stop can be called on several robots at once" in output
+    assert "a person must look at each" in output
+    assert all(word in output for word in instead)
 
 
 @each("text", ["nan", "inf", "-1e400"])
@@ -32,6 +32,6 @@ def test_a_call_that_is_not_for_several_robots_is_refused_with_alternatives(
 def test_a_number_that_is_not_finite_is_refused_with_its_name(
     name: str, text: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    values = [text if name == one else "0" for one in ("X", "Y", "YAW")]
+    values = [text if name == axis else "0" for axis in ("X", "Y", "YAW")]
     assert main(["call", "set_pose", "--", *values]) == Exit.USAGE
     assert f"{name} = {float(text)}: the number must be finite" in capsys.readouterr().err

@@ -154,9 +154,9 @@ def test_a_value_of_an_option_is_blamed_on_the_option_and_not_on_the_file(
 ) -> None:
     places.here.write_text('[robot]\nid = "r1"\n')
     assert main(words.split()) == Exit.BAD_CONFIG
-    told = capsys.readouterr().err
-    assert told.startswith(place)
-    assert told.endswith(f"acsard: 1 problem in {place.partition(':')[0]}\n")
+    output = capsys.readouterr().err
+    assert output.startswith(place)
+    assert output.endswith(f"acsard: 1 problem in {place.partition(':')[0]}\n")
 
 
 def test_problems_of_the_file_and_of_an_option_are_distinguished(
@@ -164,15 +164,15 @@ def test_problems_of_the_file_and_of_an_option_are_distinguished(
 ) -> None:
     places.here.write_text("[control]\nrate = 5\n")
     assert main(["run", "--id", "a/b"]) == Exit.BAD_CONFIG
-    told = capsys.readouterr().err
-    assert '--id: robot.id = "a/b"' in told
-    assert "acsard.toml: control.rate = 5" in told
-    assert "acsard: 2 problems in " in told
+    output = capsys.readouterr().err
+    assert '--id: robot.id = "a/b"' in output
+    assert "acsard.toml: control.rate = 5" in output
+    assert "acsard: 2 problems in " in output
     places.here.write_text("[control]\nrate = 100\n")
     assert main(["run", "--baud-rate", "9600"]) == Exit.BAD_CONFIG
-    told = capsys.readouterr().err
-    assert "acsard.toml: control.rate = 100: " in told
-    assert " (mcu.baud_rate is from --baud-rate)" in told
+    output = capsys.readouterr().err
+    assert "acsard.toml: control.rate = 100: " in output
+    assert " (mcu.baud_rate is from --baud-rate)" in output
 
 
 def test_every_key_that_run_can_set_has_the_name_of_its_option() -> None:
@@ -292,12 +292,14 @@ def test_published_and_unknown_keys_may_be_followed_and_queried() -> None:
 def test_the_record_directory_is_from_the_option_the_file_or_the_service_in_this_order(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    said = b'[record]\ndirectory = "/file"'
-    named, in_file = parse(said, {"record": {"directory": "/option"}}), parse(said)
+    data = b'[record]\ndirectory = "/file"'
+    named, in_file = parse(data, {"record": {"directory": "/option"}}), parse(data)
     assert with_record_directory(Config()).record.directory == ""
     monkeypatch.setenv("ACSARD_RECORD", "/service")
-    found = [with_record_directory(one).record.directory for one in (named, in_file, Config())]
-    assert found == ["/option", "/file", "/service"]
+    directories = [
+        with_record_directory(config).record.directory for config in (named, in_file, Config())
+    ]
+    assert directories == ["/option", "/file", "/service"]
 
 
 def test_a_relative_record_directory_becomes_an_absolute_path(

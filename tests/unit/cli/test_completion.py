@@ -101,9 +101,9 @@ def test_fish_offers_the_same_values(
     scripts: dict[str, Path], words: str, offered: set[str]
 ) -> None:
     require("fish")
-    told = offers("fish", "--no-config", "-c", f"source {scripts['fish']}; complete -C '{words}'")
-    assert set(told) >= offered
-    assert all(one.startswith(words.split()[-1]) for one in told)
+    values = offers("fish", "--no-config", "-c", f"source {scripts['fish']}; complete -C '{words}'")
+    assert set(values) >= offered
+    assert all(value.startswith(words.split()[-1]) for value in values)
 
 
 @pytest.mark.slow

@@ -115,7 +115,7 @@ def printed(robots: str, senders: str, most: int | None, timeout: float | None =
 
 
 @pytest.mark.parametrize(
-    ("robots", "senders", "most", "code", "shown"),
+    ("robots", "senders", "most", "code", "ids"),
     [
         ("abc", "aaabac", 1, 0, "abc"),
         ("abc", "aabbaccab", 2, 0, "aabbcc"),
@@ -128,12 +128,12 @@ def printed(robots: str, senders: str, most: int | None, timeout: float | None =
     ],
 )
 def test_a_number_of_messages_counts_for_each_robot(
-    robots: str, senders: str, most: int | None, code: int, shown: str,
+    robots: str, senders: str, most: int | None, code: int, ids: str,
     capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
     assert printed(robots, senders, most) == code
     lines = capsys.readouterr().out.splitlines()
-    assert "".join(msgspec.json.decode(line)["robot"] for line in lines) == shown
+    assert "".join(msgspec.json.decode(line)["robot"] for line in lines) == ids
 
 
 def test_a_robot_that_publishes_does_not_hide_the_silence_of_another(
@@ -147,9 +147,9 @@ def test_a_key_without_a_short_form_is_refused_with_those_that_have_one(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     assert main(["echo", "tf", "--short"]) == Exit.USAGE
-    told = capsys.readouterr().err
-    assert "tf has no short form" in told
-    assert all(key in told for key in ("odom", "state", "cmd_vel_out", "sim/pose"))
+    output = capsys.readouterr().err
+    assert "tf has no short form" in output
+    assert all(key in output for key in ("odom", "state", "cmd_vel_out", "sim/pose"))
 
 
 @each("form", ["json", "msgpack"])
@@ -182,22 +182,24 @@ def test_a_message_that_does_not_fit_into_the_csv_log_is_left_out_and_reported_o
         ],
         "wheel_states": [encode(wheel, "json") for wheel in wheels],
     }
-    heard: list[None] = []
+    calls: list[None] = []
 
     def subscribe(name: str) -> Any:
         samples = [
-            SimpleNamespace(encoding="", payload=SimpleNamespace(to_bytes=lambda held=held: held))
-            for held in payloads[name]
+            SimpleNamespace(
+                encoding="", payload=SimpleNamespace(to_bytes=lambda payload=payload: payload)
+            )
+            for payload in payloads[name]
         ]
         return SimpleNamespace(try_recv=lambda: samples.pop(0) if samples else None)
 
     robot: Any = SimpleNamespace(key=lambda name: f"acsard/acsar/{name}", subscribe=subscribe)
-    assert _record(robot, list(payloads), 3, None, lambda: heard.append(None)) == 0
+    assert _record(robot, list(payloads), 3, None, lambda: calls.append(None)) == 0
     out, err = capsys.readouterr()
     table = [line.split(",")[1:] for line in out.splitlines()]
     gyro = ["", "", "", "", "0.5", "", "", ""]
     assert table == [HEADER.split(",")[1:], gyro, gyro, ["1"] * 4 + [""] * 4]
-    assert len(heard) == 6
+    assert len(calls) == 6
     imu, joints = err.splitlines()
     assert "a message on acsard/acsar/imu is left out of the log" in imu
     assert "\x1b" not in imu

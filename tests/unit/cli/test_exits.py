@@ -52,9 +52,9 @@ def test_every_error_class_has_an_exit_code() -> None:
 def test_the_help_names_every_code(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         main(["--help"])
-    told = capsys.readouterr().out
-    assert all(f" {int(code)} " in told for code in Exit)
-    assert all(f"{code} {words}" in " ".join(told.split()) for code, words in EXIT_TEXTS.items())
+    output = capsys.readouterr().out
+    assert all(f" {int(code)} " in output for code in Exit)
+    assert all(f"{code} {words}" in " ".join(output.split()) for code, words in EXIT_TEXTS.items())
     assert set(EXIT_TEXTS) == set(Exit)
 
 
@@ -69,8 +69,8 @@ def test_an_unknown_option_names_the_help_that_lists_the_known_ones(
     with pytest.raises(SystemExit) as ended:
         main(["recording", "show", "--stops"])
     assert ended.value.code == Exit.USAGE
-    told = "unrecognized arguments: --stops; `acsard recording show --help` lists the options"
-    assert told in capsys.readouterr().err
+    error = "unrecognized arguments: --stops; `acsard recording show --help` lists the options"
+    assert error in capsys.readouterr().err
 
 
 @each(
@@ -97,6 +97,6 @@ def test_an_unexpected_word_after_an_option_is_named_too(
     with pytest.raises(SystemExit) as ended:
         main(["recording", "export", "1", "--csv", "a.csv", "b.csv"])
     assert ended.value.code == Exit.USAGE
-    told = capsys.readouterr().err
-    assert "usage: acsard recording export " in told
-    assert "unrecognized arguments: b.csv; `acsard recording export --help` lists" in told
+    output = capsys.readouterr().err
+    assert "usage: acsard recording export " in output
+    assert "unrecognized arguments: b.csv; `acsard recording export --help` lists" in output

@@ -21,9 +21,9 @@ def test_without_its_library_it_says_which_extra_to_install(
     for name in [name for name in sys.modules if name.startswith("acsard.foxglove")]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "foxglove", None)  # as if the library were not installed
-    with pytest.raises(MendableError, match=r"pip install .*\[foxglove\]'") as told:
+    with pytest.raises(MendableError, match=r"pip install .*\[foxglove\]'") as error:
         foxglove.main(argparse.Namespace())
-    assert told.value.code == Exit.FAILURE
+    assert error.value.code == Exit.FAILURE
 
 
 def test_the_server_refuses_to_listen_beyond_this_machine() -> None:
@@ -53,10 +53,10 @@ def test_an_address_beyond_this_machine_is_refused_and_the_message_names_a_tunne
     port = text.rpartition(":")[2]
     with pytest.raises(UsageError, match="has no authentication") as refused:
         foxglove.loopback(text)
-    told = str(refused.value)
-    assert "could stop the robot, and with --drive could drive it" in told
-    assert f"Listen on 127.0.0.1:{port} and" in told
-    assert f"ssh -N -L {port}:127.0.0.1:{port} USER@ROBOT" in told
+    error = str(refused.value)
+    assert "could stop the robot, and with --drive could drive it" in error
+    assert f"Listen on 127.0.0.1:{port} and" in error
+    assert f"ssh -N -L {port}:127.0.0.1:{port} USER@ROBOT" in error
 
 
 @each("text", ["", "8765", "127.0.0.1", "robot:8765", "127.0.0.1:x", "[::1]:8765"])

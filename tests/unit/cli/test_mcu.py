@@ -60,22 +60,22 @@ def test_a_check_that_this_computer_was_too_late_for_has_not_passed(
 
     monkeypatch.setattr(mcu, "_wire", late)
     assert called(tmp_path, "--port", "sim", "--yes", "--json") == 1
-    found = json.loads(capsys.readouterr().out)
-    assert not found["passed"]
-    assert "FAIL" not in [one["verdict"] for one in found["findings"]]
+    report = json.loads(capsys.readouterr().out)
+    assert not report["passed"]
+    assert "FAIL" not in [finding["verdict"] for finding in report["findings"]]
 
 
 @pytest.mark.slow
 def test_json_is_one_object(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert called(tmp_path, "--port", "sim", "--yes", "--json") == 0
     out, err = capsys.readouterr()
-    found = json.loads(out)
+    report = json.loads(out)
     assert err == ""
-    assert found["passed"] is True
-    assert found["changes"] == {"mcu.link_check": "auto", "mcu.encoder_counts": 3200}
-    assert parse(found["toml"].encode()).mcu.link_check == "auto"
-    assert found["written"] is None
-    watchdog = next(one for one in found["findings"] if one["name"] == "watchdog")
+    assert report["passed"] is True
+    assert report["changes"] == {"mcu.link_check": "auto", "mcu.encoder_counts": 3200}
+    assert parse(report["toml"].encode()).mcu.link_check == "auto"
+    assert report["written"] is None
+    watchdog = next(finding for finding in report["findings"] if finding["name"] == "watchdog")
     assert (watchdog["verdict"], watchdog["figure"][:2]) == ("PASS", "30")
 
 
@@ -106,8 +106,8 @@ def test_findings_of_the_simulator_are_not_offered_for_a_robot_s_file(
     out = capsys.readouterr().out
     assert "the configured mcu.port is /dev/acsar_mcu" in out
     if "--json" in how:
-        found = json.loads(out)
-        assert (found["changes"], found["toml"]) == ({}, "")
+        report = json.loads(out)
+        assert (report["changes"], report["toml"]) == ({}, "")
     else:
         assert f"{tmp_path / 'acsard.toml'} stays unchanged: the tool checked the simulator" in out
         assert "encoder_counts =" not in out
@@ -125,7 +125,7 @@ def test_write_of_simulator_findings_to_a_robot_s_file_is_refused_before_the_che
 def test_findings_are_printed_also_if_the_file_cannot_be_written(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def full(*given: object) -> None:
+    def full(*arguments: object) -> None:
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("acsard.host.config_file.replace", full)
@@ -195,9 +195,9 @@ def test_a_port_without_an_answer_is_not_written(
 ) -> None:
     with pytest.raises(NoPortError):
         called(tmp_path, "--port", str(tmp_path / "none"), "--yes", "--write", "--json")
-    found = json.loads(capsys.readouterr().out)
-    assert (found["passed"], found["changes"]) == (False, {})
-    assert "acsard ports" in found["error"]
+    report = json.loads(capsys.readouterr().out)
+    assert (report["passed"], report["changes"]) == (False, {})
+    assert "acsard ports" in report["error"]
     assert (tmp_path / "acsard.toml").read_text() == ""
 
 
@@ -256,9 +256,9 @@ def test_progress_is_one_line_on_a_terminal_that_the_next_one_writes_over(
     written = on_terminal(columns, lambda: called(tmp_path, *check), monkeypatch)
     assert "listening for 3 s at the configu" in written
     assert "\n" not in written
-    shown = [line for line in written.split("\r\033[K") if line]
-    assert len(shown) > 8
-    assert max(map(len, shown)) < (columns or 80)
+    lines = [line for line in written.split("\r\033[K") if line]
+    assert len(lines) > 8
+    assert max(map(len, lines)) < (columns or 80)
     assert written.endswith("\r\033[K"), "what is printed at last stands on a line of its own"
 
 

@@ -54,8 +54,8 @@ def where(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def log(where: Path, *words: str) -> tuple[int, str, str]:
-    told = typed("recording", *words, "--directory", str(where))
-    return told.code, told.out, told.err
+    result = typed("recording", *words, "--directory", str(where))
+    return result.code, result.out, result.err
 
 
 @pytest.mark.slow
@@ -130,9 +130,9 @@ def test_the_list_refuses_seconds_and_replay_and_recover_refuse_a_time(where: Pa
     code, _, err = log(where, "--from", "5")
     assert (code, "count from the beginning of one recording" in err) == (Exit.USAGE, True)
     for words in (["replay", "1"], ["recover", "1", "new.mcap"]):
-        told = typed("recording", "--from", "14:05", "--directory", str(where), *words)
-        assert "leave out --from and --to" in told.err
-        assert told.code == Exit.USAGE
+        result = typed("recording", "--from", "14:05", "--directory", str(where), *words)
+        assert "leave out --from and --to" in result.err
+        assert result.code == Exit.USAGE
 
 
 @pytest.mark.slow
@@ -149,8 +149,8 @@ def test_the_configuration_names_the_directory_of_the_recordings(
         ["show", "1", "--config", str(file)],
         ["--config", str(file), "replay", "1", "--config", str(other)],
     ):
-        told = typed("recording", *words)
-        assert (told.code, bool(told.out)) == (0, True)
+        result = typed("recording", *words)
+        assert (result.code, bool(result.out)) == (0, True)
 
 
 @pytest.mark.slow
@@ -190,9 +190,9 @@ def test_a_timeline_is_in_order_as_sentences_or_json(where: Path) -> None:
     assert lines[0].endswith("start: the daemon starts")
     assert any("drive: drove 0.85 m in 2.0 s (by app)" in line for line in lines)
     _, out, _ = log(where, "show", "1", "--json")
-    told = [json.loads(line) for line in out.splitlines()]
-    assert len(told) == len(lines)
-    assert [one["seconds"] for one in told] == sorted(one["seconds"] for one in told)
+    events = [json.loads(line) for line in out.splitlines()]
+    assert len(events) == len(lines)
+    assert [event["seconds"] for event in events] == sorted(event["seconds"] for event in events)
 
 
 def test_a_part_of_a_story_by_seconds_and_by_the_time_of_day(
@@ -287,21 +287,21 @@ def test_a_recording_that_a_kill_truncated_is_reported_as_such(
         part.unlink()
         (tmp_path / part.stem).write_bytes(data)
     RecordingDirectory(RecordConfig(str(tmp_path))).close()
-    told = "cut: the daemon or the computer stopped suddenly"
+    reason = "cut: the daemon or the computer stopped suddenly"
     _, out, _ = log(tmp_path)
-    assert (told in out) is cut
+    assert (reason in out) is cut
     _, out, err = log(tmp_path, "show")
-    assert (out.splitlines()[-1].endswith(f"  ! {told}"), told in err) == (cut, cut)
+    assert (out.splitlines()[-1].endswith(f"  ! {reason}"), reason in err) == (cut, cut)
     _, out, _ = log(tmp_path, "show", "--json")
     last = json.loads(out.splitlines()[-1])
-    assert (last["name"] == "cut", last["text"] == told.removeprefix("cut: ")) == (cut, cut)
+    assert (last["name"] == "cut", last["text"] == reason.removeprefix("cut: ")) == (cut, cut)
     if cut:
         new = tmp_path / "new.html"
         _, _, err = log(tmp_path, "report", "2", str(new))
-        assert (told in err, told in new.read_text()) == (True, True)
+        assert (reason in err, reason in new.read_text()) == (True, True)
     copy = tmp_path / "copy.mcap"
     assert log(tmp_path, "recover", str(next(tmp_path.glob("*2-*.mcap"))), str(copy))[0] == 0
-    assert (told in log(tmp_path, "show", str(copy))[1]) is cut
+    assert (reason in log(tmp_path, "show", str(copy))[1]) is cut
 
 
 def test_recorded_texts_cannot_send_control_characters_to_the_terminal(tmp_path: Path) -> None:
@@ -343,7 +343,7 @@ def test_a_replay_without_differences_reports_equal_counts(where: Path) -> None:
 
 def test_a_replay_says_what_it_has_compared(where: Path) -> None:
     _, out, _ = log(where, "replay", "1")
-    _, told = out.splitlines()
+    _, summary = out.splitlines()
     for word in (
         "each line to the board",
         "each odometry pose",
@@ -351,7 +351,7 @@ def test_a_replay_says_what_it_has_compared(where: Path) -> None:
         "each event",
         "the recorded inputs",
     ):
-        assert word in told
+        assert word in summary
 
 
 def test_a_replay_of_a_truncated_recording_reports_the_missing_end(where: Path) -> None:
@@ -383,11 +383,11 @@ def test_a_replay_names_changed_limits_their_effect_and_a_fault_they_might_avoid
     (keys,) = [line for line in out.splitlines() if line.startswith("changed settings: ")]
     assert "limits.linear_speed was 1.0, is 0.1" in keys
     assert "limits.linear_acceleration was 1.0, is 0.5" in keys
-    (told,) = [
+    (sentence,) = [
         line for line in out.splitlines() if line.startswith("the highest wheel speed in the first")
     ]
-    assert told.endswith(", because of limits.linear_speed, limits.linear_acceleration")
-    then, now = (float(word) for word in re.findall(r"(\d+\.\d+) rad/s", told))
+    assert sentence.endswith(", because of limits.linear_speed, limits.linear_acceleration")
+    then, now = (float(word) for word in re.findall(r"(\d+\.\d+) rad/s", sentence))
     assert then > now
     (fault,) = [line for line in out.splitlines() if "in the mode fault from " in line]
     assert "wheel" in fault
@@ -421,30 +421,33 @@ def test_recover_writes_a_whole_file_or_none_and_overwrites_no_recording(
 ) -> None:
     new = tmp_path / "new.mcap"
     (cut,) = where.glob("*.part")
-    seen: list[bool] = []
+    states: list[bool] = []
     finish = RecordingWriter.finish
 
     def looked(writing: RecordingWriter, *how: str) -> None:
-        seen.append(new.exists())
+        states.append(new.exists())
         finish(writing, *how)
 
     monkeypatch.setattr(RecordingWriter, "finish", looked)
     assert log(where, "recover", str(cut), str(new))[0] == 0
-    assert seen == [False]
+    assert states == [False]
     (other,) = where.glob("*.mcap")
-    (held := tmp_path / "held.mcap").write_bytes(other.read_bytes())
-    code, _, err = log(where, "recover", str(cut), str(held), "--force")
+    (copy := tmp_path / "held.mcap").write_bytes(other.read_bytes())
+    code, _, err = log(where, "recover", str(cut), str(copy), "--force")
     assert (
         code,
         "this file is a recording of acsard, and would be overwritten; name another file" in err,
     ) == (1, True)
-    assert held.read_bytes() == other.read_bytes()
-    held.unlink()
+    assert copy.read_bytes() == other.read_bytes()
+    copy.unlink()
     (mine := tmp_path / "mine").write_text("mine")
     code, _, err = log(where, "recover", str(cut), str(mine))
     assert (code, "--force" in err, mine.read_text()) == (1, True, "mine")
     assert log(where, "recover", str(cut), str(mine), "--force")[0] == 0
-    assert sorted(one.name for one in tmp_path.iterdir() if one.is_file()) == ["mine", "new.mcap"]
+    assert sorted(path.name for path in tmp_path.iterdir() if path.is_file()) == [
+        "mine",
+        "new.mcap",
+    ]
 
 
 def test_recover_replaces_its_earlier_result_only_with_force_and_reports_it(
@@ -539,7 +542,7 @@ def test_a_missing_recording_is_reported(tmp_path: Path) -> None:
 
 def test_the_default_directory_is_that_of_the_service() -> None:
     unit = Path(__file__).parents[3] / "deploy/systemd/acsard.service"
-    says = dict(row.partition("=")[::2] for row in unit.read_text().splitlines() if "=" in row)
-    state = Path("/var/lib") / says["StateDirectory"]
-    assert says["Environment"] == f"ACSARD_RECORD=%S/{says['StateDirectory']}/record"
+    settings = dict(row.partition("=")[::2] for row in unit.read_text().splitlines() if "=" in row)
+    state = Path("/var/lib") / settings["StateDirectory"]
+    assert settings["Environment"] == f"ACSARD_RECORD=%S/{settings['StateDirectory']}/record"
     assert state / "record" == SERVICE_DIRECTORY

@@ -50,9 +50,9 @@ def test_the_newest_recording_is_exported_to_a_named_file_in_the_working_directo
     words: tuple[str, ...], name: str, where: Path, here: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert export(where, *words) == 0
-    told = capsys.readouterr()
-    assert told.err == ""  # without a terminal there is no progress line
-    assert told.out.endswith(f" in {name}\n")
+    output = capsys.readouterr()
+    assert output.err == ""  # without a terminal there is no progress line
+    assert output.out.endswith(f" in {name}\n")
     assert [path.name for path in here.iterdir()] == [name]
 
 

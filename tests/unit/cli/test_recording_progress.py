@@ -39,9 +39,9 @@ def test_the_progress_is_shown_on_a_terminal(
         str(recorded),
         *([] if verb == "replay" else [str(tmp_path / "new")]),
     ]
-    told = on_terminal(80, lambda: main(words), monkeypatch)
-    assert re.match(r"\r0 of \d s of the recording\r\d of \d s of the recording", told)
-    assert told.endswith("\r\x1b[K")
+    output = on_terminal(80, lambda: main(words), monkeypatch)
+    assert re.match(r"\r0 of \d s of the recording\r\d of \d s of the recording", output)
+    assert output.endswith("\r\x1b[K")
 
 
 def test_no_progress_is_written_into_a_pipe(

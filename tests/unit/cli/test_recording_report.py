@@ -24,8 +24,8 @@ QUIET = RECORDINGS / "quiet.mcap"
 
 
 def report(*words: object) -> tuple[int, str, str]:
-    told = typed("recording", "report", *map(str, words))
-    return told.code, told.out, told.err
+    result = typed("recording", "report", *map(str, words))
+    return result.code, result.out, result.err
 
 
 def pictures(path: Path) -> dict[str, list[dict[str, Any]]]:

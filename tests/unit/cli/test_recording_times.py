@@ -61,8 +61,8 @@ def ring(tmp_path_factory: pytest.TempPathFactory) -> Ring:
 
 
 def recording(where: Path, *words: str) -> tuple[int, str, str]:
-    told = typed("recording", *words, "--directory", str(where))
-    return told.code, told.out, told.err
+    result = typed("recording", *words, "--directory", str(where))
+    return result.code, result.out, result.err
 
 
 @pytest.mark.slow
@@ -183,7 +183,7 @@ def test_a_file_alone_says_that_its_drive_began_before_it_and_goes_on_after_it(
     assert first[-1].endswith(" so far (by app)")
     counted = ", counted from the beginning of this recording (by app)"
     assert second[-1].endswith(f" s so far{counted}")
-    assert any("  drive: drove " in one and one.endswith(counted) for one in last)
+    assert any("  drive: drove " in line and line.endswith(counted) for line in last)
 
 
 @pytest.mark.slow
@@ -317,9 +317,9 @@ def test_the_help_says_where_seconds_are_a_time(
 ) -> None:
     with pytest.raises(SystemExit):
         main(["recording", *verb.split(), "--help"])
-    told = " ".join(capsys.readouterr().out.split())
-    assert words in told
-    assert ("number of seconds" in told) == bool(verb)
+    output = " ".join(capsys.readouterr().out.split())
+    assert words in output
+    assert ("number of seconds" in output) == bool(verb)
 
 
 def test_a_recording_without_a_step_in_the_range_is_reported(ring: Ring) -> None:

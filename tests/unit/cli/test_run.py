@@ -23,9 +23,9 @@ def test_without_options_nothing_is_overridden() -> None:
 
 
 def test_the_options_are_the_keys_of_the_configuration() -> None:
-    given = given_by("--port", "/dev/x", "--baud-rate", "57600", "--id", "r7", "--namespace", "a/b",
+    flags = given_by("--port", "/dev/x", "--baud-rate", "57600", "--id", "r7", "--namespace", "a/b",
                      "--listen", "tcp/127.0.0.1:1", "--connect", "tcp/[::1]:2")  # fmt: skip
-    config = parse(b"", given)
+    config = parse(b"", flags)
     assert (config.mcu.port, config.mcu.baud_rate) == ("/dev/x", 57600)
     assert (config.robot.id, config.ros.namespace) == ("r7", "a/b")
     assert config.bus.listen == ("tcp/127.0.0.1:1",)
@@ -33,10 +33,10 @@ def test_the_options_are_the_keys_of_the_configuration() -> None:
 
 
 def test_the_doctor_knows_every_key_that_options_set() -> None:
-    given = given_by("--port", "x", "--baud-rate", "9600", "--id", "r", "--namespace", "n",
+    flags = given_by("--port", "x", "--baud-rate", "9600", "--id", "r", "--namespace", "n",
                      "--record", "d", "--listen", "tcp/127.0.0.1:1", "--connect", "tcp/127.0.0.1:2",
                      )  # fmt: skip
-    keys = {f"{section}.{key}" for section, values in given.items() for key in values}
+    keys = {f"{section}.{key}" for section, values in flags.items() for key in values}
     assert keys == set(OPTION_KEYS)
 
 
@@ -51,9 +51,9 @@ def test_the_doctor_knows_every_key_that_options_set() -> None:
     ],
 )
 def test_one_option_changes_its_own_table_only(words: list[str], table: str) -> None:
-    given = given_by(*words)
-    assert list(given) == [table]
-    config, default = parse(b"", given), Config()
+    flags = given_by(*words)
+    assert list(flags) == [table]
+    config, default = parse(b"", flags), Config()
     changed = [n for n in Config.__struct_fields__ if getattr(config, n) != getattr(default, n)]
     assert changed == [table]
 
@@ -74,9 +74,11 @@ def test_the_banner_distinguishes_a_simulator_from_a_robot() -> None:
 def test_the_banner_has_what_a_newcomer_types_next_and_the_page_where_it_is_served() -> None:
     web = WebConfig(address=("http://127.0.0.1:8080", "https://0.0.0.0:8443"))
     config = Config(web=web)
-    silent, served = (run.banner(config, "x.toml", "/dev/x", served=one) for one in (False, True))
-    for told in (silent, served):
-        tries = [line.split("  ")[0] for line in map(str.strip, told.splitlines())]
+    silent, served = (
+        run.banner(config, "x.toml", "/dev/x", served=enabled) for enabled in (False, True)
+    )
+    for banner in (silent, served):
+        tries = [line.split("  ")[0] for line in map(str.strip, banner.splitlines())]
         assert tries[-3:] == ["acsard drive", "acsard top", "acsard call stop"]
     assert "  page    http://127.0.0.1:8080, https://0.0.0.0:8443, for a browser; " in served
     assert "page" not in silent
@@ -89,8 +91,8 @@ def test_the_banner_s_tools_reach_this_daemon_and_no_other() -> None:
     words = ["run", "--id", "two", "--listen", "tcp/0.0.0.0:7458", "--config", "my robot.toml"]
     options = run.reach(parser(["run"]).parse_args(words))
     assert options == " --config 'my robot.toml' --connect tcp/127.0.0.1:7458 --id two"
-    told = run.banner(Config(), "acsard.toml", "/dev/pts/3", reach=options)
-    assert f"acsard call stop{options} " in told
+    banner = run.banner(Config(), "acsard.toml", "/dev/pts/3", reach=options)
+    assert f"acsard call stop{options} " in banner
 
 
 def test_on_a_terminal_the_page_is_served_unless_it_is_disabled_or_missing(

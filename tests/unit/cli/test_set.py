@@ -34,9 +34,9 @@ from tests.each import each
 def test_a_value_is_written_as_in_the_file_and_a_bare_word_is_a_text(
     word: str, value: object
 ) -> None:
-    found = pairs(["log.level", word])
-    assert found == {"log.level": value}
-    assert type(found["log.level"]) is type(value)
+    settings = pairs(["log.level", word])
+    assert settings == {"log.level": value}
+    assert type(settings["log.level"]) is type(value)
 
 
 def test_several_settings_are_a_list_of_key_value_pairs() -> None:
@@ -67,8 +67,8 @@ def test_the_help_and_the_ros_page_say_what_write_does_not_write(
         parser().parse_args(["set", "--help"])
     page = (Path(__file__).parents[3] / "deploy" / "ros2" / "README.md").read_text()
     exception = r"--write`? cannot write a source's timeout: edit `?\[\[commands\.sources\]\]"
-    for told in (capsys.readouterr().out, page):
-        assert re.search(exception, " ".join(told.split()))
+    for text in (capsys.readouterr().out, page):
+        assert re.search(exception, " ".join(text.split()))
 
 
 @pytest.mark.parametrize(
@@ -121,10 +121,10 @@ def test_the_answer_says_how_long_the_setting_lasts(
             return ServiceReply(True, f"{answer}; written to robot.toml" if keep else answer)
 
     monkeypatch.setattr("acsard.cli.connection.connect", lambda *words, **more: Robot())
-    for words, told in (([], answer + until), (["--keep"], f"{answer}; written to robot.toml")):
+    for words, output in (([], answer + until), (["--keep"], f"{answer}; written to robot.toml")):
         args = parser().parse_args(["set", "rates.state", "0.5", *words])
         assert args.main(args) == 0
-        assert capsys.readouterr().out == f"{told}\n"
+        assert capsys.readouterr().out == f"{output}\n"
 
 
 def test_keep_needs_a_setting(capsys: pytest.CaptureFixture[str]) -> None:

@@ -55,8 +55,8 @@ def common_name(name: x509.Name) -> str:
 
 def files(directory: Path) -> dict[str, bytes]:
     """Return the content of every file below this directory, by relative path."""
-    found = (path for path in directory.rglob("*") if path.is_file())
-    return {str(path.relative_to(directory)): path.read_bytes() for path in found}
+    paths = (path for path in directory.rglob("*") if path.is_file())
+    return {str(path.relative_to(directory)): path.read_bytes() for path in paths}
 
 
 def tables(printed: str) -> bytes:
@@ -146,13 +146,15 @@ def test_a_certificate_serves_at_both_ends_of_a_link(made: Path, place: str) -> 
 
 
 def test_the_robot_is_known_by_its_names_and_the_addresses_given(made: Path) -> None:
-    found = certificate(made).extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    alt_names = (
+        certificate(made).extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    )
     host = os.uname().nodename
     assert {host, f"{host}.local", "localhost", "robot.example"} <= set(
-        found.get_values_for_type(x509.DNSName)
+        alt_names.get_values_for_type(x509.DNSName)
     )
-    given = {ipaddress.ip_address(text) for text in ("127.0.0.1", "192.0.2.7", "2001:db8::7")}
-    assert given <= set(found.get_values_for_type(x509.IPAddress))
+    addresses = {ipaddress.ip_address(text) for text in ("127.0.0.1", "192.0.2.7", "2001:db8::7")}
+    assert addresses <= set(alt_names.get_values_for_type(x509.IPAddress))
 
 
 @each("place", PLACES)
@@ -225,10 +227,10 @@ def test_init_overwrites_nothing_without_force(
     before = files(own)
     assert tls("init", "--directory", str(own)) == Exit.FAILURE
     assert files(own) == before
-    said = capsys.readouterr()
-    assert said.out == ""
-    assert "--force" in said.err
-    assert "acsard tls add" in said.err
+    output = capsys.readouterr()
+    assert output.out == ""
+    assert "--force" in output.err
+    assert "acsard tls add" in output.err
 
 
 def test_init_with_force_makes_a_new_authority_that_did_not_sign_old_certificates(
@@ -300,10 +302,10 @@ def test_the_lines_that_add_prints_give_the_new_certificate_its_role(
     own: Path, capsys: pytest.CaptureFixture[str], role: str, name: str
 ) -> None:
     assert tls("add", name, "--role", role, "--directory", str(own)) == 0
-    told = capsys.readouterr().out
-    assert "systemctl restart acsard" in told
-    assert "--write" in told
-    printed = tables(told)
+    output = capsys.readouterr().out
+    assert "systemctl restart acsard" in output
+    assert "--write" in output
+    printed = tables(output)
     assert set(tomllib.loads(printed.decode())) == {"access"}
     access = parse(printed).access
     listed = {"viewer": access.viewers, "operator": access.operators}
@@ -452,12 +454,12 @@ def test_init_writes_the_bus_into_a_configuration_and_keeps_its_comments(
     config = parse(text.encode())
     assert config.bus.listen == ("tcp/127.0.0.1:9", "tls/0.0.0.0:7449")
     assert config.bus.tls == str(directory)
-    told = capsys.readouterr().out
-    assert str(file) in told
-    assert "systemctl restart acsard" in told
+    output = capsys.readouterr().out
+    assert str(file) in output
+    assert "systemctl restart acsard" in output
     # it lists the settings it made and prints no lines to paste
-    assert "listen = [" in told.partition("\n")[0]
-    assert "[bus]" not in told
+    assert "listen = [" in output.partition("\n")[0]
+    assert "[bus]" not in output
 
 
 def test_init_keeps_a_configuration_s_line_ends_link_and_mode(tmp_path: Path) -> None:
@@ -506,9 +508,9 @@ def test_renew_by_name_replaces_that_certificate_alone_and_keeps_its_addresses(
     assert common_name(new.subject) == "robot4"
     assert new.not_valid_after_utc > old.not_valid_after_utc
     assert names_of(place) == {*names, "10.0.0.5"} >= {"robot4.local", "10.0.0.4"}
-    said = capsys.readouterr().out
-    assert f"{place} has a new certificate. Copy ca.pem, certificate.pem, key.pem" in said
-    assert "sudo systemctl try-reload-or-restart acsard-gateway acsard-web" in said
+    output = capsys.readouterr().out
+    assert f"{place} has a new certificate. Copy ca.pem, certificate.pem, key.pem" in output
+    assert "sudo systemctl try-reload-or-restart acsard-gateway acsard-web" in output
 
 
 def test_a_name_without_a_certificate_is_not_renewed(
@@ -516,9 +518,9 @@ def test_a_name_without_a_certificate_is_not_renewed(
 ) -> None:
     before = files(own)
     assert tls("renew", "--name", "robot9", "--directory", str(own)) == Exit.FAILURE
-    told = capsys.readouterr().err
-    assert "has no certificate for robot9, only for: maintainer, operator, viewer" in told
-    assert f"`acsard tls add robot9 --directory {own}` makes this certificate" in told
+    output = capsys.readouterr().err
+    assert "has no certificate for robot9, only for: maintainer, operator, viewer" in output
+    assert f"`acsard tls add robot9 --directory {own}` makes this certificate" in output
     assert files(own) == before
 
 
@@ -526,28 +528,30 @@ def test_without_an_authority_nothing_is_renewed(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert tls("renew", "--directory", str(tmp_path)) == Exit.FAILURE
-    said = capsys.readouterr().err
-    assert "name the directory that contains ca-key.pem with --directory" in said
-    assert "if you have no authority yet, run `acsard tls init`" in said
+    output = capsys.readouterr().err
+    assert "name the directory that contains ca-key.pem with --directory" in output
+    assert "if you have no authority yet, run `acsard tls init`" in output
 
 
 # files that the operator would lose
 
 
 def names_of(directory: Path) -> set[str]:
-    found = certificate(directory).extensions.get_extension_for_class(x509.SubjectAlternativeName)
-    addresses = found.value.get_values_for_type(x509.IPAddress)
-    return {*found.value.get_values_for_type(x509.DNSName), *map(str, addresses)}
+    extension = certificate(directory).extensions.get_extension_for_class(
+        x509.SubjectAlternativeName
+    )
+    addresses = extension.value.get_values_for_type(x509.IPAddress)
+    return {*extension.value.get_values_for_type(x509.DNSName), *map(str, addresses)}
 
 
 def test_init_certifies_the_machine_s_addresses_and_prints_them(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert tls("init", "--directory", str(tmp_path / "tls")) == 0
-    said = capsys.readouterr().out
+    output = capsys.readouterr().out
     expected = {"127.0.0.1", "localhost", os.uname().nodename, *own_addresses()}
     assert expected <= names_of(tmp_path / "tls")
-    assert all(name in said.splitlines()[0] for name in expected)
+    assert all(name in output.splitlines()[0] for name in expected)
 
 
 @each("words", [("renew",), ("add", "anna")])
@@ -557,9 +561,9 @@ def test_no_certificate_is_made_that_the_authority_may_not_sign(
     before = certificate(own).serial_number
     more = ("--directory", str(own), "--address", "bank.example", "--address", "new.local")
     assert tls(*words, *more) == Exit.FAILURE
-    said = capsys.readouterr().err
-    assert "may not sign a certificate for bank.example: " in said
-    assert "tls init --force --address bank.example`" in said
+    output = capsys.readouterr().err
+    assert "may not sign a certificate for bank.example: " in output
+    assert "tls init --force --address bank.example`" in output
     assert certificate(own).serial_number == before
 
 
@@ -618,11 +622,11 @@ def test_add_writes_the_name_into_its_role_s_list_and_leaves_nothing_to_paste(
     assert tls("add", "eve", *words) == Exit.USAGE
     assert not (own / "clients" / "eve").exists()
     assert tls("add", "eve", "--role", "operator", *words) == 0
-    told = capsys.readouterr().out
+    output = capsys.readouterr().out
     assert parse(file.read_bytes()).access.operators == ("bob", "eve")
     assert file.read_text().startswith("# mine\n")
-    assert "[access]" not in told
-    assert "systemctl restart acsard" in told
+    assert "[access]" not in output
+    assert "systemctl restart acsard" in output
 
 
 def encrypt(own: Path, password: bytes) -> None:
@@ -642,9 +646,9 @@ def test_an_encrypted_authority_s_password_is_asked_for(own: Path) -> None:
         words, stdin=follower, stdout=follower, stderr=follower, start_new_session=True
     )
     os.close(follower)
-    said = b""
-    while b"password of ca-key.pem" not in said:
-        said += os.read(leader, 1024)
+    output = b""
+    while b"password of ca-key.pem" not in output:
+        output += os.read(leader, 1024)
     os.write(leader, b"secret\n")
     assert process.wait(30.0) == 0
     os.close(leader)
@@ -673,10 +677,10 @@ def test_the_printed_lines_are_those_that_write_writes(
     for before in ('[bus]\nlisten = ["tcp/127.0.0.1:9"]\n', text):
         Path("acsard.toml").write_text(before)
         assert tls("init", "--force", "--directory", "tls") == 0
-        told = capsys.readouterr().out
-        printed = parse(tables(told)).bus
+        output = capsys.readouterr().out
+        printed = parse(tables(output)).bus
         port = printed.listen[1].rpartition(":")[2]
-        assert f".local:{port} --tls" in told
+        assert f".local:{port} --tls" in output
         Path("acsard.toml").write_text(f'{before}tls = "/old"\n')
         words = ("--directory", "tls", "--write", "acsard.toml")
         assert tls("init", "--force", *words) == 0
@@ -692,6 +696,6 @@ def test_init_prints_how_to_query_this_robot_by_its_id(
     Path("acsard.toml").write_text('[robot]\nid = "robot7"\n')
     words = ("--write", "acsard.toml") if write else ()
     assert tls("init", "--directory", "tls", *words) == 0
-    told = capsys.readouterr().out
-    assert "acsard echo state --id robot7 --connect tls/" in told
-    assert 'robot_id="robot7"' in told
+    output = capsys.readouterr().out
+    assert "acsard echo state --id robot7 --connect tls/" in output
+    assert 'robot_id="robot7"' in output

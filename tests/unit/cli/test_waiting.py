@@ -13,7 +13,7 @@ NEVER_S = 3600.0
 
 
 def ended() -> bool:
-    return not any(one.name == "waiting" for one in threading.enumerate())
+    return not any(thread.name == "waiting" for thread in threading.enumerate())
 
 
 def await_end() -> None:
@@ -28,17 +28,17 @@ def test_a_wait_is_explained_in_one_line_on_stderr(
 ) -> None:
     with explained(lambda: "waiting for\x1b[2J acsard/ghost/state", after_s=0.0):
         await_end()
-    told = capsys.readouterr()
-    assert told.out == ""
-    assert told.err.count("\n") == 1
-    assert told.err.startswith("acsard: waiting for")
-    assert told.err.strip().isprintable()
+    output = capsys.readouterr()
+    assert output.out == ""
+    assert output.err.count("\n") == 1
+    assert output.err.startswith("acsard: waiting for")
+    assert output.err.strip().isprintable()
 
 
 def test_a_wait_that_a_message_ended_is_not_explained(capsys: pytest.CaptureFixture[str]) -> None:
-    with explained(lambda: "why", after_s=NEVER_S) as heard:
+    with explained(lambda: "why", after_s=NEVER_S) as notify:
         assert not ended()
-        heard()
+        notify()
         await_end()
     assert capsys.readouterr().err == ""
 
@@ -53,9 +53,9 @@ def test_a_message_during_the_diagnosis_suppresses_the_explanation(
         come.wait(10.0)
         return "why"
 
-    with explained(look, after_s=0.0) as heard:
+    with explained(look, after_s=0.0) as notify:
         assert looking.wait(10.0)
-        heard()
+        notify()
         come.set()
         await_end()
     assert capsys.readouterr().err == ""
@@ -81,18 +81,18 @@ def test_a_silence_that_ends_with_the_timeout_is_explained_before_it_ends(
 
 def told(lines: int, capsys: pytest.CaptureFixture[str]) -> str:
     """Wait until standard error has this many lines, and return its text."""
-    said, end = "", time.monotonic() + 10.0
-    while said.count("\n") < lines:
-        assert time.monotonic() < end, f"told only: {said}"
+    output, end = "", time.monotonic() + 10.0
+    while output.count("\n") < lines:
+        assert time.monotonic() < end, f"told only: {output}"
         time.sleep(0.001)
-        said += capsys.readouterr().err
-    return said
+        output += capsys.readouterr().err
+    return output
 
 
 def test_each_silence_is_explained_once(capsys: pytest.CaptureFixture[str]) -> None:
-    with explained(lambda: "", lambda: "its certificate has ended", 0.01) as heard:
+    with explained(lambda: "", lambda: "its certificate has ended", 0.01) as notify:
         for _ in range(2):
-            heard()
+            notify()
             assert told(1, capsys) == "acsard: its certificate has ended\n"
     await_end()
     assert capsys.readouterr().err == ""
@@ -101,8 +101,8 @@ def test_each_silence_is_explained_once(capsys: pytest.CaptureFixture[str]) -> N
 def test_a_silence_without_a_found_cause_is_diagnosed_again(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    found = iter(["", "", "the way to it is cut"])
-    with explained(lambda: "", lambda: next(found), 0.001) as heard:
-        heard()
+    causes = iter(["", "", "the way to it is cut"])
+    with explained(lambda: "", lambda: next(causes), 0.001) as notify:
+        notify()
         assert told(1, capsys) == "acsard: the way to it is cut\n"
     await_end()

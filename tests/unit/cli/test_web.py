@@ -19,9 +19,9 @@ def test_an_invitation_without_a_reachable_address_names_the_file_that_was_read(
     monkeypatch.chdir(tmp_path)
     Path("acsard.toml").touch()  # as in a clone of the repository; the service uses another file
     assert main(["web", "--invite", "viewer"]) == 2
-    told = capsys.readouterr().err
-    assert "acsard.toml" in told
-    assert "--config" in told
+    output = capsys.readouterr().err
+    assert "acsard.toml" in output
+    assert "--config" in output
 
 
 @pytest.fixture
@@ -90,8 +90,8 @@ def test_the_options_of_an_invitation_require_invite(
 ) -> None:
     assert main(["web", *doing.split(), *option.split()]) == Exit.USAGE
     name = option.split()[0]
-    told = f"{name} is for a new token: add --invite ROLE, or leave {name} out"
-    assert told in capsys.readouterr().err
+    error = f"{name} is for a new token: add --invite ROLE, or leave {name} out"
+    assert error in capsys.readouterr().err
 
 
 def test_a_second_robot_of_the_same_user_has_tokens_of_its_own(told: Callable[..., str]) -> None:

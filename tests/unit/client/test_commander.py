@@ -252,5 +252,5 @@ def test_a_zero_has_a_stamp_not_older_than_the_commands_before_it() -> None:
 def test_the_commands_of_a_sender_are_numbered() -> None:
     sender = Sender("joe/aa")
     signed = [sender.sign(9, steady=False) for _ in range(3)]
-    assert [one.sequence for one in signed] == [1, 2, 3]
-    assert {one.sender for one in signed} == {"joe/aa"}
+    assert [signature.sequence for signature in signed] == [1, 2, 3]
+    assert {signature.sender for signature in signed} == {"joe/aa"}

@@ -62,8 +62,8 @@ def test_a_directory_without_certificates_is_reported_and_not_taken_for_a_missin
 
 def test_every_documented_error_is_exported_by_the_client() -> None:
     assert client.__doc__ is not None
-    told = {line.split()[0] for line in client.__doc__.splitlines() if line.startswith("    ")}
-    errors = {name for name in told if name.endswith("Error")}
+    names = {line.split()[0] for line in client.__doc__.splitlines() if line.startswith("    ")}
+    errors = {name for name in names if name.endswith("Error")}
     assert errors == {n for n in client.__all__ if n.endswith("Error")} - {"AcsardError"}
     assert all(issubclass(getattr(client, name), client.AcsardError) for name in errors)
 
@@ -71,7 +71,7 @@ def test_every_documented_error_is_exported_by_the_client() -> None:
 def test_a_missing_daemon_is_reported_without_the_errors_of_zenoh() -> None:
     with pytest.raises(client.UnreachableError) as raised, client.connect("tcp/127.0.0.1:1"):
         pass
-    shown = "".join(traceback.format_exception(raised.value))
-    assert "no daemon answers at tcp/127.0.0.1:1" in shown
-    assert "ZError" not in shown
-    assert ".rs" not in shown
+    trace = "".join(traceback.format_exception(raised.value))
+    assert "no daemon answers at tcp/127.0.0.1:1" in trace
+    assert "ZError" not in trace
+    assert ".rs" not in trace

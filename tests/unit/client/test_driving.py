@@ -56,7 +56,7 @@ class World:
 
     source, sender = "app", US
 
-    def __init__(self, says: Says) -> None:
+    def __init__(self, responder: Says) -> None:
         self.now = 100.0
         self.sent: list[float] = []
         self.asked = 0
@@ -70,7 +70,7 @@ class World:
         are lost, except for one that waits in the queue."""
         self.blocks: tuple[float, float] = math.inf, 0.0
         """Time from which the bus accepts nothing, and for how long, s."""
-        self._says, self._told = says, 100.0
+        self._says, self._told = responder, 100.0
 
     def send(self, linear: float, angular: float = 0.0) -> None:
         self._block()
@@ -176,15 +176,15 @@ def test_an_answer_of_another_thread_is_processed_on_the_driving_thread(
     made = world._sample
 
     def sample() -> Any:
-        one = made()
-        payload: bytes = one.payload.to_bytes()
+        message = made()
+        payload: bytes = message.payload.to_bytes()
 
         def read() -> bytes:
             readers.add(get_ident())
             return payload
 
-        one.payload = SimpleNamespace(to_bytes=read)
-        return one
+        message.payload = SimpleNamespace(to_bytes=read)
+        return message
 
     def ask(name: str, take: Any) -> None:
         thread = Thread(target=take, args=(sample(),))
@@ -249,19 +249,19 @@ AGAINST: list[tuple[str, Says, type[Exception], str, float, bool]] = [
 
 
 @pytest.mark.parametrize(
-    ("says", "error", "words", "took", "moved"),
+    ("responder", "error", "words", "took", "moved"),
     [c[1:] for c in AGAINST],
     ids=[c[0] for c in AGAINST],
 )
 def test_a_drive_that_is_not_followed_ends_with_the_reason_and_a_zero(
     monkeypatch: pytest.MonkeyPatch,
-    says: Says,
+    responder: Says,
     error: type[Exception],
     words: str,
     took: float,
     moved: bool,
 ) -> None:
-    world = World(says)
+    world = World(responder)
     with pytest.raises(error, match=words):
         world.drive(monkeypatch, 60.0)
     assert took - 0.02 <= world.now - 100.0 <= took + 0.3
@@ -422,11 +422,11 @@ def test_a_drive_on_a_closed_connection_ends_with_a_no_answer_error(
 
 def test_a_value_that_is_not_a_number_is_refused_before_a_command_is_sent() -> None:
     world: Any = World(followed)
-    given: Any
-    for given in (float("nan"), float("inf"), "0.1", None, [0.1]):
+    value: Any
+    for value in (float("nan"), float("inf"), "0.1", None, [0.1]):
         for place, name in enumerate(("linear", "angular", "seconds")):
             numbers = [0.1, 0.1, 0.1]
-            numbers[place] = given
+            numbers[place] = value
             with pytest.raises(UsageError, match=f"^{name} = .*finite"):
                 next(drive(world, *numbers))
     with pytest.raises(UsageError, match="linear: this number is too large"):
@@ -461,10 +461,10 @@ def test_a_drive_without_a_positive_duration_is_refused_before_a_command_is_sent
     ],
 )
 def test_the_error_has_the_reason_that_the_daemon_reports(state: RobotState, words: str) -> None:
-    found = objection(state, "app", US)
+    text = objection(state, "app", US)
     assert (
-        found.startswith(words)
+        text.startswith(words)
         if words != "may be late" and words != "receives no command"
-        else (words in found)
+        else (words in text)
     )
-    assert bool(found) == bool(words)
+    assert bool(text) == bool(words)

@@ -45,16 +45,16 @@ def bus() -> Iterator[Bus]:
 
 
 def test_only_the_newest_wish_is_sent_after_the_bus_was_blocked(bus: Bus) -> None:
-    outbox, blocker, one = Outbox(), Commander(), Commander()
+    outbox, blocker, commander = Outbox(), Commander(), Commander()
     bus.block()
     outbox.take(blocker, bus.put, ZERO)
     assert bus.entered.wait(PATIENCE_S)
     for wish in (AHEAD, AHEAD, ZERO):
-        outbox.take(one, bus.put, wish)
+        outbox.take(commander, bus.put, wish)
     bus.free.set()
     outbox.flush(PATIENCE_S)
     assert bus.sent == [ZERO, ZERO]
-    assert one.replaced == 2
+    assert commander.replaced == 2
 
 
 def test_an_outdated_speed_is_dropped_but_a_zero_is_sent_at_any_age(bus: Bus) -> None:
@@ -81,9 +81,9 @@ def test_a_speed_that_waited_for_a_burst_during_a_suspend_is_dropped(
     asleep_ns = 0
     monkeypatch.setattr(clock, "asleep_ns", lambda: asleep_ns)
     dropped: list[bool] = []
-    outbox, one = Outbox(lambda: dropped.append(True)), Commander(detects_bursts=True)
+    outbox, commander = Outbox(lambda: dropped.append(True)), Commander(detects_bursts=True)
     with outbox._news:  # the thread cannot send the command before the suspend
-        outbox.take(one, bus.put, AHEAD)
+        outbox.take(commander, bus.put, AHEAD)
         asleep_ns = 3600 * NS_PER_S
     outbox.flush(PATIENCE_S)
     assert bus.sent == []
@@ -95,32 +95,32 @@ def test_no_zero_is_sent_for_a_drive_that_ended_before_a_suspend(
 ) -> None:
     asleep_ns = 0
     monkeypatch.setattr(clock, "asleep_ns", lambda: asleep_ns)
-    outbox, one = Outbox(), Commander()
-    outbox.take(one, bus.put, AHEAD)
+    outbox, commander = Outbox(), Commander()
+    outbox.take(commander, bus.put, AHEAD)
     outbox.flush(PATIENCE_S)
     asleep_ns = 3600 * NS_PER_S
-    outbox.release(one, 0.25)
+    outbox.release(commander, 0.25)
     outbox.end(PATIENCE_S)
     assert bus.sent == [AHEAD]
 
 
 def test_the_zero_of_a_sender_that_leaves_while_the_bus_is_blocked_is_sent(bus: Bus) -> None:
-    outbox, one = Outbox(), Commander()
+    outbox, commander = Outbox(), Commander()
     bus.block()
-    outbox.take(one, bus.put, AHEAD)
+    outbox.take(commander, bus.put, AHEAD)
     assert bus.entered.wait(PATIENCE_S)
-    outbox.take(one, bus.put, LEFT)
-    outbox.release(one)
+    outbox.take(commander, bus.put, LEFT)
+    outbox.release(commander)
     bus.free.set()
     outbox.flush(PATIENCE_S)
     assert bus.sent == [AHEAD, ZERO]
 
 
 def test_the_last_zero_is_sent_before_the_thread_ends(bus: Bus) -> None:
-    outbox, one = Outbox(), Commander()
-    outbox.take(one, bus.put, AHEAD)
+    outbox, commander = Outbox(), Commander()
+    outbox.take(commander, bus.put, AHEAD)
     outbox.flush(PATIENCE_S)
-    outbox.release(one)
+    outbox.release(commander)
     outbox.end(PATIENCE_S)
     assert bus.sent == [AHEAD, ZERO]
     assert not outbox.dead.done()

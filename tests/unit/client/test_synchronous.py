@@ -82,10 +82,10 @@ def test_each_command_has_its_sender_its_sequence_number_and_its_time(session: S
     before_ns = time.time_ns()
     for _ in range(3):
         client.send(0.5)
-    assert [one.sequence for one in session.heard] == [1, 2, 3]
-    (sender,) = {one.sender for one in session.heard}
+    assert [command.sequence for command in session.heard] == [1, 2, 3]
+    (sender,) = {command.sender for command in session.heard}
     assert sender == client.sender
-    stamps = [one.stamp_ns or 0 for one in session.heard]
+    stamps = [command.stamp_ns or 0 for command in session.heard]
     assert before_ns <= stamps[0] + 1_000_000
     assert stamps == sorted(stamps)
     assert stamps[-1] <= time.time_ns() + 1_000_000
@@ -93,10 +93,10 @@ def test_each_command_has_its_sender_its_sequence_number_and_its_time(session: S
 
 def test_two_clients_of_one_connection_keep_the_spacing_between_commands(session: Session) -> None:
     """The daemon drops a command that arrives less than 1 ms after another one on the same key."""
-    one = client_of(session)
-    other = one.sibling("acsar")
+    first = client_of(session)
+    other = first.sibling("acsar")
     begun = time.monotonic()
-    for sender in (one, other) * 5:
+    for sender in (first, other) * 5:
         sender.send(0.0)
     assert time.monotonic() - begun > 8.9 * MIN_SPACING_S
 
@@ -122,7 +122,7 @@ def test_the_commands_of_two_threads_leave_in_their_order_and_with_the_pause(
     assert began.wait(5.0)
     client.send(0.0)
     thread.join()
-    assert [one.sequence for one in session.heard] == [1, 2, 3]
+    assert [command.sequence for command in session.heard] == [1, 2, 3]
     assert session.heard[-1].twist == REST
     assert puts_s[1] - puts_s[0] >= MIN_SPACING_S
 
@@ -262,8 +262,8 @@ async def test_an_async_call_without_a_new_thread_raises_a_documented_error(
 
 def test_two_sessions_of_one_process_are_two_senders(session: Session) -> None:
     other = Session("fedcba9876543210")
-    for one in (session, other):
-        client_of(one).send(0.5)
+    for peer in (session, other):
+        client_of(peer).send(0.5)
     assert session.heard[0].sender != other.heard[0].sender
 
 
@@ -271,10 +271,10 @@ def test_two_sessions_of_one_process_are_two_senders(session: Session) -> None:
 def test_an_unknown_key_is_reported_as_the_only_reason(session: Session, name: str) -> None:
     with pytest.raises(NoAnswerError) as raised:
         client_of(session).reply(name)
-    told = str(raised.value)
-    assert f"acsard/acsar/{name}" in told
-    assert "did you mean" in told
-    assert "daemon" not in told
+    message = str(raised.value)
+    assert f"acsard/acsar/{name}" in message
+    assert "did you mean" in message
+    assert "daemon" not in message
 
 
 @pytest.mark.parametrize(
@@ -292,10 +292,10 @@ def test_over_tls_the_error_names_the_role_only_if_no_command_arrived(
     ours = client_of(session)
     ours.where = ours.where._replace(tls="certificates")
     monkeypatch.setattr(ours, "whoami", lambda: Identity("operator", "anna", "anna/1"))
-    found = ours.explain_error(UnheardError(objection))
-    assert type(found) is client.NotDrivenError
-    assert str(found).startswith(objection)
-    assert ("your certificate anna has the role operator" in str(found)) == names_role
+    error = ours.explain_error(UnheardError(objection))
+    assert type(error) is client.NotDrivenError
+    assert str(error).startswith(objection)
+    assert ("your certificate anna has the role operator" in str(error)) == names_role
 
 
 def test_over_tls_a_viewer_gets_a_permission_error_whatever_the_robot_reports(
@@ -304,16 +304,16 @@ def test_over_tls_a_viewer_gets_a_permission_error_whatever_the_robot_reports(
     ours = client_of(session)
     ours.where = ours.where._replace(tls="certificates")
     monkeypatch.setattr(ours, "whoami", lambda: Identity("viewer", "anna", "anna/1"))
-    found = ours.explain_error(UnheardError("fault: rear_left wheel is stuck"))
-    assert isinstance(found, client.NotPermittedError)
+    error = ours.explain_error(UnheardError("fault: rear_left wheel is stuck"))
+    assert isinstance(error, client.NotPermittedError)
 
 
 def test_a_drive_without_arriving_commands_ends_with_a_documented_error(
     session: Session,
 ) -> None:
-    found = client_of(session).explain_error(UnheardError(no_command("app")))
-    assert type(found).__name__ in client.__doc__.split()
-    assert isinstance(found, client.NotDrivenError)
+    error = client_of(session).explain_error(UnheardError(no_command("app")))
+    assert type(error).__name__ in client.__doc__.split()
+    assert isinstance(error, client.NotDrivenError)
 
 
 TURN = b'{"angular_velocity":{"z":0.5}}'

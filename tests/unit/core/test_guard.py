@@ -120,8 +120,8 @@ class Guarded:
         self._passed = stop
         self.trip = ""
 
-    def check(self, found: Outputs) -> bytes | None:
-        line, self.trip = self.guard.check(found)
+    def check(self, result: Outputs) -> bytes | None:
+        line, self.trip = self.guard.check(result)
         self._passed = line or self._passed
         return line
 
@@ -142,10 +142,10 @@ def sent(guard: Guarded, *wheels: float) -> Guarded:
     return guard
 
 
-def objection(guard: Guarded, found: Outputs) -> str:
+def objection(guard: Guarded, result: Outputs) -> str:
     """Return why the line became STOP, or "" if it passed unchanged."""
-    passed = guard.check(found)
-    assert passed == (STOP if guard.trip else found.line)
+    passed = guard.check(result)
+    assert passed == (STOP if guard.trip else result.line)
     return guard.trip
 
 
@@ -393,15 +393,15 @@ class Clocked:
         The step has a fresh command only if the mode is driving.
         """
         fresh = mode == "driving"
-        found = outputs(
+        result = outputs(
             line(speed) if line_due else None,
             mode=mode,
             source="app" if fresh else "",
             age_ms=0.0 if fresh else None,
             at_ns=NOW_NS + int(ms * MS),
         )
-        passed, trip = self.guard.check(found)
-        assert passed == (STOP if trip else found.line)
+        passed, trip = self.guard.check(result)
+        assert passed == (STOP if trip else result.line)
         if passed is not None:
             self.guard.record_written(passed)
         return trip
@@ -595,7 +595,7 @@ class Loop:
     ) -> Outputs:
         self.now_ns += int(ms * MS)
         now = Instant(self.now_ns, self.now_ns)
-        found = self.robot.step(
+        result = self.robot.step(
             Inputs(
                 now=now,
                 tick=tick,
@@ -608,20 +608,20 @@ class Loop:
                 superseded=self.superseded,
             )
         )
-        self.events += [event.name for event in found.events]
+        self.events += [event.name for event in result.events]
         if self.robot.config is not self.config:
             self.config = self.robot.config
             self.guard.guard.use(self.config)
-        data, self.trip = self.guard.check(found), self.guard.trip
+        data, self.trip = self.guard.check(result), self.guard.trip
         self.trips += [self.trip] * bool(self.trip)
         if data is None:
             self.superseded = False
-            return found
+            return result
         self.superseded = not (goes and port_open)
         if not self.superseded:
             self.guard.note_sent()
-            self.wire.append((data, found))
-        return found
+            self.wire.append((data, result))
+        return result
 
     def command(self, linear: float, angular: float = 0.0) -> Command:
         return Command("app", Twist(linear, angular), self.now_ns)
@@ -632,10 +632,10 @@ def test_one_trip_causes_one_fault_that_names_its_reason() -> None:
     loop.step(heard=3)
     loop.step(loop.command(0.0))
     for _ in range(60):
-        found = loop.step(loop.command(1.0))
+        result = loop.step(loop.command(1.0))
     assert loop.trips == [TOO_FAST]
     assert loop.events.count("fault") == 1
-    assert TOO_FAST in found.reason
+    assert TOO_FAST in result.reason
     assert loop.wire[-1][0] == STOP
 
 
@@ -750,7 +750,7 @@ EACH_CONFIG = pytest.mark.parametrize(
 
 def random_walk(rng: random.Random, config: Config) -> Loop:
     """Run three seconds with random behaviour of the port, the MCU, the wire and the operators."""
-    loop, port_open, heard, goes = Loop(config), True, 1, 1.0
+    loop, port_open, line_count, goes = Loop(config), True, 1, 1.0
     twist = REST
     verbs: tuple[Verb, ...] = ("stop", "clear", "clear", "activate", "deactivate")
     for _ in range(300):
@@ -760,7 +760,7 @@ def random_walk(rng: random.Random, config: Config) -> Loop:
         if rng.random() < 0.01:
             loop.opened += port_open  # lost and found again between two steps
         if rng.random() < 0.05:
-            heard = rng.choice((0, 1, 1, 1, 3))
+            line_count = rng.choice((0, 1, 1, 1, 3))
         if rng.random() < 0.02:
             goes = rng.choice((1.0, 1.0, 0.7, 0.2))
         if rng.random() < 0.1:
@@ -770,7 +770,7 @@ def random_walk(rng: random.Random, config: Config) -> Loop:
             ask=rng.choice(verbs) if rng.random() < 0.01 else None,
             ms=rng.choice((10.0, 10.0, 10.0, 11.0, 3.0, 60.0)),
             tick=rng.random() < 0.85,
-            heard=heard,
+            heard=line_count,
             port_open=port_open,
             goes=rng.random() < goes,
         )
@@ -787,12 +787,12 @@ def test_a_healthy_robot_never_trips_the_guard_and_speeds_up_only_by_fresh_comma
         assert loop.trips == []
         moved += sum(data != STOP for data, _ in loop.wire)
         before = (0.0, 0.0, 0.0, 0.0)
-        for data, found in loop.wire:
+        for data, result in loop.wire:
             wheels = CODEC.decode(data.rstrip()).as_tuple()
-            assert found.linked or not any(wheels)
-            arrived_ns = found.command_ns
-            fresh = arrived_ns is not None and found.now.mono_ns - arrived_ns <= 250 * MS
-            if not (fresh and found.linked and found.mode == "driving"):
+            assert result.linked or not any(wheels)
+            arrived_ns = result.command_ns
+            fresh = arrived_ns is not None and result.now.mono_ns - arrived_ns <= 250 * MS
+            if not (fresh and result.linked and result.mode == "driving"):
                 for old, new in zip(before, wheels, strict=True):
                     assert abs(new) <= abs(old)
                     assert new * old >= 0.0

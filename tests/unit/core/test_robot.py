@@ -107,10 +107,10 @@ class Bench:
         is the rate in a gyro sample. With `late_ms`, another clock stamps the commands, and the
         stamps are `late_ms` old.
         """
-        held = self.out.latches.in_force
-        latch = held.number if ask in ("clear", "activate") and held else None
+        active_latch = self.out.latches.in_force
+        latch = active_latch.number if ask in ("clear", "activate") and active_latch else None
         self.now_ns += int((self.period_ms if ms is None else ms) * MS)
-        heard = self.reply is not None and self.port_open
+        has_reply = self.reply is not None and self.port_open
         stamp_ns = None if late_ms is None else self.now_ns + WALL_NS - int(late_ms * MS)
         self.out = self.robot.step(
             Inputs(
@@ -118,7 +118,7 @@ class Bench:
                 tick=tick,
                 port_open=self.port_open,
                 opened=self.opened,
-                received=(Received(self.now, self.reply),) if heard and self.reply else (),
+                received=(Received(self.now, self.reply),) if has_reply and self.reply else (),
                 commands=tuple(Command(source, t, self.now_ns, stamp_ns) for t in commands),
                 gyro=() if gyro is None else (GyroSample(self.now_ns, None, gyro),),
                 requests=(Request(ask, 7, pose, latch=latch),) if ask else (),
@@ -316,13 +316,13 @@ def test_a_press_is_latched_in_every_mode(before: str) -> None:
             bench.shutting_down = True
             bench.step()
     assert bench.mode() == before
-    held = bench.out.latches.stop
+    stop_latch = bench.out.latches.stop
     bench.reply = PRESSED_LINE if before == "waiting" else bench.status(PRESSED_LINE).reply
     out = bench.step()
     assert out.mode == (before if before in ("fault", "shutdown") else "stopped")
     assert out.latches.stop is not None
     assert out.latches.stop.why == "emergency stop pressed at the robot"
-    assert held is None or out.latches.stop.number > held.number
+    assert stop_latch is None or out.latches.stop.number > stop_latch.number
     assert out.line in (None, ZERO_LINE)
 
 
@@ -387,11 +387,11 @@ def test_damaged_status_lines_are_counted_and_do_not_change_the_link() -> None:
 
 
 def test_status_lines_change_neither_the_pose_nor_its_times() -> None:
-    plain, told = Bench(), Bench()
-    told.reply = OK_LINE + told.codec.stop
+    plain, status_bench = Bench(), Bench()
+    status_bench.reply = OK_LINE + status_bench.codec.stop
     for _ in range(200):
-        one, other = plain.step(), told.step()
-        assert (one.line, one.mode, one.link, one.estimates) == (
+        plain_out, other = plain.step(), status_bench.step()
+        assert (plain_out.line, plain_out.mode, plain_out.link, plain_out.estimates) == (
             other.line, other.mode, other.link, other.estimates,
         )  # fmt: skip
 
@@ -868,17 +868,17 @@ def test_an_empty_battery_ramps_to_rest_and_is_latched() -> None:
 def test_each_new_level_is_an_event_and_a_change_of_the_status() -> None:
     bench = Button(FULL_LINE, GUARDED)
     bench.linked()
-    told, changed = [], []
+    events, changed = [], []
     for step in range(1500):
         if step == 500:
             bench.status(EMPTY_LINE)
         out = bench.step()
-        told += [(event.name, event.level) for event in out.events if "battery" in event.name]
+        events += [(event.name, event.level) for event in out.events if "battery" in event.name]
         battery = bench.robot.snapshot(bench.now_ns).battery
         assert battery is not None
         if out.status_changed:
             changed.append(battery.level)
-    assert told == [("battery", "info"), ("battery", "warning"), ("battery_stop", "error")]
+    assert events == [("battery", "info"), ("battery", "warning"), ("battery_stop", "error")]
     assert changed == ["ok", "warning", "stop"]
 
 
@@ -980,12 +980,12 @@ def test_without_a_port_the_robot_waits_and_reports_the_reason() -> None:
 
 def test_after_the_port_opens_three_good_lines_make_the_robot_ready() -> None:
     bench = Bench()
-    seen = []
+    states = []
     for _ in range(4):
         out = bench.step()
-        seen.append((out.mode, out.link, out.linked))
+        states.append((out.mode, out.link, out.linked))
     booting = ("waiting", "booting", False)
-    assert seen == [booting, booting, ("ready", "up", True), ("ready", "up", True)]
+    assert states == [booting, booting, ("ready", "up", True), ("ready", "up", True)]
 
 
 def test_each_change_of_the_link_is_one_event() -> None:
@@ -1456,8 +1456,8 @@ def test_a_clear_requested_before_the_stop_was_applied_does_not_release_the_stop
 
 def test_a_service_that_is_called_continuously_causes_one_event_per_second() -> None:
     bench = Bench().linked()
-    said = [event for _ in range(250) for event in bench.step(ask="reset_odometry").events]
-    assert [event.count for event in said] == [1, 100, 100]
+    events = [event for _ in range(250) for event in bench.step(ask="reset_odometry").events]
+    assert [event.count for event in events] == [1, 100, 100]
 
 
 def test_a_stop_that_arrives_before_its_query_and_with_it_is_one_event() -> None:
@@ -1467,12 +1467,12 @@ def test_a_stop_that_arrives_before_its_query_and_with_it_is_one_event() -> None
         ahead = Request("stop", asked_ns=asked_ns, by="joe (native)")
         bench.now_ns += 10 * MS
         out = bench.robot.step(Inputs(bench.now, True, True, 1, requests=(ahead,)))
-        told = [out.events]
+        batches = [out.events]
         bench.now_ns += 1500 * MS
         out = bench.robot.step(Inputs(bench.now, True, True, 1, requests=(replace(ahead, id=7),)))
         assert out.answers[0].success
-        told.append(out.events)
-        stops = [event for events in told for event in events if event.name == "stop"]
+        batches.append(out.events)
+        stops = [event for events in batches for event in events if event.name == "stop"]
         assert [(event.by, event.count) for event in stops] == [("joe (native)", 1)], number
         bench.now_ns += 1500 * MS
 
@@ -1486,8 +1486,8 @@ def test_a_refused_command_is_reported_with_its_reason_and_its_sender() -> None:
     assert event.text == "unknown_source: source nobody: this source is not in commands.sources"
     refusal = Refusal("malformed", "cmd/app: no map", "app", "a" * 1000)
     bench = Bench().linked()
-    told = [event for _ in range(150) for event in bench.step(refusals=(refusal,)).events]
-    first, second = told
+    events = [event for _ in range(150) for event in bench.step(refusals=(refusal,)).events]
+    first, second = events
     assert first.text.startswith("malformed: cmd/app")
     assert (first.by, first.count) == ("a" * MAX_SENDER_LENGTH, 1)
     assert second.text.startswith("100 x malformed; the last: ")
@@ -1507,23 +1507,23 @@ def test_missed_periods_are_reported_with_their_number() -> None:
 
 def test_events_from_outside_the_robot_come_first_and_are_throttled() -> None:
     bench = Bench()
-    told: list[Event] = []
+    events: list[Event] = []
     lost = Event("port_lost", "it is gone", "warning")
     for _ in range(1000):
         bench.now_ns += 10 * MS
-        told += bench.robot.step(Inputs(bench.now, True, True, 1, events=(lost,))).events
-    assert told[0] == lost
-    lines = [event for event in told if event.name == "port_lost"]
+        events += bench.robot.step(Inputs(bench.now, True, True, 1, events=(lost,))).events
+    assert events[0] == lost
+    lines = [event for event in events if event.name == "port_lost"]
     assert len(lines) <= 15
     assert sum(event.count for event in lines) > 900
 
 
 def test_more_than_one_implausible_line_in_a_hundred_is_an_event() -> None:
-    bench, told = Bench().linked(), Counter[str]()
+    bench, event_counts = Bench().linked(), Counter[str]()
     for i in range(2000):
         bench.reply = bench.codec.encode(WheelSpeeds(99.0, 0.0, 0.0, 0.0) if i % 50 == 0 else STILL)
-        told.update(names(bench.step()))
-    assert told["lines_implausible"] == 2
+        event_counts.update(names(bench.step()))
+    assert event_counts["lines_implausible"] == 2
     assert bench.out.mode == "ready"
 
 
@@ -1819,7 +1819,7 @@ def random_walk(seed: int) -> list[Outputs]:
     bench = Bench(
         Config(commands=CommandsConfig(sources=(Source("app", 50), Source("teleop", 100))))
     )
-    found = []
+    outputs = []
     for _ in range(200):
         bench.reply = rng.choice((bench.codec.stop, bench.codec.encode(ROLLING), b"hello\n", None))
         if rng.random() < 0.02:
@@ -1827,7 +1827,7 @@ def random_walk(seed: int) -> list[Outputs]:
         elif rng.random() < 0.2 and not bench.port_open:
             bench.replug()
         verbs: tuple[Verb, ...] = ("stop", "clear", "clear", "activate", "deactivate", "set_pose")
-        found.append(
+        outputs.append(
             bench.step(
                 *rng.choices((REST, GO, Twist(-1.0, 3.0)), k=rng.randrange(3)),
                 source=rng.choice(("app", "teleop", "stranger")),
@@ -1837,7 +1837,7 @@ def random_walk(seed: int) -> list[Outputs]:
                 superseded=rng.random() < 0.1,
             )
         )
-    return found
+    return outputs
 
 
 @each("seed", range(5))
@@ -1968,16 +1968,18 @@ def test_a_track_learned_from_the_gyro_is_an_event_and_is_used_afterwards() -> N
     bench = Bench(Config(odometry=OdometryConfig(gyro=True, learned_track=True))).linked()
     for _ in range(150):
         bench.step(gyro=0.0)
-    told: list[Event] = []
+    events: list[Event] = []
     for second in range(60):
         # Opposite wheels turn by 1 rad/s at the configured track; the robot turns by 1/1.6 of that.
         rate = (1.0, -1.0, 0.5, 0.0)[second % 4]
         bench.reply = bench.codec.encode(bench.robot._kinematics.wheel_speeds(Twist(0.0, rate)))
         for _ in range(100):
-            told += [
-                one for one in bench.step(gyro=rate / 1.6).events if one.name == "learned_track"
+            events += [
+                entry
+                for entry in bench.step(gyro=rate / 1.6).events
+                if entry.name == "learned_track"
             ]
-    (event,) = told
+    (event,) = events
     assert event.text.endswith(" (in use), configured 1.000")
     assert bench.robot.snapshot(bench.now_ns).gyro.track_use == "used"
 
@@ -2020,8 +2022,8 @@ def test_wheels_that_turn_against_their_command_are_a_fault() -> None:
 def test_wheels_that_turn_without_a_command_are_reported_and_counted() -> None:
     bench = Bench(fault_time=0.3).linked()
     bench.reply = bench.codec.encode(WheelSpeeds(5.0, 5.0, 5.0, 5.0))
-    told = [one.name for _ in range(100) for one in bench.step().events]
-    assert "uncommanded_motion" in told
+    event_names = [event.name for _ in range(100) for event in bench.step().events]
+    assert "uncommanded_motion" in event_names
     assert bench.counters()["uncommanded_motion"] >= 1
     assert bench.mode() == "ready"
 
@@ -2029,8 +2031,8 @@ def test_wheels_that_turn_without_a_command_are_reported_and_counted() -> None:
 def test_a_wheel_at_rest_while_the_others_roll_is_reported_and_counted() -> None:
     bench = Bench().driving()
     bench.reply = bench.codec.encode(replace(ROLLING, front_left=0.0))
-    told = [one.name for _ in range(200) for one in bench.step(GO).events]
-    assert "wheel_fault" in told
+    event_names = [event.name for _ in range(200) for event in bench.step(GO).events]
+    assert "wheel_fault" in event_names
     assert bench.counters()["wheel_faults"] >= 1
 
 
@@ -2105,12 +2107,12 @@ def test_the_latches_of_the_robot_are_those_of_its_last_step() -> None:
 
 def test_lines_that_are_not_answered_are_reported() -> None:
     bench = Bench().linked()
-    told: list[str] = []
+    event_names: list[str] = []
     for number in range(1100):
         bench.robot.counters["lines_sent"] += 1
         bench.reply = None if number % 5 == 0 else bench.codec.stop
-        told += [one.name for one in bench.step().events]
-    assert told.count("lines_lost") == 1
+        event_names += [event.name for event in bench.step().events]
+    assert event_names.count("lines_lost") == 1
 
 
 def test_stamps_that_a_router_replaced_are_counted() -> None:

@@ -102,7 +102,7 @@ places = st.floats(-1e6, 1e6)
 
 def read(line: bytes) -> Wheels:
     """Return the wheel speeds of a line from the host. Fail on any other form of line."""
-    found = []
+    values = []
     for letter, start in zip("abcd", (0, 8, 16, 24), strict=True):
         token = line[start : start + 7].decode("ascii")
         assert token[0] == letter, line
@@ -110,8 +110,8 @@ def read(line: bytes) -> Wheels:
         assert token[4] == ".", line
         assert (token[2:4] + token[5:]).isdigit(), line
         assert start == 24 or line[start + 7 : start + 8] == b",", line
-        found.append(float(token[2:]) * (1 if token[1] == "p" else -1))
-    return found[0], found[1], found[2], found[3]
+        values.append(float(token[2:]) * (1 if token[1] == "p" else -1))
+    return values[0], values[1], values[2], values[3]
 
 
 def write(wheels: Wheels) -> bytes:
@@ -180,8 +180,8 @@ class RobotMachine(RuleBasedStateMachine):
         self.latches = latches
         self.robot = Robot(config, latches)
         self.config, self.limits = config, self.robot.config.limits
-        for key, kept in latches.lowered.items():
-            assert getattr(self.limits, key.removeprefix("limits.")) == kept
+        for key, limit in latches.lowered.items():
+            assert getattr(self.limits, key.removeprefix("limits.")) == limit
         self.guard = Guard(self.robot.session.codec.stop, self.robot.config)
         self.quiet_ns = round(NS_PER_S * max(0.1, 4 / config.rate_hz))
         self.period_ms = 1000 / config.rate_hz
@@ -443,9 +443,9 @@ class RobotMachine(RuleBasedStateMachine):
     # inputs of the robot
 
     def ask(self, verb: Verb, off: int | None = 0) -> None:
-        held = self.latches.in_force
-        named = held is not None and verb in ("clear", "activate") and off is not None
-        latch = held.number + (off or 0) if held is not None and named else None
+        active_latch = self.latches.in_force
+        named = active_latch is not None and verb in ("clear", "activate") and off is not None
+        latch = active_latch.number + (off or 0) if active_latch is not None and named else None
         self.requests.append(Request(verb, 1, latch=latch))
 
     def command(
@@ -507,8 +507,8 @@ class RobotMachine(RuleBasedStateMachine):
             self.heard_ns, self.good_in_row = None, 0
         share = passed_ms / (50 + passed_ms)  # a motor with a lag of 50 ms
         a, b, c, d = (
-            round(turning + (told - turning) * share, 2)
-            for turning, told in zip(self.turning, self.told, strict=True)
+            round(turning + (target - turning) * share, 2)
+            for turning, target in zip(self.turning, self.told, strict=True)
         )
         self.turning = a, b, c, d
         if passed_ms > 300:
@@ -600,8 +600,8 @@ class RobotMachine(RuleBasedStateMachine):
         self.check_latches(outputs, requests)
         self.check_odometry(outputs)
         snapshot = self.robot.snapshot(self.now_ns)
-        told = msgspec.to_builtins((outputs.estimates, snapshot, outputs.applied, outputs.speeds))
-        assert all(map(math.isfinite, numbers(told)))
+        values = msgspec.to_builtins((outputs.estimates, snapshot, outputs.applied, outputs.speeds))
+        assert all(map(math.isfinite, numbers(values)))
         assert all(
             waiting(source.waits_for) or source.age_s is not None for source in snapshot.sources
         )
@@ -656,8 +656,8 @@ class RobotMachine(RuleBasedStateMachine):
         for name in ("linear_speed", "angular_speed", "wheel_speed"):
             lowered = getattr(limits, name) < getattr(file, name)
             assert (after.lowered.get(f"limits.{name}") == getattr(limits, name)) == lowered
-        held = after.fault or after.stop or after.inactive
-        assert not held or outputs.mode not in ("waiting", "ready", "driving")
+        active_latch = after.fault or after.stop or after.inactive
+        assert not active_latch or outputs.mode not in ("waiting", "ready", "driving")
 
     def check_emergency_stop(self, outputs: Outputs, requests: tuple[Request, ...]) -> None:
         """Check that an emergency stop that is pressed, or silent for long, stops the robot.
@@ -690,7 +690,7 @@ class RobotMachine(RuleBasedStateMachine):
         """
         drive, feedback = self.config.drive, self.config.feedback
         left_out = self.robot.snapshot(self.now_ns).doubt.left_out
-        found, self.left_out = set(left_out) - set(self.left_out), left_out
+        exclusions, self.left_out = set(left_out) - set(self.left_out), left_out
         for estimate in outputs.estimates:
             fastest = max(map(abs, estimate.speeds.as_tuple())) * drive.wheel_radius
             assert fastest <= feedback.wheel_speed * drive.wheel_radius
@@ -700,7 +700,7 @@ class RobotMachine(RuleBasedStateMachine):
             dt = min(dt, MAX_FILLED_GAP_S) + 2 * self.period_ms / 1000
             fastest, self.fastest = max(fastest, self.fastest), fastest
             self.steps.append(fastest * dt)
-            most = sum(self.steps) if found else fastest * dt
+            most = sum(self.steps) if exclusions else fastest * dt
             x, y = estimate.pose.x - self.pose.x, estimate.pose.y - self.pose.y
             slack = 1e-9 * (1 + abs(self.pose.x) + abs(self.pose.y))
             assert math.hypot(x, y) <= most + slack
@@ -755,8 +755,8 @@ class RobotMachine(RuleBasedStateMachine):
         half = twist.angular * drive.wheel_separation / 2
         right = (twist.linear + half) / drive.wheel_radius
         left = (twist.linear - half) / drive.wheel_radius
-        for said, meant in zip(wheels, (right, left, left, right), strict=True):
-            assert abs(said - meant) <= ROUNDING
+        for speed, target in zip(wheels, (right, left, left, right), strict=True):
+            assert abs(speed - target) <= ROUNDING
 
     def check_commanded(self, outputs: Outputs) -> None:
         """Check that the robot follows only a fresh command of a source that has sent a zero."""

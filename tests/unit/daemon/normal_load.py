@@ -64,9 +64,9 @@ def record(seconds: float) -> list[Lateness]:
 def main() -> None:
     path, seconds = Path(sys.argv[1]), float(sys.argv[2])
     noted = record(seconds)
-    kept = [one for one in noted if one.loop.waited_ns < 0.5 * one.late_ns]
-    path.write_bytes(b"".join(msgspec.json.encode(one) + b"\n" for one in kept))
-    print(f"{len(kept)} kept, {len(noted) - len(kept)} waited for a processor")
+    records = [lateness for lateness in noted if lateness.loop.waited_ns < 0.5 * lateness.late_ns]
+    path.write_bytes(b"".join(msgspec.json.encode(lateness) + b"\n" for lateness in records))
+    print(f"{len(records)} kept, {len(noted) - len(records)} waited for a processor")
 
 
 if __name__ == "__main__":

@@ -153,7 +153,7 @@ def test_a_directory_that_cannot_be_written_starts_the_robot_stopped(
     assert file.trouble.startswith("a stop would not survive a restart: ")
 
 
-def same(one: Latches, other: Latches) -> bool:
+def same(first: Latches, other: Latches) -> bool:
     """Return whether two sets of latches are equal apart from their numbers."""
 
     def plain(latches: Latches) -> Latches:
@@ -163,7 +163,7 @@ def same(one: Latches, other: Latches) -> bool:
         )
         return Latches(stop, fault, inactive, latches.lowered)
 
-    return plain(one) == plain(other)
+    return plain(first) == plain(other)
 
 
 def test_an_old_stop_in_a_directory_that_cannot_be_written_keeps_its_name(
@@ -710,12 +710,12 @@ def test_a_full_disk_is_reported_once_and_retried_until_a_write_succeeds(
     until(lambda: len(tries) > 3)
     news = file.take_events()
     path = tmp_path / NAME
-    said = (
+    text = (
         f"a stop would not survive a restart: the latch file ({path}) cannot be written: No space "
         "left on device"
     )
-    assert file.trouble == said
-    again = f"{said}; the daemon tries again every {module.RETRY_PAUSE_S:g} s"
+    assert file.trouble == text
+    again = f"{text}; the daemon tries again every {module.RETRY_PAUSE_S:g} s"
     assert news == [Event("latch_file", again, "warning")]
     monkeypatch.setattr(module, "replace", replace_file)
     until(lambda: file.trouble == "")

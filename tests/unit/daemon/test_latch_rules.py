@@ -68,10 +68,10 @@ def test_all_decoded_latches_are_marked_as_kept() -> None:
 @each("depth", [1, 2, 300])
 @each("name", ["stop", "fault", "inactive"])
 def test_an_earlier_cause_with_earlier_causes_of_its_own_is_refused(name: str, depth: int) -> None:
-    one = json.dumps(json.loads(encode("acsar", Latches(stop=STOP)))["latches"]["stop"])
-    nested = one
+    cause = json.dumps(json.loads(encode("acsar", Latches(stop=STOP)))["latches"]["stop"])
+    nested = cause
     for _ in range(depth):
-        nested = f'{one[:-1]}, "earlier": [{nested}]}}'
+        nested = f'{cause[:-1]}, "earlier": [{nested}]}}'
     latches = (
         f'{{"stop": null, "fault": null, "inactive": null, "lowered": {{}}, "{name}": {nested}}}'
     )
@@ -90,7 +90,7 @@ def test_no_text_of_a_client_loses_a_latch(latches: Latches) -> None:
     assert len(data) < MAX_BYTES
     before = latches.stop, latches.fault, latches.inactive
     now = after.stop, after.fault, after.inactive
-    assert [one and one.number for one in now] == [one and one.number for one in before]
+    assert [entry and entry.number for entry in now] == [entry and entry.number for entry in before]
 
 
 def test_half_a_file_is_refused_at_every_length() -> None:
@@ -313,12 +313,12 @@ def test_a_stop_that_no_step_served_is_newer_than_a_stop_that_was_released() -> 
     life = Lifecycle(active=True, latches=Latches(inactive=INACTIVE))
     life.stop("joe", 1, Instant(1, now.wall_ns))
     assert life.latches.stop
-    seen = life.latches.stop.number
-    life.clear(seen, 2, Instant(2, now.wall_ns))
+    number = life.latches.stop.number
+    life.clear(number, 2, Instant(2, now.wall_ns))
     Handover(life.latches, keeper).take_stops(life.latches, ["ann"], now)
     (latches,) = keeper.given
     assert latches.stop
-    assert latches.stop.number > seen
+    assert latches.stop.number > number
 
 
 def test_without_an_unserved_stop_the_latches_are_handed_over_unchanged() -> None:

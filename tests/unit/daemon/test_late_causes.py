@@ -96,7 +96,7 @@ def test_a_suspend_is_named_eight_of_eight_times(tmp_path: Path) -> None:
 
 
 def test_every_cause_of_the_table_is_planted() -> None:
-    assert {one.name for one in CAUSES} == {"suspended", *planted(10)}
+    assert {cause.name for cause in CAUSES} == {"suspended", *planted(10)}
 
 
 @each("late_ms", SIZES_MS)
@@ -115,17 +115,17 @@ def test_normal_load_has_no_false_cause() -> None:
         msgspec.json.decode(line, type=Lateness) for line in NORMAL.read_bytes().splitlines()
     ]
     assert len(recorded) >= 200
-    assert max(one.late_ns for one in recorded) > 150 * MS
-    assert [causes(one) for one in recorded if causes(one)[0]] == []
+    assert max(lateness.late_ns for lateness in recorded) > 150 * MS
+    assert [causes(lateness) for lateness in recorded if causes(lateness)[0]] == []
 
 
 def test_the_recorded_load_is_not_idle() -> None:
     recorded = [
         msgspec.json.decode(line, type=Lateness) for line in NORMAL.read_bytes().splitlines()
     ]
-    assert sum(one.after.disk_ns > one.before.disk_ns for one in recorded) > 20
-    assert sum(one.after.steal_ns > one.before.steal_ns for one in recorded) > 0
-    assert sum(one.loop.waited_ns > 0 for one in recorded) > 20
+    assert sum(lateness.after.disk_ns > lateness.before.disk_ns for lateness in recorded) > 20
+    assert sum(lateness.after.steal_ns > lateness.before.steal_ns for lateness in recorded) > 0
+    assert sum(lateness.loop.waited_ns > 0 for lateness in recorded) > 20
 
 
 @pytest.mark.parametrize(

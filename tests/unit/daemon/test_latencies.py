@@ -44,9 +44,9 @@ def test_an_empty_histogram_has_only_zeros() -> None:
 @given(st.lists(st.floats(1.0, 10.0**DECADES), min_size=1, max_size=300))
 def test_a_percentile_is_at_most_one_bucket_above_the_truth(values: list[float]) -> None:
     spread = spread_of(values)
-    for share, shown in ((0.50, spread.p50), (0.99, spread.p99)):
+    for share, percentile in ((0.50, spread.p50), (0.99, spread.p99)):
         truth = order_statistic(values, share)
-        assert truth * (1 - 1e-9) <= shown <= truth * BUCKET * (1 + 1e-9)
+        assert truth * (1 - 1e-9) <= percentile <= truth * BUCKET * (1 + 1e-9)
 
 
 @given(st.lists(st.floats(-1e3, 1e12), min_size=1, max_size=100))
@@ -91,16 +91,16 @@ def test_every_figure_is_reported_from_the_start() -> None:
 def test_a_new_measurement_counts_since_the_start_and_in_the_last_minute() -> None:
     stopwatch = Stopwatch()
     stopwatch.figures["step_time"].add(NS_PER_S, 250 * US)
-    one = step_time(stopwatch, NS_PER_S)
-    assert one.since_start == one.last_minute == Spread(1, 250.0, 250.0, 250.0)
+    figure = step_time(stopwatch, NS_PER_S)
+    assert figure.since_start == figure.last_minute == Spread(1, 250.0, 250.0, 250.0)
 
 
 def test_a_measurement_older_than_a_minute_counts_only_since_the_start() -> None:
     stopwatch = Stopwatch()
     stopwatch.figures["step_time"].add(0, 250 * US)
     assert step_time(stopwatch, MINUTE_NS - 1).last_minute.count == 1
-    one = step_time(stopwatch, MINUTE_NS + NS_PER_S)
-    assert (one.since_start.count, one.last_minute.count) == (1, 0)
+    figure = step_time(stopwatch, MINUTE_NS + NS_PER_S)
+    assert (figure.since_start.count, figure.last_minute.count) == (1, 0)
 
 
 def test_after_a_pause_of_any_length_the_last_minute_has_no_old_measurements() -> None:
@@ -126,13 +126,13 @@ def test_reported_figures_are_at_most_a_second_old() -> None:
 def test_the_last_minute_equals_a_histogram_of_its_measurements(
     measurements: list[tuple[int, int]],
 ) -> None:
-    stopwatch, now_ns, kept = Stopwatch(), 0, []
+    stopwatch, now_ns, samples = Stopwatch(), 0, []
     for wait_ns, duration_ns in measurements:
         now_ns += wait_ns
         stopwatch.figures["mcu_round_trip"].add(now_ns, duration_ns)
-        kept.append((now_ns, duration_ns))
+        samples.append((now_ns, duration_ns))
     minute = Histogram()
-    for at_ns, duration_ns in kept:
+    for at_ns, duration_ns in samples:
         if now_ns // SLOT_NS - at_ns // SLOT_NS < SLOTS:
             minute.add(duration_ns / 1000)
     assert stopwatch.measured(now_ns)["mcu_round_trip"].last_minute == minute.spread()

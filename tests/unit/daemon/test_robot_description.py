@@ -58,7 +58,7 @@ def test_a_path_that_is_not_a_regular_file_is_not_read(tmp_path: Path) -> None:
 
 
 @each(
-    ("text", "said"),
+    ("text", "phrase"),
     [
         ("", "not XML"),
         ("robot: acsar\n", "not XML"),
@@ -78,8 +78,8 @@ def test_a_path_that_is_not_a_regular_file_is_not_read(tmp_path: Path) -> None:
         ('<?xml version="1.0"?>\n<!DOCTYPE robot SYSTEM "urdf.dtd"><robot/>', "document type"),
     ],
 )
-def test_a_file_that_is_not_urdf_is_refused(text: str | bytes, said: str, tmp_path: Path) -> None:
-    assert said in refusal(written(tmp_path, text))
+def test_a_file_that_is_not_urdf_is_refused(text: str | bytes, phrase: str, tmp_path: Path) -> None:
+    assert phrase in refusal(written(tmp_path, text))
 
 
 def test_a_urdf_with_only_the_xacro_namespace_is_accepted(tmp_path: Path) -> None:

@@ -50,8 +50,8 @@ def started(monkeypatch: pytest.MonkeyPatch) -> Iterator[Started]:
         return made
 
     yield start
-    for one in files:
-        one.close()
+    for watch in files:
+        watch.close()
 
 
 @pytest.fixture
@@ -152,15 +152,15 @@ OBEYED = Answer(7, True, "limits.linear_speed = 0.8 (was 0.5)")
 
 def result(made: SettingsFile, events: list[Event] | None = None) -> Request | Answer:
     """Return the next result, at a time when no answer is overdue."""
-    found: list[Request | Answer] = []
+    results: list[Request | Answer] = []
 
     def look() -> bool:
-        found.extend(made.results(0, [] if events is None else events))
-        return bool(found)
+        results.extend(made.results(0, [] if events is None else events))
+        return bool(results)
 
     until(look)
-    (one,) = found
-    return one
+    (outcome,) = results
+    return outcome
 
 
 def check(made: SettingsFile) -> None:
@@ -421,8 +421,8 @@ def test_a_limit_below_a_kept_one_is_lowered_at_the_next_start(
     check(made)
     assert made.defers_answer(OBEYED)
     result(made)
-    kept, limits = with_speed(config, 0.8).limits, with_speed(config, 0.6).limits
-    assert made.latches(latches, kept).lowered == {}
+    old_limits, limits = with_speed(config, 0.8).limits, with_speed(config, 0.6).limits
+    assert made.latches(latches, old_limits).lowered == {}
     # The robot itself compares with 0.5, the limit of its start.
     to_keep = made.latches(latches, limits)
     assert to_keep.lowered == {"limits.linear_speed": 0.6}
@@ -470,8 +470,8 @@ def test_too_many_requests_are_refused_and_overdue_ones_take_no_more_time(
     for number in range(1, module.MAX_JOBS + 11):
         made.keep(replace(REQUEST, id=number), 0)
     until(lambda: checked)
-    refused = [one for one in made.results(0, []) if isinstance(one, Answer)]
-    assert [one.id for one in refused] == [*range(module.MAX_JOBS + 1, module.MAX_JOBS + 11)]
+    refused = [answer for answer in made.results(0, []) if isinstance(answer, Answer)]
+    assert [answer.id for answer in refused] == [*range(module.MAX_JOBS + 1, module.MAX_JOBS + 11)]
     assert "more than 32 changes of the file wait" in refused[0].message
     assert len(made.results(module.REPLY_TIMEOUT_NS + 1, [])) == module.MAX_JOBS
     hangs.set()
@@ -570,9 +570,9 @@ def test_the_text_is_computed_where_the_priority_cannot_be_lowered(
         raise PermissionError(errno.EPERM, os.strerror(errno.EPERM))
 
     task = msgspec.json.encode(config_edit_process.Task(TEXT, {"limits.linear_speed": 0.8}))
-    given, answer = io.TextIOWrapper(io.BytesIO(task)), io.TextIOWrapper(io.BytesIO())
+    stdin, answer = io.TextIOWrapper(io.BytesIO(task)), io.TextIOWrapper(io.BytesIO())
     monkeypatch.setattr(os, "nice", refuse)
-    monkeypatch.setattr(sys, "stdin", given)
+    monkeypatch.setattr(sys, "stdin", stdin)
     monkeypatch.setattr(sys, "stdout", answer)
     config_edit_process.main()
     answer.seek(0)

@@ -17,9 +17,9 @@ from acsard.daemon.supervisor import GATEWAY, ROUTER, Kind, keep_running
 
 async def told(kind: Kind = GATEWAY) -> Event:
     """Return the first event of the supervisor."""
-    said: asyncio.Queue[Event] = asyncio.Queue()
-    keeper = asyncio.create_task(keep_running(["gateway"], said.put_nowait, kind))
-    first = asyncio.create_task(said.get())
+    queue: asyncio.Queue[Event] = asyncio.Queue()
+    keeper = asyncio.create_task(keep_running(["gateway"], queue.put_nowait, kind))
+    first = asyncio.create_task(queue.get())
     await asyncio.wait({keeper, first}, return_when=asyncio.FIRST_COMPLETED, timeout=10.0)
     assert not keeper.done(), keeper
     keeper.cancel()
@@ -66,9 +66,9 @@ def test_a_router_that_cannot_start_is_not_restarted(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, code: int
 ) -> None:
     program(monkeypatch, tmp_path, f"raise SystemExit({code})")
-    said: list[Event] = []
-    assert asyncio.run(keep_running(["router"], said.append, ROUTER)) == code
-    assert said == []
+    events: list[Event] = []
+    assert asyncio.run(keep_running(["router"], events.append, ROUTER)) == code
+    assert events == []
 
 
 @pytest.mark.parametrize("code", [2, 78])
@@ -79,16 +79,16 @@ def test_a_router_that_once_ran_is_started_again_when_its_files_are_wrong(
     began = tmp_path / "began"
     ends = f"import os; p = {str(began)!r}; new = not os.path.exists(p); open(p, 'a').close(); "
     program(monkeypatch, tmp_path, ends + f"raise SystemExit(1 if new else {code})")
-    said: list[Event] = []
+    events: list[Event] = []
 
     async def runs() -> None:
-        keeper = asyncio.create_task(keep_running(["router"], said.append, ROUTER))
-        while len(said) < 3 and not keeper.done():
+        keeper = asyncio.create_task(keep_running(["router"], events.append, ROUTER))
+        while len(events) < 3 and not keeper.done():
             await asyncio.sleep(0.01)
         keeper.cancel()
 
     asyncio.run(asyncio.wait_for(runs(), 10.0))
-    codes = [event.text.partition(";")[0] for event in said[:3]]
+    codes = [event.text.partition(";")[0] for event in events[:3]]
     assert codes == [f"the router ended with exit code {number}" for number in (1, code, code)]
 
 

@@ -34,66 +34,66 @@ def kernel(monkeypatch: pytest.MonkeyPatch) -> Kernel:
     return kernel
 
 
-def goes_off(kernel: Kernel, one: Ticker, late_ns: int = 0) -> Period:
+def goes_off(kernel: Kernel, ticker: Ticker, late_ns: int = 0) -> Period:
     kernel.now_ns = kernel.at_ns + late_ns
-    one._expire()
-    return one.take(kernel.now_ns)
+    ticker._expire()
+    return ticker.take(kernel.now_ns)
 
 
 @pytest.mark.parametrize("rate", [0.92, 1.0, 1.08])
 def test_a_slewed_timer_neither_loses_a_period_nor_drifts(kernel: Kernel, rate: float) -> None:
-    one = Ticker(PERIOD_NS, lambda: None)
+    ticker = Ticker(PERIOD_NS, lambda: None)
     kernel.rate = rate
     start_ns = kernel.now_ns
-    one.start(start_ns)
+    ticker.start(start_ns)
     for number in range(1, 1001):
-        assert goes_off(kernel, one) == Period(1, start_ns + number * PERIOD_NS)
+        assert goes_off(kernel, ticker) == Period(1, start_ns + number * PERIOD_NS)
         assert abs(kernel.now_ns - start_ns - number * PERIOD_NS) < PERIOD_NS / 10
 
 
 def test_periods_that_were_missed_are_counted_from_the_first(kernel: Kernel) -> None:
-    one = Ticker(PERIOD_NS, lambda: None)
+    ticker = Ticker(PERIOD_NS, lambda: None)
     start_ns = kernel.now_ns
-    one.start(start_ns)
-    assert goes_off(kernel, one, late_ns=3 * PERIOD_NS) == Period(4, start_ns + PERIOD_NS)
-    assert goes_off(kernel, one) == Period(1, start_ns + 5 * PERIOD_NS)
+    ticker.start(start_ns)
+    assert goes_off(kernel, ticker, late_ns=3 * PERIOD_NS) == Period(4, start_ns + PERIOD_NS)
+    assert goes_off(kernel, ticker) == Period(1, start_ns + 5 * PERIOD_NS)
 
 
 def test_a_timer_that_expires_again_before_it_is_read_ends_no_period_twice(
     kernel: Kernel,
 ) -> None:
     woken: list[int] = []
-    one = Ticker(PERIOD_NS, lambda: woken.append(1))
+    ticker = Ticker(PERIOD_NS, lambda: woken.append(1))
     start_ns = kernel.now_ns
-    one.start(start_ns)
+    ticker.start(start_ns)
     kernel.now_ns = kernel.at_ns
     for _ in range(3):
-        one._expire()
+        ticker._expire()
     assert len(woken) == 3
-    assert one.take(kernel.now_ns) == Period(1, start_ns + PERIOD_NS)
-    assert one.take(kernel.now_ns).expired == 0
+    assert ticker.take(kernel.now_ns) == Period(1, start_ns + PERIOD_NS)
+    assert ticker.take(kernel.now_ns).expired == 0
 
 
 def test_expired_periods_are_counted_also_if_a_command_wakes_the_loop_first(kernel: Kernel) -> None:
     """After a stall, the loop may get a waiting command before it gets the timer."""
-    one = Ticker(PERIOD_NS, lambda: None)
+    ticker = Ticker(PERIOD_NS, lambda: None)
     start_ns = kernel.now_ns
-    one.start(start_ns)
+    ticker.start(start_ns)
     kernel.now_ns += 39 * PERIOD_NS + PERIOD_NS // 2
-    assert one.take(kernel.now_ns) == Period(39, start_ns + PERIOD_NS)
+    assert ticker.take(kernel.now_ns) == Period(39, start_ns + PERIOD_NS)
     assert kernel.at_ns == start_ns + 40 * PERIOD_NS
     kernel.now_ns = kernel.at_ns - PERIOD_NS // 20
-    assert one.take(kernel.now_ns).expired == 0, "only a timer goes off early"
-    assert goes_off(kernel, one) == Period(1, start_ns + 40 * PERIOD_NS)
+    assert ticker.take(kernel.now_ns).expired == 0, "only a timer goes off early"
+    assert goes_off(kernel, ticker) == Period(1, start_ns + 40 * PERIOD_NS)
 
 
 def test_a_timer_that_goes_off_much_too_early_is_set_again(kernel: Kernel) -> None:
-    one = Ticker(PERIOD_NS, lambda: None)
+    ticker = Ticker(PERIOD_NS, lambda: None)
     start_ns = kernel.now_ns
     kernel.rate = 0.5
-    one.start(start_ns)
+    ticker.start(start_ns)
     kernel.rate = 1.0
-    assert goes_off(kernel, one).expired == 0
+    assert goes_off(kernel, ticker).expired == 0
     assert kernel.at_ns == start_ns + PERIOD_NS
 
 
@@ -115,12 +115,12 @@ def test_an_alarm_that_went_off_too_early_may_be_set_for_the_same_time_again(
 
 def test_an_expiry_from_before_the_timer_was_set_again_wakes_nothing(kernel: Kernel) -> None:
     woken: list[int] = []
-    one = Ticker(PERIOD_NS, lambda: woken.append(1))
-    one.start(kernel.now_ns)
+    ticker = Ticker(PERIOD_NS, lambda: woken.append(1))
+    ticker.start(kernel.now_ns)
     kernel.count = 0
-    one._expire()
+    ticker._expire()
     assert not woken
-    assert one.take(kernel.now_ns).expired == 0
+    assert ticker.take(kernel.now_ns).expired == 0
 
 
 async def test_in_a_flood_of_stops_one_step_is_early_and_the_period_takes_the_rest() -> None:

@@ -13,7 +13,7 @@ class Server:
         self.shown.append(text)
 
     def remove_status(self, ids: list[str]) -> None:
-        self.shown += [f"without {one}" for one in ids]
+        self.shown += [f"without {status_id}" for status_id in ids]
 
     def publish_parameter_values(self, values: object) -> None:
         pass

@@ -59,7 +59,7 @@ class World:
     def restart(self) -> None:
         """Restart the daemon with another timeout, so that the test can recognize the new facts."""
         self.daemon(zenoh.SampleKind.DELETE)
-        (app,) = (one for one in self.facts.config.commands.sources if one.name == "app")
+        (app,) = (source for source in self.facts.config.commands.sources if source.name == "app")
         sources = (replace(app, timeout=app.timeout + 1.0),)
         commands = replace(self.facts.config.commands, sources=sources)
         self.facts = replace(self.facts, config=replace(Config(), commands=commands))

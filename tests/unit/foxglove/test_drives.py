@@ -85,9 +85,11 @@ class Viewers:
 
     def heard(self, viewer: int, count: int) -> list[Command]:
         """Wait until the bus has at least `count` commands of this viewer, and return them."""
-        heard = self.sessions[viewer].heard
-        until(lambda: len(heard) >= count, HOLD_S, f"{count} commands of {viewer}, not {heard}")
-        return heard
+        commands = self.sessions[viewer].heard
+        until(
+            lambda: len(commands) >= count, HOLD_S, f"{count} commands of {viewer}, not {commands}"
+        )
+        return commands
 
 
 @pytest.fixture
@@ -138,20 +140,23 @@ def test_a_stamp_is_passed_on_and_the_added_zeros_use_the_same_clock(viewers: Vi
     viewers.publish(1, TwistStamped(Header(Time.from_ns(long_ago_ns)), AHEAD))
     viewers.heard(1, 2)
     viewers.drives.withdrawn(1, 2)
-    heard = viewers.heard(1, 3)
-    assert [one.twist.linear for one in heard] == [0.0, 0.3, 0.0]
-    assert [one.stamp_ns for one in heard[:2]] == [long_ago_ns - BURST_WINDOW_NS, long_ago_ns]
-    assert len({one.clock for one in heard}) == 1
-    assert heard[2].stamp_ns is not None
-    assert 0 <= heard[2].stamp_ns - long_ago_ns < HOLD_S * NS_PER_S
+    commands = viewers.heard(1, 3)
+    assert [command.twist.linear for command in commands] == [0.0, 0.3, 0.0]
+    assert [command.stamp_ns for command in commands[:2]] == [
+        long_ago_ns - BURST_WINDOW_NS,
+        long_ago_ns,
+    ]
+    assert len({command.clock for command in commands}) == 1
+    assert commands[2].stamp_ns is not None
+    assert 0 <= commands[2].stamp_ns - long_ago_ns < HOLD_S * NS_PER_S
 
 
 def test_a_plain_twist_has_the_time_of_its_receipt(viewers: Viewers) -> None:
     before_ns = clock.now().wall_ns
     viewers.publish(1, AHEAD)
-    for one in viewers.heard(1, 2):
-        assert one.stamp_ns is not None
-        assert abs(one.stamp_ns - before_ns) < HOLD_S * NS_PER_S
+    for command in viewers.heard(1, 2):
+        assert command.stamp_ns is not None
+        assert abs(command.stamp_ns - before_ns) < HOLD_S * NS_PER_S
 
 
 def test_a_command_that_waited_for_another_viewer_s_locked_bus_is_dropped(
@@ -173,7 +178,7 @@ def test_a_command_that_waited_for_another_viewer_s_locked_bus_is_dropped(
     viewers.heard(1, 3)
     viewers.publish(2, STILL)
     until(lambda: second.heard[-1].twist == REST, HOLD_S, "the zero behind it")
-    assert [one.twist.linear for one in second.heard if one.twist != REST] == [0.3]
+    assert [command.twist.linear for command in second.heard if command.twist != REST] == [0.3]
 
 
 def test_a_viewer_does_not_drive_after_a_suspend(
@@ -194,7 +199,7 @@ def test_a_bus_that_fails_for_one_viewer_is_reported_and_serves_the_others(
     until(lambda: said(viewers.notices), HOLD_S, "that the bus takes nothing")
     assert "the bus accepts no commands" in said(viewers.notices)[0]
     viewers.publish(2, AHEAD)
-    assert [one.twist.linear for one in viewers.heard(2, 2)] == [0.0, 0.3]
+    assert [command.twist.linear for command in viewers.heard(2, 2)] == [0.0, 0.3]
     viewers.sessions[1].broken = False
     viewers.publish(1, AHEAD)
     viewers.heard(1, 1)
@@ -227,7 +232,7 @@ def told_slow(every_ns: float) -> bool:
 
 
 def said(notices: Notices) -> list[str]:
-    return [one.text for one in notices._waiting.waiting]
+    return [notice.text for notice in notices._waiting.waiting]
 
 
 # the messages of a panel: accepted whole, or refused with the reason
@@ -240,15 +245,15 @@ STAMPED = TwistStamped(Header(Time(5)), MESSAGE)
 @pytest.mark.parametrize("form", ["json", "cdr"])
 def test_a_panel_s_twist_is_decoded(name: str, form: str) -> None:
     encoding = encoding_of(form, name)
-    found = wish(encoding, encode(MESSAGE, "json" if form == "json" else "cdr"))
-    assert found == Wish(values.Twist(0.3, -0.2))
+    result = wish(encoding, encode(MESSAGE, "json" if form == "json" else "cdr"))
+    assert result == Wish(values.Twist(0.3, -0.2))
 
 
 @pytest.mark.parametrize("form", ["json", "cdr"])
 def test_a_panel_s_stamped_twist_is_decoded_with_its_stamp(form: str) -> None:
     encoding = encoding_of(form, "geometry_msgs/msg/TwistStamped")
-    found = wish(encoding, encode(STAMPED, "json" if form == "json" else "cdr"))
-    assert found == Wish(values.Twist(0.3, -0.2), 5 * NS_PER_S)
+    result = wish(encoding, encode(STAMPED, "json" if form == "json" else "cdr"))
+    assert result == Wish(values.Twist(0.3, -0.2), 5 * NS_PER_S)
 
 
 @each(

@@ -31,13 +31,13 @@ KEPT = 20
 
 def events(total: int, of: str = "first") -> Events:
     """Return the daemon's recent events after this many events have happened."""
-    kept = range(max(0, total - KEPT), total)
-    told = [LogEvent(Time(n), f"mode{n}", "warning", f"{of} {n}", "ann", 1) for n in kept]
-    return Events(Time(total), total, told)
+    numbers = range(max(0, total - KEPT), total)
+    log_events = [LogEvent(Time(n), f"mode{n}", "warning", f"{of} {n}", "ann", 1) for n in numbers]
+    return Events(Time(total), total, log_events)
 
 
-def names(deduplicator: EventDeduplicator, said: Events) -> list[str]:
-    return [line.name for line in deduplicator.of(said)]
+def names(deduplicator: EventDeduplicator, report: Events) -> list[str]:
+    return [line.name for line in deduplicator.of(report)]
 
 
 def test_the_first_answer_gives_all_stored_events() -> None:
@@ -90,9 +90,9 @@ def test_a_restarted_daemon_s_events_are_reported_from_the_first() -> None:
 def test_a_restarted_daemon_that_has_logged_as_many_events_reports_all_of_them(total: int) -> None:
     deduplicator = EventDeduplicator()
     deduplicator.of(events(3))
-    restarted = [replace(one, stamp=Time(10)) for one in events(total, "second").events]
-    found = names(deduplicator, Events(Time(11), total, restarted))
-    assert found == [f"mode{n}" for n in range(total)]
+    restarted = [replace(event, stamp=Time(10)) for event in events(total, "second").events]
+    event_names = names(deduplicator, Events(Time(11), total, restarted))
+    assert event_names == [f"mode{n}" for n in range(total)]
 
 
 TWIST = Twist(Vector3(x=0.3), Vector3(z=-0.2))
@@ -128,9 +128,9 @@ def test_a_source_commands_on_its_native_keys_and_those_of_ros() -> None:
 
 def test_every_ros_command_key_belongs_to_a_source() -> None:
     ros = RosConfig()
-    heard = {key for source in SOURCES.values() for key in found(source, ros)}
+    source_keys = {key for source in SOURCES.values() for key in found(source, ros)}
     others = ("imu", "speed_limit")
-    assert {key for key in command_keys(ros) if not any(o in key for o in others)} <= heard
+    assert {key for key in command_keys(ros) if not any(o in key for o in others)} <= source_keys
 
 
 def test_a_namespace_is_before_the_names_of_ros_and_a_tree_that_is_off_has_none() -> None:
@@ -144,8 +144,8 @@ def test_a_namespace_is_before_the_names_of_ros_and_a_tree_that_is_off_has_none(
 def test_a_twist_is_reported_with_the_time_it_came(
     form: Format, message: Twist | TwistStamped
 ) -> None:
-    told = read(encode(message, form))
-    assert told == TwistStamped(Header(Time(9, 1), "base_link"), TWIST)
+    command = read(encode(message, form))
+    assert command == TwistStamped(Header(Time(9, 1), "base_link"), TWIST)
 
 
 @pytest.mark.parametrize("message", [TWIST, STAMPED], ids=["plain", "stamped"])
@@ -161,9 +161,9 @@ def test_a_twist_over_ros_is_decoded_the_same_way(message: Twist | TwistStamped)
 @pytest.mark.parametrize("form", FORMATS)
 def test_wheel_speeds_are_shown_as_the_equivalent_twist(form: Format) -> None:
     wheels = JointState(name=NAMES, velocity=[6.0] * 4)
-    told = read(encode(wheels, form), CommandForm("wheel_cmd/ros2_control"))
-    assert told.twist.linear.x == pytest.approx(0.3)
-    assert told.twist.angular.z == pytest.approx(0.0)
+    command = read(encode(wheels, form), CommandForm("wheel_cmd/ros2_control"))
+    assert command.twist.linear.x == pytest.approx(0.3)
+    assert command.twist.angular.z == pytest.approx(0.0)
 
 
 def test_wheels_and_frame_are_those_of_this_robot() -> None:
@@ -173,9 +173,9 @@ def test_wheels_and_frame_are_those_of_this_robot() -> None:
         odometry=replace(Config().odometry, base_frame="trunk"),
     )
     payload = encode(JointState(name=NAMES, velocity=[6.0] * 4), "json")
-    told = Reader(mine).read(arrival(payload, CommandForm("wheel_cmd/nav")), 0)
-    assert told.header.frame_id == "trunk"
-    assert told.twist.linear.x == pytest.approx(0.6)
+    command = Reader(mine).read(arrival(payload, CommandForm("wheel_cmd/nav")), 0)
+    assert command.header.frame_id == "trunk"
+    assert command.twist.linear.x == pytest.approx(0.6)
 
 
 @each(

@@ -17,11 +17,11 @@ def topics(config: Config) -> dict[str, str]:
 
 
 def test_each_source_has_a_topic_of_its_own() -> None:
-    found = topics(Config())
-    assert found["/cmd_vel_in/teleop"] == "cmd/teleop"
-    assert found["/cmd_vel_in/app"] == "cmd/app"
-    assert found["/joint_states"] == "wheel_states"
-    assert found["/log"] == "events"
+    keys = topics(Config())
+    assert keys["/cmd_vel_in/teleop"] == "cmd/teleop"
+    assert keys["/cmd_vel_in/app"] == "cmd/app"
+    assert keys["/joint_states"] == "wheel_states"
+    assert keys["/log"] == "events"
 
 
 def test_a_namespace_precedes_every_topic() -> None:

@@ -57,13 +57,13 @@ class Robot:
 
 def of_robot(robot: Robot) -> tuple[Settings, Callable[[], list[str]]]:
     """Return the settings of a robot, and a function that returns the updates to the viewers."""
-    told = list[str]()
-    notices = Notices(told.append, lambda: None)
+    updates = list[str]()
+    notices = Notices(updates.append, lambda: None)
 
     def words() -> list[str]:
         server: Any = SimpleNamespace(publish_status=lambda *_: None)
         notices.send(server, lambda _: None, newcomers=False)
-        return told
+        return updates
 
     return Settings(cast(Client, robot), notices, effective(Config()), lambda: None), words
 
@@ -147,15 +147,15 @@ def test_parameter_values_have_only_types_of_the_protocol() -> None:
 
 
 @pytest.mark.parametrize(
-    ("names", "found"),
+    ("names", "parameters"),
     [
         ([], set(NOW)),
         (["rates.odom"], {"rates.odom"}),
         (["rates.odom", "no.such"], {"rates.odom"}),
     ],
 )
-def test_a_request_gets_the_named_parameters_or_all(names: list[str], found: set[str]) -> None:
-    assert set(asked(NOW, names)) == found
+def test_a_request_gets_the_named_parameters_or_all(names: list[str], parameters: set[str]) -> None:
+    assert set(asked(NOW, names)) == parameters
 
 
 def test_changes_are_only_settings_with_another_value() -> None:

@@ -138,10 +138,10 @@ def test_a_child_has_its_own_session_and_no_notify_socket_of_its_parent(
 ) -> None:
     monkeypatch.setenv("NOTIFY_SOCKET", "/run/us")
     monkeypatch.setenv("MORE", "1")
-    found = tmp_path / "found"
+    output = tmp_path / "found"
     text = "import os; print(os.getsid(0) == os.getpid(), 'NOTIFY_SOCKET' in os.environ, "
-    assert Child(program(f"{text} file=open({str(found)!r}, 'w'))")).run() == 0
-    assert found.read_text() == "True False\n"
+    assert Child(program(f"{text} file=open({str(output)!r}, 'w'))")).run() == 0
+    assert output.read_text() == "True False\n"
     assert "MORE" in environment()
     assert "MORE" not in environment(("MORE",))
 
@@ -186,8 +186,8 @@ async def test_a_running_child_gets_its_limits_and_an_ended_child_raises_no_erro
     text = "import sys; sys.stdin.read(1); bytearray(100 << 20)"
     async with running(program(text), limits, stdin=PIPE, stderr=PIPE) as child:
         assert os.getpriority(os.PRIO_PROCESS, child.pid) == 19
-        _, said = await child.communicate(b"go")
-    assert b"MemoryError" in said
+        _, stderr = await child.communicate(b"go")
+    assert b"MemoryError" in stderr
     ended = subprocess.Popen(program(""))
     ended.wait(WAIT_S)
     module.limit(ended.pid, limits)

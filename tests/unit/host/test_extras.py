@@ -39,8 +39,8 @@ def test_an_installation_from_a_clone_installs_the_extra_from_the_clone(
     clone = tmp_path / "my clone"
     clone.mkdir()
     (clone / "pyproject.toml").touch()
-    found = installed(tmp_path, url=clone.as_uri(), dir_info={"editable": editable})
-    assert requirements_of(found, "tls") == [*(["-e"] if editable else []), f"{clone}[tls]"]
+    installation = installed(tmp_path, url=clone.as_uri(), dir_info={"editable": editable})
+    assert requirements_of(installation, "tls") == [*(["-e"] if editable else []), f"{clone}[tls]"]
 
 
 @pytest.mark.parametrize("url", ["file:///gone/away", "https://example.org/acsard.whl"])

@@ -66,7 +66,7 @@ def test_a_computer_without_these_files_has_zeros(tmp_path: Path) -> None:
 def test_this_computer_has_the_files_that_every_linux_has() -> None:
     reading = Kernel().read()
     assert len(reading.steal_ns) >= 1
-    assert any(one.pid == 1 for one in Kernel().programs())
+    assert any(process.pid == 1 for process in Kernel().programs())
 
 
 def test_given_conditions_replace_those_of_the_files(tmp_path: Path) -> None:
@@ -136,8 +136,8 @@ def test_a_clock_is_slow_if_its_limit_is_far_below_the_full_clock(
         "scaling_setspeed": "700000" if governor == "userspace" else "<unsupported>",
         "cpuinfo_max_freq": "1500000",
     }
-    found = slow_clock(policy)
-    assert found == (None if limit is None else SlowClock(governor, limit, 1500))
+    result = slow_clock(policy)
+    assert result == (None if limit is None else SlowClock(governor, limit, 1500))
 
 
 def test_the_throttled_time_is_read_from_both_versions_of_cgroups(tmp_path: Path) -> None:

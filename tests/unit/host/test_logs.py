@@ -39,7 +39,7 @@ class Journal:
 
 def fields(text: str) -> dict[str, str]:
     """Parse a datagram to the journal. Each line must be NAME=value with a valid name."""
-    found: dict[str, str] = {}
+    variables: dict[str, str] = {}
     for line in text.removesuffix("\n").split("\n"):
         name, equals, value = line.partition("=")
         assert equals, f"{line!r} is no assignment"
@@ -49,9 +49,9 @@ def fields(text: str) -> dict[str, str]:
         assert name == name.upper(), name
         assert name[0].isalpha(), name
         assert len(name) <= 64, name
-        assert name not in found, f"{name} twice"
-        found[name] = value
-    return found
+        assert name not in variables, f"{name} twice"
+        variables[name] = value
+    return variables
 
 
 @pytest.fixture
@@ -137,9 +137,9 @@ def test_a_missing_journal_socket_raises_an_os_error(tmp_path: Path) -> None:
 
 def test_a_stream_is_the_journal_if_the_environment_names_it() -> None:
     with socket.socketpair()[0].makefile("w") as stream:
-        found = os.fstat(stream.fileno())
-        assert is_journal(stream, {"JOURNAL_STREAM": f"{found.st_dev}:{found.st_ino}"})
-        assert not is_journal(stream, {"JOURNAL_STREAM": f"{found.st_dev}:{found.st_ino + 1}"})
+        status = os.fstat(stream.fileno())
+        assert is_journal(stream, {"JOURNAL_STREAM": f"{status.st_dev}:{status.st_ino}"})
+        assert not is_journal(stream, {"JOURNAL_STREAM": f"{status.st_dev}:{status.st_ino + 1}"})
         assert not is_journal(stream, {"JOURNAL_STREAM": ""})
         assert not is_journal(stream, {})
 
@@ -225,8 +225,8 @@ def test_control_characters_of_a_logged_text_are_replaced(
 ) -> None:
     evil = "cmd/\x1b[2J\n\r\x00\u202eapp"
     (line,) = written(tmp_path, Event("command_refused", evil, by=evil), form=form)
-    told = line.replace("\x1b[0m", "").replace("\x1b[1m", "").replace("\x1b[2m", "")
-    assert "cmd/\ufffd[2J  \ufffd\ufffdapp" in told.replace("\\ufffd", "\ufffd")
+    text = line.replace("\x1b[0m", "").replace("\x1b[1m", "").replace("\x1b[2m", "")
+    assert "cmd/\ufffd[2J  \ufffd\ufffdapp" in text.replace("\\ufffd", "\ufffd")
     assert "\x1b[2J" not in line
     assert "\u202e" not in line
 
@@ -254,6 +254,6 @@ def test_a_changed_log_level_applies_to_the_next_events(tmp_path: Path) -> None:
             log.event(Event("mode", level))
         log.close()
         stream.seek(0)
-        told = [json.loads(line) for line in stream.read().splitlines()]
-    assert [line["text"] for line in told] == ["info", "info"]
-    assert all(set(line) == {"timestamp", "level", "event", "text"} for line in told)
+        records = [json.loads(line) for line in stream.read().splitlines()]
+    assert [line["text"] for line in records] == ["info", "info"]
+    assert all(set(line) == {"timestamp", "level", "event", "text"} for line in records)

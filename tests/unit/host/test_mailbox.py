@@ -100,12 +100,12 @@ def test_an_item_ends_a_wait_that_has_begun() -> None:
 def test_no_wake_up_is_lost_between_concurrent_writers_and_the_reader() -> None:
     # The reader waits without a limit, so a lost wake-up leaves it waiting for ever.
     writers, each = 4, 2000
-    box, seen, done = Mailbox[int](writers * each), [0], threading.Event()
+    box, count, done = Mailbox[int](writers * each), [0], threading.Event()
 
     def read() -> None:
-        while seen[0] < writers * each:
+        while count[0] < writers * each:
             box.wait()
-            seen[0] += len(box.take())
+            count[0] += len(box.take())
         done.set()
 
     def write() -> None:
@@ -115,7 +115,7 @@ def test_no_wake_up_is_lost_between_concurrent_writers_and_the_reader() -> None:
     threads = [Thread(target=read, daemon=True)] + [Thread(target=write) for _ in range(writers)]
     for thread in threads:
         thread.start()
-    assert done.wait(WAIT_S), seen
+    assert done.wait(WAIT_S), count
 
 
 def test_an_item_that_is_only_stored_wakes_no_reader() -> None:
@@ -129,12 +129,12 @@ def test_an_item_that_is_only_stored_wakes_no_reader() -> None:
 
 
 def test_a_callback_runs_on_the_writer_s_thread_and_finds_the_item() -> None:
-    found: list[tuple[str, int | None]] = []
-    box = Mailbox[int](4, lambda: found.append((threading.current_thread().name, box.pop())))
+    calls: list[tuple[str, int | None]] = []
+    box = Mailbox[int](4, lambda: calls.append((threading.current_thread().name, box.pop())))
     writer = Thread(target=box.put, args=(5,), name="writer")
     writer.start()
     writer.join(WAIT_S)
-    assert found == [("writer", 5)]
+    assert calls == [("writer", 5)]
 
 
 @pytest.mark.parametrize(("items", "closes", "woken"), [(0, False, 0), (2, False, 1), (0, True, 1)])

@@ -20,7 +20,7 @@ from acsard.host.own_identity import own_name, sender_id
 
 
 @pytest.mark.parametrize(
-    ("program", "told"),
+    ("program", "suffix"),
     [
         ("/home/joe/patrol.py", " patrol"),
         ("/opt/venv/bin/acsard", " acsard"),
@@ -30,11 +30,11 @@ from acsard.host.own_identity import own_name, sender_id
     ],
 )
 def test_the_own_name_has_user_machine_and_program(
-    monkeypatch: pytest.MonkeyPatch, program: str, told: str
+    monkeypatch: pytest.MonkeyPatch, program: str, suffix: str
 ) -> None:
     monkeypatch.setattr(sys, "argv", [program])
     user, machine = pwd.getpwuid(os.getuid()).pw_name, os.uname().nodename.partition(".")[0]
-    assert own_name() == f"{user}@{machine}{told}"
+    assert own_name() == f"{user}@{machine}{suffix}"
 
 
 def test_a_user_without_a_name_is_shown_as_a_number(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -44,10 +44,10 @@ def test_a_user_without_a_name_is_shown_as_a_number(monkeypatch: pytest.MonkeyPa
 
 @pytest.mark.parametrize("name", ["joe", "a/b/c", "\U0001f916" * 100])
 def test_a_sender_id_is_unique_and_fits_into_an_attachment(name: str) -> None:
-    one, other = sender_id(name), sender_id(name)
-    assert one != other
-    assert one.rpartition("/")[0] == name[:MAX_NAME_LENGTH]
-    signature = Signature(one, MAX_INT64, MAX_INT64)
+    sender, other = sender_id(name), sender_id(name)
+    assert sender != other
+    assert sender.rpartition("/")[0] == name[:MAX_NAME_LENGTH]
+    signature = Signature(sender, MAX_INT64, MAX_INT64)
     assert unpack(signature.pack()) == signature
     assert len(signature.pack()) <= MAX_ATTACHMENT_BYTES
 

@@ -56,26 +56,26 @@ def device() -> Iterator[str]:
 def test_each_process_that_has_the_device_open_is_listed_once(device: str) -> None:
     again = os.open(device, os.O_RDWR | os.O_NOCTTY)
     with another(device) as pid:
-        assert sorted(one.pid for one in holders(device)) == sorted([os.getpid(), pid])
+        assert sorted(holder.pid for holder in holders(device)) == sorted([os.getpid(), pid])
     os.close(again)
-    assert [one.pid for one in holders(device)] == [os.getpid()]
+    assert [holder.pid for holder in holders(device)] == [os.getpid()]
 
 
 def test_the_holder_of_a_device_is_the_process_with_the_lock(device: str) -> None:
     assert holder_of(device) is None, "this process does not count as the holder"
     with another(device, "lock") as locker, another(device), another(device):
-        found = holder_of(device)
-        assert found is not None
-        assert found.pid == locker
+        holder = holder_of(device)
+        assert holder is not None
+        assert holder.pid == locker
 
 
 def test_without_a_lock_the_holder_is_another_process_with_the_device_open(device: str) -> None:
     own = os.open(device, os.O_RDWR | os.O_NOCTTY)
     fcntl.flock(own, fcntl.LOCK_EX)
     with another(device) as pid:
-        found = holder_of(device)
-        assert found is not None
-        assert found.pid == pid
+        holder = holder_of(device)
+        assert holder is not None
+        assert holder.pid == pid
     os.close(own)
 
 
@@ -95,8 +95,8 @@ def test_a_path_that_is_not_a_device_has_no_holder(path: str) -> None:
 
 def test_a_program_is_found_by_its_name(device: str) -> None:
     with another(device) as pid:
-        (found,) = [one for one in holders(device) if one.pid == pid]
-        assert is_running(found.name)
+        (holder,) = [process for process in holders(device) if process.pid == pid]
+        assert is_running(holder.name)
     assert not is_running("no such program")
 
 
@@ -148,9 +148,13 @@ def test_the_time_that_a_process_waited_for_a_processor_is_read() -> None:
     spin = "import os; os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})\nwhile True: pass"
     two = [subprocess.Popen([sys.executable, "-c", spin]) for _ in range(2)]
     try:
-        until(lambda: all(waited_ns(one.pid) > 20_000_000 for one in two), 20.0, "both have waited")
+        until(
+            lambda: all(waited_ns(process.pid) > 20_000_000 for process in two),
+            20.0,
+            "both have waited",
+        )
     finally:
-        for one in two:
-            one.kill()
-            one.wait()
+        for process in two:
+            process.kill()
+            process.wait()
     assert waited_ns(two[0].pid) == 0  # the process has ended

@@ -18,8 +18,8 @@ GUESSES_OF_ONE, GUESSES = Rate(10 / 60, 10.0), Rate(100 / 60, 100.0)
 def test_a_bucket_permits_an_initial_burst_and_then_its_rate() -> None:
     bucket = Bucket(Rate(10.0, 20.0))
     assert [bucket.take(0) for _ in range(21)] == [True] * 20 + [False]
-    taken = sum(bucket.take(n * NS_PER_S // 1000) for n in range(10_000))
-    assert 99 <= taken <= 100  # within ten seconds
+    count = sum(bucket.take(n * NS_PER_S // 1000) for n in range(10_000))
+    assert 99 <= count <= 100  # within ten seconds
 
 
 def test_a_bucket_holds_at_most_its_burst_size_after_a_long_pause() -> None:
@@ -60,10 +60,10 @@ def test_inactive_names_are_removed_to_bound_the_memory() -> None:
     try:
         for n in range(10_000):
             guesses.take(f"address {n}", n * NS_PER_S // 10)
-        held, _ = tracemalloc.get_traced_memory()
+        size, _ = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()
-    assert held < 200_000  # bytes; all names together take 2.3 MB
+    assert size < 200_000  # bytes; all names together take 2.3 MB
 
 
 def test_places_are_limited_per_address_and_in_total() -> None:

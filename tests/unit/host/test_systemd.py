@@ -123,14 +123,14 @@ def test_the_socket_is_not_inherited_by_children(manager: Manager) -> None:
 
 def sockets() -> set[int]:
     """Return the open sockets of this process."""
-    found = set()
+    descriptors = set()
     for fd in map(int, os.listdir("/proc/self/fd")):
         try:
             if stat.S_ISSOCK(os.fstat(fd).st_mode):
-                found.add(fd)
+                descriptors.add(fd)
         except OSError:
             pass  # the descriptor that listed the directory
-    return found
+    return descriptors
 
 
 # the life of a service
@@ -199,7 +199,7 @@ def test_the_watchdog_is_fed_at_its_interval_and_not_in_each_step(
 
 
 @pytest.mark.parametrize(
-    "told",
+    "environment",
     [
         {},
         {"WATCHDOG_USEC": "0"},
@@ -210,9 +210,9 @@ def test_the_watchdog_is_fed_at_its_interval_and_not_in_each_step(
     ],
 )
 def test_a_watchdog_that_is_off_broken_or_another_process_s_is_not_fed(
-    manager: Manager, told: dict[str, str]
+    manager: Manager, environment: dict[str, str]
 ) -> None:
-    assert feeds(manager, systemd(manager, **told), 10 * MS, 50) == []
+    assert feeds(manager, systemd(manager, **environment), 10 * MS, 50) == []
 
 
 def test_a_watchdog_with_the_pid_of_this_process_is_fed(manager: Manager) -> None:

@@ -15,9 +15,9 @@ from tests.pages import ROOT
 
 
 def git(where: Path, *words: str) -> str:
-    who = ("-c", "user.name=a", "-c", "user.email=a@b", "-c", "init.defaultBranch=main")
+    options = ("-c", "user.name=a", "-c", "user.email=a@b", "-c", "init.defaultBranch=main")
     done = subprocess.run(
-        ["git", "-C", where, *who, *words], capture_output=True, text=True, check=True
+        ["git", "-C", where, *options, *words], capture_output=True, text=True, check=True
     )
     return done.stdout.strip()
 

@@ -53,10 +53,10 @@ def connects(where: Path, server: Path, name: str, client: Path) -> bool:
     for context, own in ((serving, server), (asking, client)):
         context.load_verify_locations(where / "ca.pem")
         context.load_cert_chain(own / "certificate.pem", own / "key.pem")
-    one = asking.wrap_bio(there, here, server_hostname=name)
+    client_tls = asking.wrap_bio(there, here, server_hostname=name)
     other = serving.wrap_bio(here, there, server_side=True)
     try:
-        for side in (one, other, one, other):
+        for side in (client_tls, other, client_tls, other):
             with suppress(ssl.SSLWantReadError):
                 side.do_handshake()
     except ssl.SSLCertVerificationError:
@@ -78,8 +78,8 @@ def test_a_certificate_is_valid_for_a_permitted_name_only(
 
 def test_the_constraints_are_critical(authority: tuple[Authority, Path]) -> None:
     certificate = x509.load_pem_x509_certificate((authority[1] / "ca.pem").read_bytes())
-    found = certificate.extensions.get_extension_for_class(x509.NameConstraints)
-    assert found.critical
+    extension = certificate.extensions.get_extension_for_class(x509.NameConstraints)
+    assert extension.critical
 
 
 def test_an_authority_of_another_program_without_constraints_may_sign_for_any_name(

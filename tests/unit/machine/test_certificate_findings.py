@@ -41,8 +41,8 @@ def fleet(tmp_path: Path) -> Path:
 
 
 def finding(directory: Path) -> Finding:
-    (found,) = certificates(str(directory))
-    return found
+    (result,) = certificates(str(directory))
+    return result
 
 
 def days_left(directory: Path) -> int:
@@ -57,17 +57,17 @@ def typed(mend: str, where: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_sound_certificates_need_no_advice(fleet: Path) -> None:
-    told = Finding("certificates", "ok", f"{fleet}: valid for 730 days")
-    assert finding(fleet) == told
+    expected = Finding("certificates", "ok", f"{fleet}: valid for 730 days")
+    assert finding(fleet) == expected
 
 
 def test_the_advised_command_renews_the_robots_own_certificate(
     fleet: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     Authority.load(fleet, str).issue(fleet, "robot", ["localhost"], 9.9)
-    told = finding(fleet)
-    assert (told.level, told.text) == ("warning", f"{fleet}: expires in 10 days")
-    typed(told.mend, fleet, monkeypatch)
+    result = finding(fleet)
+    assert (result.level, result.text) == ("warning", f"{fleet}: expires in 10 days")
+    typed(result.mend, fleet, monkeypatch)
     assert finding(fleet).level == "ok"
 
 
@@ -78,10 +78,10 @@ def test_the_advised_command_replaces_a_key_that_only_zenoh_refuses(
         # OpenSSL accepts a key of this curve, and Zenoh does not.
         patch.setattr(ec, "SECP256R1", ec.SECP521R1)
         Authority.load(fleet, str).issue(fleet, "robot", ["localhost"], 100)
-    told = finding(fleet)
-    assert told.level == "failure"
-    assert f"the key {fleet}/key.pem (failed to parse private key" in told.text
-    typed(told.mend, fleet, monkeypatch)
+    result = finding(fleet)
+    assert result.level == "failure"
+    assert f"the key {fleet}/key.pem (failed to parse private key" in result.text
+    typed(result.mend, fleet, monkeypatch)
     assert finding(fleet).level == "ok"
 
 
@@ -102,10 +102,10 @@ def test_the_advised_commands_renew_the_certificate_of_a_robot_of_a_fleet(
     Authority.load(fleet, str).issue(fleet / "clients" / "robot4", "robot4", ["10.0.0.4"], days)
     there = tmp_path / "etc tls"
     shutil.copytree(fleet / "clients" / "robot4", there)
-    told = finding(there)
-    assert told.level == ("warning" if days > 0 else "failure")
-    typed(told.mend, fleet, monkeypatch)
-    assert told.mend.endswith(f"; then copy clients/robot4/*.pem from there to {there}")
+    result = finding(there)
+    assert result.level == ("warning" if days > 0 else "failure")
+    typed(result.mend, fleet, monkeypatch)
+    assert result.mend.endswith(f"; then copy clients/robot4/*.pem from there to {there}")
     for name in PEM:
         shutil.copy(fleet / "clients" / "robot4" / name, there)
     require_usable(str(there))
@@ -117,16 +117,16 @@ def test_the_advice_about_an_authority_makes_a_new_one(
 ) -> None:
     directory = tmp_path / "fleet"
     Authority.make(directory, "fleet", 2).issue(directory, "robot", [], 700)
-    told = finding(directory)
-    assert told.text == f"{directory}: expires in 10 days (certificate of the authority)"
-    typed(told.mend, directory, monkeypatch)
+    result = finding(directory)
+    assert result.text == f"{directory}: expires in 10 days (certificate of the authority)"
+    typed(result.mend, directory, monkeypatch)
     assert finding(directory).level == "ok"
 
 
 def test_the_advice_about_a_router_names_its_certificate(fleet: Path) -> None:
-    told = renewal(str(fleet / "clients" / "robot4"), "the router tls/router.local:7447")
-    assert "`acsard tls renew --name router.local --directory .`" in told
-    assert told.endswith("then copy clients/router.local/*.pem from there to the router")
+    advice = renewal(str(fleet / "clients" / "robot4"), "the router tls/router.local:7447")
+    assert "`acsard tls renew --name router.local --directory .`" in advice
+    assert advice.endswith("then copy clients/router.local/*.pem from there to the router")
     assert "init --force" in renewal(str(fleet), AUTHORITY)
 
 
@@ -135,23 +135,23 @@ def test_an_expiring_certificate_of_a_router_is_a_finding(
 ) -> None:
     end_ns = clock.now().wall_ns + 9 * DAY_NS
     ends_ns = {"tls/router.local:7447": end_ns, "tls/away.local:7447": None}
-    monkeypatch.setattr(certificate_watch, "peer_ends_ns", lambda one, tls: ends_ns[one])
+    monkeypatch.setattr(certificate_watch, "peer_ends_ns", lambda endpoint, tls: ends_ns[endpoint])
     bus = BusConfig(
         mode="client", connect=("tcp/127.0.0.1:7447", *ends_ns), tls=str(fleet / "clients/robot4")
     )
-    (told,) = router_certificates(Config(bus=bus))
-    assert (told.subject, told.level) == ("router", "warning")
-    assert told.text == "expires in 9 days (certificate of the router tls/router.local:7447)"
-    assert "--name router.local" in told.mend
+    (result,) = router_certificates(Config(bus=bus))
+    assert (result.subject, result.level) == ("router", "warning")
+    assert result.text == "expires in 9 days (certificate of the router tls/router.local:7447)"
+    assert "--name router.local" in result.mend
 
 
 def test_the_advised_command_makes_the_first_certificate_of_an_empty_directory(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     directory = tmp_path / "tls"
-    told = [*certificates(str(directory))]
-    assert {one.level for one in told} == {"failure"}
-    first, *_ = re.findall(r"`(acsard tls init [^`]+)`", told[0].mend)
+    findings = [*certificates(str(directory))]
+    assert {item.level for item in findings} == {"failure"}
+    first, *_ = re.findall(r"`(acsard tls init [^`]+)`", findings[0].mend)
     typed(f"`{first}`", tmp_path, monkeypatch)
     assert finding(directory).level == "ok"
 
@@ -167,9 +167,11 @@ def test_the_advised_command_replaces_a_missing_key_beside_the_authoritys_key(
 def test_for_a_missing_key_of_a_fleet_robot_no_new_authority_is_advised(fleet: Path) -> None:
     own = fleet / "clients" / "robot4"
     (own / "key.pem").unlink()
-    for one in certificates(str(own)):
-        assert "tls init" not in one.mend
-        assert "copy ca.pem, certificate.pem and key.pem from there into this directory" in one.mend
+    for result in certificates(str(own)):
+        assert "tls init" not in result.mend
+        assert (
+            "copy ca.pem, certificate.pem and key.pem from there into this directory" in result.mend
+        )
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
@@ -198,8 +200,8 @@ def test_for_a_directory_that_this_user_may_not_look_into_sudo_is_advised(
         directory = Path(place) / "tls"
         directory.mkdir(mode=mode)
         try:
-            (told, *_) = certificates(str(directory))
-            assert "sudo" in told.mend
+            (result, *_) = certificates(str(directory))
+            assert "sudo" in result.mend
             Path(place).chmod(0o600)
             with pytest.raises(NotPermittedError, match="sudo"):
                 require_usable(str(directory))
@@ -210,5 +212,5 @@ def test_for_a_directory_that_this_user_may_not_look_into_sudo_is_advised(
 
 def test_for_a_key_that_other_users_can_read_chmod_is_advised(fleet: Path) -> None:
     (fleet / "key.pem").chmod(0o644)
-    (told, _) = certificates(str(fleet))
-    assert told.mend == f"chmod 600 {fleet}/key.pem"
+    (result, _) = certificates(str(fleet))
+    assert result.mend == f"chmod 600 {fleet}/key.pem"

@@ -75,7 +75,7 @@ def test_a_daemon_with_the_settings_of_the_file_is_ok() -> None:
 
 def test_each_key_that_differs_from_the_file_is_reported_with_both_values() -> None:
     runs = replace(FILE, mcu=McuConfig(port="/dev/pts/3", baud_rate=57600))
-    assert [one.words(key) for key, one in differences(runs, FILE).items()] == [
+    assert [difference.words(key) for key, difference in differences(runs, FILE).items()] == [
         'mcu.port = "/dev/pts/3", not "sim"',
         "mcu.baud_rate = 57600, not 115200",
     ]
@@ -198,7 +198,7 @@ def test_an_open_gateway_is_reported_with_its_endpoint() -> None:
 
 @pytest.mark.parametrize("does", ["off", "used", "waiting for rest", "waiting for turn"])
 def test_a_gyro_that_works_causes_no_warning(does: str) -> None:
-    assert [one.level for one in gyro(does, {})] == ([] if does == "off" else ["ok"])
+    assert [finding.level for finding in gyro(does, {})] == ([] if does == "off" else ["ok"])
 
 
 def test_each_state_of_the_gyro_has_its_own_remedy() -> None:
@@ -228,7 +228,7 @@ def test_a_stop_that_a_restart_would_lose_is_a_warning_with_a_remedy() -> None:
     )
     running = seen(0.0)
     running = replace(running, state=replace(running.state, latch_file_error=trouble))
-    (finding,) = (one for one in daemon(running) if one.subject == "latch file")
+    (finding,) = (item for item in daemon(running) if item.subject == "latch file")
     assert (finding.level, finding.text) == ("warning", trouble)
     assert "control.state_directory" in finding.mend
 
@@ -247,10 +247,10 @@ CONFIG = Config(mcu=McuConfig(port="/dev/ttyX"))
 def test_an_expiring_certificate_in_use_is_a_warning_with_a_remedy(here: bool, mend: str) -> None:
     words = "expires in 9 days (certificate of the router tls/router.local:7447)"
     row = DiagnosticStatus(1, "acsard: certificate", words, "acsar", [])
-    (told,) = certificate(row, here)
-    assert (told.subject, told.level) == ("certificates", "warning")
-    assert told.text.endswith(words)
-    assert mend in told.mend
+    (finding,) = certificate(row, here)
+    assert (finding.subject, finding.level) == ("certificates", "warning")
+    assert finding.text.endswith(words)
+    assert mend in finding.mend
     assert list(certificate(replace(row, level=0), here)) == list(certificate(None, here)) == []
 
 
@@ -258,17 +258,17 @@ def test_an_expiring_certificate_in_use_is_a_warning_with_a_remedy(here: bool, m
 def test_settings_that_differ_from_the_file_of_another_machine_are_a_warning(here: bool) -> None:
     running = seen(0.0, here=here)
     running = replace(running, state=replace(running.state, settings_differ="rates.state = 7.5"))
-    told = [one.text for one in daemon(running) if one.subject == "configuration"]
+    texts = [finding.text for finding in daemon(running) if finding.subject == "configuration"]
     words = (
         "the daemon's settings differ from the configuration file on the robot: rates.state = 7.5"
     )
     # On the daemon's own machine the doctor compares with the file itself.
-    assert told == ([] if here else [words])
+    assert texts == ([] if here else [words])
 
 
 def found(before: dict[str, int], after: dict[str, int], **state: str) -> list[Finding]:
-    one, two = replace(STATE, counters=before), replace(STATE, counters=after, **state)
-    return list(link(Running(INFO, CONFIG, one, two, 0)))
+    first, two = replace(STATE, counters=before), replace(STATE, counters=after, **state)
+    return list(link(Running(INFO, CONFIG, first, two, 0)))
 
 
 @pytest.mark.parametrize(
@@ -356,15 +356,17 @@ def test_lines_that_are_not_answered_are_a_warning() -> None:
 
 
 @each(
-    ("sent", "came", "period", "told"),
+    ("sent", "line_count", "period", "findings"),
     [(100, 100, 0.0, 0), (100, 98, 0.0, 0), (100, 97, 0.0, 0), (100, 96, 0.0, 1),
      (100, 130, 0.0, 0), (10, 0, 0.0, 0), (100, 10, 0.1, 0)],
 )  # fmt: skip
 def test_unanswered_lines_are_reported_only_if_they_are_a_loss(
-    sent: int, came: int, period: float, told: int
+    sent: int, line_count: int, period: float, findings: int
 ) -> None:
     config = Config(mcu=McuConfig(reply_period=period))
-    assert len(list(unanswered_lines({"lines_sent": sent, "lines": came}, config))) == told
+    assert (
+        len(list(unanswered_lines({"lines_sent": sent, "lines": line_count}, config))) == findings
+    )
 
 
 def test_rejected_lines_are_reported_by_kind_above_one_in_fifty() -> None:
@@ -479,7 +481,7 @@ def test_the_battery_of_the_board_is_reported(
 
 
 def test_a_board_without_a_battery_has_no_finding_unless_thresholds_need_it() -> None:
-    assert [one.subject for one in found({}, {})] == ["link"]
+    assert [finding.subject for finding in found({}, {})] == ["link"]
 
 
 DAYS_40 = {"lines": 340_000_000, "lines_sent": 345_600_000}
@@ -516,8 +518,8 @@ def test_the_last_causes_of_lateness_are_warnings_only_if_periods_are_missed_now
     )
     calm = replace(seen(0.0, lines_sent=345_600_000, missed_periods=600), events=events)
     findings = list(late(calm))
-    assert [one.level for one in findings] == ["ok", "ok", "ok"]
-    assert [one.text.rpartition("because ")[2] for one in findings] == [
+    assert [finding.level for finding in findings] == ["ok", "ok", "ok"]
+    assert [finding.text.rpartition("because ")[2] for finding in findings] == [
         "it is 2", "it is 3", "it is 4",
     ]  # fmt: skip
     assert (
@@ -525,7 +527,7 @@ def test_the_last_causes_of_lateness_are_warnings_only_if_periods_are_missed_now
         in findings[-1].text
     )
     row = DiagnosticStatus(1, "acsard: control loop", "600 of 6000 periods missed", "acsar", [])
-    assert {one.level for one in late(replace(calm, rows=(row,)))} == {"warning"}
+    assert {finding.level for finding in late(replace(calm, rows=(row,)))} == {"warning"}
 
 
 @pytest.mark.parametrize("host", ["a..b", "a" * 70])

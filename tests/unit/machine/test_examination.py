@@ -57,7 +57,7 @@ def test_a_computer_without_causes_of_lateness_is_ok(tmp_path: Path) -> None:
 def test_each_present_cause_of_lateness_is_a_warning_with_a_remedy(tmp_path: Path) -> None:
     files = {HWMON + "in0_lcrit_alarm": "1\n", POLICY + "scaling_governor": "powersave\n"}
     findings = list(slowness(Kernel(write(tmp_path, QUIET | files))))
-    assert [one.level for one in findings] == ["warning", "warning"]
+    assert [finding.level for finding in findings] == ["warning", "warning"]
     assert "supply voltage is too low" in findings[0].text
     assert "power supply" in findings[0].mend
     assert "powersave keeps the processor at 600 of 1500 MHz" in findings[1].text

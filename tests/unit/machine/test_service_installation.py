@@ -61,16 +61,16 @@ def test_a_service_is_refused_in_a_home_directory_and_outside_a_venv(
 
 
 def test_outside_a_venv_the_reason_of_the_refusal_is_not_a_hidden_directory() -> None:
-    told = unusable_location("/usr", "/usr", PROGRAM)
-    assert "which is not a venv" in told
-    assert "home directories" not in told
+    reason = unusable_location("/usr", "/usr", PROGRAM)
+    assert "which is not a venv" in reason
+    assert "home directories" not in reason
     assert "home directories" in unusable_location("/home/anna/venv", "/usr", PROGRAM)
 
 
 def test_a_service_is_refused_with_a_python_in_a_home_directory() -> None:
-    told = unusable_location("/opt/acsard/venv", "/root/.pyenv/versions/3.11.7", PROGRAM)
-    assert "/root/.pyenv/versions/3.11.7" in told
-    assert "/usr/bin/python3 -m venv --clear /opt/acsard/venv" in told
+    reason = unusable_location("/opt/acsard/venv", "/root/.pyenv/versions/3.11.7", PROGRAM)
+    assert "/root/.pyenv/versions/3.11.7" in reason
+    assert "/usr/bin/python3 -m venv --clear /opt/acsard/venv" in reason
 
 
 def test_a_link_to_a_python_in_a_home_is_followed(tmp_path: Path) -> None:
@@ -86,9 +86,9 @@ def test_a_directory_that_other_users_cannot_enter_is_reported(tmp_path: Path) -
     venv = tmp_path / "venv"
     venv.mkdir()
     tmp_path.chmod(0o700)
-    told = unusable_location(str(venv), "/usr", PROGRAM, hidden=())
-    assert "no permission to enter" in told
-    assert "chmod o+rx" in told
+    reason = unusable_location(str(venv), "/usr", PROGRAM, hidden=())
+    assert "no permission to enter" in reason
+    assert "chmod o+rx" in reason
 
 
 def test_a_missing_group_or_program_of_the_units_is_reported_with_a_remedy() -> None:
@@ -180,10 +180,10 @@ def test_a_wrong_mode_or_owner_is_detected_and_corrected(
 
 
 def test_a_file_with_other_content_is_overwritten_only_by_force() -> None:
-    found = there(unit=b"mine", own=None)
+    state = there(unit=b"mine", own=None)
     with pytest.raises(MendableError, match=f"this version of acsard installs: {UNIT_FILE.path};"):
-        installing(ALL, found, (), force=False)
-    steps = installing(ALL, found, (), force=True)
+        installing(ALL, state, (), force=False)
+    steps = installing(ALL, state, (), force=True)
     assert [step for step in steps if isinstance(step, Write)] == [Write(UNIT_FILE), Write(OWN)]
 
 
@@ -208,8 +208,8 @@ def test_without_installed_files_no_unit_is_stopped_and_no_file_is_removed() -> 
     assert uninstalling(ALL, NOTHING, (), force=False) == [*REMOVE_COMMANDS]
 
 
-def kept(found: Found, *, force: bool) -> set[Path]:
-    steps = uninstalling(ALL, found, (), force=force)
+def kept(state: Found, *, force: bool) -> set[Path]:
+    steps = uninstalling(ALL, state, (), force=force)
     return {step.path for step in steps if isinstance(step, Keep)}
 
 
@@ -235,8 +235,8 @@ def test_the_files_are_those_of_deploy_with_the_port_of_a_real_robot() -> None:
 
 def test_each_kept_path_is_reported_with_its_reason_and_how_to_remove_it() -> None:
     tls, own = Path("/etc/acsard/tls"), ETC / "own.conf"
-    found = there(unit=b"mine", own=b"mine")
-    steps = uninstalling(ALL, found, [tls, own], force=False)
+    state = there(unit=b"mine", own=b"mine")
+    steps = uninstalling(ALL, state, [tls, own], force=False)
     assert {step.path: step.why for step in steps if isinstance(step, Keep)} == {
         UNIT_FILE.path: "the file differs from what this version installs; --force removes it",
         STOP_FILE.path: f"{UNIT} stays and needs this file",
@@ -247,8 +247,8 @@ def test_each_kept_path_is_reported_with_its_reason_and_how_to_remove_it() -> No
 
 
 def test_a_forced_purge_keeps_no_file() -> None:
-    tls, found = Path("/etc/acsard/tls"), there(unit=b"mine", own=b"mine")
-    steps = uninstalling(ALL, found, [tls], force=True, purge=True)
+    tls, state = Path("/etc/acsard/tls"), there(unit=b"mine", own=b"mine")
+    steps = uninstalling(ALL, state, [tls], force=True, purge=True)
     assert not [step for step in steps if isinstance(step, Keep)]
     assert {step.path for step in steps if isinstance(step, (Remove, Remove))} == {
         *(file.path for file in ALL),
@@ -267,9 +267,9 @@ def test_a_purge_reinstalls_a_unit_so_that_systemd_can_clean_its_state() -> None
 @pytest.mark.parametrize("purge", [False, True])
 def test_recordings_and_invitations_are_kept_unless_purged(purge: bool) -> None:
     steps = uninstalling(ALL, there(), (), force=False, purge=purge, stateful=STATE_DIRECTORIES)
-    kept = {step.path for step in steps if isinstance(step, Keep)}
+    paths = {step.path for step in steps if isinstance(step, Keep)}
     cleans = {Run(("systemctl", "clean", "--what=state", unit)) for unit in (UNIT, PAGE)}
-    assert kept == (set() if purge else {where for where, _ in STATE_DIRECTORIES.values()})
+    assert paths == (set() if purge else {where for where, _ in STATE_DIRECTORIES.values()})
     assert cleans & {*steps} == (cleans if purge else set())
     if purge:  # the units have stopped, but systemd still knows them
         assert {*steps[1:3]} == cleans

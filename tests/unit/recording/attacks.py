@@ -46,9 +46,9 @@ def doubled(times: int) -> bytes:
 def counted_again(keys: int, times: int) -> bytes:
     """Return a large dict, and `times` objects of `Counter` that are made from it."""
     pairs = b"".join(pickle.BININT + struct.pack("<i", key) + ONE for key in range(keys))
-    given = pickle.EMPTY_DICT + pickle.MARK + pairs + pickle.SETITEMS + pickle.TUPLE1
+    argument = pickle.EMPTY_DICT + pickle.MARK + pairs + pickle.SETITEMS + pickle.TUPLE1
     made = (pickle.BINGET + b"\x00" + pickle.BINGET + b"\x01" + pickle.REDUCE) * times
-    return pickle.MARK + COUNTER + pickle.MEMOIZE + given + pickle.MEMOIZE + made + pickle.TUPLE
+    return pickle.MARK + COUNTER + pickle.MEMOIZE + argument + pickle.MEMOIZE + made + pickle.TUPLE
 
 
 def of_one_hash(keys: int) -> bytes:
@@ -211,19 +211,19 @@ ATTACKS = {name: whole(body) for name, body in BODIES.items()} | {
 
 def main() -> None:
     copyreg.add_extension("os", "system", EXTENSION)
-    said, step, modules = {}, Robot.step, set(sys.modules)
+    errors, step, modules = {}, Robot.step, set(sys.modules)
     ran: list[str] = []
     os.system = ran.append  # type: ignore[assignment]
     for name, data in ATTACKS.items():
         try:
             thaw(data)
-            said[name] = ""
+            errors[name] = ""
         except StateError as error:
-            said[name] = str(error)
+            errors[name] = str(error)
         if ran or Robot.step is not step or set(sys.modules) - modules:
-            said[name], modules = "", set(sys.modules)
+            errors[name], modules = "", set(sys.modules)
             ran.clear()
-    print(json.dumps(said))
+    print(json.dumps(errors))
 
 
 if __name__ == "__main__":

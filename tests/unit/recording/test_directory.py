@@ -38,20 +38,20 @@ def ring(where: Path, megabytes: float = 10.0, days: float = 14.0) -> RecordingD
     return RecordingDirectory(RecordConfig(str(where), megabytes, days))
 
 
-def record(one: RecordingDirectory, size: int = 10, kind: Kind = "plain", days: int = 0) -> Path:
-    writing = one.begin(about())
+def record(store: RecordingDirectory, size: int = 10, kind: Kind = "plain", days: int = 0) -> Path:
+    writing = store.begin(about())
     writing.add("steps", NOW_NS, os.urandom(size))
-    path = one.end(writing, kind)
+    path = store.end(writing, kind)
     os.utime(path, ns=(0, NOW_NS - days * DAY_NS))
     return path
 
 
-def later(one: RecordingDirectory) -> None:
+def later(store: RecordingDirectory) -> None:
     """Delete surplus recordings after the clock has run steadily for long enough."""
     for mono_ns in (0, STEADY_CLOCK_NS):
         now = Instant(mono_ns, NOW_NS + mono_ns)
-        one.maintain(now)
-    one.trim(now)
+        store.maintain(now)
+    store.trim(now)
 
 
 def sizes(where: Path) -> int:
@@ -59,10 +59,10 @@ def sizes(where: Path) -> int:
 
 
 def test_file_numbers_increase_whatever_the_clock_shows(tmp_path: Path) -> None:
-    one = ring(tmp_path)
+    store = ring(tmp_path)
     for wall_ns in (NOW_NS, 0, NOW_NS - DAY_NS):
-        one.end(one.begin(about(wall_ns)), "plain")
-    one.close()
+        store.end(store.begin(about(wall_ns)), "plain")
+    store.close()
     names = [path.name for path in listed(tmp_path)]
     assert [name[:6] for name in names] == ["000001", "000002", "000003"]
     assert names[1] == "000002-19700101T000000Z.mcap"
@@ -74,8 +74,8 @@ def test_file_numbers_increase_whatever_the_clock_shows(tmp_path: Path) -> None:
 def test_the_service_and_its_group_may_read_the_directory(tmp_path: Path, umask: int) -> None:
     before = os.umask(umask)
     try:
-        one = ring(tmp_path / "b")
-        path = record(one)
+        store = ring(tmp_path / "b")
+        path = record(store)
     finally:
         os.umask(before)
     assert (tmp_path / "b").stat().st_mode & 0o777 == DIRECTORY_MODE == 0o750
@@ -90,12 +90,12 @@ def test_every_user_may_read_the_directory_of_a_service_but_not_open_its_lock(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     where = tmp_path / "b"
-    one = ring(where)
-    record(one)  # as an older version did, which had one directory for one robot
-    cut = one.begin(about())
+    store = ring(where)
+    record(store)  # as an older version did, which had one directory for one robot
+    cut = store.begin(about())
     cut.add("steps", NOW_NS, b"whole")
     cut.flush()
-    one.close()
+    store.close()
     assert modes(where) == {0o640}
     monkeypatch.setenv("ACSARD_RECORD", str(tmp_path))
     ring(where).close()
@@ -106,9 +106,9 @@ def test_every_user_may_read_the_directory_of_a_service_but_not_open_its_lock(
     monkeypatch.setattr(directory, "PRIVATE_STATE", tmp_path)
     before = os.umask(0o077)
     try:
-        one = ring(where)
-        record(one)
-        one.begin(about())
+        store = ring(where)
+        record(store)
+        store.begin(about())
     finally:
         os.umask(before)
     assert where.stat().st_mode & 0o777 == OPEN_DIRECTORY_MODE == 0o755
@@ -128,9 +128,9 @@ def test_recording_works_in_a_directory_of_another_user(
     if child == 0:
         try:
             os.setresuid(65534, 65534, 65534)
-            one = ring(Path())
-            record(one)
-            one.close()
+            store = ring(Path())
+            record(store)
+            store.close()
         finally:
             os._exit(0)
     os.waitpid(child, 0)
@@ -141,14 +141,14 @@ def test_recording_works_in_a_directory_of_another_user(
 def test_beyond_the_limit_in_bytes_the_oldest_files_go_first_and_protected_ones_last(
     tmp_path: Path,
 ) -> None:
-    one = ring(tmp_path)
-    kept = record(one, 400_000, kind="kept")
-    first = record(one, 400_000)
+    store = ring(tmp_path)
+    incident = record(store, 400_000, kind="kept")
+    first = record(store, 400_000)
     for _ in range(40):
-        record(one, 400_000)
-        one.trim(None)
+        record(store, 400_000)
+        store.trim(None)
         assert sizes(tmp_path) <= 10e6
-    assert kept.exists()
+    assert incident.exists()
     assert not first.exists()
     assert len(listed(tmp_path)) > 20
 
@@ -159,11 +159,11 @@ def test_the_time_to_make_room_is_proportional_to_the_number_of_files(tmp_path: 
 
     def seconds(count: int, turn: int) -> float:
         where = tmp_path / f"{count}-{turn}"
-        one = ring(where, 1e-3)
+        store = ring(where, 1e-3)
         for number in range(count):
             os.link(first, where / f"{number:06}-20270115T080000Z.mcap")
         began = time.process_time()
-        one.trim(None)
+        store.trim(None)
         took = time.process_time() - began
         assert listed(where) == []
         return took
@@ -174,10 +174,10 @@ def test_the_time_to_make_room_is_proportional_to_the_number_of_files(tmp_path: 
 
 @pytest.mark.slow
 def test_protected_files_count_for_the_limit_in_bytes(tmp_path: Path) -> None:
-    one = ring(tmp_path)
+    store = ring(tmp_path)
     for _ in range(30):
-        newest = record(one, 400_000, kind="kept")
-    one.trim(None)
+        newest = record(store, 400_000, kind="kept")
+    store.trim(None)
     assert sizes(tmp_path) <= 10e6
     assert newest.exists()
 
@@ -186,13 +186,13 @@ def test_protected_files_count_for_the_limit_in_bytes(tmp_path: Path) -> None:
 def test_old_files_go_except_the_last_fifty_with_an_incident(
     tmp_path: Path,
 ) -> None:
-    one = ring(tmp_path, days=2.0)
-    kept = [record(one, kind="kept", days=3) for _ in range(MAX_KEPT_FILES + 3)]
-    fresh = record(one, kind="kept", days=1)
-    old, new = record(one, days=3), record(one, days=1)
-    one.close()
+    store = ring(tmp_path, days=2.0)
+    incidents = [record(store, kind="kept", days=3) for _ in range(MAX_KEPT_FILES + 3)]
+    fresh = record(store, kind="kept", days=1)
+    old, new = record(store, days=3), record(store, days=1)
+    store.close()
     later(ring(tmp_path, days=2.0))
-    assert [path.exists() for path in kept] == [False] * 4 + [True] * (MAX_KEPT_FILES - 1)
+    assert [path.exists() for path in incidents] == [False] * 4 + [True] * (MAX_KEPT_FILES - 1)
     assert [path.exists() for path in (fresh, old, new)] == [True, False, True]
 
 
@@ -202,28 +202,28 @@ def test_no_file_of_this_run_is_too_old_and_a_clock_that_was_just_set_is_not_tru
     before = ring(tmp_path, days=2.0)
     old = record(before, days=3)
     before.close()
-    one = ring(tmp_path, days=2.0)
-    mine = record(one, days=3)
+    store = ring(tmp_path, days=2.0)
+    mine = record(store, days=3)
     for mono_ns, jump_ns in ((0, 0), (STEADY_CLOCK_NS - 1, 0), (STEADY_CLOCK_NS, 400 * DAY_NS)):
         now = Instant(mono_ns, NOW_NS + mono_ns + jump_ns)
-        one.maintain(now)
-        one.trim(now)
+        store.maintain(now)
+        store.trim(now)
         assert old.exists()
     for mono_ns in (STEADY_CLOCK_NS + 1, 2 * STEADY_CLOCK_NS + 1):
         now = Instant(mono_ns, NOW_NS + mono_ns)
-        one.maintain(now)
-        one.trim(now)
+        store.maintain(now)
+        store.trim(now)
     assert (old.exists(), mine.exists()) == (False, True)
 
 
 def test_a_jump_of_the_clock_does_not_make_earlier_files_older(tmp_path: Path) -> None:
-    one = ring(tmp_path, days=2.0)
-    mine = record(one)
+    store = ring(tmp_path, days=2.0)
+    mine = record(store)
     ended_ns = mine.stat().st_mtime_ns
-    one.maintain(Instant(0, NOW_NS))
-    one.maintain(Instant(NS_PER_S, NOW_NS + NS_PER_S + 20 * DAY_NS))
+    store.maintain(Instant(0, NOW_NS))
+    store.maintain(Instant(NS_PER_S, NOW_NS + NS_PER_S + 20 * DAY_NS))
     assert mine.stat().st_mtime_ns == ended_ns + 20 * DAY_NS
-    one.close()
+    store.close()
     again = ring(tmp_path, days=2.0)
     for mono_ns in (0, STEADY_CLOCK_NS):
         now = Instant(mono_ns, NOW_NS + 21 * DAY_NS + mono_ns)
@@ -235,9 +235,9 @@ def test_a_jump_of_the_clock_does_not_make_earlier_files_older(tmp_path: Path) -
 def test_if_other_programs_fill_the_disk_the_oldest_files_go_and_protected_ones_stay(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    one = ring(tmp_path)
-    kept = record(one, 100_000, kind="kept")
-    plain = [record(one, 100_000) for _ in range(10)]
+    store = ring(tmp_path)
+    incident = record(store, 100_000, kind="kept")
+    plain = [record(store, 100_000) for _ in range(10)]
     total, others = 10_000_000, 0
     real = os.statvfs(tmp_path)
 
@@ -246,51 +246,51 @@ def test_if_other_programs_fill_the_disk_the_oldest_files_go_and_protected_ones_
         return os.statvfs_result((1000, 1000, total // 1000, free, free, *real[5:]))
 
     monkeypatch.setattr(os, "statvfs", told)
-    one.maintain(Instant(0, NOW_NS))
+    store.maintain(Instant(0, NOW_NS))
     assert all(path.exists() for path in plain)
     others = 8_500_000
-    one.maintain(Instant(1, NOW_NS + 1))
+    store.maintain(Instant(1, NOW_NS + 1))
     assert [path.exists() for path in plain] == [False] * 2 + [True] * 8
     left = []
     for _ in range(4):  # other programs repeatedly use all free space
         others = total - sizes(tmp_path)
-        one.maintain(Instant(2, NOW_NS + 2))
-        left.append((sum(path.exists() for path in plain), kept.exists()))
+        store.maintain(Instant(2, NOW_NS + 2))
+        left.append((sum(path.exists() for path in plain), incident.exists()))
     assert left == [(3, True), (1, True), (0, True), (0, False)]
 
 
 def test_the_current_file_and_files_of_other_programs_are_never_deleted(tmp_path: Path) -> None:
-    one = ring(tmp_path, days=0.01)
+    store = ring(tmp_path, days=0.01)
     (tmp_path / "notes.mcap").write_bytes(b"mine")
     (tmp_path / "notes-1.txt").write_bytes(b"mine")
-    writing = one.begin(about(0))
-    one.trim(None)
+    writing = store.begin(about(0))
+    store.trim(None)
     assert writing.path.exists()
     assert (tmp_path / "notes.mcap").exists()
     assert len(listed(tmp_path)) == 1
 
 
 def test_a_finished_file_can_be_retained_later(tmp_path: Path) -> None:
-    one = ring(tmp_path)
-    path = record(one)
-    one.retain(path)
+    store = ring(tmp_path)
+    path = record(store)
+    store.retain(path)
     (near,) = listed(tmp_path)
     assert near.name == path.name.replace(".mcap", NEAR_SUFFIX)
     for _ in range(2):
-        one.retain(near)
+        store.retain(near)
     assert listed(tmp_path) == [near]
 
 
 def test_a_file_that_a_crash_cut_is_finished_and_protected(tmp_path: Path) -> None:
-    one = ring(tmp_path)
-    writing = one.begin(about())
+    store = ring(tmp_path)
+    writing = store.begin(about())
     writing.add("steps", NOW_NS, b"whole")
     writing.flush()
     with writing.path.open("ab") as file:
         file.write(b"\x06torn")
-    empty = one.begin(about())
+    empty = store.begin(about())
     empty.path.write_bytes(b"\x89MC")
-    one.close()
+    store.close()
     again = ring(tmp_path)
     (path,) = listed(tmp_path)
     assert path.name.endswith(KEPT_SUFFIX)
@@ -307,15 +307,15 @@ def test_a_file_that_a_crash_cut_is_finished_and_protected(tmp_path: Path) -> No
 def test_a_crash_retains_the_minute_before_it_but_not_all_files_if_the_clock_was_behind(
     tmp_path: Path, behind_ns: int, retained: bool
 ) -> None:
-    one = ring(tmp_path)
+    store = ring(tmp_path)
     for _ in range(3):
-        record(one)
-    writing = one.begin(about(NOW_NS - behind_ns))
+        record(store)
+    writing = store.begin(about(NOW_NS - behind_ns))
     writing.add("steps", NOW_NS - behind_ns, b"whole")
     writing.flush()
     writing.close()
     os.utime(writing.path, ns=(0, NOW_NS - behind_ns))
-    one.close()
+    store.close()
     again = ring(tmp_path)
     *earlier, cut = listed(tmp_path)
     assert [path.name.endswith(NEAR_SUFFIX) for path in earlier] == [retained] * 3
@@ -324,12 +324,12 @@ def test_a_crash_retains_the_minute_before_it_but_not_all_files_if_the_clock_was
 
 
 def test_a_file_that_a_disk_error_cut_is_finished_and_keeps_its_class(tmp_path: Path) -> None:
-    one = ring(tmp_path)
-    writing = one.begin(about())
+    store = ring(tmp_path)
+    writing = store.begin(about())
     writing.add("steps", NOW_NS, b"whole")
     writing.flush()
     writing.close()
-    one.close()
+    store.close()
     RecordingDirectory(RecordConfig(str(tmp_path)), Run(cut={writing.path.name: "plain"}))
     (path,) = listed(tmp_path)
     assert path.name == writing.path.name.removesuffix(".part")
@@ -339,13 +339,13 @@ def test_a_file_that_a_disk_error_cut_is_finished_and_keeps_its_class(tmp_path: 
 
 
 def test_two_daemons_cannot_record_to_the_same_directory(tmp_path: Path) -> None:
-    one = ring(tmp_path)
-    writing = one.begin(about())
+    store = ring(tmp_path)
+    writing = store.begin(about())
     with pytest.raises(OSError, match="another daemon records into this directory"):
         ring(tmp_path)
     assert writing.path.name.endswith(PART_SUFFIX)
     assert writing.path.exists()
-    one.close()
+    store.close()
     ring(tmp_path).close()
 
 
@@ -378,13 +378,13 @@ def test_a_cut_file_that_this_version_cannot_read_stays_and_is_reported(
     writing.flush()
     writing.close()
     before = part.read_bytes()
-    one = RecordingDirectory(RecordConfig(str(tmp_path)))
+    store = RecordingDirectory(RecordConfig(str(tmp_path)))
     (path,) = listed(tmp_path)
     assert path.read_bytes() == before
     assert path.name.endswith(KEPT_SUFFIX)
-    (said,) = one.messages
-    assert path.name in said
-    assert ("acsard/99" if not event else "an event that cannot be read") in said
+    (message,) = store.messages
+    assert path.name in message
+    assert ("acsard/99" if not event else "an event that cannot be read") in message
 
 
 def test_a_disk_error_does_not_keep_the_directory_locked(
@@ -395,7 +395,7 @@ def test_a_disk_error_does_not_keep_the_directory_locked(
     monkeypatch.setenv(RECORD_VARIABLE, str(where))
     with monkeypatch.context() as failing:
 
-        def fails(one: RecordingDirectory) -> None:
+        def fails(store: RecordingDirectory) -> None:
             raise OSError(5, "Input/output error")
 
         failing.setattr(RecordingDirectory, "_open_files", fails)
@@ -416,12 +416,12 @@ def test_a_recording_that_could_not_be_deleted_does_not_count_as_freed(
     def refuse(path: Path) -> None:
         raise PermissionError(str(path))
 
-    one = ring(tmp_path)
-    record(one, 2 * MIN_FILE_BYTES)
+    store = ring(tmp_path)
+    record(store, 2 * MIN_FILE_BYTES)
     with monkeypatch.context() as patch:
         patch.setattr(Path, "unlink", refuse)
-        one.trim(None, refused=True)
-    one.trim(None, refused=True)
+        store.trim(None, refused=True)
+    store.trim(None, refused=True)
     assert not listed(tmp_path)
 
 
@@ -441,17 +441,17 @@ def test_a_file_that_another_process_removes_meanwhile_does_no_harm(
 
     removed = list[Path]()
     monkeypatch.setattr(directory, "listed", found)
-    one = ring(tmp_path)
-    first, second = record(one), record(one)
+    store = ring(tmp_path)
+    first, second = record(store), record(store)
     removed = [first]
-    one.trim(None)
-    one.maintain(Instant(0, NOW_NS))
+    store.trim(None)
+    store.maintain(Instant(0, NOW_NS))
     removed = [second]
-    one.maintain(Instant(1, NOW_NS + DAY_NS))
-    third, part = record(one), one.begin(about())
+    store.maintain(Instant(1, NOW_NS + DAY_NS))
+    third, part = record(store), store.begin(about())
     part.add("steps", NOW_NS, b"cut")
     part.flush()
-    one.close()
+    store.close()
     monkeypatch.setattr(
         RecordingDirectory, "trim", lambda *_: None
     )  # the trim would find the third file first

@@ -93,18 +93,18 @@ def test_the_mcap_library_finds_the_export_finished_indexed_and_compressed(
         assert summary is not None
         assert summary.statistics is not None
         assert summary.statistics.message_count == done.count > 500
-        assert {one.topic for one in summary.channels.values()} == TOPICS
-        assert {one.compression for one in summary.chunk_indexes} == {"zstd"}
-        kinds = {one.name: one.encoding for one in summary.schemas.values()}
-        assert kinds == {one.schema_name: "ros2msg" for one in CHANNELS}
+        assert {record.topic for record in summary.channels.values()} == TOPICS
+        assert {record.compression for record in summary.chunk_indexes} == {"zstd"}
+        kinds = {record.name: record.encoding for record in summary.schemas.values()}
+        assert kinds == {record.schema_name: "ros2msg" for record in CHANNELS}
         first, last = (
             (t - START.wall_ns) / 1e9
             for t in (summary.statistics.message_start_time, summary.statistics.message_end_time)
         )
         assert first == pytest.approx(0.0)
         assert last == pytest.approx(SECONDS, abs=0.1)
-        odom = [one for _, _, one in reader.iter_messages("/odom")]
-    assert [one.sequence for one in odom] == [*range(1, len(odom) + 1)]
+        odom = [record for _, _, record in reader.iter_messages("/odom")]
+    assert [record.sequence for record in odom] == [*range(1, len(odom) + 1)]
     assert done.gaps == []
 
 
@@ -124,7 +124,7 @@ def test_rosbags_reads_every_message_with_the_definitions_in_the_file(
     path: Path, tmp_path: Path
 ) -> None:
     recording = Recording(path)
-    one = export(recording, tmp_path / "one.mcap", "mcap")
+    result = export(recording, tmp_path / "one.mcap", "mcap")
     other = export(recording, tmp_path / "bag", "rosbag2")
     alone, bag = (
         counted(AnyReader([tmp_path / name], default_typestore=get_typestore(Stores.EMPTY)))
@@ -132,20 +132,20 @@ def test_rosbags_reads_every_message_with_the_definitions_in_the_file(
     )
     assert alone == bag
     assert set(bag) == TOPICS
-    assert bag.total() == one.count == other.count
+    assert bag.total() == result.count == other.count
 
 
 @pytest.mark.slow
 def test_a_bag_is_a_directory_whose_metadata_match_its_file(path: Path, tmp_path: Path) -> None:
     export(Recording(path), tmp_path / "bag", "rosbag2")
-    assert {one.name for one in (tmp_path / "bag").iterdir()} == {"bag_0.mcap", "metadata.yaml"}
+    assert {entry.name for entry in (tmp_path / "bag").iterdir()} == {"bag_0.mcap", "metadata.yaml"}
     with Reader(tmp_path / "bag") as reader:
         times = [time for _, time, _ in reader.messages()]
         assert reader.message_count == len(times)
         assert (reader.start_time, reader.end_time - 1) == (min(times), max(times))
         latched = {
-            one.topic: one.ext.offered_qos_profiles[0].durability.name  # type: ignore[union-attr]
-            for one in reader.connections
+            entry.topic: entry.ext.offered_qos_profiles[0].durability.name  # type: ignore[union-attr]
+            for entry in reader.connections
         }
     assert latched.pop("/tf_static") == "TRANSIENT_LOCAL"
     assert set(latched.values()) == {"VOLATILE"}
@@ -157,7 +157,9 @@ def test_every_topic_begins_with_the_namespace(path: Path, tmp_path: Path) -> No
     with (tmp_path / "new.mcap").open("rb") as stream:
         summary = make_reader(stream).get_summary()
     assert summary is not None
-    assert {one.topic for one in summary.channels.values()} == {f"/robot1{one}" for one in TOPICS}
+    assert {entry.topic for entry in summary.channels.values()} == {
+        f"/robot1{entry}" for entry in TOPICS
+    }
 
 
 def test_only_messages_of_the_time_span_are_written(path: Path, tmp_path: Path) -> None:
@@ -230,8 +232,8 @@ def test_a_link_to_a_bag_is_replaced_and_the_bag_stays(path: Path, tmp_path: Pat
     link.symlink_to(bag)
     export(Recording(path), link, "rosbag2", force=True)
     assert not link.is_symlink()
-    assert {one.name for one in bag.iterdir()} == {"bag_0.mcap", "metadata.yaml"}
-    assert {one.name for one in tmp_path.iterdir()} == {"bag", "link"}
+    assert {entry.name for entry in bag.iterdir()} == {"bag_0.mcap", "metadata.yaml"}
+    assert {entry.name for entry in tmp_path.iterdir()} == {"bag", "link"}
 
 
 def test_a_bag_stays_until_the_new_one_can_take_its_place(tmp_path: Path) -> None:
@@ -241,7 +243,7 @@ def test_a_bag_stays_until_the_new_one_can_take_its_place(tmp_path: Path) -> Non
         (bag / name).write_text("1")
     with pytest.raises(FileNotFoundError), replacing(bag, force=True):
         pass  # the block writes no file that could replace it
-    assert {one.name for one in bag.iterdir()} == {"metadata.yaml", "bag_0.db3"}
+    assert {entry.name for entry in bag.iterdir()} == {"metadata.yaml", "bag_0.db3"}
     assert [*tmp_path.iterdir()] == [bag]
 
 
@@ -374,10 +376,10 @@ def test_an_export_of_a_damaged_file_writes_messages_or_says_why_not(
 
 
 def test_an_export_reports_its_progress(path: Path, tmp_path: Path) -> None:
-    told: list[int] = []
-    export(Recording(path), tmp_path / "new.csv", "csv", progress=told.append)
-    assert told[0] >= START.wall_ns
-    assert told == sorted(told)
+    times: list[int] = []
+    export(Recording(path), tmp_path / "new.csv", "csv", progress=times.append)
+    assert times[0] >= START.wall_ns
+    assert times == sorted(times)
 
 
 def test_calibration_refuses_a_recording_without_a_gyro(path: Path) -> None:
@@ -446,7 +448,7 @@ def test_the_table_has_a_row_for_each_feedback_line_and_each_gyro_sample(tape: T
     for step in tape.steps():
         lines += csv_rows(step, replay_step(robot, step))
     estimates = [e for t in tape.taken for e in t.outputs.estimates]
-    reports = [one for t in tape.taken for one in t.inputs.gyro]
+    reports = [sample for t in tape.taken for sample in t.inputs.gyro]
     cells = [line.split(",") for line in lines]
     assert {len(row) for row in cells} == {len(CSV_HEADER.split(","))}
     assert len(estimates) == sum(row[1] != "" for row in cells) > 100
@@ -497,10 +499,10 @@ def loaded(text: str) -> Any:
 def test_qos_policies_are_written_as_the_numbers_of_rmw(
     qos: Qos, depth: int, reliability: int, durability: int
 ) -> None:
-    (said,) = loaded(offered_qos(qos))
-    assert (said["history"], said["depth"]) == (1, depth)
-    assert (said["reliability"], said["durability"]) == (reliability, durability)
-    assert said["avoid_ros_namespace_conventions"] is False
+    (profile,) = loaded(offered_qos(qos))
+    assert (profile["history"], profile["depth"]) == (1, depth)
+    assert (profile["reliability"], profile["durability"]) == (reliability, durability)
+    assert profile["avoid_ros_namespace_conventions"] is False
 
 
 def test_topics_are_written_whatever_their_names() -> None:
@@ -508,18 +510,18 @@ def test_topics_are_written_whatever_their_names() -> None:
         BagTopic("/odom", "nav_msgs/msg/Odometry", Qos(), 7),
         BagTopic("/cmd_vel_in/off", "geometry_msgs/msg/TwistStamped", Qos(), 2),
     ]
-    said = loaded(bag_metadata("yes: no #.mcap", topics, 5, 25))["rosbag2_bagfile_information"]
-    assert said["relative_file_paths"] == ["yes: no #.mcap"]
-    assert said["message_count"] == 9
-    assert said["starting_time"] == {"nanoseconds_since_epoch": 5}
-    assert said["duration"] == {"nanoseconds": 20}
-    assert said["files"][0] == {
+    metadata = loaded(bag_metadata("yes: no #.mcap", topics, 5, 25))["rosbag2_bagfile_information"]
+    assert metadata["relative_file_paths"] == ["yes: no #.mcap"]
+    assert metadata["message_count"] == 9
+    assert metadata["starting_time"] == {"nanoseconds_since_epoch": 5}
+    assert metadata["duration"] == {"nanoseconds": 20}
+    assert metadata["files"][0] == {
         "path": "yes: no #.mcap",
         "starting_time": {"nanoseconds_since_epoch": 5},
         "duration": {"nanoseconds": 20},
         "message_count": 9,
     }
-    names = [one["topic_metadata"]["name"] for one in said["topics_with_message_count"]]
+    names = [topic["topic_metadata"]["name"] for topic in metadata["topics_with_message_count"]]
     assert names == ["/odom", "/cmd_vel_in/off"]
-    first = said["topics_with_message_count"][0]
+    first = metadata["topics_with_message_count"][0]
     assert loaded(first["topic_metadata"]["offered_qos_profiles"]) == loaded(offered_qos(Qos()))

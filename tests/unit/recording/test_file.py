@@ -58,7 +58,7 @@ def numbers(path: Path) -> list[int]:
 def test_all_recorded_data_is_read_back(tape: Tape, whole: Path) -> None:
     recording = Recording(whole)
     read = list(steps(recording))
-    assert [step.inputs for step in read] == [taken.inputs for taken in tape.taken]
+    assert [step.inputs for step in read] == [entry.inputs for entry in tape.taken]
     assert [step.recorded.status for step in read] == [status_of(t.outputs) for t in tape.taken]
     assert (recording.is_intact, recording.damaged) == (True, 0)
     assert config_of(recording) == Config()
@@ -71,13 +71,13 @@ def test_the_mcap_library_reads_a_recording(tape: Tape, whole: Path) -> None:
         summary = reader.get_summary()
         assert summary is not None
         assert summary.statistics is not None
-        got = [channel.topic for _, channel, _ in reader.iter_messages()]
+        topics = [channel.topic for _, channel, _ in reader.iter_messages()]
         config, copy = list(reader.iter_attachments())
         (about, about_copy) = [r for r in reader.iter_metadata() if r.name == "acsard"]
         (how_to_read,) = [r for r in reader.iter_metadata() if r.name == HOW_TO_READ.name]
         contents = {c.topic: c.metadata["content"] for c in summary.channels.values()}
-    assert got.count("steps") == -(-len(tape.taken) // BATCH)
-    assert summary.statistics.message_count == len(got)
+    assert topics.count("steps") == -(-len(tape.taken) // BATCH)
+    assert summary.statistics.message_count == len(topics)
     assert config.name == "acsard.toml"
     assert (config, about) == (copy, about_copy)
     assert "acsard recording export" in how_to_read.metadata["export"]
@@ -91,16 +91,16 @@ def on_a_machine(tape: Tape) -> None:
     A step is some tens of µs late, and each read is some µs older than its step.
     """
     dice = random.Random(1)
-    for at, taken in enumerate(tape.taken):
+    for at, step in enumerate(tape.taken):
         late = 1000 * round(dice.expovariate(1 / 30))
-        mono, wall = taken.inputs.now.mono_ns + late, taken.inputs.now.wall_ns + late
+        mono, wall = step.inputs.now.mono_ns + late, step.inputs.now.wall_ns + late
         now = Instant(mono, wall + 1000 * dice.randint(0, 1))
         reads = tuple(
             replace(read, at=Instant(mono - age, wall - age))
-            for read in taken.inputs.received
+            for read in step.inputs.received
             if (age := 1000 * dice.randint(5, 15))
         )
-        tape.taken[at] = taken._replace(inputs=replace(taken.inputs, now=now, received=reads))
+        tape.taken[at] = step._replace(inputs=replace(step.inputs, now=now, received=reads))
 
 
 @pytest.mark.slow
@@ -142,10 +142,10 @@ def test_every_complete_chunk_of_a_cut_file_is_read(whole: Path, tmp_path: Path,
         size = dice.randrange(first, len(data))
         tail = dice.choice([b"", bytes(512), dice.randbytes(64)])
         path.write_bytes(data[:size] + tail)
-        kept = sum(end <= size for _, end in ends)
-        got = numbers(path)
-        assert got == every[: len(got)]
-        assert len(got) >= kept * BATCH or got == every
+        count = sum(end <= size for _, end in ends)
+        indices = numbers(path)
+        assert indices == every[: len(indices)]
+        assert len(indices) >= count * BATCH or indices == every
 
 
 def test_every_second_that_was_synced_can_be_read_before_its_chunk_ends(
@@ -216,8 +216,10 @@ def test_a_chunk_covers_about_ten_seconds_and_a_jump_of_the_clock_ends_it(tmp_pa
         writing.flush()
     writing.finish()
     with path.open("rb") as stream:
-        found = [r for r in StreamReader(stream, emit_chunks=True).records if isinstance(r, Chunk)]
-    times = [(r.message_start_time // NS_PER_S, r.message_end_time // NS_PER_S) for r in found]
+        records = [
+            r for r in StreamReader(stream, emit_chunks=True).records if isinstance(r, Chunk)
+        ]
+    times = [(r.message_start_time // NS_PER_S, r.message_end_time // NS_PER_S) for r in records]
     assert times == [(0, 9), (10, 19), (20, 24), (1_000_000, 1_000_000), (3, 3)]
 
 
@@ -228,9 +230,11 @@ def test_a_chunk_has_at_most_about_a_mebibyte(tmp_path: Path) -> None:
         writing.add("steps", 5, bytes(100_000))
     writing.finish()
     with path.open("rb") as stream:
-        found = [r for r in StreamReader(stream, emit_chunks=True).records if isinstance(r, Chunk)]
-    assert len(found) == 4
-    assert max(chunk.uncompressed_size for chunk in found) < CHUNK_BYTES + 110_000
+        records = [
+            r for r in StreamReader(stream, emit_chunks=True).records if isinstance(r, Chunk)
+        ]
+    assert len(records) == 4
+    assert max(chunk.uncompressed_size for chunk in records) < CHUNK_BYTES + 110_000
 
 
 @pytest.mark.parametrize("cuts", [30, pytest.param(1000, marks=pytest.mark.slow)])
@@ -246,15 +250,15 @@ def test_a_file_that_was_cut_before_its_first_chunk_is_refused_with_a_message(
         path.write_bytes(data[:size] + tail)
         with pytest.raises(RecordingError) as refused:
             replay_file(Recording(path))
-        told = str(refused.value)
-        assert (str(path) in told, told.isprintable()) == (True, True)
+        text = str(refused.value)
+        assert (str(path) in text, text.isprintable()) == (True, True)
         if not tail:
             lacks = (
                 "has no readable steps"
                 if size >= config_end
                 else "the beginning of the file is missing"
             )
-            assert lacks in told
+            assert lacks in text
 
 
 @pytest.mark.parametrize("files", [15, pytest.param(200, marks=pytest.mark.slow)])
@@ -272,12 +276,12 @@ def test_all_undamaged_chunks_of_a_damaged_file_are_read(
         bad[at] ^= 1 << dice.randrange(8)
         path.write_bytes(bad)
         recording = Recording(path)
-        got = [step.number for step in steps(recording)]
-        assert recording.damaged == 1 or got == numbers(whole)  # the bit has no meaning
+        indices = [step.number for step in steps(recording)]
+        assert recording.damaged == 1 or indices == numbers(whole)  # the bit has no meaning
         assert recording.is_intact == (recording.damaged == 0)
         hits += recording.damaged
         assert recording.ended
-        assert set(range(max(numbers(whole)) + 1)) - set(got) <= set(
+        assert set(range(max(numbers(whole)) + 1)) - set(indices) <= set(
             range(hit * BATCH, (hit + 1) * BATCH)
         )
     assert files / 2 < hits < files
@@ -334,7 +338,7 @@ def test_the_beginnings_of_two_neighbouring_damaged_chunks_are_read(tmp_path: Pa
 @pytest.mark.slow
 def test_random_bytes_in_a_file_raise_only_recording_errors(whole: Path, tmp_path: Path) -> None:
     data, dice, path = whole.read_bytes(), random.Random(3), tmp_path / "random.mcap"
-    said: list[str] = []
+    errors: list[str] = []
     for _ in range(40):
         bad = bytearray(data)
         for _ in range(dice.randint(1, 20)):
@@ -343,9 +347,9 @@ def test_random_bytes_in_a_file_raise_only_recording_errors(whole: Path, tmp_pat
         try:
             replay_file(Recording(path))
         except RecordingError as error:
-            said.append(str(error))
-    assert said
-    assert all(str(path) in text for text in said)
+            errors.append(str(error))
+    assert errors
+    assert all(str(path) in text for text in errors)
 
 
 @pytest.mark.parametrize("data", [b"", b"\x89MCAP", b"hello" * 100])
@@ -408,19 +412,21 @@ def test_a_replay_without_a_later_state_ends_at_missing_steps_and_reports_them(
 
 def test_the_end_record_summarizes_the_recording(tape: Tape, whole: Path, tmp_path: Path) -> None:
     first, last = tape.taken[0].inputs.now, tape.taken[-1].inputs.now
-    said = read_end(whole)
-    assert said is not None
-    assert (said.wall_ns, said.said) == (
+    ending = read_end(whole)
+    assert ending is not None
+    assert (ending.wall_ns, ending.said) == (
         first.wall_ns,
         "start, 1 change of commander, 1 stop (stopped by unnamed (native))",
     )
-    assert 0 <= last.wall_ns - said.last_ns < 2e9
+    assert 0 <= last.wall_ns - ending.last_ns < 2e9
     cut, new = tmp_path / "cut.mcap", tmp_path / "new.mcap"
     cut.write_bytes(whole.read_bytes()[:-100])
     assert read_end(cut) is None
     rewrite(Recording(cut), new)
-    assert read_end(new) == replace(said, cut="open")
-    assert said == EndRecord(said.wall_ns, said.last_ns, said.said, earliest_ns=said.wall_ns)
+    assert read_end(new) == replace(ending, cut="open")
+    assert ending == EndRecord(
+        ending.wall_ns, ending.last_ns, ending.said, earliest_ns=ending.wall_ns
+    )
     rewrite(Recording(new), tmp_path / "again.mcap", "crash")
     assert read_end(tmp_path / "again.mcap") == read_end(new), "it was finished before"
     assert read_end(tmp_path / "none") is None

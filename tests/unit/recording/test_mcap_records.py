@@ -56,21 +56,21 @@ GROWS, ENDS, COMPLETE = grown(SECONDS)
 
 def test_a_growing_chunk_has_all_seconds_written_so_far() -> None:
     for number, end in enumerate(ENDS, start=1):
-        got = read_chunk(GROWS[:end], 0)
-        assert got is not None
-        assert got.messages == [message for second in SECONDS[:number] for message in second]
-        assert (got.end, got.complete) == (end, False)
+        result = read_chunk(GROWS[:end], 0)
+        assert result is not None
+        assert result.messages == [message for second in SECONDS[:number] for message in second]
+        assert (result.end, result.complete) == (end, False)
 
 
 @pytest.mark.parametrize("torn", [b"", bytes(700), DICE.randbytes(64)])
 def test_a_cut_at_any_byte_costs_only_its_second(torn: bytes) -> None:
     for cut in range(len(GROWING_HEAD), len(GROWS), 7):
         whole = sum(end <= cut for end in ENDS)
-        got = read_chunk(GROWS[:cut] + torn, 0)
-        assert got is not None
-        assert got.messages[: 3 * whole] == ALL[: 3 * whole]
-        assert got.messages == ALL[: len(got.messages)]
-        assert len(got.messages) <= 3 * (whole + 1)
+        result = read_chunk(GROWS[:cut] + torn, 0)
+        assert result is not None
+        assert result.messages[: 3 * whole] == ALL[: 3 * whole]
+        assert result.messages == ALL[: len(result.messages)]
+        assert len(result.messages) <= 3 * (whole + 1)
 
 
 def test_the_mcap_library_reads_a_complete_chunk_and_a_cut_chunk_that_was_ended() -> None:
@@ -78,9 +78,9 @@ def test_the_mcap_library_reads_a_complete_chunk_and_a_cut_chunk_that_was_ended(
     assert cut is not None
     ended = cut.head(GROWS) + GROWS[len(GROWING_HEAD) : cut.end] + LAST_BLOCK
     for data, messages in ((COMPLETE, ALL), (ended, ALL[:21])):
-        got = read_chunk(data, 0)
-        assert got is not None
-        assert (got.messages, got.end, got.complete) == (messages, len(data), True)
+        result = read_chunk(data, 0)
+        assert result is not None
+        assert (result.messages, result.end, result.complete) == (messages, len(data), True)
         chunk = Chunk.read(ReadDataStream(io.BytesIO(data[9:])))
         read = breakup_chunk(chunk, validate_crc=True)
         assert [Message(m.channel_id, m.log_time, m.data) for m in read] == messages  # type: ignore[attr-defined]
@@ -93,14 +93,14 @@ def test_damage_never_changes_a_message_and_damage_in_the_head_costs_no_message(
     for at in range(len(COMPLETE)):
         bad = bytearray(COMPLETE)
         bad[at] ^= 1 << DICE.randrange(8)
-        got = read_chunk(bytes(bad), 0)
+        result = read_chunk(bytes(bad), 0)
         if at < len(GROWING_HEAD):
-            assert got is None or got.messages == ALL
+            assert result is None or result.messages == ALL
             continue
-        assert got is not None
+        assert result is not None
         second = sum(end <= at for end in ENDS)
-        assert got.messages == ALL[: len(got.messages)]
-        assert len(got.messages) >= 3 * second
+        assert result.messages == ALL[: len(result.messages)]
+        assert len(result.messages) >= 3 * second
 
 
 def test_each_compression_name_may_belong_to_the_head_of_a_chunk() -> None:
@@ -118,9 +118,9 @@ def test_the_time_to_read_a_chunk_is_proportional_to_the_number_of_its_blocks() 
         parts.append(chunk.take())
     data += b"".join(parts)
     began = time.process_time()
-    got = read_chunk(data, 0)
-    assert got is not None
-    assert got.messages == [message] * 20_000
+    result = read_chunk(data, 0)
+    assert result is not None
+    assert result.messages == [message] * 20_000
     assert time.process_time() - began < 2.0
 
 
@@ -133,7 +133,7 @@ def test_the_time_to_read_chunks_that_claim_megabytes_is_proportional_to_their_n
     packed = zstandard.ZstdCompressor(compression_params=ZSTD_PARAMETERS).compress(inside)
     data = MAGIC + (GROWING_HEAD + packed[:-20]) * 1000
     began = time.process_time()
-    assert [found.messages for found in walk(data)] == [[]]
+    assert [result.messages for result in walk(data)] == [[]]
     assert time.process_time() - began < 3.0
 
 
@@ -171,9 +171,9 @@ def test_a_few_bytes_that_claim_gigabytes_get_no_memory(first: bytes) -> None:
     """The first byte of a message is its type. The next eight bytes are its length."""
     data = GROWING_HEAD + FRAME_HEAD + raw(first) + REPEATED * 30_000
     began = time.process_time()
-    got = read_chunk(data, 0)
-    assert got is not None
-    assert (got.messages, got.complete) == ([], False)
+    result = read_chunk(data, 0)
+    assert result is not None
+    assert (result.messages, result.complete) == ([], False)
     assert time.process_time() - began < 0.5
 
 
@@ -188,10 +188,10 @@ NEXT = GROWING_HEAD[:1] + struct.pack("<Q", EACH - 9) + GROWING_HEAD[9:]
 def test_the_time_to_read_chunks_that_share_their_end_is_limited(tail: bytes, head: bytes) -> None:
     data = with_a_shared_tail(1000, tail, head)
     began = time.process_time()
-    found = list(walk(data))
+    results = list(walk(data))
     assert time.process_time() - began < 1.0
-    assert (found[-1].end, found[-1].damaged) == (len(data), True)
-    assert not any(one.messages for one in found)
+    assert (results[-1].end, results[-1].damaged) == (len(data), True)
+    assert not any(result.messages for result in results)
 
 
 def test_the_beginnings_of_damaged_chunks_and_the_complete_chunk_after_them_are_read() -> None:
@@ -199,5 +199,5 @@ def test_the_beginnings_of_damaged_chunks_and_the_complete_chunk_after_them_are_
     bad[ENDS[4] + 3 :] = b"\xff" * (len(bad) - ENDS[4] - 3)
     *damaged, last = walk(MAGIC + bytes(bad) * 200 + COMPLETE)
     assert last.messages == ALL
-    assert [one.messages for one in damaged] == [ALL[:15]] * 200
-    assert all(one.damaged for one in damaged)
+    assert [result.messages for result in damaged] == [ALL[:15]] * 200
+    assert all(result.damaged for result in damaged)

@@ -25,7 +25,7 @@ def said(tape: Tape, config: Config) -> list[Published]:
 
 
 def names(published: list[Published]) -> set[str]:
-    return {one.channel.name for one in published}
+    return {message.channel.name for message in published}
 
 
 def driven() -> Tape:
@@ -49,21 +49,25 @@ def test_other_parameters_change_the_pose_but_not_the_received_commands() -> Non
     tape, config = driven(), Config()
     wider = replace(config, drive=replace(config.drive, wheel_separation=0.6))
     then, now = said(tape, config), said(tape, wider)
-    (last, other) = ([m for m in one if m.channel.name == "odom"][-1] for one in (then, now))
+    (last, other) = (
+        [m for m in messages if m.channel.name == "odom"][-1] for messages in (then, now)
+    )
     turned, less = (m.message.pose.pose.orientation.z for m in (last, other))
     assert 0.3 < less / turned < 0.7
-    heard = [[m for m in one if m.channel.name.startswith("cmd_vel_in")] for one in (then, now)]
-    assert heard[0] == heard[1] != []
+    commands = [
+        [m for m in messages if m.channel.name.startswith("cmd_vel_in")] for messages in (then, now)
+    ]
+    assert commands[0] == commands[1] != []
 
 
 def test_odometry_is_published_after_its_sample_and_a_command_at_its_arrival() -> None:
     published = said(driven(), Config())
     odom = [m for m in published if m.channel.name == "odom"]
     assert all(m.message.header.stamp.to_ns() <= m.wall_ns for m in odom)
-    went = [m.wall_ns for m in odom]
-    assert went == sorted(went)
-    heard = [m for m in published if m.source == "app"]
-    assert all(m.message.header.stamp.to_ns() == m.wall_ns for m in heard)
+    times = [m.wall_ns for m in odom]
+    assert times == sorted(times)
+    commands = [m for m in published if m.source == "app"]
+    assert all(m.message.header.stamp.to_ns() == m.wall_ns for m in commands)
 
 
 def test_values_that_a_recording_lacks_are_not_published() -> None:
@@ -74,7 +78,7 @@ def test_values_that_a_recording_lacks_are_not_published() -> None:
     assert rows
     assert not rows & MEASURED_ROWS
     states = [m.message for m in published if m.channel.name == "state"]
-    assert all(one.latencies == {} and one.certificate_expiry == "" for one in states)
+    assert all(state.latencies == {} and state.certificate_expiry == "" for state in states)
 
 
 @pytest.mark.slow

@@ -20,7 +20,7 @@ from tests.scenarios.world import World
 def estimates() -> list[Estimate]:
     tape = Tape()
     World(recorder=tape).drive(0.5, 0.2, seconds=0.5)
-    return [estimate for taken in tape.taken for estimate in taken.outputs.estimates]
+    return [estimate for step in tape.taken for estimate in step.outputs.estimates]
 
 
 def test_poses_are_rounded_to_millionths() -> None:
@@ -43,10 +43,10 @@ def test_the_inputs_of_an_unfinished_step_are_read_back() -> None:
     tape, world = recorded_world()
     world.drive(0.5, 0.2, seconds=0.5)
     world.call("stop")
-    for number, taken in enumerate(tape.taken):
-        step = Unfinished(number, taken.inputs)
+    for number, entry in enumerate(tape.taken):
+        step = Unfinished(number, entry.inputs)
         assert unfinished(step.encode()) == step
-    for data in (b"", b"none", Unfinished(1, taken.inputs).encode()[:-1]):
+    for data in (b"", b"none", Unfinished(1, entry.inputs).encode()[:-1]):
         with pytest.raises(
             UnfinishedError, match="the step in which the daemon failed cannot be read"
         ):

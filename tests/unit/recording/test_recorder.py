@@ -145,8 +145,8 @@ def test_if_the_queue_is_full_steps_are_lost_and_counted_and_the_loop_never_wait
     assert missing > 100
     before, after = bench.end()
     works = f"the daemon records to {bench.where}"
-    told = [event.text for event in bench.said if event.text != works]
-    assert told == [
+    texts = [event.text for event in bench.said if event.text != works]
+    assert texts == [
         "the disk is too slow, so steps are missing in the recording",
         f"the disk is fast enough again; {missing} steps are missing in the recording",
     ]
@@ -304,13 +304,13 @@ def test_the_minute_before_and_after_an_incident_is_retained(
     ended_s = bench.world.now_ns / 1e9
     rest(14.0)
     paths = bench.end()
-    kept = [not path.name.endswith("Z.mcap") for path in paths]
+    flags = [not path.name.endswith("Z.mcap") for path in paths]
     began = [Recording(path).about.mono_ns / 1e9 for path in paths]
     spans = list(zip(began, [*began[1:], bench.world.now_ns / 1e9], strict=True))
     close = [s < began_s + minute - 0.5 and e > ended_s - minute + 0.5 for s, e in spans]
     near = [s < ended_s + minute + 2 and e > began_s - minute - 2 for s, e in spans]
     assert 2 <= sum(close) <= sum(near) <= len(paths) - 2, (close, near)
-    for has, must, may in zip(kept, close, near, strict=True):
+    for has, must, may in zip(flags, close, near, strict=True):
         assert must <= has <= may
 
 
@@ -341,8 +341,8 @@ def test_the_minute_before_and_after_a_crash_is_retained(
     again = Bench(tmp_path, monkeypatch)
     again.world.run(1.0)
     again.write()
-    kept = [not path.name.endswith("Z.mcap") for path in again.end()]
-    assert kept == [False] * (len(before) - 1) + [True, True, after_s < 60]
+    flags = [not path.name.endswith("Z.mcap") for path in again.end()]
+    assert flags == [False] * (len(before) - 1) + [True, True, after_s < 60]
 
 
 @pytest.mark.parametrize("fault_before", [True, False])
@@ -431,7 +431,7 @@ def test_a_bug_of_the_daemon_is_recorded_with_the_inputs_of_the_failed_step(
     assert recording.unfinished is not None
     step = unfinished(recording.unfinished)
     assert step.number == number
-    assert [one.verb for one in step.inputs.requests] == ["stop"]
+    assert [request.verb for request in step.inputs.requests] == ["stop"]
     assert step.inputs.now.mono_ns <= bench.world.now_ns
     assert "does not fail in this version" in result.failed_step
     assert ("also fails in this version of acsard, with ZeroDivision" in ended) is (
@@ -448,9 +448,9 @@ def test_the_text_of_a_bug_is_shortened_and_printable(bench: Bench) -> None:
     (path,) = ends_by(bench, ValueError("\x1b[2J" + "x" * 1000))
     last = read_end(path)
     assert last is not None
-    told = ending_text(last.cut, last.why)
-    assert told.startswith("cut: an internal error ended the daemon: ValueError: ")
-    assert (told.isprintable(), len(told) < 300) == (True, True)
+    text = ending_text(last.cut, last.why)
+    assert text.startswith("cut: an internal error ended the daemon: ValueError: ")
+    assert (text.isprintable(), len(text) < 300) == (True, True)
 
 
 def test_a_bug_whose_text_cannot_be_produced_is_still_recorded(bench: Bench) -> None:
@@ -473,8 +473,8 @@ def test_inputs_that_cannot_be_encoded_are_left_out(bench: Bench) -> None:
     (path,) = ends_by(bench, OverflowError("a name that is none: \udc80"))
     last, recording = read_end(path), Recording(path)
     assert last is not None
-    told = f"in step {bench.world.steps}, OverflowError: a name that is none: "
-    assert (last.cut, last.why.startswith(told)) == ("bug", True)
+    prefix = f"in step {bench.world.steps}, OverflowError: a name that is none: "
+    assert (last.cut, last.why.startswith(prefix)) == ("bug", True)
     assert [topic for topic, _, _ in recording.messages()].count("unfinished") == 0
     assert (replay_file(recording).comparison.same, recording.is_intact) == (True, True)
 
@@ -505,9 +505,9 @@ def test_the_minute_before_a_bug_is_retained(bench: Bench, monkeypatch: pytest.M
     monkeypatch.setattr(step_writer, "MAX_FILE_NS", 2_000_000_000)
     bench.world.drive(0.5, 0.2, seconds=1.0)
     bench.drive(6.0)
-    told = cuts(ends_by(bench, ValueError(BUG)))
-    assert len(told) > 2
-    assert told == [("near.mcap", "")] * (len(told) - 1) + [("kept.mcap", "bug")]
+    endings = cuts(ends_by(bench, ValueError(BUG)))
+    assert len(endings) > 2
+    assert endings == [("near.mcap", "")] * (len(endings) - 1) + [("kept.mcap", "bug")]
 
 
 @pytest.mark.slow
@@ -521,7 +521,7 @@ def test_a_jump_of_the_clock_costs_no_recording(
     """
     monkeypatch.setattr(step_writer, "MAX_FILE_NS", 2_000_000_000)
     monkeypatch.setattr(retention, "INCIDENT_MARGIN_NS", 0)
-    seen = set[str]()
+    names = set[str]()
 
     def there() -> set[str]:
         return {path.name.partition(".")[0] for path in listed(tmp_path)}
@@ -532,10 +532,10 @@ def test_a_jump_of_the_clock_costs_no_recording(
         for days in (0, *jumps):
             bench.world.wall_offset_ns += days * 86_400 * 10**9
             bench.drive(6.0)
-            seen |= there()
+            names |= there()
         bench.end()
-    assert len(seen) > 6
-    assert seen <= there()
+    assert len(names) > 6
+    assert names <= there()
 
 
 @pytest.mark.slow
@@ -603,7 +603,7 @@ def files_of_at_most(size: int) -> Iterator[None]:
 
 
 @pytest.mark.parametrize(
-    ("happened", "error", "told"),
+    ("happened", "error", "ending"),
     [
         (False, None, ("mcap", "late")),
         (True, None, ("kept.mcap", "late")),
@@ -613,7 +613,7 @@ def files_of_at_most(size: int) -> Iterator[None]:
 def test_an_end_that_the_disk_was_too_slow_for_counts_as_a_crash_only_after_a_crash(
     happened: bool,
     error: Exception | None,
-    told: tuple[str, str],
+    ending: tuple[str, str],
     eager: Bench,
     tmp_path_factory: pytest.TempPathFactory,
     monkeypatch: pytest.MonkeyPatch,
@@ -640,7 +640,7 @@ def test_an_end_that_the_disk_was_too_slow_for_counts_as_a_crash_only_after_a_cr
     part.write_bytes(part.read_bytes()[:synced])
     again = Bench(where, monkeypatch)
     rounds(again)
-    assert cuts(again.end()) == [told, ("mcap", "")]
+    assert cuts(again.end()) == [ending, ("mcap", "")]
     assert not list(where.glob(".0*"))
 
 
@@ -709,8 +709,8 @@ def test_each_file_that_the_disk_cut_keeps_its_class_and_cause(
         patched.setattr(os, "fsync", no_copies)
         refuse(eager)
     refuse(eager)
-    told = [("kept.mcap", "disk"), ("near.mcap", "disk"), ("near.mcap", "")]
-    assert cuts(eager.end()) == told
+    endings = [("kept.mcap", "disk"), ("near.mcap", "disk"), ("near.mcap", "")]
+    assert cuts(eager.end()) == endings
 
 
 def test_a_file_whose_end_the_disk_refuses_has_the_cause_disk(
@@ -730,7 +730,7 @@ def test_a_file_whose_end_the_disk_refuses_has_the_cause_disk(
 
 
 @pytest.mark.parametrize(
-    ("happened", "error", "told"),
+    ("happened", "error", "ending"),
     [
         (False, None, ("mcap", "disk")),
         (True, None, ("kept.mcap", "disk")),
@@ -740,7 +740,7 @@ def test_a_file_whose_end_the_disk_refuses_has_the_cause_disk(
 def test_a_disk_that_refuses_the_end_does_not_look_like_a_crash_to_the_next_daemon(
     happened: bool,
     error: Exception | None,
-    told: tuple[str, str],
+    ending: tuple[str, str],
     eager: Bench,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -755,7 +755,7 @@ def test_a_disk_that_refuses_the_end_does_not_look_like_a_crash_to_the_next_daem
     part.write_bytes(part.read_bytes()[:synced])
     again = Bench(eager.where, monkeypatch)
     rounds(again)
-    assert cuts(again.end())[0] == told
+    assert cuts(again.end())[0] == ending
     assert not list(eager.where.glob(".0*"))
 
 
@@ -810,7 +810,9 @@ def test_a_file_that_cannot_be_finished_is_reported(
     bench.world.run(1.0)
     bench.write()
     bench.world.run(1.0)
-    assert ("warning", True) in [(one.level, path.name[:24] in one.text) for one in bench.said]
+    assert ("warning", True) in [
+        (event.level, path.name[:24] in event.text) for event in bench.said
+    ]
     assert len(bench.end()) == 2
 
 
@@ -835,10 +837,10 @@ def test_the_control_loop_only_appends_to_the_queue(
 ) -> None:
     """The loop runs a thousand steps while the recorder's thread waits for a sync."""
     asked, goes, sync = threading.Event(), threading.Event(), os.fsync
-    who = set[str]()
+    thread_names = set[str]()
 
     def hangs(handle: int) -> None:
-        who.add(name := threading.current_thread().name)
+        thread_names.add(name := threading.current_thread().name)
         asked.set()
         if name == "record":
             goes.wait(20.0)
@@ -849,16 +851,16 @@ def test_the_control_loop_only_appends_to_the_queue(
     monkeypatch.setattr(module, "CLOSE_S", 20.0)
     tape, world = recorded_world()
     world.drive(0.5, seconds=0.5)
-    taken = tape.taken[-1]
+    step = tape.taken[-1]
     recorder = Recorder(config(tmp_path), lambda event: None)
-    recorder.step(*taken, world.loop.robot, world.loop._guard)
+    recorder.step(*step, world.loop.robot, world.loop._guard)
     assert asked.wait(20.0)
     before = len(recorder._queue)
     for _ in range(1000):
-        recorder.step(*taken, world.loop.robot, world.loop._guard)
+        recorder.step(*step, world.loop.robot, world.loop._guard)
     hung = not goes.is_set()
-    assert (len(recorder._queue) - before, who, hung) == (1000, {"record"}, True)
-    assert recorder._queue[-1][0] is taken.inputs
+    assert (len(recorder._queue) - before, thread_names, hung) == (1000, {"record"}, True)
+    assert recorder._queue[-1][0] is step.inputs
     goes.set()
     recorder.close()
     assert len(numbers_of(listed(tmp_path))) == 1001
@@ -887,11 +889,11 @@ def test_recordings_and_exports_name_the_paths_of_keys_and_contain_no_secret(
     recording = Recording(path)
     export(recording, tmp_path / "new.mcap", "mcap")
     export(recording, tmp_path / "new.csv", "csv")
-    held = [path.read_bytes(), recording.about.config.encode()]
-    held += [data for _, _, data in recording.messages()]
-    held += [(tmp_path / name).read_bytes() for name in ("new.mcap", "new.csv")]
+    contents = [path.read_bytes(), recording.about.config.encode()]
+    contents += [data for _, _, data in recording.messages()]
+    contents += [(tmp_path / name).read_bytes() for name in ("new.mcap", "new.csv")]
     with (tmp_path / "new.mcap").open("rb") as stream:
-        held += [message.data for _, _, message in make_reader(stream).iter_messages()]
-    assert len(held) > 200
-    assert not [data for data in held if SECRET.encode() in data]
+        contents += [message.data for _, _, message in make_reader(stream).iter_messages()]
+    assert len(contents) > 200
+    assert not [data for data in contents if SECRET.encode() in data]
     assert str(certificates) in recording.about.config

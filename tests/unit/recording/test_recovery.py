@@ -49,8 +49,8 @@ def messages(path: Path) -> list[tuple[str, int, bytes]]:
 
 def read_by_the_library(path: Path) -> list[tuple[str, int, bytes]]:
     with path.open("rb") as stream:
-        found = make_reader(stream, validate_crcs=True).iter_messages(log_time_order=False)
-        return [(channel.topic, one.log_time, one.data) for _, channel, one in found]
+        records = make_reader(stream, validate_crcs=True).iter_messages(log_time_order=False)
+        return [(channel.topic, message.log_time, message.data) for _, channel, message in records]
 
 
 @pytest.mark.slow
@@ -95,9 +95,9 @@ def test_a_disk_that_refuses_the_end_costs_no_chunk_and_is_reported(
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(os, "fsync", full)
-    told = recover(part, whole, "crash", room=False)
+    text = recover(part, whole, "crash", room=False)
     assert whole.read_bytes() == cut
-    assert "a.mcap was cut off. Because the disk is full, the file gets no end record" in told
+    assert "a.mcap was cut off. Because the disk is full, the file gets no end record" in text
     assert (part.exists(), whole.stat().st_mtime) == (False, 1e9)
 
 
@@ -146,20 +146,20 @@ def test_a_torn_last_chunk_is_removed_and_a_damaged_chunk_between_others_stays(
 
 
 @pytest.mark.parametrize(
-    ("hit", "said"),
+    ("hit", "text"),
     [
         pytest.param([1], "1 damaged place is left out of a.mcap", id="one"),
         pytest.param([1, 3], "2 damaged places are left out of a.mcap", id="two"),
     ],
 )
 def test_damage_that_a_copy_leaves_out_is_reported(
-    data: bytes, hit: list[int], said: str, tmp_path: Path
+    data: bytes, hit: list[int], text: str, tmp_path: Path
 ) -> None:
     part, whole, bad = tmp_path / "a.part", tmp_path / "a.mcap", bytearray(data)
     for begin, end in [chunks(data)[number] for number in hit]:
         bad[begin + 80 : end] = b"\xff" * (end - begin - 80)
     part.write_bytes(bad[: chunks(data)[-1][1]])
-    assert recover(part, whole, "crash", room=True) == said
+    assert recover(part, whole, "crash", room=True) == text
 
 
 @pytest.mark.parametrize("room", [False, True])
@@ -195,9 +195,9 @@ def test_a_chunk_that_still_grew_keeps_all_its_seconds(
         size = dice.randrange(begin, len(growing)) if number else len(growing)
         part.write_bytes(growing[:size] + tail)
         before = messages(part)
-        said = recover(part, whole, "crash", room)
+        text = recover(part, whole, "crash", room)
         counts.add(len(before))
-        assert bool(before) != ("no intact data" in said)
+        assert bool(before) != ("no intact data" in text)
         if before:
             recording, last = Recording(whole), read_end(whole)
             assert list(recording.messages()) == before
@@ -283,7 +283,7 @@ def test_a_recovery_in_place_writes_the_statistics_and_the_index_of_a_finished_f
     assert recover(part, whole, "crash", room=False) == ""
     other = tmp_path / "c.mcap"
     assert recover(copy, other, "crash", room=True) == ""
-    found = []
+    results = []
     for path in (whole, other):
         with path.open("rb") as stream:
             reader = make_reader(stream)
@@ -296,13 +296,13 @@ def test_a_recovery_in_place_writes_the_statistics_and_the_index_of_a_finished_f
             counts = (summary.statistics.metadata_count, summary.statistics.attachment_count)
             assert counts == (len(named), len(attached))
             plain = replace(summary.statistics, chunk_count=0, metadata_count=0, attachment_count=0)
-            found.append((plain, named, attached))
-    assert found[0][0] == found[1][0]
-    assert found[0][0].message_count == len(messages(whole))
+            results.append((plain, named, attached))
+    assert results[0][0] == results[1][0]
+    assert results[0][0].message_count == len(messages(whole))
     how = HOW_TO_READ.name
     # The copy repeats its beginning at its end, for which a full disk may have no room.
-    assert found[0][1:] == ([how, "acsard", END_RECORD_NAME], ["acsard.toml"])
-    assert found[1][1:] == ([how, "acsard", "acsard", END_RECORD_NAME], ["acsard.toml"] * 2)
+    assert results[0][1:] == ([how, "acsard", END_RECORD_NAME], ["acsard.toml"])
+    assert results[1][1:] == ([how, "acsard", "acsard", END_RECORD_NAME], ["acsard.toml"] * 2)
 
 
 def test_a_recovery_in_place_holds_one_chunk_in_memory_and_not_the_unpacked_file(
@@ -326,11 +326,11 @@ def test_a_recovery_in_place_holds_one_chunk_in_memory_and_not_the_unpacked_file
 
 def test_an_empty_file_is_removed_and_an_unreadable_file_is_reported(tmp_path: Path) -> None:
     part, whole = tmp_path / "a.part", tmp_path / "a.mcap"
-    for content, told in ((b"", ""), (b"\x89MC", "its beginning is missing")):
+    for content, phrase in ((b"", ""), (b"\x89MC", "its beginning is missing")):
         part.write_bytes(content)
-        said = recover(part, whole, "crash", room=True)
-        assert told in said
-        assert bool(said) == bool(told)
+        text = recover(part, whole, "crash", room=True)
+        assert phrase in text
+        assert bool(text) == bool(phrase)
         assert list(tmp_path.iterdir()) == []
     part.write_bytes(b"\x89MC" + bytes(MAX_DELETED_BYTES))
     assert "cannot finish a recording" in recover(part, whole, "crash", room=True)

@@ -56,7 +56,9 @@ def test_near_files_are_protected_while_their_incident_is_protected() -> None:
     turns: list[Kind] = ["plain", "kept"]
     ended = files("near", "kept", "near", *turns * MAX_KEPT_FILES)
     old = Bounds(10**10, math.inf)
-    assert to_delete(ended, old, WIDE) == {one.name for one in ended if one.kind != "kept"} | {"2"}
+    assert to_delete(ended, old, WIDE) == {file.name for file in ended if file.kind != "kept"} | {
+        "2"
+    }
     assert {"1", "3"} & to_delete(ended[:-1], old, WIDE) == set()
 
 

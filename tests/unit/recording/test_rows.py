@@ -97,7 +97,7 @@ def test_every_field_of_the_inputs_is_recorded() -> None:
 @given(st.lists(INPUTS, min_size=1, max_size=6), st.integers(0, 1 << 40))
 def test_all_inputs_are_read_back(inputs: list[Inputs], first: int) -> None:
     outputs = Robot(Config()).step(Inputs(Instant(1, 2), True, True))
-    steps = decode(encode(first, [FinishedStep(one, outputs, b"other") for one in inputs]))
+    steps = decode(encode(first, [FinishedStep(item, outputs, b"other") for item in inputs]))
     assert [step.inputs for step in steps] == inputs
     assert [step.number for step in steps] == [first + n for n in range(len(inputs))]
     assert {step.recorded.sent for step in steps} == {b"other"}
@@ -114,12 +114,12 @@ def driven() -> list[FinishedStep]:
 def test_all_outputs_are_read_back() -> None:
     for at in range(0, len(driven()), 100):
         batch = driven()[at : at + 100]
-        for taken, step in zip(batch, decode(encode(at, batch)), strict=True):
-            said, outputs = step.recorded, taken.outputs
-            assert (said.line, said.sent) == (outputs.line, taken.sent)
-            assert said.status == status_of(outputs)
-            assert said.poses == tuple(map(micropose, outputs.estimates))
-            assert said.events == outputs.events
+        for original, step in zip(batch, decode(encode(at, batch)), strict=True):
+            record, outputs = step.recorded, original.outputs
+            assert (record.line, record.sent) == (outputs.line, original.sent)
+            assert record.status == status_of(outputs)
+            assert record.poses == tuple(map(micropose, outputs.estimates))
+            assert record.events == outputs.events
 
 
 def test_a_second_at_rest_takes_few_bytes() -> None:
@@ -133,7 +133,7 @@ def test_steps_with_equal_times_keep_their_order() -> None:
     tick, other = Inputs(Instant(5, 5), True, True), Inputs(Instant(5, 5), False, True)
     outputs = Robot(Config()).step(tick)
     for inputs in ([tick, other, other], [other, tick], [tick, other, tick, other]):
-        steps = decode(encode(0, [FinishedStep(one, outputs, None) for one in inputs]))
+        steps = decode(encode(0, [FinishedStep(item, outputs, None) for item in inputs]))
         assert [step.inputs for step in steps] == inputs
 
 

@@ -23,12 +23,12 @@ def test_a_second_above_the_largest_message_is_divided_and_read_back(tmp_path: P
     tape, dice, each = Tape(), random.Random(1), MAX_MESSAGE_BYTES // 40
     World(recorder=tape).run(0.5)
     items = [
-        taken._replace(
+        entry._replace(
             inputs=replace(
-                taken.inputs, received=(Received(taken.inputs.now, dice.randbytes(each)),)
+                entry.inputs, received=(Received(entry.inputs.now, dice.randbytes(each)),)
             )
         )
-        for taken in tape.taken[:50]
+        for entry in tape.taken[:50]
     ]
     assert len(items) < MAX_BATCH_STEPS
     config = replace(Config(), record=RecordConfig(str(tmp_path), 100.0))
@@ -39,6 +39,6 @@ def test_a_second_above_the_largest_message_is_divided_and_read_back(tmp_path: P
     (path,) = listed(tmp_path)
     read = list(steps(Recording(path)))
     assert [step.number for step in read] == list(range(len(tape.taken)))
-    assert [step.inputs.received for step in read[:50]] == [one.inputs.received for one in items]
+    assert [step.inputs.received for step in read[:50]] == [item.inputs.received for item in items]
     messages = [data for topic, _, data in Recording(path).messages() if topic == "steps"]
     assert len(messages) == 3

@@ -66,7 +66,7 @@ def test_a_text_that_is_not_a_time_is_refused_with_examples(text: str, words: st
 
 
 @pytest.mark.parametrize(
-    ("begin", "end", "found"),
+    ("begin", "end", "span"),
     [
         ("14:05", None, (at(23, 14, 5), math.inf)),
         ("16:00", None, (at(22, 16), math.inf)),
@@ -82,10 +82,10 @@ def test_a_text_that_is_not_a_time_is_refused_with_examples(text: str, words: st
     ],
 )
 def test_a_time_of_day_is_its_most_recent_occurrence_and_a_range_goes_forward(
-    begin: str | None, end: str | None, found: tuple[float, float]
+    begin: str | None, end: str | None, span: tuple[float, float]
 ) -> None:
     first, last = (None if text is None else parse_when(text, NOW) for text in (begin, end))
-    assert resolve(first, last, NOW) == found
+    assert resolve(first, last, NOW) == span
 
 
 def test_a_range_that_ends_before_it_begins_is_refused() -> None:

@@ -28,7 +28,7 @@ BOARD = Config(mcu=McuConfig(port="/dev/ttyACM0"))
 def story(tape: Tape, without: range = range(0)) -> list[TimelineEntry]:
     teller = TimelineWriter()
     steps = [s for s in decode(encode(0, tape.taken)) if s.number not in without]
-    return [one for step in steps for one in teller.step(step)]
+    return [entry for step in steps for entry in teller.step(step)]
 
 
 def driven() -> Tape:
@@ -43,13 +43,13 @@ def driven() -> Tape:
 
 def test_the_timeline_has_the_start_each_drive_and_the_end() -> None:
     tape = driven()
-    told = story(tape)
-    assert (told[0].name, told[-1].name) == ("start", "end")
-    (drive,) = [one for one in told if one.name == "drive"]
+    entries = story(tape)
+    assert (entries[0].name, entries[-1].name) == ("start", "end")
+    (drive,) = [entry for entry in entries if entry.name == "drive"]
     assert drive.by == "app"
     assert drive.text == "drove 0.85 m in 2.0 s"
-    assert "stop" in [one.name for one in told]
-    assert [one.seconds for one in told] == sorted(one.seconds for one in told)
+    assert "stop" in [entry.name for entry in entries]
+    assert [entry.seconds for entry in entries] == sorted(entry.seconds for entry in entries)
 
 
 def test_a_recording_that_continues_another_begins_with_what_the_robot_does() -> None:
@@ -88,7 +88,7 @@ def test_a_drive_that_goes_on_at_the_last_step_has_an_entry() -> None:
     tape = Tape()
     World(recorder=tape).drive(0.5, seconds=1.3)
     writer, steps = TimelineWriter(), decode(encode(0, tape.taken))
-    assert not [one for step in steps for one in writer.step(step) if one.name == "drive"]
+    assert not [entry for step in steps for entry in writer.step(step) if entry.name == "drive"]
     (drive,) = writer.end()
     assert (drive.name, drive.by, drive.text[:13]) == ("drive", "app", "was driving, ")
     assert drive.text.endswith(" m in 1.3 s so far")
@@ -122,12 +122,12 @@ def held_by_neutral_first() -> tuple[Tape, float]:
 @pytest.mark.slow
 def test_a_reason_that_changes_without_the_mode_has_an_entry() -> None:
     tape, began = held_by_neutral_first()
-    held, silent = [one for one in story(tape) if one.name == "reason"]
+    waiting, silent = [entry for entry in story(tape) if entry.name == "reason"]
     sentence = "ready: send a zero first: app must send a zero before it can drive"
-    assert (held.text, held.seconds - began < 0.1) == (sentence, True)
-    assert held.by == f"app ({public_name('somebody')})"
+    assert (waiting.text, waiting.seconds - began < 0.1) == (sentence, True)
+    assert waiting.by == f"app ({public_name('somebody')})"
     assert silent.text.startswith("ready: waiting for a command: no source has sent one")
-    assert 2.4 < silent.seconds - held.seconds < 2.9
+    assert 2.4 < silent.seconds - waiting.seconds < 2.9
 
 
 def two_senders(world: World, first: str, second: str, seconds: float = 3.0) -> None:
@@ -310,11 +310,11 @@ def test_a_host_stall_is_not_called_a_silence_of_the_board() -> None:
     world.hold(0.5, seconds=1.0)
     with world.mcu.mute():
         world.run(0.2)
-    told = [one for one in story(tape) if one.name in ("link_stale", "link_late")]
-    late, stale = told
+    entries = [entry for entry in story(tape) if entry.name in ("link_stale", "link_late")]
+    late, stale = entries
     assert (late.name, stale.name) == ("link_late", "link_stale")
     assert late.text.startswith("this computer did not run the daemon for 0.2")
-    assert summary(told) == "1 computer stall, 1 board silence"
+    assert summary(entries) == "1 computer stall, 1 board silence"
 
 
 def test_lines_during_a_silence_do_not_count_as_another_silence() -> None:
@@ -323,16 +323,16 @@ def test_lines_during_a_silence_do_not_count_as_another_silence() -> None:
     with world.mcu.mute():
         world.run(5.0)
     world.run(1.0)
-    told = story(tape)
-    assert [one.name for one in told if one.name in ("link_stale", "link_heard")] == [
+    entries = story(tape)
+    assert [item.name for item in entries if item.name in ("link_stale", "link_heard")] == [
         "link_stale", "link_heard"
     ]  # fmt: skip
-    said = [one for _, outputs, _ in tape.taken for one in outputs.events]
-    assert summary([entry_of(one, 1) for one in said]) == "1 board silence"
+    events = [item for _, outputs, _ in tape.taken for item in outputs.events]
+    assert summary([entry_of(item, 1) for item in events]) == "1 board silence"
 
 
 def test_missing_steps_are_reported() -> None:
-    gaps = [one.text for one in story(driven(), range(100, 160)) if one.name == "gap"]
+    gaps = [entry.text for entry in story(driven(), range(100, 160)) if entry.name == "gap"]
     assert gaps == ["60 steps are missing before this step (0.3 s)"]
 
 

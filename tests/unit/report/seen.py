@@ -15,5 +15,5 @@ def column(packed: dict[str, str]) -> list[float]:
 
 
 def trace(figure: Figure, name: str, axis: str = "y") -> dict[str, Any]:
-    (found,) = [t for t in figure.data if t["name"] == name and t.get("yaxis", "y") == axis]
-    return found
+    (curve,) = [t for t in figure.data if t["name"] == name and t.get("yaxis", "y") == axis]
+    return curve

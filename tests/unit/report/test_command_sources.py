@@ -49,8 +49,8 @@ def test_a_source_that_sends_during_a_fault_has_only_the_fault_as_reason() -> No
 
     report, _ = report_of(dead)
     (fault,) = [span for span in report.modes.spans() if span.kind == "fault"]
-    said = [s for s in report.sources.bands["app"].spans() if s.begin > fault.begin]
-    assert {(span.kind, span.words) for span in said} == {("sends", f"fault: {fault.words}")}
+    segments = [s for s in report.sources.bands["app"].spans() if s.begin > fault.begin]
+    assert {(span.kind, span.words) for span in segments} == {("sends", f"fault: {fault.words}")}
 
 
 def test_a_source_that_is_not_configured_is_refused_among_the_others() -> None:

@@ -52,8 +52,8 @@ def test_no_two_symbols_of_a_picture_look_alike() -> None:
 @pytest.mark.slow
 def test_a_curve_under_another_curve_stays_visible(figures: dict[str, Figure]) -> None:
     for name, beneath in (("speeds", "limited"), ("wheels", "commanded"), ("link", "sent")):
-        widths = {one["name"]: one["line"]["width"] for one in figures[name].data}
-        below = [one["name"] for one in figures[name].data].index(beneath)
+        widths = {curve["name"]: curve["line"]["width"] for curve in figures[name].data}
+        below = [curve["name"] for curve in figures[name].data].index(beneath)
         above = figures[name].data[below + 1]["name"]
         assert widths[beneath] > 2 * widths[above]
 
@@ -88,9 +88,9 @@ def test_one_command_of_99_m_s_does_not_flatten_the_speeds() -> None:
     figure = TimeFigures(report, OFFSET_S).speeds()
     library.Figure(data=figure.data, layout=figure.layout)
     for axis, wish in (("y", 99.0), ("y2", -50.0)):
-        measured = max(abs(one) for one in column(trace(figure, "measured", axis)["y"]))
+        measured = max(abs(value) for value in column(trace(figure, "measured", axis)["y"]))
         commanded = trace(figure, "commanded", axis)
-        assert max(abs(one) for one in column(commanded["y"])) < max(2.0 * measured, 0.5)
+        assert max(abs(value) for value in column(commanded["y"])) < max(2.0 * measured, 0.5)
         assert wish in column(commanded["customdata"])
         mark = trace(figure, "commanded outside", axis)
         assert column(mark["customdata"]) == [wish]
@@ -104,7 +104,7 @@ def test_commands_near_the_driven_speeds_are_drawn_as_they_are(figures: dict[str
     drawn = column(trace(figures["speeds"], "commanded")["y"])
     assert known(drawn) == known(point.value for point in report.linear["commanded"].points())
     assert "triangle" not in figures["speeds"].caption
-    assert [one["name"] for one in figures["speeds"].data].count("commanded outside") == 0
+    assert [curve["name"] for curve in figures["speeds"].data].count("commanded outside") == 0
 
 
 def test_a_curve_is_marked_each_time_it_leaves_the_scale_of_the_others() -> None:
@@ -139,8 +139,8 @@ def test_bands_show_the_reason_on_hover(figures: dict[str, Figure]) -> None:
 
 def drivers(figure: Figure) -> dict[str, tuple[str, str]]:
     """Return the colour and pattern of each source that drove."""
-    drives = [one for one in figure.data if one["name"].endswith(" drives")]
-    looks = {one["name"].split()[0]: one["marker"] for one in drives}
+    drives = [bar for bar in figure.data if bar["name"].endswith(" drives")]
+    looks = {bar["name"].split()[0]: bar["marker"] for bar in drives}
     return {
         name: (look["color"], look.get("pattern", {}).get("shape", ""))
         for name, look in looks.items()
@@ -148,11 +148,11 @@ def drivers(figure: Figure) -> dict[str, tuple[str, str]]:
 
 
 def test_two_driving_sources_have_two_colours_in_the_legend(figures: dict[str, Figure]) -> None:
-    who = figures["sources"]
-    looks = drivers(who)
+    figure = figures["sources"]
+    looks = drivers(figure)
     assert set(looks) == {"teleop", "nav"}
     assert len(set(looks.values())) == 2
-    keys = {one: key.colour for key in who.keys for one in key.meaning.split(", ")}
+    keys = {label: key.colour for key in figure.keys for label in key.meaning.split(", ")}
     assert {name: keys[f"{name} drives"] for name in looks} == {n: c for n, (c, _) in looks.items()}
 
 

@@ -62,18 +62,18 @@ def evil_steps() -> list[Step]:
     from msgspec.structs import replace
 
     _, steps = drive_of_two()
-    found = []
+    new_steps = []
     for n, step in enumerate(steps[:300]):
-        inputs, said = step.inputs, step.recorded
+        inputs, record = step.inputs, step.recorded
         if n == 150:
             now_ns = inputs.now.mono_ns
             command = Command(EVIL, Twist(), now_ns, sender=EVIL)
             refusal = Refusal("undecodable", f"cmd/nav: {EVIL}", "nav", EVIL, now_ns)
             inputs = replace(inputs, commands=(command,), refusals=(refusal,))
             event = Event("stop", EVIL, by=EVIL)
-            said = replace(said, events=(event,), status=(EVIL, EVIL, EVIL, EVIL))
-        found.append(replace(step, inputs=inputs, recorded=said))
-    return found
+            record = replace(record, events=(event,), status=(EVIL, EVIL, EVIL, EVIL))
+        new_steps.append(replace(step, inputs=inputs, recorded=record))
+    return new_steps
 
 
 @lru_cache
@@ -102,8 +102,8 @@ def test_texts_in_the_pictures_contain_no_markup_of_plotly() -> None:
     traces = [trace for figure in json.loads(pictures) for trace in figure["data"]]
     texts = [text for t in traces for key in ("hovertext", "text") for text in t.get(key, ())]
     texts += [trace["name"] for trace in traces]
-    said = [text for text in texts if "alert(1)" in text]
-    assert len(said) >= 3  # the event, the mode, the refusal
+    alerts = [text for text in texts if "alert(1)" in text]
+    assert len(alerts) >= 3  # the event, the mode, the refusal
     tags = {tag for text in texts for tag in re.findall(r"<[^>]*>", text)}
     assert tags <= {"<b>", "</b>", "<br>"}
 

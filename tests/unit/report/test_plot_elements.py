@@ -26,7 +26,7 @@ def test_nan_stays_nan() -> None:
 def test_the_colours_of_eight_sources_are_easy_to_distinguish() -> None:
     assert len(SOURCE_COLOURS) == 8
     rgb = [bytes.fromhex(source_style(n)[0].removeprefix("#")) for n in range(8)]
-    assert min(math.dist(one, other) for one, other in combinations(rgb, 2)) > 60
+    assert min(math.dist(colour, other) for colour, other in combinations(rgb, 2)) > 60
 
 
 def test_further_sources_have_a_pattern() -> None:
@@ -51,6 +51,6 @@ def test_arrows_show_the_heading() -> None:
     heading = trace(path_figure(report), "heading")
     by_place = {(place.x, place.y): place.yaw for place in report.path.places()}
     places = zip(column(heading["x"]), column(heading["y"]), strict=True)
-    told = [math.radians(90 - angle) for angle in heading["marker"]["angle"]]
-    assert len(told) >= 8
-    assert told == pytest.approx([by_place[place] for place in places], abs=1e-3)
+    yaws = [math.radians(90 - angle) for angle in heading["marker"]["angle"]]
+    assert len(yaws) >= 8
+    assert yaws == pytest.approx([by_place[place] for place in places], abs=1e-3)

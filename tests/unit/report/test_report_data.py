@@ -83,8 +83,8 @@ def test_each_source_has_its_distance_and_duration() -> None:
         for a, b in pairwise(steps)
         if b.recorded.status[0] == "driving"
     )
-    assert sum(one.seconds for one in report.driven.values()) == pytest.approx(driving / 1e9)
-    assert 0.0 < sum(one.metres for one in report.driven.values()) <= report.metres
+    assert sum(drive.seconds for drive in report.driven.values()) == pytest.approx(driving / 1e9)
+    assert 0.0 < sum(drive.metres for drive in report.driven.values()) <= report.metres
 
 
 def test_a_mark_has_the_client_and_the_place_of_its_event() -> None:

@@ -25,10 +25,10 @@ def errors() -> Iterator[None]:
 
 
 def outputs() -> Outputs:
-    world, seen = World(), list[Outputs]()
-    world.watch = seen.append
+    world, results = World(), list[Outputs]()
+    world.watch = results.append
     world.drive(0.5, seconds=0.1)
-    return seen[-1]
+    return results[-1]
 
 
 def test_a_speed_that_is_not_a_number_is_an_error_of_the_robot() -> None:

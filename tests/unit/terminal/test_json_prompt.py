@@ -31,8 +31,8 @@ class Program:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         asked, self._to_child = os.pipe()
-        self._from_child, told = os.pipe()
-        self._asked, self._told = os.fdopen(asked), os.fdopen(told, "w")
+        self._from_child, writer = os.pipe()
+        self._asked, self._told = os.fdopen(asked), os.fdopen(writer, "w")
         monkeypatch.setattr("sys.stdin", self._asked)
         self.said: list[dict[str, Any]] = []
         self.answers: list[object] = []
@@ -40,7 +40,7 @@ class Program:
         self._thread.start()
 
     def say(self, *messages: object, raw: bytes = b"") -> None:
-        lines = b"".join(json.dumps(one).encode() + b"\n" for one in messages)
+        lines = b"".join(json.dumps(message).encode() + b"\n" for message in messages)
         os.write(self._to_child, raw + lines)
 
     @contextmanager
@@ -63,20 +63,20 @@ class Program:
     def _live(self) -> None:
         with os.fdopen(self._from_child) as lines:
             for line in lines:
-                said = json.loads(line)
-                self.said.append(said)
-                if "question" in said and self.answers:
+                message = json.loads(line)
+                self.said.append(message)
+                if "question" in message and self.answers:
                     value = self.answers.pop(0)
                     if callable(value):
-                        value(said["question"])
+                        value(message["question"])
                     else:
-                        self.say({"answer": said["question"], "value": value})
+                        self.say({"answer": message["question"], "value": value})
 
     def told(self, name: str) -> list[Any]:
         """Close the output, and return the value of this key in every message that has it."""
         self._told.close()
         self._thread.join()
-        return [one[name] for one in self.said if name in one]
+        return [message[name] for message in self.said if name in message]
 
 
 @pytest.fixture
@@ -110,7 +110,7 @@ def test_nothing_but_start_starts_a_leg_and_no_key_from_before_stops_it(program:
         program.say({"key": True})
         person.start("Go.", by_key=True)
         assert person.keys(0.05) == ""
-    assert [one.get("leg") for one in program.said] == [True, True]
+    assert [message.get("leg") for message in program.said] == [True, True]
     assert program.said[0]["by_key"] is True
     assert program.said[1]["wrong"] == "answer with one of: start"
 
@@ -155,9 +155,9 @@ def test_the_prompt_ends_even_if_standard_error_is_closed(
     """The parent program has died, so its end of standard error is closed as well."""
     reader, writer = os.pipe()
     os.close(reader)
-    gone = open(writer, "wb", buffering=0)  # noqa: SIM115
-    with gone, program.hears(JsonPrompt()) as person:
-        monkeypatch.setattr("sys.stderr", io.TextIOWrapper(gone, write_through=True))
+    pipe = open(writer, "wb", buffering=0)  # noqa: SIM115
+    with pipe, program.hears(JsonPrompt()) as person:
+        monkeypatch.setattr("sys.stderr", io.TextIOWrapper(pipe, write_through=True))
         program.answers = [lambda number: program.hang_up()]
         interrupted(program, lambda: person.ask("lifted?", ("lifted",)))
 

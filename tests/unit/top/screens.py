@@ -58,28 +58,28 @@ SEEN = ScreenData(
 )
 
 
-def lines_of(seen: ScreenData, width: int = 80, height: int | None = 24) -> list[str]:
+def lines_of(data: ScreenData, width: int = 80, height: int | None = 24) -> list[str]:
     """Return the lines of the screen as a person reads them."""
     console = Console(width=width, file=io.StringIO(), color_system=None)
     with console.capture() as captured:
-        console.print(screen(seen, width, height))
+        console.print(screen(data, width, height))
     return captured.get().rstrip("\n").split("\n")
 
 
-def painted(seen: ScreenData, width: int = 80, height: int | None = 24) -> str:
+def painted(data: ScreenData, width: int = 80, height: int | None = 24) -> str:
     """Return the screen as it is sent to a terminal."""
     console = Console(
         width=width, file=io.StringIO(), force_terminal=True, color_system="256", _environ={}
     )
     with console.capture() as captured:
-        console.print(screen(seen, width, height))
+        console.print(screen(data, width, height))
     return captured.get()
 
 
-def line_with(text: str, seen: ScreenData = SEEN, width: int = 80) -> str:
-    found = [line for line in lines_of(seen, width) if text in line]
-    assert len(found) == 1, (text, found)
-    return found[0]
+def line_with(text: str, data: ScreenData = SEEN, width: int = 80) -> str:
+    matches = [line for line in lines_of(data, width) if text in line]
+    assert len(matches) == 1, (text, matches)
+    return matches[0]
 
 
 def of(**changes: object) -> ScreenData:
@@ -94,5 +94,5 @@ def sample_of(message: Message, key: str = "acsard/acsar/state") -> Any:
 
 def raw_sample(payload: bytes, key: str = "acsard/acsar/state") -> Any:
     """Return a sample of the bus with this JSON."""
-    held = SimpleNamespace(to_bytes=lambda: payload)
-    return SimpleNamespace(key_expr=key, encoding="application/json", payload=held)
+    content = SimpleNamespace(to_bytes=lambda: payload)
+    return SimpleNamespace(key_expr=key, encoding="application/json", payload=content)

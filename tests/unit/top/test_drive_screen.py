@@ -31,48 +31,48 @@ def told(lines: list[str]) -> str:
     return " ".join(" ".join(lines).split())
 
 
-def texts(seen: Teleop, width: int, height: int | None = 24) -> list[str]:
-    return [line.plain for line in lines(seen, width, height)]
+def texts(data: Teleop, width: int, height: int | None = 24) -> list[str]:
+    return [line.plain for line in lines(data, width, height)]
 
 
 @each("width", WIDTHS)
 def test_every_width_shows_the_whole_reason_the_units_of_the_pose_and_the_help(
     width: int,
 ) -> None:
-    shown = texts(of(mode="waiting", reason=LONG, x=1.5, y=-2.25, yaw=1.0), width)
-    assert max(map(len, shown)) <= width
-    assert len(shown) < 24
-    words = " ".join(" ".join(shown).split())
-    for told in (LONG, "WAITING", "x +1.500 m", "y -2.250 m", "yaw +57.3°", "m/s", "rad/s"):
-        assert told in words
-    assert shown[-len(HELP) :] == list(HELP)
+    rows = texts(of(mode="waiting", reason=LONG, x=1.5, y=-2.25, yaw=1.0), width)
+    assert max(map(len, rows)) <= width
+    assert len(rows) < 24
+    words = " ".join(" ".join(rows).split())
+    for phrase in (LONG, "WAITING", "x +1.500 m", "y -2.250 m", "yaw +57.3°", "m/s", "rad/s"):
+        assert phrase in words
+    assert rows[-len(HELP) :] == list(HELP)
 
 
 def test_only_the_mode_has_its_colour_and_not_the_reason_below_it() -> None:
-    shown = lines(of(mode="waiting", reason=LONG), 40)
+    rows = lines(of(mode="waiting", reason=LONG), 40)
     coloured = [
-        span for line in shown for span in line.spans if span.style == MODE_STYLES["waiting"]
+        span for line in rows for span in line.spans if span.style == MODE_STYLES["waiting"]
     ]
-    assert [shown[1].plain[span.start : span.end] for span in coloured] == [" WAITING "]
+    assert [rows[1].plain[span.start : span.end] for span in coloured] == [" WAITING "]
 
 
 def test_the_screen_does_not_move_while_figures_change() -> None:
     still = texts(of(x=0.0, y=0.0, yaw=0.0, linear=0.0, angular=0.0), 80)
     moved = texts(of(x=-123.456, y=99.9, yaw=-3.1, linear=-0.55, angular=1.25), 80)
-    assert [len(one) for one in still] == [len(one) for one in moved]
+    assert [len(line) for line in still] == [len(line) for line in moved]
 
 
 def test_help_stays_on_a_screen_of_few_lines() -> None:
-    shown = texts(of(reason=LONG), 40, 10)
-    assert len(shown) == 10
-    assert shown[-len(HELP) :] == list(HELP)
+    rows = texts(of(reason=LONG), 40, 10)
+    assert len(rows) == 10
+    assert rows[-len(HELP) :] == list(HELP)
 
 
 def test_a_refused_key_must_be_pressed_again_after_space() -> None:
     why = "send a zero first: teleop must send a zero before it can drive"
-    told = " ".join(report_lines(replace(SEEN, objection=why), 200))
+    text = " ".join(report_lines(replace(SEEN, objection=why), 200))
     assert (
-        f"your keys do not drive the robot: {why} (press space, then press the key again)" in told
+        f"your keys do not drive the robot: {why} (press space, then press the key again)" in text
     )
     assert "press space" not in " ".join(
         report_lines(replace(SEEN, objection="stopped by anna"), 200)
@@ -81,33 +81,33 @@ def test_a_refused_key_must_be_pressed_again_after_space() -> None:
 
 def test_keys_that_do_not_drive_are_reported() -> None:
     why = "app has the same priority and came first: wait until it is silent"
-    seen = replace(SEEN, objection=why)
-    assert why in " ".join(" ".join(texts(seen, 40)).split())
-    assert why in told(report_lines(seen, 40))
+    data = replace(SEEN, objection=why)
+    assert why in " ".join(" ".join(texts(data, 40)).split())
+    assert why in told(report_lines(data, 40))
 
 
 def test_a_silence_is_reported_with_its_length() -> None:
     silent = replace(SEEN, age=7.0, silent=True)
-    for seen in (silent, replace(silent, state=None)):
-        assert "nothing received from the daemon for 7 s" in " ".join(texts(seen, 80))
-        assert "nothing received from the daemon for 7 s" in told(report_lines(seen, 80))
+    for data in (silent, replace(silent, state=None)):
+        assert "nothing received from the daemon for 7 s" in " ".join(texts(data, 80))
+        assert "nothing received from the daemon for 7 s" in told(report_lines(data, 80))
     assert "first state" in texts(replace(SEEN, state=None), 80)[1]
 
 
 @each("mode", list(Mode))
 def test_the_mode_is_not_repeated_in_its_reason(mode: Mode) -> None:
-    seen = of(mode=mode.value, reason=f"{mode.value}: because")
-    assert texts(seen, 80)[1].split() == [mode.value.upper(), "because"]
-    assert report_lines(seen, 80)[0].startswith(f"{mode.value}: because; ")
+    data = of(mode=mode.value, reason=f"{mode.value}: because")
+    assert texts(data, 80)[1].split() == [mode.value.upper(), "because"]
+    assert report_lines(data, 80)[0].startswith(f"{mode.value}: because; ")
 
 
 @each("width", WIDTHS)
 def test_without_a_screen_no_word_and_no_figure_is_broken_at_the_edge(width: int) -> None:
-    said = report_lines(of(mode="waiting", reason=LONG, x=1.5), width)
-    assert max(map(len, said)) <= width
-    assert LONG in told(said)
-    assert sum("x   +1.500 m" in one for one in said) == 1
-    assert sum("turn -0.60 rad/s" in one for one in said) == 1
+    rows = report_lines(of(mode="waiting", reason=LONG, x=1.5), width)
+    assert max(map(len, rows)) <= width
+    assert LONG in told(rows)
+    assert sum("x   +1.500 m" in line for line in rows) == 1
+    assert sum("turn -0.60 rad/s" in line for line in rows) == 1
 
 
 def test_the_final_report_says_whether_the_robot_stands_and_where() -> None:
@@ -139,9 +139,9 @@ def test_the_final_report_says_whether_the_robot_stands_and_where() -> None:
 def test_any_text_and_number_fits_the_screen_and_is_printable(
     text: str, number: float, width: int, height: int
 ) -> None:
-    seen = of(mode=text[:9], reason=text, x=number, linear=number, yaw=0.0)
-    seen = replace(seen, robot_id=text, objection=text)
-    shown = texts(seen, width, height)
-    assert len(shown) <= height
-    shown += [*report_lines(seen, width), *last_report_lines(seen, width)]
-    assert all(len(one) <= width and one.isprintable() for one in shown)
+    data = of(mode=text[:9], reason=text, x=number, linear=number, yaw=0.0)
+    data = replace(data, robot_id=text, objection=text)
+    rows = texts(data, width, height)
+    assert len(rows) <= height
+    rows += [*report_lines(data, width), *last_report_lines(data, width)]
+    assert all(len(line) <= width and line.isprintable() for line in rows)

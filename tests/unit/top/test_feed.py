@@ -105,9 +105,9 @@ def test_the_later_of_an_answer_and_a_published_state_is_shown(robot: Robot, sec
     robot.tells(at(sec, lines=1300 + sec - 1000))
     feed.ask()
     feed.poll()
-    told = feed.seen().state
-    assert told is not None
-    assert told.stamp == Time(max(1000, sec))
+    state = feed.seen().state
+    assert state is not None
+    assert state.stamp == Time(max(1000, sec))
 
 
 def test_a_put_on_a_wildcard_is_not_a_state(robot: Robot) -> None:

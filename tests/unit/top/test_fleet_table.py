@@ -29,7 +29,7 @@ ROW = Row("robot1", True, replace(STATE, reason="driving: commanded by app"), 0.
 
 def test_a_line_has_every_column_of_a_robot() -> None:
     head, line = table([ROW], 120)
-    assert head.split() == [one for one in COLUMN_HEADS if one != "BATTERY"]
+    assert head.split() == [column for column in COLUMN_HEADS if column != "BATTERY"]
     assert line.split() == [
         "robot1", "driving", "+0.50", "up", "+1.2", "-0.5", "+57°", "0.1.0", "0.1", "s",
         "commanded", "by", "app",
@@ -93,14 +93,14 @@ def test_the_details_of_each_warning_follow_the_list_of_warnings() -> None:
 
 def test_the_details_of_a_certificate_follow_its_warning_without_a_second_colon() -> None:
     unknown, refused = "unknown, because the gateway does not run", "expired 2 days ago: refused"
-    for expiry, told in {
+    for expiry, expected in {
         unknown: "WARNING: certificate unknown; waiting for a command; certificate: because the "
         "gateway does not run",
         refused: "WARNING: certificate expired 2 days ago; waiting for a command; certificate: "
         "refused",
     }.items():
         (_, line) = table([replace(ROW, state=replace(READY, certificate_expiry=expiry))], 300)
-        assert line.endswith(told)
+        assert line.endswith(expected)
 
 
 def test_the_reason_of_a_fault_comes_before_the_warnings() -> None:
@@ -118,7 +118,7 @@ def test_a_warning_that_is_in_the_reason_is_not_repeated() -> None:
 
 def test_a_narrow_terminal_lacks_the_version_first() -> None:
     rows = [replace(ROW, state=replace(READY, recording_error=FULL))]
-    heads = [one for one in COLUMN_HEADS if one != "BATTERY"]
+    heads = [column for column in COLUMN_HEADS if column != "BATTERY"]
     for width, missing in ((100, ""), (90, "VERSION"), (80, "PLACE"), (60, "LINK")):
         if missing:
             heads.remove(missing)
@@ -181,15 +181,15 @@ def test_two_robots_look_different_at_every_width(ids: tuple[str, str], width: i
 
 
 def test_a_long_name_is_shortened_in_the_middle_and_the_reason_keeps_its_width() -> None:
-    shown = table(rows_of("warehouse-west-1", "warehouse-west-2"), 40)
-    assert [line.split()[0] for line in shown[1:]] == ["wareh…west-1", "wareh…west-2"]
+    lines = table(rows_of("warehouse-west-1", "warehouse-west-2"), 40)
+    assert [line.split()[0] for line in lines[1:]] == ["wareh…west-1", "wareh…west-2"]
     wide = table(rows_of("robots-in-the-warehouse-west-0-1"), 80)[1]
     assert wide.endswith("commanded by app")
     assert len(wide) <= 80
 
 
 def rows_of(*ids: str) -> list[Row]:
-    return [replace(ROW, robot_id=one) for one in ids]
+    return [replace(ROW, robot_id=robot_id) for robot_id in ids]
 
 
 IN_NEED = {
@@ -204,9 +204,9 @@ IN_NEED = {
 @each("need", IN_NEED)
 def test_a_robot_that_needs_help_is_shown_first_if_the_fleet_exceeds_the_screen(need: str) -> None:
     rows = [replace(ROW, robot_id=f"robot{n:02d}") for n in range(29)]
-    shown = table([*rows, replace(IN_NEED[need], robot_id="robot99")], 120, 22)
-    assert shown[1].startswith("robot99")
-    assert [line.split()[0] for line in shown[2:-1]] == [row.robot_id for row in rows[:19]]
+    lines = table([*rows, replace(IN_NEED[need], robot_id="robot99")], 120, 22)
+    assert lines[1].startswith("robot99")
+    assert [line.split()[0] for line in lines[2:-1]] == [row.robot_id for row in rows[:19]]
 
 
 def test_a_robot_in_fault_is_before_those_that_are_off() -> None:
@@ -217,9 +217,9 @@ def test_a_robot_in_fault_is_before_those_that_are_off() -> None:
 
 def test_more_robots_than_lines_are_counted() -> None:
     rows = [replace(ROW, robot_id=f"robot{n}") for n in range(10)]
-    shown = table(rows, 80, 5)
-    assert len(shown) == 5
-    assert shown[-1] == "and 7 more"
+    lines = table(rows, 80, 5)
+    assert len(lines) == 5
+    assert lines[-1] == "and 7 more"
 
 
 @given(st.text(max_size=80), st.floats(), st.floats(0, 1e12), st.integers(20, 200))
@@ -278,8 +278,8 @@ def fleet_of(
 
     def answer(name: str, key: str, take: Callable[[Any], object]) -> None:
         if name in answering:
-            said = {"state": replace(STATE, stamp=Time(next(stamps))), "info": INFO}
-            take(sample_of(said[key], f"acsard/{name}/{key}"))
+            replies = {"state": replace(STATE, stamp=Time(next(stamps))), "info": INFO}
+            take(sample_of(replies[key], f"acsard/{name}/{key}"))
 
     return Roster(robot, ids, most=3)
 

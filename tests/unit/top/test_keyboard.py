@@ -178,8 +178,8 @@ class Robot:
     source, sender = "teleop", "joe/1/aa"
     where = Address("tcp/127.0.0.1:7448", "acsar", "")
 
-    def __init__(self, *said: RobotState) -> None:
-        self.said = deque(map(sample_of, said))
+    def __init__(self, *states: RobotState) -> None:
+        self.said = deque(map(sample_of, states))
         self.sent: list[float] = []
 
     def subscribe(self, name: str) -> Any:
@@ -367,21 +367,21 @@ class Held(Drive):
 def test_a_key_that_is_held_while_the_robot_ceases_to_follow_does_not_drive_after_a_pause(
     why: RobotState, pause: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    held = Held(why, monkeypatch)
-    assert not held.drives("i")
-    held.robot.said.append(sample_of(STATE))
-    assert not held.drives("", round(pause / 0.05))
-    assert not held.drives("i")
+    keyboard = Held(why, monkeypatch)
+    assert not keyboard.drives("i")
+    keyboard.robot.said.append(sample_of(STATE))
+    assert not keyboard.drives("", round(pause / 0.05))
+    assert not keyboard.drives("i")
 
 
 def test_delayed_keys_do_not_release_a_key_that_no_longer_drives(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    held = Held(STOPPED, monkeypatch)
-    held.robot.said.append(sample_of(STATE))
-    held.step(times=60)
-    held.step(45 * "i")
-    assert not held.drives("i", 40)
+    keyboard = Held(STOPPED, monkeypatch)
+    keyboard.robot.said.append(sample_of(STATE))
+    keyboard.step(times=60)
+    keyboard.step(45 * "i")
+    assert not keyboard.drives("i", 40)
 
 
 def test_a_delayed_space_does_not_release_a_key_that_no_longer_drives(
@@ -391,15 +391,15 @@ def test_a_delayed_space_does_not_release_a_key_that_no_longer_drives(
 
     Only a space that arrives in time releases the key.
     """
-    held = Held(STOPPED, monkeypatch)
-    held.robot.said.append(sample_of(STATE))
-    held.step("i", times=10)
-    held.now += 1.2 * GRACE_S
-    assert not held.drives(" ", 1)
-    assert not held.drives("", 5)
-    assert not held.drives("i")
-    held.step(" ")
-    assert held.drives("i")
+    keyboard = Held(STOPPED, monkeypatch)
+    keyboard.robot.said.append(sample_of(STATE))
+    keyboard.step("i", times=10)
+    keyboard.now += 1.2 * GRACE_S
+    assert not keyboard.drives(" ", 1)
+    assert not keyboard.drives("", 5)
+    assert not keyboard.drives("i")
+    keyboard.step(" ")
+    assert keyboard.drives("i")
 
 
 def test_delayed_keys_do_not_drive_if_the_robot_was_stopped_late_in_their_delay(
@@ -409,38 +409,38 @@ def test_delayed_keys_do_not_drive_if_the_robot_was_stopped_late_in_their_delay(
 
     After 2 s the robot is stopped and cleared.
     """
-    held = Held(STATE, monkeypatch)
-    held.step("i", times=10)
-    held.step(times=40)
-    held.robot.said.append(sample_of(STOPPED))
-    held.step(times=2)
-    held.robot.said.append(sample_of(STATE))
-    held.step(times=18)
-    held.step(90 * "i")
-    assert not held.drives("i", 40)
+    keyboard = Held(STATE, monkeypatch)
+    keyboard.step("i", times=10)
+    keyboard.step(times=40)
+    keyboard.robot.said.append(sample_of(STOPPED))
+    keyboard.step(times=2)
+    keyboard.robot.said.append(sample_of(STATE))
+    keyboard.step(times=18)
+    keyboard.step(90 * "i")
+    assert not keyboard.drives("i", 40)
 
 
 @each("key", [" ", "k"])
 def test_a_key_that_no_longer_drives_does_so_after_a_key_that_stops(
     key: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    held = Held(ZERO_FIRST, monkeypatch)
-    held.step("i", times=10)
-    held.robot.sent.clear()
-    held.step(key)
-    held.step("i", times=2)
-    assert held.robot.sent == [0.0, 0.5, 0.5]
+    keyboard = Held(ZERO_FIRST, monkeypatch)
+    keyboard.step("i", times=10)
+    keyboard.robot.sent.clear()
+    keyboard.step(key)
+    keyboard.step("i", times=2)
+    assert keyboard.robot.sent == [0.0, 0.5, 0.5]
 
 
 def test_a_key_that_no_longer_drives_does_so_after_its_release(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    held = Held(ZERO_FIRST, monkeypatch)
-    held.step("i", times=10)
-    held.step(times=round(RELEASE_TIMEOUT_NS / NS_PER_S / 0.05) + 2)
-    held.robot.sent.clear()
-    held.step("i", times=3)
-    assert held.robot.sent == [0.0, 0.5, 0.5]
+    keyboard = Held(ZERO_FIRST, monkeypatch)
+    keyboard.step("i", times=10)
+    keyboard.step(times=round(RELEASE_TIMEOUT_NS / NS_PER_S / 0.05) + 2)
+    keyboard.robot.sent.clear()
+    keyboard.step("i", times=3)
+    assert keyboard.robot.sent == [0.0, 0.5, 0.5]
 
 
 def test_a_state_from_before_a_press_does_not_end_the_hold(
@@ -458,14 +458,14 @@ def test_a_state_from_before_a_press_does_not_end_the_hold(
 def test_the_operator_is_informed_that_a_held_key_no_longer_drives(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    held = Held(STOPPED, monkeypatch)
-    held.step("i", times=12)
-    assert held.ride.seen().objection == "stopped by request"
-    held.robot.said.append(sample_of(replace(STATE, mode="ready", source="")))
-    held.step("i", times=12)
-    assert held.ride.seen().objection == RELEASE_REASON
-    held.step(" ")
-    assert held.ride.seen().objection == ""
+    keyboard = Held(STOPPED, monkeypatch)
+    keyboard.step("i", times=12)
+    assert keyboard.ride.seen().objection == "stopped by request"
+    keyboard.robot.said.append(sample_of(replace(STATE, mode="ready", source="")))
+    keyboard.step("i", times=12)
+    assert keyboard.ride.seen().objection == RELEASE_REASON
+    keyboard.step(" ")
+    assert keyboard.ride.seen().objection == ""
 
 
 def test_a_space_stops_at_the_next_step(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -32,7 +32,7 @@ def read(width: int) -> str:
 
 @each("width", WIDTHS)
 def test_every_figure_is_on_a_screen_of_any_width(width: int) -> None:
-    told, lines = read(width), lines_of(FULL, width, None)
+    text, lines = read(width), lines_of(FULL, width, None)
     for figure in (
         "WAITING", REASON, "x +1.250 m", "y -0.500 m", "yaw +57.3°", "forward +0.500 m/s",
         "turn -0.600 rad/s", "+12.00", "+8.00", "+12.50", "-7.50", "100 never", "50 0.0 s",
@@ -42,8 +42,8 @@ def test_every_figure_is_on_a_screen_of_any_width(width: int) -> None:
         "the twist contains NaN or infinity", "gyro used",
         "track learned 1.603 ± 0.032 (in use), configured 1.000",
     ):  # fmt: skip
-        assert figure in told, figure
-    assert told.count("63 µs 891 µs 9.7 ms") == told.count("56 µs 112 µs 8.0 ms") == 6
+        assert figure in text, figure
+    assert text.count("63 µs 891 µs 9.7 ms") == text.count("56 µs 112 µs 8.0 ms") == 6
     assert max(map(cell_len, lines)) <= width
     assert not any(line.endswith("…") for line in lines[1:])
 
@@ -54,10 +54,10 @@ def test_the_wheels_are_where_they_are_on_the_robot() -> None:
 
 
 def test_on_few_lines_the_figures_since_the_start_go_first() -> None:
-    told = lines_of(of(sources=STATE.sources[:1]), 40, 24)
-    assert len(told) == 24
-    assert any("last minute" in line for line in told)
-    assert not any("since start" in line for line in told)
+    lines = lines_of(of(sources=STATE.sources[:1]), 40, 24)
+    assert len(lines) == 24
+    assert any("last minute" in line for line in lines)
+    assert not any("since start" in line for line in lines)
 
 
 def test_sources_that_do_not_fit_are_counted() -> None:

@@ -36,17 +36,17 @@ It clears the screen, sets the title, is markup, reverses direction, colours and
 
 def test_the_head_shows_robot_address_version_and_age() -> None:
     head = lines_of(SEEN)[0]
-    for told in ("acsar", "tcp/127.0.0.1:7448", "0.1.0", "seen 0.1 s ago", "q quits"):
-        assert told in head
+    for phrase in ("acsar", "tcp/127.0.0.1:7448", "0.1.0", "seen 0.1 s ago", "q quits"):
+        assert phrase in head
 
 
 @each("mode", list(Mode))
 def test_every_mode_has_a_badge_of_its_colour_and_its_reason(mode: Mode) -> None:
-    seen = of(mode=mode.value, reason="because")
-    assert lines_of(seen)[1].strip() == f"{mode.value.upper()}   because"
+    data = of(mode=mode.value, reason="because")
+    assert lines_of(data)[1].strip() == f"{mode.value.upper()}   because"
     background = {"green": 42, "blue": 44, "yellow": 43, "white": 47, "red": 41}
     colour = background[MODE_STYLES[mode.value].rpartition(" ")[2]]
-    assert re.search(rf"\x1b\[[0-9;]*{colour}m {mode.value.upper()} ", painted(seen))
+    assert re.search(rf"\x1b\[[0-9;]*{colour}m {mode.value.upper()} ", painted(data))
 
 
 def test_stopped_and_fault_share_a_style_that_no_other_mode_has() -> None:
@@ -84,10 +84,10 @@ def test_before_the_first_state_the_screen_says_what_it_waits_for() -> None:
 
 @pytest.mark.parametrize("state", [STATE, None])
 def test_a_silent_robot_is_shown_by_three_red_lines(state: RobotState | None) -> None:
-    seen = replace(SEEN, state=state, age=3.4, silent=True)
-    assert "NOTHING RECEIVED FOR 3 s: is the daemon running?" in lines_of(seen)[2]
-    assert painted(seen).count("41m") == 3  # three lines in red
-    assert not any("DRIVING" in line for line in lines_of(seen))
+    data = replace(SEEN, state=state, age=3.4, silent=True)
+    assert "NOTHING RECEIVED FOR 3 s: is the daemon running?" in lines_of(data)[2]
+    assert painted(data).count("41m") == 3  # three lines in red
+    assert not any("DRIVING" in line for line in lines_of(data))
 
 
 def test_a_slow_state_is_not_silent_before_its_time() -> None:
@@ -96,45 +96,47 @@ def test_a_slow_state_is_not_silent_before_its_time() -> None:
 
 
 def test_the_last_values_before_a_silence_stay_dimmed() -> None:
-    seen = replace(SEEN, age=100.0, silent=True)
-    assert "NOTHING RECEIVED FOR 1 min 40 s" in lines_of(seen)[2]
-    assert "+1.250 m" in line_with("yaw", seen)
-    assert len(lines_of(seen)) == 24
-    assert re.search(r"\x1b\[2mx   \+1.250", painted(seen))
+    data = replace(SEEN, age=100.0, silent=True)
+    assert "NOTHING RECEIVED FOR 1 min 40 s" in lines_of(data)[2]
+    assert "+1.250 m" in line_with("yaw", data)
+    assert len(lines_of(data)) == 24
+    assert re.search(r"\x1b\[2mx   \+1.250", painted(data))
 
 
 @pytest.mark.parametrize("width", [40, 80])
 def test_without_a_link_no_old_speed_is_shown(width: int) -> None:
-    there, gone = ("\n".join(lines_of(of(link=link), width)) for link in ("up", "down"))
-    assert "m/s" in gone
-    assert not re.search(r"[+-]\d+\.\d+ (m/s|rad/s)", gone)
+    there, no_link = ("\n".join(lines_of(of(link=link), width)) for link in ("up", "down"))
+    assert "m/s" in no_link
+    assert not re.search(r"[+-]\d+\.\d+ (m/s|rad/s)", no_link)
     assert re.search(r"[+-]\d+\.\d+ m/s", there)
-    assert "▲" not in gone
+    assert "▲" not in no_link
 
 
 def test_undecodable_messages_are_distinguished_from_silence() -> None:
-    (told,) = [
+    (row,) = [
         line
         for line in lines_of(replace(SEEN, age=3.0, undecodable=9, silent=True))
         if "FOR 3 s" in line
     ]
-    assert "a different version?" in told
+    assert "a different version?" in row
 
 
 @each("width", [40, 80])
 def test_a_warning_is_shown_below_the_mode_with_its_text(width: int) -> None:
     inputs = {"emergency_stop": "released", "bumpers": [False, False]}
     battery = BatterySummary(24.5, 87.0, -1.25, "ok")
-    told = lines_of(of(mode="ready", recording_error="disk full", battery=battery, **inputs), width)
-    at = next(n for n, line in enumerate(told) if "READY" in line)
-    assert "WARNING: recording fails: disk full" in map(str.strip, told[at : at + 4])
-    words = " ".join(" ".join(told).split())
+    lines = lines_of(
+        of(mode="ready", recording_error="disk full", battery=battery, **inputs), width
+    )
+    at = next(n for n, line in enumerate(lines) if "READY" in line)
+    assert "WARNING: recording fails: disk full" in map(str.strip, lines[at : at + 4])
+    words = " ".join(" ".join(lines).split())
     assert "board emergency stop released bumpers .. battery 24.50 V -1.25 A 87 %" in words
 
 
 def test_more_warnings_take_one_line_of_a_wide_screen() -> None:
-    told = lines_of(of(recording_error="disk full", bumpers=[False, True]))
-    assert "WARNING: bumper 2 pressed, recording fails" in told
+    lines = lines_of(of(recording_error="disk full", bumpers=[False, True]))
+    assert "WARNING: bumper 2 pressed, recording fails" in lines
 
 
 # any message from the bus
@@ -143,16 +145,16 @@ def test_more_warnings_take_one_line_of_a_wide_screen() -> None:
 def test_a_usual_screen_fits_80_by_24_without_truncation() -> None:
     four = [*STATE.sources, SourceState("spare", 1, None, "a command")]
     counters = dict.fromkeys(STATE.counters, 10**7) | {"lines_superseded": 12_345}
-    told = lines_of(
+    lines = lines_of(
         of(
             sources=four,
             counters=counters,
             refused="source nav: the twist contains NaN or infinity",
         )
     )
-    assert len(told) == 24
-    assert max(map(cell_len, told)) == 80
-    assert not any(line.endswith("…") for line in told)
+    assert len(lines) == 24
+    assert max(map(cell_len, lines)) == 80
+    assert not any(line.endswith("…") for line in lines)
 
 
 def test_a_larger_screen_has_empty_lines_between_its_parts() -> None:
@@ -173,9 +175,9 @@ def test_a_hostile_text_changes_only_its_own_field() -> None:
         info=replace(INFO, port=ENOUGH, version=ENOUGH),
     )  # fmt: skip
     assert harmless(painted(hostile))
-    told = "\n".join(lines_of(hostile))
-    assert told.count("[red]") >= 8
-    assert "timing" in told
+    text = "\n".join(lines_of(hostile))
+    assert text.count("[red]") >= 8
+    assert "timing" in text
 
 
 def harmless(sent: str) -> bool:
@@ -223,8 +225,8 @@ def test_any_state_fits_any_terminal_and_is_printable(
     width: int,
     height: int,
 ) -> None:
-    seen = ScreenData(robot_id, endpoint, state, before, age, INFO, 0, "q quits")
-    told = lines_of(seen, width, height)
-    assert len(told) <= height
-    assert max(map(cell_len, told)) <= width
-    assert harmless(painted(seen, width, height))
+    data = ScreenData(robot_id, endpoint, state, before, age, INFO, 0, "q quits")
+    lines = lines_of(data, width, height)
+    assert len(lines) <= height
+    assert max(map(cell_len, lines)) <= width
+    assert harmless(painted(data, width, height))

@@ -36,20 +36,20 @@ def test_a_robot_that_moves_is_a_line_a_second_and_one_at_rest_one_in_ten() -> N
 
 def test_another_reason_is_reported_immediately_up_to_two_lines_a_second() -> None:
     stopped = replace(STATE, mode="stopped", reason="stopped by request")
-    found = told([(0.0, STATE), (0.5, stopped), (0.6, STATE), (1.0, STATE)])
-    assert [state.mode for state in found] == ["driving", "stopped", "driving"]
+    states = told([(0.0, STATE), (0.5, stopped), (0.6, STATE), (1.0, STATE)])
+    assert [state.mode for state in states] == ["driving", "stopped", "driving"]
     flickering = [(n / 20, replace(STATE, reason=f"because {n}")) for n in range(200)]
     assert len(told(flickering)) <= 20
 
 
 def test_the_help_is_repeated_before_reports_scroll_it_off_the_terminal() -> None:
-    page, shown = Page(), list[str]()
+    page, lines = Page(), list[str]()
     for number in range(100):
-        shown += page.with_help([f"news {number}", *["more of it"] * (number % 4)], 24)
+        lines += page.with_help([f"news {number}", *["more of it"] * (number % 4)], 24)
         # The last line of a terminal stays empty, because the cursor is there.
-        assert list(HELP) == [line for line in shown[-23:] if line in HELP]
-    assert shown.count(HELP[0]) < 30
-    assert shown[-4:-3] == ["news 99"]
+        assert list(HELP) == [line for line in lines[-23:] if line in HELP]
+    assert lines.count(HELP[0]) < 30
+    assert lines[-4:-3] == ["news 99"]
 
 
 def test_output_to_a_file_has_the_help_once() -> None:

@@ -14,7 +14,7 @@ from tests.each import each
 
 
 @each(
-    ("text", "shown"),
+    ("text", "expected"),
     [
         ("commanded by app", "commanded by app"),
         ("[bold]not markup[/bold] :smile:", "[bold]not markup[/bold] :smile:"),
@@ -28,8 +28,8 @@ from tests.each import each
         ("Größe 大", "Größe 大"),
     ],
 )
-def test_text_from_the_bus_keeps_only_printable_characters(text: str, shown: str) -> None:
-    assert clean(text) == shown
+def test_text_from_the_bus_keeps_only_printable_characters(text: str, expected: str) -> None:
+    assert clean(text) == expected
 
 
 @settings(max_examples=30)

@@ -26,10 +26,10 @@ from tests.unit.top.screens import (
 
 def test_commands_of_new_senders_are_counted_as_commands_and_not_as_rejected() -> None:
     counters = {**STATE.counters, "commands_of_new_senders": 40}
-    shown = lines_of(replace(SEEN, state=replace(STATE, counters=counters)))
-    (line,) = [line for line in shown if "of new senders 40" in line]
+    lines = lines_of(replace(SEEN, state=replace(STATE, counters=counters)))
+    (line,) = [line for line in lines if "of new senders 40" in line]
     assert line.startswith("commands")
-    assert any(line.startswith("rejected") and "nothing" in line for line in shown)
+    assert any(line.startswith("rejected") and "nothing" in line for line in lines)
 
 
 def test_pose_and_twist_have_their_units() -> None:
@@ -54,17 +54,17 @@ def test_sources_show_priority_age_and_what_they_wait_for() -> None:
 
 
 def test_a_source_of_a_stopped_robot_is_not_shown_as_driving() -> None:
-    seen = of(mode="stopped", reason="stopped by request; call srv/clear")
-    assert "▶" not in "".join(lines_of(seen))
-    assert "the robot is stopped" in line_with("  app  ", seen)
+    data = of(mode="stopped", reason="stopped by request; call srv/clear")
+    assert "▶" not in "".join(lines_of(data))
+    assert "the robot is stopped" in line_with("  app  ", data)
 
 
 def test_sources_that_do_not_fit_are_counted() -> None:
     many = [SourceState(f"source{n}", n, None, "a command") for n in range(40)]
-    told = lines_of(of(sources=many))
-    assert len(told) == 24
-    assert any("and 37 more: source3, source4" in line for line in told)
-    assert "mcu_round_trip" in told[-1]
+    lines = lines_of(of(sources=many))
+    assert len(lines) == 24
+    assert any("and 37 more: source3, source4" in line for line in lines)
+    assert "mcu_round_trip" in lines[-1]
     assert not any("more:" in line for line in lines_of(of(sources=many[:4])))
 
 
@@ -80,9 +80,9 @@ def test_rates_are_taken_between_two_states() -> None:
 @each("width", [80, 60])
 def test_a_robot_s_clock_that_is_set_changes_no_rate(set_by: int, width: int) -> None:
     stepped = replace(STATE, stamp=Time(1000 + set_by, 0))
-    told = "\n".join(lines_of(replace(SEEN, state=stepped, passed=1.0), width))
-    assert "100.0/s of 1,300" in told
-    assert "20.0/s of 220" in told
+    text = "\n".join(lines_of(replace(SEEN, state=stepped, passed=1.0), width))
+    assert "100.0/s of 1,300" in text
+    assert "20.0/s of 220" in text
 
 
 def test_missed_periods_are_counted_and_stand_out_while_they_grow() -> None:
@@ -94,13 +94,13 @@ def test_missed_periods_are_counted_and_stand_out_while_they_grow() -> None:
 
 def test_rejects_are_shown_by_reason_and_stand_out_while_they_grow() -> None:
     counters = {"line_malformed": 3, "line_implausible": 12, "command_stale": 4, "line_zero": 0}
-    seen = of(counters=counters, refused="source nav: the twist contains NaN or infinity")
-    assert line_with("rejected", seen).split(maxsplit=1)[1] == (
+    data = of(counters=counters, refused="source nav: the twist contains NaN or infinity")
+    assert line_with("rejected", data).split(maxsplit=1)[1] == (
         "lines implausible 12, malformed 3 · commands stale 4"
     )
-    assert "source nav: the twist contains NaN or infinity" in line_with("last one", seen)
-    assert "\x1b[33mimplausible 12\x1b[0m" in painted(seen)
-    assert "\x1b[33mimplausible" not in painted(replace(seen, before=seen.state))
+    assert "source nav: the twist contains NaN or infinity" in line_with("last one", data)
+    assert "\x1b[33mimplausible 12\x1b[0m" in painted(data)
+    assert "\x1b[33mimplausible" not in painted(replace(data, before=data.state))
     assert "nothing" in line_with("rejected")
 
 
@@ -111,14 +111,14 @@ def test_the_state_of_the_gyro_is_shown_if_there_is_one(does: str) -> None:
 
 
 def test_the_learned_track_is_shown_beside_the_configured_one() -> None:
-    told = "learned 1.603 ± 0.032 (only reported), configured 1.000 (in use)"
-    assert line_with("track", of(gyro="used", effective_track=told)).split(maxsplit=1)[1] == told
+    text = "learned 1.603 ± 0.032 (only reported), configured 1.000 (in use)"
+    assert line_with("track", of(gyro="used", effective_track=text)).split(maxsplit=1)[1] == text
     assert not any("track" in line for line in lines_of(of(gyro="used")))
 
 
 def test_samples_of_a_gyro_that_do_not_count_are_among_the_rejects() -> None:
-    seen = of(counters={"imu_second_sender": 1200, "imu_out_of_range": 3})
-    assert "gyro second sender 1,200, out of range 3" in line_with("rejected", seen)
+    data = of(counters={"imu_second_sender": 1200, "imu_out_of_range": 3})
+    assert "gyro second sender 1,200, out of range 3" in line_with("rejected", data)
 
 
 def test_the_link_is_reported_with_its_port() -> None:
@@ -143,8 +143,8 @@ def test_the_certificate_is_shown_if_there_is_one() -> None:
 
 def test_each_figure_is_shown_for_the_last_minute_and_since_the_start() -> None:
     for name in NAMES:
-        told = re.split(r"\s{2,}|(?<=s) ", line_with(name).removeprefix(name).strip())
-        assert told[-6:] == ["63 µs", "891 µs", "9.7 ms", "56 µs", "112 µs", "8.0 ms"]
+        cells = re.split(r"\s{2,}|(?<=s) ", line_with(name).removeprefix(name).strip())
+        assert cells[-6:] == ["63 µs", "891 µs", "9.7 ms", "56 µs", "112 µs", "8.0 ms"]
         assert LATENCY_ROWS[name][0] in line_with(name)
         assert LATENCY_ROWS[name][1] in line_with(name, width=116)
 

@@ -83,15 +83,15 @@ def test_without_a_directory_no_file_is_found(tmp_path: Path) -> None:
 def test_the_page_has_stop_and_its_style_in_itself_and_allows_them_by_their_hashes() -> None:
     page = Files().get("index.html")
     assert page is not None
-    found = {
+    sources = {
         "script-src": re.findall(rb"<script>(.*?)</script>", page.body, re.DOTALL),
         "style-src": re.findall(rb"<style>(.*?)</style>", page.body, re.DOTALL),
     }
-    assert found["script-src"] == [(PAGE_DIRECTORY / "stop.js").read_bytes()]
-    assert found["style-src"] == [(PAGE_DIRECTORY / "style.css").read_bytes()]
+    assert sources["script-src"] == [(PAGE_DIRECTORY / "stop.js").read_bytes()]
+    assert sources["style-src"] == [(PAGE_DIRECTORY / "style.css").read_bytes()]
     assert not any(loads in page.body for loads, _ in INLINED["index.html"].values())
-    policy = dict(one.split(maxsplit=1) for one in page.policy.split("; ") if one)
-    for name, (source,) in found.items():
+    policy = dict(directive.split(maxsplit=1) for directive in page.policy.split("; ") if directive)
+    for name, (source,) in sources.items():
         digest = base64.b64encode(hashlib.sha256(source).digest()).decode()
         assert policy.pop(name) == f"'self' 'sha256-{digest}'"
     assert not policy
@@ -107,7 +107,7 @@ def test_a_page_that_the_browser_has_already_keeps_its_policy() -> None:
     first = sent(make_mocked_request("GET", "/"), page)
     again = sent(make_mocked_request("GET", "/", {"If-None-Match": page.tag}), page)
     assert (first.status, again.status) == (200, 304)
-    policies = [one.headers["Content-Security-Policy"] for one in (first, again)]
+    policies = [response.headers["Content-Security-Policy"] for response in (first, again)]
     assert policies[0] == policies[1]
     assert policies[0].endswith(page.policy)
 

@@ -102,8 +102,8 @@ async def test_the_age_of_a_picture_counts_a_suspend(
     page = Page(parts, Vault(tmp_path, "acsar"), frozenset(), Acceptor(counts))
     page._camera = Camera("http://127.0.0.1:1/")
 
-    async def sent(request: web.Request, body: bytes, told: dict[str, str], *_: object) -> None:
-        headers.update(told)
+    async def sent(request: web.Request, body: bytes, fields: dict[str, str], *_: object) -> None:
+        headers.update(fields)
 
     monkeypatch.setattr(app, "sent_in_pieces", sent)
     page._camera._take(b"picture")
@@ -121,7 +121,7 @@ ROWS = {row.key: row for row in settings_in(effective(Config()))}
 
 
 def test_each_setting_that_may_change_has_a_row_and_no_other() -> None:
-    sources = {f"commands.sources.{one.name}.timeout" for one in Config().commands.sources}
+    sources = {f"commands.sources.{source.name}.timeout" for source in Config().commands.sources}
     assert set(ROWS) == (set(LIVE) - {"commands.sources.*.timeout"}) | sources
 
 

@@ -65,17 +65,17 @@ def test_a_browser_on_the_robot_s_machine_is_local(peer: str, host: str) -> None
     ],
 )
 def test_any_other_host_name_is_refused(facts: RequestFacts, reason: str) -> None:
-    with pytest.raises(RefusedError) as found:
+    with pytest.raises(RefusedError) as error:
         place(facts, NAMES)
-    assert found.value.reason == reason
+    assert error.value.reason == reason
 
 
 @each("secure", [False, True])
 @each("host", ["localhost:8080", "robot.local"])
 def test_a_request_through_a_proxy_is_refused(secure: bool, host: str) -> None:
-    with pytest.raises(RefusedError, match="proxy") as found:
+    with pytest.raises(RefusedError, match="proxy") as error:
         place(RequestFacts("127.0.0.1", secure, host, proxied=True), NAMES)
-    assert found.value.reason == "proxy"
+    assert error.value.reason == "proxy"
 
 
 @pytest.mark.parametrize("host", ["robot.local:8443", "Robot.Local", "192.168.1.7:8443"])
@@ -115,9 +115,9 @@ def test_the_robot_s_own_page_and_programs_pass_the_origin_check(
     ],
 )
 def test_a_page_of_another_origin_is_refused(origin: str | None, site: str | None) -> None:
-    with pytest.raises(RefusedError) as found:
+    with pytest.raises(RefusedError) as error:
         require_own_origin(RequestFacts("127.0.0.1", False, "localhost:8080", origin, site))
-    assert found.value.reason == "origin"
+    assert error.value.reason == "origin"
 
 
 def test_a_role_has_the_permissions_of_the_roles_below_it() -> None:
@@ -126,9 +126,9 @@ def test_a_role_has_the_permissions_of_the_roles_below_it() -> None:
     assert [operator.may("operator"), operator.may("maintainer")] == [True, False]
     assert MAINTAINER.may("maintainer")
     operator.require("operator", "clear")
-    with pytest.raises(RefusedError, match="clear is for operators; your role is viewer") as found:
+    with pytest.raises(RefusedError, match="clear is for operators; your role is viewer") as error:
         viewer.require("operator", "clear")
-    assert found.value.reason == "role"
+    assert error.value.reason == "role"
 
 
 def test_host_names_are_split_from_ports_and_loopback_addresses_are_recognized() -> None:
@@ -141,8 +141,13 @@ def test_host_names_are_split_from_ports_and_loopback_addresses_are_recognized()
 
 
 def test_a_mapped_ipv4_address_is_shown_as_ipv4() -> None:
-    told = ("::ffff:192.168.1.7", "192.168.1.7", "::1", "fe80::ffff:1", "")
-    assert [unmapped(one) for one in told] == ["192.168.1.7", "192.168.1.7", "::1", *told[3:]]
+    addresses = ("::ffff:192.168.1.7", "192.168.1.7", "::1", "fe80::ffff:1", "")
+    assert [unmapped(address) for address in addresses] == [
+        "192.168.1.7",
+        "192.168.1.7",
+        "::1",
+        *addresses[3:],
+    ]
 
 
 def test_a_page_reads_its_own_cookie_first_and_no_other_robot_s_cookie() -> None:
@@ -150,27 +155,27 @@ def test_a_page_reads_its_own_cookie_first_and_no_other_robot_s_cookie() -> None
 
     A browser sends the cookies of all ports of a host.
     """
-    shown = {
+    cookies = {
         cookie_name("robot1", 8444): "elsewhere",
         cookie_name("robot2", 8443): "another robot's",
         cookie_name("robot1-8443", 8443): "another robot's",
         cookie_name("robot1", 8443): "own",
         "session": "no token",
     }
-    assert tokens_in(shown, "robot1", 8443) == ["own", "elsewhere"]
-    assert tokens_in(shown, "robot3", 8443) == []
+    assert tokens_in(cookies, "robot1", 8443) == ["own", "elsewhere"]
+    assert tokens_in(cookies, "robot3", 8443) == []
     assert tokens_in({}, "robot1", 8443) == []
 
 
 def test_a_limited_number_of_cookies_is_read_and_includes_the_page_s_own() -> None:
-    shown = {cookie_name("robot1", port): str(port) for port in range(9000)}
-    told = tokens_in(shown, "robot1", 8443)
-    assert (len(told), told[0]) == (MAX_TOKENS, "8443")
+    cookies = {cookie_name("robot1", port): str(port) for port in range(9000)}
+    tokens = tokens_in(cookies, "robot1", 8443)
+    assert (len(tokens), tokens[0]) == (MAX_TOKENS, "8443")
 
 
 def test_an_ipv6_address_counts_by_its_network_and_an_ipv4_address_by_itself() -> None:
-    told = ("2001:db8:1:2:3::4", "2001:db8:1:2::ffff", "2001:db8:1:3::4", "192.168.1.7", "")
-    assert [network_of(one) for one in told] == [
+    addresses = ("2001:db8:1:2:3::4", "2001:db8:1:2::ffff", "2001:db8:1:3::4", "192.168.1.7", "")
+    assert [network_of(address) for address in addresses] == [
         "2001:db8:1:2::/64", "2001:db8:1:2::/64", "2001:db8:1:3::/64", "192.168.1.7", "",
     ]  # fmt: skip
     assert network_of("fe80::1%eth0") == "fe80::/64"

@@ -92,20 +92,20 @@ async def test_a_stop_that_fails_fails_its_waiting_callers_and_not_the_next_stop
     await asyncio.sleep(0)
     go.set()
     async with asyncio.timeout(PATIENCE_S):
-        told = await asyncio.gather(*later, return_exceptions=True)
-        assert [str(one) for one in told] == ["gone"] * 3
+        results = await asyncio.gather(*later, return_exceptions=True)
+        assert [str(result) for result in results] == ["gone"] * 3
         assert (await stops.ask(held)).success
         await asyncio.gather(*first)
 
 
 async def test_only_stop_may_be_called_on_another_robot_and_only_with_a_valid_id() -> None:
     calls = calls_of(robots(None))
-    with pytest.raises(RefusedError, match=r"r2 is not this page's robot.*own page") as told:
+    with pytest.raises(RefusedError, match=r"r2 is not this page's robot.*own page") as error:
         await calls.call(MAINTAINER, "clear", {}, "r2")
-    assert told.value.reason == "role"
-    with pytest.raises(RefusedError, match="not a robot's id") as told:
+    assert error.value.reason == "role"
+    with pytest.raises(RefusedError, match="not a robot's id") as error:
         await calls.call(MAINTAINER, "stop", {}, "**")
-    assert told.value.reason == "malformed"
+    assert error.value.reason == "malformed"
     # Naming the page's own robot counts as its own.
     assert not (await calls.call(MAINTAINER, "clear", {}, "acsar")).success
 
@@ -130,23 +130,23 @@ def test_a_stop_succeeds_when_the_check_has_ended_and_the_daemon_has_replied(
         ).success
         return await calls.call(replace(MAINTAINER, role="viewer"), "stop", {})
 
-    told = asyncio.run(story(None))
-    assert not told.success, "no daemon has confirmed anything"
-    assert told.message.startswith("the check started by phone has ended; ")
+    outcome = asyncio.run(story(None))
+    assert not outcome.success, "no daemon has confirmed anything"
+    assert outcome.message.startswith("the check started by phone has ended; ")
     with zenoh.open(quiet()) as session:
         session.declare_queryable("acsard/acsar/srv/stop", served)
-        told = asyncio.run(story(Client(session, "acsar", "teleop")))
-    assert told.success == ended
-    assert told.message == "the check started by phone has ended; stopped"
+        outcome = asyncio.run(story(Client(session, "acsar", "teleop")))
+    assert outcome.success == ended
+    assert outcome.message == "the check started by phone has ended; stopped"
 
 
 async def test_a_stop_of_another_robot_is_sent_however_many_replies_are_pending() -> None:
-    held: list[zenoh.Query] = []
-    told: list[str] = []
+    queries: list[zenoh.Query] = []
+    keys: list[str] = []
     with zenoh.open(quiet()) as session:
-        session.declare_queryable("acsard/r2/srv/stop", held.append)
+        session.declare_queryable("acsard/r2/srv/stop", queries.append)
         session.declare_subscriber(
-            "acsard/*/stop", lambda sample: told.append(str(sample.key_expr))
+            "acsard/*/stop", lambda sample: keys.append(str(sample.key_expr))
         )
         calls = calls_of(robots(Client(session, "acsar", "teleop")))
 
@@ -155,17 +155,17 @@ async def test_a_stop_of_another_robot_is_sent_however_many_replies_are_pending(
 
         first = [asyncio.create_task(stop("r2", n)) for n in range(MAX_REMOTE_STOPS)]
         async with asyncio.timeout(PATIENCE_S):
-            while len(held) < MAX_REMOTE_STOPS:
+            while len(queries) < MAX_REMOTE_STOPS:
                 await asyncio.sleep(0.01)
             beyond = await stop("r3")
-            while not told:
+            while not keys:
                 await asyncio.sleep(0.01)
         assert not beyond.success
         assert "the stop was sent to r3" in beyond.message
-        assert told == ["acsard/r3/stop"]
+        assert keys == ["acsard/r3/stop"]
         answer = encode(ServiceReply(True, "stopped"), "msgpack")
-        while held:
-            with held.pop() as query:
+        while queries:
+            with queries.pop() as query:
                 kind = encoding_name("msgpack", "ServiceReply")
                 query.reply(query.key_expr, answer, encoding=kind)
         assert all(reply.success for reply in await asyncio.gather(*first))
@@ -214,11 +214,11 @@ async def test_a_stop_that_comes_as_the_pause_ends_is_sent_and_so_are_the_later_
 
 
 async def test_stops_to_silent_robots_are_limited_and_an_answering_robot_is_stopped() -> None:
-    told: Counter[str] = Counter()
+    stop_counts: Counter[str] = Counter()
 
     def served(query: zenoh.Query) -> None:
         with query:
-            told["r2"] += 1
+            stop_counts["r2"] += 1
             answer = encode(ServiceReply(True, "stopped"), "msgpack")
             kind = encoding_name("msgpack", "ServiceReply")
             query.reply(query.key_expr, answer, encoding=kind)
@@ -239,7 +239,7 @@ async def test_stops_to_silent_robots_are_limited_and_an_answering_robot_is_stop
                 refused += 1
         assert refused > 100 - 2 * REMOTE_STOP_RATE.burst
         assert await stop("r2")
-        assert told["r2"] == 2
+        assert stop_counts["r2"] == 2
 
 
 async def test_a_robot_that_a_page_shows_is_stopped_however_many_stops_were_refused() -> None:
@@ -265,11 +265,11 @@ async def test_a_robot_that_a_page_shows_is_stopped_however_many_stops_were_refu
 
         fleet.join(1)
         token = session.liveliness().declare_token("acsard/r2/alive")
-        await row(fleet, lambda one: one.robot == "r2")
+        await row(fleet, lambda entry: entry.robot == "r2")
         await refused()
         assert await stop("r2") != "too_fast"
         token.undeclare()
-        await row(fleet, lambda one: one.robot == "r2" and one.mode == "gone")
+        await row(fleet, lambda entry: entry.robot == "r2" and entry.mode == "gone")
         await refused()
         assert await stop("r2") == "too_fast"
         fleet.leave(1)

@@ -29,13 +29,13 @@ def test_every_picture_is_found_in_pieces_of_any_size(boundary, form, size) -> N
     stream = b"".join(map(form, [*PICTURES, b"last"]))
     parts = Parts(boundary)
     pieces = [stream[n : n + size] for n in range(0, len(stream), size)]
-    found = [part for piece in pieces if (part := parts.feed(piece)) is not None]
+    pictures = [part for piece in pieces if (part := parts.feed(piece)) is not None]
     wanted = [*PICTURES, b"last"] if form is measured else PICTURES
     if size == 1:
-        assert found == wanted
+        assert pictures == wanted
     else:
-        assert found[-1] == wanted[-1]  # of several at once only the newest counts
-        assert all(one in wanted for one in found)
+        assert pictures[-1] == wanted[-1]  # of several at once only the newest counts
+        assert all(picture in wanted for picture in pictures)
 
 
 @each(

@@ -59,18 +59,18 @@ def robots(client: Client | None) -> Robots:
     def connect() -> Client:
         raise AssertionError("nobody runs this")
 
-    found = Robots(Address("tcp/127.0.0.1:1", "acsar", ""), connect, ABOUT, Counts())
-    found.client = client
-    return found
+    result = Robots(Address("tcp/127.0.0.1:1", "acsar", ""), connect, ABOUT, Counts())
+    result.client = client
+    return result
 
 
 async def row(fleet: Fleet, look: Callable[[Row], Any]) -> Row:
     """Wait for a row for which `look` is true, and return it."""
     async with asyncio.timeout(PATIENCE_S):
         while True:
-            for one in fleet.rows():
-                if look(one):
-                    return one
+            for entry in fleet.rows():
+                if look(entry):
+                    return entry
             await asyncio.sleep(0.01)
 
 
@@ -81,11 +81,11 @@ async def test_a_robot_that_is_present_and_silent_is_not_shown_in_its_last_mode(
     fleet = Fleet(robots(Client(session, "acsar", "teleop")))
     token = session.liveliness().declare_token("acsard/r2/alive")
     fleet.join(1)
-    await row(fleet, lambda one: one.robot == "r2")
+    await row(fleet, lambda entry: entry.robot == "r2")
     key, named = "acsard/r2/state", encoding_name("msgpack", "RobotState")
     session.put(key, encode(STATE, "msgpack"), encoding=named)
-    await row(fleet, lambda one: one.mode == STATE.mode)
-    silent = await row(fleet, lambda one: one.mode is None)
+    await row(fleet, lambda entry: entry.mode == STATE.mode)
+    silent = await row(fleet, lambda entry: entry.mode is None)
     assert (silent.speed, silent.link, silent.place) == (None, "", None)
     assert silent.reason == f"the robot was {STATE.mode}"
     assert silent.age is not None
@@ -104,29 +104,29 @@ async def test_a_robot_is_reported_with_its_version_and_seconds_and_as_gone_when
         )  # fmt: skip
 
     def info(query: zenoh.Query) -> None:
-        said = encode(INFO, "msgpack")
-        query.reply("acsard/r2/info", said, encoding=encoding_name("msgpack", "Info"))
+        payload = encode(INFO, "msgpack")
+        query.reply("acsard/r2/info", payload, encoding=encoding_name("msgpack", "Info"))
         query.drop()
 
     fleet = Fleet(robots(Client(session, "acsar", "teleop")))
     session.declare_queryable("acsard/r2/info", info)
     token = session.liveliness().declare_token("acsard/r2/alive")
     fleet.join(1)
-    silent = await row(fleet, lambda one: one.robot == "r2")
+    silent = await row(fleet, lambda entry: entry.robot == "r2")
     assert (silent.mode, silent.speed, silent.age) == (None, None, None)
     say()
-    heard = await row(fleet, lambda one: one.mode == STATE.mode and one.version)
-    assert (heard.version, heard.speed) == ("1.2.3", STATE.linear)
-    assert (heard.place, heard.warnings) == ([STATE.x, STATE.y, STATE.yaw], [WARNS])
+    present = await row(fleet, lambda entry: entry.mode == STATE.mode and entry.version)
+    assert (present.version, present.speed) == ("1.2.3", STATE.linear)
+    assert (present.place, present.warnings) == ([STATE.x, STATE.y, STATE.yaw], [WARNS])
     say()
     await asyncio.sleep(0.5)
     (late,) = fleet.rows()
     assert late.age is not None
     assert 0.4 < late.age < PATIENCE_S
     token.undeclare()
-    gone = await row(fleet, lambda one: one.mode == "gone")
-    assert STATE.mode in gone.reason
-    assert gone.version == ""
+    absent = await row(fleet, lambda entry: entry.mode == "gone")
+    assert STATE.mode in absent.reason
+    assert absent.version == ""
     fleet.leave(1)
 
 
@@ -144,6 +144,6 @@ async def test_the_fleet_is_searched_again_after_no_connection_or_a_failed_bus(
     await asyncio.sleep(0.1)
     known.client = Client(session, "acsar", "teleop")
     token = session.liveliness().declare_token("acsard/r2/alive")
-    await row(fleet, lambda one: one.robot == "r2")
+    await row(fleet, lambda entry: entry.robot == "r2")
     token.undeclare()
     fleet.leave(1)

@@ -28,8 +28,8 @@ def test_the_configured_port_is_listed_under_its_configured_name(
     configured: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("acsard.web.guide.serial_devices", lambda: [MEGA, HELD])
-    found = {one.port: one.what for one in boards(configured)}
-    assert found == {
+    labels = {board.port: board.what for board in boards(configured)}
+    assert labels == {
         configured: "Arduino Mega 2560 R3, configured",
         "/dev/ttyUSB0": "USB Serial, in use by acsard (process 7)",
         "sim": "the simulator: no real robot moves",
@@ -48,7 +48,7 @@ def test_the_simulator_is_listed_once_whatever_is_configured(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("acsard.web.guide.serial_devices", list)
-    assert [one.port for one in boards("sim")] == ["sim"]
+    assert [board.port for board in boards("sim")] == ["sim"]
 
 
 @pytest.mark.parametrize("configured", ["sim", "/dev/ttyUSB0"])
@@ -80,9 +80,9 @@ async def test_a_server_that_sees_no_port_says_what_to_do(
     assert (await Guide(REACH, configured).choices(simulated=False)).note == note
 
 
-def parsed(given: list[str]) -> argparse.Namespace:
+def parsed(argv: list[str]) -> argparse.Namespace:
     """Return the arguments as the command line parses them."""
-    return parser(["calibrate", "mcu"]).parse_args(given)
+    return parser(["calibrate", "mcu"]).parse_args(argv)
 
 
 def test_a_check_gets_the_port_and_the_file_and_asks_before_it_moves() -> None:
@@ -103,9 +103,9 @@ def test_a_calibration_is_of_the_page_s_robot_and_asks_before_it_moves(way: str)
 
 
 def test_unknown_values_are_not_passed_as_options() -> None:
-    given = arguments(Begin("calibrate"), Reach("", "tcp/127.0.0.1:7448", "acsar", ""), ())
+    argv = arguments(Begin("calibrate"), Reach("", "tcp/127.0.0.1:7448", "acsar", ""), ())
     assert not any(
-        word.startswith(("--config", "--tls", "--method", "--positions")) for word in given
+        word.startswith(("--config", "--tls", "--method", "--positions")) for word in argv
     )
 
 
@@ -143,10 +143,10 @@ def test_no_text_becomes_an_option_of_its_own(
     what: str, port: str, way: str, positions: str
 ) -> None:
     try:
-        given = arguments(Begin(what, port, way, positions), REACH, PORTS)  # type: ignore[arg-type]
+        argv = arguments(Begin(what, port, way, positions), REACH, PORTS)  # type: ignore[arg-type]
     except FrameError:
         return
-    names = {word.partition("=")[0] for word in given}
+    names = {word.partition("=")[0] for word in argv}
     assert names <= {
         "mcu", "check", "calibrate", "--json-lines", "--config", "--port", "--connect", "--id",
         "--tls", "--method", "--positions",
@@ -160,7 +160,7 @@ def test_every_calibration_method_has_its_requirements() -> None:
 def test_the_text_about_the_simulator_mentions_every_method() -> None:
     way, why = SIMULATED
     assert way in NEEDS
-    assert [one for one in NEEDS if one not in why] == []
+    assert [method for method in NEEDS if method not in why] == []
 
 
 @each("key", ["a//b", "a/", "/a", "-a", "a" * 81, "a*", "a b", "a\n"])
@@ -170,12 +170,12 @@ def test_an_invalid_key_is_refused_as_a_source_of_positions(key: str) -> None:
 
 
 @each(
-    ("said", "kept"),
+    ("data", "expected"),
     [
         (b"short", "short"),
         (b"x\n" * 2000 + b"last", "x\n" * 1997 + "last"),
         ("ü".encode() * 3000 + b"x", "ü" * 1999 + "x"),
     ],
 )
-def test_a_long_error_text_is_cut_between_lines_or_characters(said: bytes, kept: str) -> None:
-    assert last_part(said).decode() == kept
+def test_a_long_error_text_is_cut_between_lines_or_characters(data: bytes, expected: str) -> None:
+    assert last_part(data).decode() == expected

@@ -42,45 +42,45 @@ def lived(seconds: float, look_ns: int = NS_PER_S // 10) -> Minute:
 
 
 def columns(plotted: Plotted) -> list[list[float | None]]:
-    told = msgspec.to_builtins(plotted)
-    wheels = told.pop("wheels")
-    return [*told.values(), *wheels]
+    series = msgspec.to_builtins(plotted)
+    wheels = series.pop("wheels")
+    return [*series.values(), *wheels]
 
 
 def test_a_row_has_what_each_line_of_the_plots_shows() -> None:
     minute = Minute()
     minute.add(NS_PER_S, replace(STATE, battery=BatterySummary(24.5, 87.0, None, "ok")), WISHED)
-    told = minute.plotted(3 * NS_PER_S)
-    assert told.age == [2000]
-    assert (told.linear, told.angular) == ([0.25], [-0.5])
-    assert (told.wished_linear, told.wished_angular) == ([0.3], [-0.6])
-    assert told.wheels == [[1.0], [2.0], [3.0], [4.0]]
-    assert (told.late_p99, told.late_max, told.volts) == ([0.02], [0.08], [24.5])
+    plot = minute.plotted(3 * NS_PER_S)
+    assert plot.age == [2000]
+    assert (plot.linear, plot.angular) == ([0.25], [-0.5])
+    assert (plot.wished_linear, plot.wished_angular) == ([0.3], [-0.6])
+    assert plot.wheels == [[1.0], [2.0], [3.0], [4.0]]
+    assert (plot.late_p99, plot.late_max, plot.volts) == ([0.02], [0.08], [24.5])
 
 
 def test_the_plots_show_only_the_last_minute_of_a_longer_run() -> None:
-    told = lived(150.0).plotted(150 * NS_PER_S)
-    assert 0.98 * MINUTE_NS / STEP_NS < len(told.age) <= MINUTE_NS // STEP_NS + 1
-    assert max(told.age) <= MINUTE_NS // 1_000_000
-    assert told.age == sorted(told.age, reverse=True)
-    assert told.linear[-1] == 150.0
-    assert {len(column) for column in columns(told)} == {len(told.age)}
+    plot = lived(150.0).plotted(150 * NS_PER_S)
+    assert 0.98 * MINUTE_NS / STEP_NS < len(plot.age) <= MINUTE_NS // STEP_NS + 1
+    assert max(plot.age) <= MINUTE_NS // 1_000_000
+    assert plot.age == sorted(plot.age, reverse=True)
+    assert plot.linear[-1] == 150.0
+    assert {len(column) for column in columns(plot)} == {len(plot.age)}
 
 
 @each("look_ns", [1_000_000, 30_000_000, 90_000_000, 110_000_000])
 def test_the_plots_are_bounded_and_cover_a_minute_at_any_sampling_interval(look_ns: int) -> None:
-    told = lived(100.0, look_ns).plotted(100 * NS_PER_S)
-    assert len(told.age) <= MAX_ROWS
-    assert max(told.age) > 0.98 * MINUTE_NS / 1_000_000
+    plot = lived(100.0, look_ns).plotted(100 * NS_PER_S)
+    assert len(plot.age) <= MAX_ROWS
+    assert max(plot.age) > 0.98 * MINUTE_NS / 1_000_000
 
 
 def test_an_unknown_value_is_null() -> None:
     minute = Minute()
     unknown = replace(STATE, linear=None, angular=None, wheels=[], latencies={})
     minute.add(0, unknown, None)
-    told = minute.plotted(1)
-    assert told.age == [0]
-    assert {value for column in columns(told)[1:] for value in column} == {None}
+    plot = minute.plotted(1)
+    assert plot.age == [0]
+    assert {value for column in columns(plot)[1:] for value in column} == {None}
 
 
 def test_before_the_first_state_the_plots_are_empty() -> None:

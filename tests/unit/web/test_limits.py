@@ -39,9 +39,9 @@ from acsard.web.limits import (
 
 def test_a_token_has_a_share_of_the_connections_over_all_its_addresses() -> None:
     limits = WebSocketLimits()
-    told = [limits.enter(f"10.0.0.{n}", "wall") for n in range(MAX_WEBSOCKETS)]
-    assert told.count("") == MAX_WEBSOCKETS_OF_TOKEN < MAX_WEBSOCKETS
-    assert str(MAX_WEBSOCKETS_OF_TOKEN) in told[-1]
+    refusals = [limits.enter(f"10.0.0.{n}", "wall") for n in range(MAX_WEBSOCKETS)]
+    assert refusals.count("") == MAX_WEBSOCKETS_OF_TOKEN < MAX_WEBSOCKETS
+    assert str(MAX_WEBSOCKETS_OF_TOKEN) in refusals[-1]
     assert not limits.enter("10.0.1.1", "phone")
     limits.leave("10.0.0.0", "wall")
     assert not limits.enter("10.0.2.1", "wall")
@@ -57,13 +57,13 @@ def test_a_refused_token_takes_no_place_of_its_address() -> None:
 
 def test_a_token_has_a_share_of_its_address_and_leaves_others_theirs() -> None:
     limits = WebSocketLimits()
-    told = [limits.enter("10.0.0.1", "broken") for _ in range(MAX_WEBSOCKETS_OF_NETWORK)]
-    assert told.count("") == MAX_WEBSOCKETS_OF_TOKEN_IN_NETWORK < MAX_WEBSOCKETS_OF_NETWORK
+    refusals = [limits.enter("10.0.0.1", "broken") for _ in range(MAX_WEBSOCKETS_OF_NETWORK)]
+    assert refusals.count("") == MAX_WEBSOCKETS_OF_TOKEN_IN_NETWORK < MAX_WEBSOCKETS_OF_NETWORK
     assert (
         f"{MAX_WEBSOCKETS_OF_TOKEN_IN_NETWORK} pages with this token are open at 10.0.0.1"
-        in told[-1]
+        in refusals[-1]
     )
-    assert "broken" not in told[-1]
+    assert "broken" not in refusals[-1]
     assert not limits.enter("10.0.0.1", "phone")
     assert not limits.enter("10.0.0.2", "broken")
     limits.leave("10.0.0.1", "broken")
@@ -72,22 +72,22 @@ def test_a_token_has_a_share_of_its_address_and_leaves_others_theirs() -> None:
 
 def test_an_address_has_a_share_of_the_connections_over_all_its_tokens() -> None:
     limits = WebSocketLimits()
-    told = [limits.enter("10.0.0.1", f"token{n}") for n in range(MAX_WEBSOCKETS)]
-    assert told.count("") == MAX_WEBSOCKETS_OF_NETWORK
-    assert f"{MAX_WEBSOCKETS_OF_NETWORK} from 10.0.0.1" in told[-1]
+    refusals = [limits.enter("10.0.0.1", f"token{n}") for n in range(MAX_WEBSOCKETS)]
+    assert refusals.count("") == MAX_WEBSOCKETS_OF_NETWORK
+    assert f"{MAX_WEBSOCKETS_OF_NETWORK} from 10.0.0.1" in refusals[-1]
     assert not limits.enter("10.0.0.2", "token0")
 
 
 def test_all_addresses_of_an_ipv6_network_share_the_limits_of_one_address() -> None:
     limits = WebSocketLimits()
-    told = [
+    refusals = [
         limits.enter(f"2001:db8::{n + 1:x}", "broken") for n in range(MAX_WEBSOCKETS_OF_NETWORK)
     ]
-    assert told.count("") == MAX_WEBSOCKETS_OF_TOKEN_IN_NETWORK
-    assert "are open at 2001:db8::/64 already" in told[-1]
-    told = [limits.enter(f"2001:db8::{n + 1:x}", f"token{n}") for n in range(MAX_WEBSOCKETS)]
-    assert told.count("") == MAX_WEBSOCKETS_OF_NETWORK - MAX_WEBSOCKETS_OF_TOKEN_IN_NETWORK
-    assert f"{MAX_WEBSOCKETS_OF_NETWORK} from 2001:db8::/64" in told[-1]
+    assert refusals.count("") == MAX_WEBSOCKETS_OF_TOKEN_IN_NETWORK
+    assert "are open at 2001:db8::/64 already" in refusals[-1]
+    refusals = [limits.enter(f"2001:db8::{n + 1:x}", f"token{n}") for n in range(MAX_WEBSOCKETS)]
+    assert refusals.count("") == MAX_WEBSOCKETS_OF_NETWORK - MAX_WEBSOCKETS_OF_TOKEN_IN_NETWORK
+    assert f"{MAX_WEBSOCKETS_OF_NETWORK} from 2001:db8::/64" in refusals[-1]
     assert not limits.enter("2001:db8:0:1::1", "broken")
     limits.leave("2001:db8::9", "broken")
     assert not limits.enter("2001:db8::a", "broken")
@@ -98,9 +98,9 @@ def test_local_browsers_have_reserved_connections() -> None:
     for n in range(2 * MAX_WEBSOCKETS):
         limits.enter(f"127.0.0.{n % 9}", f"token{n}")
     assert limits.refusal("127.0.0.1", "another")
-    told = [limits.enter("127.0.0.1", "") for _ in range(MAX_LOCAL_WEBSOCKETS + 1)]
-    assert told[:-1] == [""] * MAX_LOCAL_WEBSOCKETS
-    assert "on the robot itself" in told[-1]
+    refusals = [limits.enter("127.0.0.1", "") for _ in range(MAX_LOCAL_WEBSOCKETS + 1)]
+    assert refusals[:-1] == [""] * MAX_LOCAL_WEBSOCKETS
+    assert "on the robot itself" in refusals[-1]
     limits.leave("127.0.0.1", "")
     assert not limits.enter("::1", "")
 
@@ -126,37 +126,37 @@ def test_a_shared_item_takes_room_once_until_all_holders_have_released_it() -> N
 
 def test_the_manual_states_the_limits_of_the_connections() -> None:
     page = Path(__file__).parents[3] / "deploy" / "web" / "README.md"
-    told = " ".join(page.read_text(encoding="utf-8").split())
+    text = " ".join(page.read_text(encoding="utf-8").split())
     assert (
         f"There are {MAX_WEBSOCKETS} WebSockets for other machines: at most "
         f"{MAX_WEBSOCKETS_OF_NETWORK} of one network (with any tokens), "
         f"{MAX_WEBSOCKETS_OF_TOKEN} with one token (from all its "
         f"networks), and {MAX_WEBSOCKETS_OF_TOKEN_IN_NETWORK} with one token from one network"
-    ) in told
-    assert f"another {MAX_LOCAL_WEBSOCKETS} WebSockets for the machine itself" in told
-    assert f"room for {MAX_TCP_CONNECTIONS} TCP connections from other machines" in told
-    assert f"for another {MAX_LOCAL_TCP_CONNECTIONS} from the machine itself" in told
+    ) in text
+    assert f"another {MAX_LOCAL_WEBSOCKETS} WebSockets for the machine itself" in text
+    assert f"room for {MAX_TCP_CONNECTIONS} TCP connections from other machines" in text
+    assert f"for another {MAX_LOCAL_TCP_CONNECTIONS} from the machine itself" in text
     fewest = next(files for files in range(4096) if sockets_for(files) == MAX_TCP_CONNECTIONS)
-    assert f"fewer than {fewest} files" in told
-    assert f"A network with {MAX_TCP_OF_NETWORK} such connections" in told
-    assert f"A token keeps {MAX_TCP_OF_TOKEN} connections" in told
-    assert f"{COMMAND_RATE.hz:g} commands a second, and {COMMAND_RATE.burst:g} at once" in told
-    assert f"Some requests wait {REFUSAL_DELAY_S:g} s beyond a rate" in told
-    assert f"{STOPS.hz:g} stops or `whoami` a second of one token in one network" in told
-    assert f"{PICTURES.hz:g} pictures, {OPENINGS.hz:g} new WebSockets" in told
-    assert f"{STRANGER_RATE.hz:g} requests a second of one network without a token" in told
-    assert f"{STRANGER_RATE.burst:g} of the requests without a token may come at once" in told
+    assert f"fewer than {fewest} files" in text
+    assert f"A network with {MAX_TCP_OF_NETWORK} such connections" in text
+    assert f"A token keeps {MAX_TCP_OF_TOKEN} connections" in text
+    assert f"{COMMAND_RATE.hz:g} commands a second, and {COMMAND_RATE.burst:g} at once" in text
+    assert f"Some requests wait {REFUSAL_DELAY_S:g} s beyond a rate" in text
+    assert f"{STOPS.hz:g} stops or `whoami` a second of one token in one network" in text
+    assert f"{PICTURES.hz:g} pictures, {OPENINGS.hz:g} new WebSockets" in text
+    assert f"{STRANGER_RATE.hz:g} requests a second of one network without a token" in text
+    assert f"{STRANGER_RATE.burst:g} of the requests without a token may come at once" in text
     shakes = HANDSHAKE_RATE
-    assert f"begin {shakes.burst:g} TLS handshakes at once, then {shakes.hz:g} a second" in told
+    assert f"begin {shakes.burst:g} TLS handshakes at once, then {shakes.hz:g} a second" in text
     most, hz = GUESSES_OF_ONE.burst, GUESSES_OF_ONE.hz
-    assert f"may try {most:g} wrong tokens at once, then one every {1 / hz:g} s" in told
+    assert f"may try {most:g} wrong tokens at once, then one every {1 / hz:g} s" in text
     assert (GUESSES.burst / most, GUESSES.hz / hz) == pytest.approx((10, 10))
 
 
 def test_each_token_has_its_own_rate_limit() -> None:
     paces, most = Buckets(REQUEST_RATE), int(REQUEST_RATE.burst)
-    taken = [paces.take("one", 0) for _ in range(most + 1)]
-    assert taken == [True] * most + [False]
+    grants = [paces.take("one", 0) for _ in range(most + 1)]
+    assert grants == [True] * most + [False]
     assert paces.take("another", 0)
     assert paces.take("one", NS_PER_S)
 
@@ -189,18 +189,24 @@ def test_if_all_places_are_taken_a_phone_displaces_a_connection_of_the_largest_c
 def test_a_connection_with_a_valid_token_is_never_displaced() -> None:
     sockets = _filled("a", "b", "c", "d", "e")
     sockets.prove("stranger 0", "token")
-    gone = [sockets.enter("abcde"[n % 5], f"more {n}") for n in range(1000)]
-    assert None not in gone
-    assert "stranger 0" not in gone
+    victims = [sockets.enter("abcde"[n % 5], f"more {n}") for n in range(1000)]
+    assert None not in victims
+    assert "stranger 0" not in victims
 
 
 def test_the_connections_of_a_token_that_has_ended_are_found() -> None:
     sockets = Sockets[str](MAX_TCP_CONNECTIONS)
-    shown = {"none": [], "lent": ["lent"], "kept": ["kept"], "both": ["lent", "kept"], "here": [""]}
-    for one, tokens in shown.items():
-        sockets.enter("10.0.0.1", one)
+    proofs = {
+        "none": [],
+        "lent": ["lent"],
+        "kept": ["kept"],
+        "both": ["lent", "kept"],
+        "here": [""],
+    }
+    for connection, tokens in proofs.items():
+        sockets.enter("10.0.0.1", connection)
         for token in tokens:
-            sockets.prove(one, token)
+            sockets.prove(connection, token)
     assert sockets.ended({"kept", "lent"}) == []
     assert sockets.ended({"kept"}) == ["lent"]
     assert sockets.ended(()) == ["lent", "kept", "both"]
@@ -220,9 +226,9 @@ def test_a_token_keeps_a_share_of_the_places_only() -> None:
     sockets = _filled("a", "b", "c", "d", "e")
     for n in range(MAX_TCP_CONNECTIONS):
         sockets.prove(f"stranger {n}", "greedy")
-    gone = {sockets.enter(f"phone {n}", f"phone {n}") for n in range(100)}
-    assert len(gone) == 100
-    assert gone < {f"stranger {n}" for n in range(MAX_TCP_OF_TOKEN, MAX_TCP_CONNECTIONS)}
+    victims = {sockets.enter(f"phone {n}", f"phone {n}") for n in range(100)}
+    assert len(victims) == 100
+    assert victims < {f"stranger {n}" for n in range(MAX_TCP_OF_TOKEN, MAX_TCP_CONNECTIONS)}
 
 
 def test_if_all_connections_have_shown_a_token_the_token_with_the_most_gives_a_place() -> None:

@@ -35,9 +35,9 @@ def tls(tmp_path: Path) -> str:
 
 
 def free_port() -> int:
-    with socket.socket() as one:
-        one.bind(("127.0.0.1", 0))
-        return int(one.getsockname()[1])
+    with socket.socket() as sock:
+        sock.bind(("127.0.0.1", 0))
+        return int(sock.getsockname()[1])
 
 
 def reached(port: int, host: str) -> bool:
@@ -63,16 +63,16 @@ def test_an_address_is_parsed_and_a_remote_one_must_be_https() -> None:
 def test_an_invitation_has_the_certified_addresses_at_which_the_server_listens(
     host: str, tls: str
 ) -> None:
-    told = invitations([Listen(True, host, 8443), Listen(False, "127.0.0.1", 8080)], tls)
+    urls = invitations([Listen(True, host, 8443), Listen(False, "127.0.0.1", 8080)], tls)
     older = [at for at in own_addresses() if ":" not in at]
     newer = [f"[{at}]" for at in own_addresses() if ":" in at and host == "::"]
-    assert told == [f"https://{at}:8443/" for at in (*older, *newer, own_name())]
+    assert urls == [f"https://{at}:8443/" for at in (*older, *newer, own_name())]
 
 
 def test_an_invitation_has_no_ipv4_address_if_another_server_has_that_port(tls: str) -> None:
-    told = invitations([Listen(False, "127.0.0.1", 8443), Listen(True, "::", 8443)], tls)
-    assert told
-    assert not any(f"https://{at}:" in url for at in OWN if ":" not in at for url in told)
+    urls = invitations([Listen(False, "127.0.0.1", 8443), Listen(True, "::", 8443)], tls)
+    assert urls
+    assert not any(f"https://{at}:" in url for at in OWN if ":" not in at for url in urls)
 
 
 def test_the_reported_addresses_of_the_page_are_those_of_an_invitation(tls: str) -> None:
@@ -86,31 +86,31 @@ def test_the_reported_addresses_of_the_page_are_those_of_an_invitation(tls: str)
 def test_a_wildcard_address_is_reached_by_ipv4_and_only_the_ipv6_one_by_ipv6(
     host: str, by: set[str]
 ) -> None:
-    [(one, opened)] = open_sockets([Listen(True, host, free_port())], next_port=False)
+    [(endpoint, opened)] = open_sockets([Listen(True, host, free_port())], next_port=False)
     with opened:
-        assert {at for at in ("127.0.0.1", "::1") if reached(one.port, at)} == by
+        assert {at for at in ("127.0.0.1", "::1") if reached(endpoint.port, at)} == by
 
 
 @pytest.mark.parametrize("first", ["0.0.0.0", "127.0.0.1"])
 def test_an_ipv4_address_and_the_ipv6_wildcard_can_share_a_port(first: str) -> None:
     port = free_port()
-    for one, opened in open_sockets(
+    for endpoint, opened in open_sockets(
         [Listen(True, at, port) for at in (first, "::")], next_port=False
     ):
         with opened:
-            assert reached(one.port, "::1" if one.host == "::" else "127.0.0.1")
+            assert reached(endpoint.port, "::1" if endpoint.host == "::" else "127.0.0.1")
 
 
 def test_a_port_in_use_is_reported_or_the_next_port_is_used() -> None:
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        taken.listen()
-        wished = Listen(False, "127.0.0.1", taken.getsockname()[1])
+    with socket.socket() as occupant:
+        occupant.bind(("127.0.0.1", 0))
+        occupant.listen()
+        wished = Listen(False, "127.0.0.1", occupant.getsockname()[1])
         with pytest.raises(InUseError, match="choose another"):
             open_sockets([wished], next_port=False)
-        [(one, opened)] = open_sockets([wished], next_port=True)
+        [(endpoint, opened)] = open_sockets([wished], next_port=True)
         with opened:
-            assert one.port > wished.port
+            assert endpoint.port > wished.port
 
 
 def test_https_without_a_certificate_is_reported_and_http_needs_none(tmp_path: Path) -> None:

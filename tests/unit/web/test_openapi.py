@@ -27,9 +27,9 @@ def references(node: Any) -> list[str]:
     """Return all references in this node."""
     if isinstance(node, dict):
         own = [node["$ref"]] if "$ref" in node else []
-        return own + [one for value in node.values() for one in references(value)]
+        return own + [reference for value in node.values() for reference in references(value)]
     if isinstance(node, list):
-        return [one for value in node for one in references(value)]
+        return [reference for value in node for reference in references(value)]
     return []
 
 
@@ -43,17 +43,17 @@ def test_every_key_that_answers_and_every_service_is_described() -> None:
 
 
 def test_every_reference_leads_to_a_schema() -> None:
-    told = references(WHOLE)
-    assert len(told) > 100
-    for one in told:
-        name = one.removeprefix("#/components/schemas/")
-        assert name in WHOLE["components"]["schemas"], one
+    refs = references(WHOLE)
+    assert len(refs) > 100
+    for reference in refs:
+        name = reference.removeprefix("#/components/schemas/")
+        assert name in WHOLE["components"]["schemas"], reference
 
 
 @pytest.mark.slow
 def test_the_description_is_valid_openapi() -> None:
     whole: dict[Hashable, Any] = dict(WHOLE.items())
-    assert [one.message for one in OpenAPIV31SpecValidator(whole).iter_errors()] == []
+    assert [error.message for error in OpenAPIV31SpecValidator(whole).iter_errors()] == []
 
 
 @pytest.mark.slow
@@ -74,18 +74,18 @@ MESSAGES = [one for one in re.findall(r"`(\{.*?\})`", TO_IT) if "..." not in one
 
 
 def test_the_page_has_a_message_of_each_kind() -> None:
-    assert {type(decode(one)) for one in MESSAGES} == set(MESSAGE_TYPES.values())
+    assert {type(decode(message)) for message in MESSAGES} == set(MESSAGE_TYPES.values())
 
 
 @each("message", [*MESSAGES, "{}", '{"ping": 1, "call": "stop"}', '{"cmd": {}}'])
 def test_the_socket_accepts_exactly_the_messages_that_its_schema_allows(message: str) -> None:
-    meant = {"components": WHOLE["components"], "$ref": f"#/components/schemas/{TO_ROBOT}"}
+    schema = {"components": WHOLE["components"], "$ref": f"#/components/schemas/{TO_ROBOT}"}
     try:
         decode(message)
-        taken = True
+        valid = True
     except FrameError:
-        taken = False
-    assert Draft202012Validator(meant).is_valid(json.loads(message)) == taken
+        valid = False
+    assert Draft202012Validator(schema).is_valid(json.loads(message)) == valid
 
 
 def test_the_socket_and_the_token_are_described() -> None:
@@ -98,7 +98,7 @@ def test_the_socket_and_the_token_are_described() -> None:
 def test_parameters_in_a_path_are_declared() -> None:
     for path, item in WHOLE["paths"].items():
         for action in item.values():
-            names = {one["name"] for one in action.get("parameters", ())}
+            names = {parameter["name"] for parameter in action.get("parameters", ())}
             assert names == {part[1:-1] for part in path.split("/") if part.startswith("{")}
 
 

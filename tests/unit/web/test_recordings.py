@@ -39,7 +39,7 @@ def test_a_file_that_the_daemon_renames_meanwhile_does_not_hide_the_others(
         (tmp_path / name).write_bytes(b"")
     monkeypatch.setattr(reports, "listed", lambda place: [place / name for name in names])
     (tmp_path / names[1]).rename(tmp_path / "000002-20261121T070127Z.mcap")
-    assert [one.name for one in rows(tmp_path)] == names[:1]
+    assert [row.name for row in rows(tmp_path)] == names[:1]
 
 
 def test_a_file_in_place_of_the_directory_is_an_error(tmp_path: Path) -> None:
@@ -83,46 +83,46 @@ def drawn_by(program: str) -> Reports:
     return Reports((sys.executable, "-S", "-c", program))
 
 
-async def become(found: Reports, path: Path, *states: str, stamp: int = 1) -> ReportState:
+async def become(renderer: Reports, path: Path, *states: str, stamp: int = 1) -> ReportState:
     """Wait until the report's progress has one of these states, and return the progress."""
     async with asyncio.timeout(PATIENCE_S):
-        while (told := found.ask(path, (stamp, 0))).report not in states:
+        while (progress := renderer.ask(path, (stamp, 0))).report not in states:
             await asyncio.sleep(0.01)
-    return told
+    return progress
 
 
 async def test_a_request_starts_the_report_and_a_later_one_gets_it() -> None:
-    found = drawn_by(DRAWS)
-    assert found.ask(A, (1, 0)).report == "drawing"
-    assert found.drawn("a.mcap") is None
-    told = await become(found, A, "ready", "failed")
-    assert told == ReportState("ready", href="report/a.mcap")
-    body = found.drawn("a.mcap")
+    renderer = drawn_by(DRAWS)
+    assert renderer.ask(A, (1, 0)).report == "drawing"
+    assert renderer.drawn("a.mcap") is None
+    progress = await become(renderer, A, "ready", "failed")
+    assert progress == ReportState("ready", href="report/a.mcap")
+    body = renderer.drawn("a.mcap")
     assert body is not None
     assert gzip.decompress(body) == b"<html> /a.mcap\n"
-    assert found.drawn("b.mcap") is None
+    assert renderer.drawn("b.mcap") is None
 
 
 async def test_a_report_has_its_progress_and_a_second_report_waits() -> None:
-    found = drawn_by(WAITS)
-    found.ask(A, (1, 0))
+    renderer = drawn_by(WAITS)
+    renderer.ask(A, (1, 0))
     async with asyncio.timeout(PATIENCE_S):
-        while found.ask(A, (1, 0)).percent != 40:
+        while renderer.ask(A, (1, 0)).percent != 40:
             await asyncio.sleep(0.01)
-    assert found.ask(B, (1, 0)).report == "busy"
-    assert "a.mcap" in found.ask(B, (1, 0)).text
-    found.end()
-    assert found.ask(B, (1, 0)).report == "drawing"
-    found.end()
+    assert renderer.ask(B, (1, 0)).report == "busy"
+    assert "a.mcap" in renderer.ask(B, (1, 0)).text
+    renderer.end()
+    assert renderer.ask(B, (1, 0)).report == "drawing"
+    renderer.end()
 
 
 async def test_a_report_is_made_again_only_if_its_recording_has_grown() -> None:
-    found = drawn_by(DRAWS)
-    await become(found, A, "ready")
-    assert found.ask(A, (1, 0)).report == "ready"
-    assert found.ask(A, (2, 0)).report == "drawing"
+    renderer = drawn_by(DRAWS)
+    await become(renderer, A, "ready")
+    assert renderer.ask(A, (1, 0)).report == "ready"
+    assert renderer.ask(A, (2, 0)).report == "drawing"
     # The recording grows while it is drawn, so the report has the stamp that was requested.
-    await become(found, A, "ready", stamp=3)
+    await become(renderer, A, "ready", stamp=3)
 
 
 @pytest.mark.slow
@@ -146,35 +146,37 @@ async def test_a_report_is_made_again_only_if_its_recording_has_grown() -> None:
 async def test_a_failed_report_has_its_reason_and_the_next_request_starts_it_again(
     program: str, why: str
 ) -> None:
-    found = drawn_by(program)
-    told = await become(found, A, "ready", "failed")
-    assert told.report == "failed"
-    assert why in told.text
-    assert "acsard: " not in told.text
-    assert found.ask(A, (1, 0)).report == "drawing"
-    found.end()
+    renderer = drawn_by(program)
+    progress = await become(renderer, A, "ready", "failed")
+    assert progress.report == "failed"
+    assert why in progress.text
+    assert "acsard: " not in progress.text
+    assert renderer.ask(A, (1, 0)).report == "drawing"
+    renderer.end()
 
 
 @each(
-    ("end", "shown"),
+    ("end", "expected"),
     [("'ä is missing'.encode()", "xä is missing"), ("b'\\xc3'", "x\N{REPLACEMENT CHARACTER}")],
 )
-async def test_a_character_across_two_reads_of_an_error_text_is_whole(end: str, shown: str) -> None:
+async def test_a_character_across_two_reads_of_an_error_text_is_whole(
+    end: str, expected: str
+) -> None:
     """The server reads at most 4096 bytes at once, so a read may end inside a UTF-8 character."""
     program = f"import sys; sys.stderr.buffer.write(b'x' * 4095 + {end}); sys.exit(1)"
-    told = await become(drawn_by(program), A, "failed")
-    assert told.text.lstrip("x") == shown.lstrip("x")
+    progress = await become(drawn_by(program), A, "failed")
+    assert progress.text.lstrip("x") == expected.lstrip("x")
 
 
 async def test_a_missing_report_program_is_reported() -> None:
-    told = await become(Reports(("/nowhere/acsard",)), A, "ready", "failed")
-    assert "No such file" in told.text
+    progress = await become(Reports(("/nowhere/acsard",)), A, "ready", "failed")
+    assert "No such file" in progress.text
 
 
 async def test_a_report_that_takes_too_long_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(reports, "DRAW_TIMEOUT_S", 0.05)
-    told = await become(drawn_by(WAITS), A, "ready", "failed")
-    assert "acsard recording report" in told.text
+    progress = await become(drawn_by(WAITS), A, "ready", "failed")
+    assert "acsard recording report" in progress.text
 
 
 TELLS = """import os, resource, sys, time
@@ -187,9 +189,9 @@ time.sleep(float(sys.argv[1].strip("/")))"""
 
 
 async def test_a_report_process_has_low_priority_limited_memory_and_is_killed_first() -> None:
-    found = drawn_by(TELLS)
-    await become(found, Path("/0"), "ready")
-    priority, memory, first = gzip.decompress(found.drawn("0") or b"").split()
+    renderer = drawn_by(TELLS)
+    await become(renderer, Path("/0"), "ready")
+    priority, memory, first = gzip.decompress(renderer.drawn("0") or b"").split()
     assert (int(priority), int(memory)) == (max(CHILD_NICE, os.nice(0)), reports.MAX_CHILD_MEMORY)
     assert first == b"1000"
 
@@ -197,20 +199,20 @@ async def test_a_report_process_has_low_priority_limited_memory_and_is_killed_fi
 async def test_a_report_without_further_requests_is_cancelled_and_its_process_ends(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    told = tmp_path / "pid"
-    program = f"import os; open({str(told)!r}, 'w').write(str(os.getpid())); {WAITS}"
-    found = drawn_by(program)
-    found.ask(A, (1, 0))
+    pid_file = tmp_path / "pid"
+    program = f"import os; open({str(pid_file)!r}, 'w').write(str(os.getpid())); {WAITS}"
+    renderer = drawn_by(program)
+    renderer.ask(A, (1, 0))
     async with asyncio.timeout(PATIENCE_S):
-        while not (told.exists() and told.read_text()):
+        while not (pid_file.exists() and pid_file.read_text()):
             await asyncio.sleep(0.01)
-        found.tidy()
-        assert found.ask(A, (1, 0)).report == "drawing"
+        renderer.tidy()
+        assert renderer.ask(A, (1, 0)).report == "drawing"
         monkeypatch.setattr(reports, "ABANDONED_NS", -NS_PER_S)
-        found.tidy()
-        while Path(f"/proc/{told.read_text()}").exists():
+        renderer.tidy()
+        while Path(f"/proc/{pid_file.read_text()}").exists():
             await asyncio.sleep(0.01)
-    assert found.drawn("a.mcap") is None
+    assert renderer.drawn("a.mcap") is None
 
 
 async def test_an_opened_report_is_kept_for_another_quarter_of_an_hour(
@@ -218,12 +220,12 @@ async def test_an_opened_report_is_kept_for_another_quarter_of_an_hour(
 ) -> None:
     now_ns = 0
     monkeypatch.setattr("acsard.web.recordings.clock.mono_ns", lambda: now_ns)
-    found = drawn_by(DRAWS)
-    await become(found, A, "ready")
+    renderer = drawn_by(DRAWS)
+    await become(renderer, A, "ready")
     for _ in range(3):
         now_ns += KEEP_REPORT_NS - NS_PER_S
-        found.tidy()
-        assert found.drawn("a.mcap")
+        renderer.tidy()
+        assert renderer.drawn("a.mcap")
     now_ns += KEEP_REPORT_NS + NS_PER_S
-    found.tidy()
-    assert found.drawn("a.mcap") is None
+    renderer.tidy()
+    assert renderer.drawn("a.mcap") is None

@@ -64,7 +64,7 @@ class World:
 
         `publishes` returns the sample that the robot publishes at a time, or None.
         """
-        found: list[tuple[float, str]] = []
+        changes: list[tuple[float, str]] = []
 
         async def story() -> None:
             client: Any = self.robot
@@ -78,13 +78,13 @@ class World:
                     await asyncio.sleep(0)
                 if self.robots.gone != before:
                     before = self.robots.gone
-                    found.append((self.now - began, before))
+                    changes.append((self.now - began, before))
                 self.now += PROCESS_PERIOD_S
             assert not watching.done()
             watching.cancel()
 
         asyncio.run(story())
-        return found
+        return changes
 
 
 class Answering(Robot):
@@ -106,10 +106,10 @@ def world(monkeypatch: pytest.MonkeyPatch) -> World:
 
 
 def test_a_robot_that_falls_silent_is_reported_within_its_time(world: World) -> None:
-    found = world.told(10.0, lambda t: world.state() if t < 5.0 else None)
-    (_, here), (at, gone) = found
+    changes = world.told(10.0, lambda t: world.state() if t < 5.0 else None)
+    (_, here), (at, reason) = changes
     assert here == ""
-    assert "nothing is received from the daemon at tcp/x:1" in gone
+    assert "nothing is received from the daemon at tcp/x:1" in reason
     assert (
         4.9 + ROBOT_SILENCE_TIMEOUT_S - PROCESS_PERIOD_S
         <= at
@@ -121,21 +121,21 @@ def test_a_robot_that_publishes_once_in_ten_seconds_is_queried_and_is_not_gone(
     world: World,
 ) -> None:
     world.answers = world.state
-    found = world.told(30.0, lambda t: world.state() if round(t * 10) % 100 == 0 else None)
-    assert [gone for _, gone in found] == [""]
+    changes = world.told(30.0, lambda t: world.state() if round(t * 10) % 100 == 0 else None)
+    assert [reason for _, reason in changes] == [""]
     assert world.asked > 30.0 / (2 * QUERY_PERIOD_S + 2 * PROCESS_PERIOD_S)
 
 
 def test_a_daemon_of_another_version_is_reported_as_such(world: World) -> None:
-    ((at, gone),) = world.told(10.0, lambda t: UNREADABLE)
-    assert "another version" in gone
+    ((at, reason),) = world.told(10.0, lambda t: UNREADABLE)
+    assert "another version" in reason
     assert at <= FIRST_STATE_TIMEOUT_S + 2 * PROCESS_PERIOD_S
 
 
 def test_a_robot_that_returns_is_present_without_delay(world: World) -> None:
-    found = world.told(10.0, lambda t: None if 2.0 < t < 6.0 else world.state())
-    assert [bool(gone) for _, gone in found] == [False, True, False]
-    assert found[-1][0] <= 6.0 + 2 * PROCESS_PERIOD_S
+    changes = world.told(10.0, lambda t: None if 2.0 < t < 6.0 else world.state())
+    assert [bool(reason) for _, reason in changes] == [False, True, False]
+    assert changes[-1][0] <= 6.0 + 2 * PROCESS_PERIOD_S
 
 
 def test_a_robot_whose_last_state_is_older_than_a_suspend_is_silent_immediately(
@@ -149,9 +149,9 @@ def test_a_robot_whose_last_state_is_older_than_a_suspend_is_silent_immediately(
             world.now += 60.0
         return None
 
-    (_, here), (at, gone) = world.told(70.0, publishes)
+    (_, here), (at, reason) = world.told(70.0, publishes)
     assert here == ""
-    assert "nothing is received" in gone
+    assert "nothing is received" in reason
     assert 65.0 <= at <= 65.0 + 2 * PROCESS_PERIOD_S
 
 

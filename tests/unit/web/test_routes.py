@@ -48,8 +48,10 @@ def named(cell: str) -> set[tuple[str, str]]:
 
 def test_the_page_has_a_row_for_each_path_that_programs_may_use() -> None:
     table = PAGE.partition("| request | meaning |")[2].partition("Over the WebSocket")[0]
-    told = {one for line in table.splitlines() for one in named("".join(line.split("|")[1:2]))}
+    routes = {
+        route for line in table.splitlines() for route in named("".join(line.split("|")[1:2]))
+    }
     rows = {(row.method, row.path.replace("{name}", "NAME")) for row in ROUTES if row.summary}
-    of_the_bus = {one for one in rows if row_of(one[1].removeprefix("/api/")) is not None}
+    of_the_bus = {route for route in rows if row_of(route[1].removeprefix("/api/")) is not None}
     elsewhere = {("GET", "/api"), ("GET", "/report/NAME")}  # in a sentence, in another row
-    assert told - of_the_bus - {("GET", "/api/schema/Twist")} == rows - of_the_bus - elsewhere
+    assert routes - of_the_bus - {("GET", "/api/schema/Twist")} == rows - of_the_bus - elsewhere

@@ -58,16 +58,16 @@ def as_told(message: object) -> Any:
 
 def test_every_key_that_may_be_followed_is_described() -> None:
     assert set(KEYS) == FOLLOWED
-    assert {one.removeprefix(VALUE_PREFIX) for one in FRAMES if one.startswith(VALUE_PREFIX)} == {
-        key.replace("/", ".") for key in KEYS
-    }
+    assert {
+        name.removeprefix(VALUE_PREFIX) for name in FRAMES if name.startswith(VALUE_PREFIX)
+    } == {key.replace("/", ".") for key in KEYS}
 
 
 @each("message", SAID)
 def test_each_sent_message_matches_its_schema_only_if_it_is_complete(message: Struct) -> None:
     frame = as_told(message)
     assert kinds([frame]) == {type(message).__name__}
-    assert [one for one in spoilt(frame) if taken(one)] == []
+    assert [variant for variant in spoilt(frame) if taken(variant)] == []
 
 
 @each("line", GUIDED)
@@ -78,8 +78,8 @@ def test_each_line_of_a_check_or_calibration_is_as_described(line: Struct) -> No
 
 
 def test_each_kind_of_sent_message_has_an_example() -> None:
-    assert {type(one) for one in SAID} == set(SENT_MESSAGES)
-    assert {type(one) for one in GUIDED} == set(GUIDE_MESSAGES)
+    assert {type(message) for message in SAID} == set(SENT_MESSAGES)
+    assert {type(message) for message in GUIDED} == set(GUIDE_MESSAGES)
     assert len(GUIDES) == len(GUIDE_MESSAGES)
 
 
@@ -99,7 +99,7 @@ def test_a_message_of_a_key_has_its_type_by_reference(robot: str) -> None:
     head = Following(robot, "odom", "acsar", 0.1).head
     frame = as_told(msgspec.Raw(b'%b%b,"age":1.5}' % (head, encode(odom, "json"))))
     assert kinds([frame, frame | {"value": None}]) == {"Value.odom"}
-    assert [one for one in spoilt(frame) if taken(one)] == _without(frame)
+    assert [variant for variant in spoilt(frame) if taken(variant)] == _without(frame)
     assert not taken(frame | {"key": "state"})
     assert SCHEMAS["Value.odom"]["properties"]["value"]["anyOf"][0] == {
         "$ref": "#/components/schemas/Odometry"

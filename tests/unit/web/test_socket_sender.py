@@ -14,13 +14,13 @@ from acsard.web.streams import Stream
 
 async def test_earlier_messages_do_not_delay_a_key_that_is_due_soon() -> None:
     out = Outgoing(web.WebSocketResponse(), make_mocked_request("GET", "/ws"), Counts(), "")
-    one = Following("acsar", "state", "acsar", 0.1)
-    one.stream = Stream()
-    due = await out._send_due(one, 100.03)
+    subscription = Following("acsar", "state", "acsar", 0.1)
+    subscription.stream = Stream()
+    due = await out._send_due(subscription, 100.03)
     assert abs(due - 100.1) < 1e-6
-    woken = [await out._send_due(one, now) for now in (100.04, 100.07, 100.099)]
+    woken = [await out._send_due(subscription, now) for now in (100.04, 100.07, 100.099)]
     assert woken == [due] * 3
-    assert await out._send_due(one, due) > due
+    assert await out._send_due(subscription, due) > due
 
 
 @pytest.mark.slow
@@ -31,6 +31,6 @@ async def test_a_refusal_is_reported_once_a_second_for_each_kind_of_message_and_
         out.refuse("subscribe", "malformed", "no such key")
         out.refuse("cmd", "malformed", "not a number")
         out.refuse("cmd", "role", "for operators")
-    said = [msgspec.json.decode(one) for one in out._out]
-    assert [one["refused"] for one in said] == ["subscribe", "cmd", "cmd"]
+    messages = [msgspec.json.decode(message) for message in out._out]
+    assert [message["refused"] for message in messages] == ["subscribe", "cmd", "cmd"]
     assert counts.refused() == {"malformed": 6, "role": 3}

@@ -32,10 +32,10 @@ def session() -> Iterator[zenoh.Session]:
 @pytest.fixture(scope="module")
 def samples(session: zenoh.Session) -> list[zenoh.Sample]:
     """Return two samples of the key."""
-    heard = session.declare_subscriber(KEY)
-    for said in (b"1", b"2"):
-        session.put(KEY, said, encoding="application/json")
-    return [heard.recv(), heard.recv()]
+    subscriber = session.declare_subscriber(KEY)
+    for payload in (b"1", b"2"):
+        session.put(KEY, payload, encoding="application/json")
+    return [subscriber.recv(), subscriber.recv()]
 
 
 def test_an_answer_is_the_value_until_a_message_is_published(samples: list[zenoh.Sample]) -> None:
@@ -100,15 +100,15 @@ def test_periodic_keys_of_another_robot_are_not_queried(session: zenoh.Session) 
 
     storage = session.declare_queryable("acsard/*/*", old)
     asked = [("acsar", "state"), ("other", "events"), ("other", "state"), ("other", "odom")]
-    assert [asyncio.run(story(*one)) for one in asked] == [b"1", b"1", b"null", b"null"]
+    assert [asyncio.run(story(*target)) for target in asked] == [b"1", b"1", b"null", b"null"]
     storage.undeclare()
 
 
 async def test_a_put_on_a_wildcard_is_not_a_message_of_the_key(session: zenoh.Session) -> None:
     streams = Streams()
     stream = await streams.follow(Client(session, "acsar", "app"), "acsar", "events")
-    for key, said in ((KEY, b"1"), ("acsard/**", b"666"), ("acsard/*/*", b"667"), (KEY, b"2")):
-        session.put(key, said, encoding="application/json")
+    for key, payload in ((KEY, b"1"), ("acsard/**", b"666"), ("acsard/*/*", b"667"), (KEY, b"2")):
+        session.put(key, payload, encoding="application/json")
     async with asyncio.timeout(10.0):
         while stream.value()[1] != b"2":  # it arrives on a Zenoh thread
             await asyncio.sleep(0.001)

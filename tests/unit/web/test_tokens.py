@@ -20,20 +20,20 @@ def test_a_token_is_valid_until_it_is_revoked(tmp_path: Path) -> None:
     keeper, server = Vault(tmp_path / "state", "robot1"), Vault(tmp_path / "state", "robot1")
     assert server.all() == []
     text, _ = keeper.invite("operator", "phone", 30)
-    who = owner_in(server.all(), text)
-    assert who is not None
-    assert (who.role, who.name) == ("operator", "phone")
-    assert who.token in server.valid_digests()
+    owner = owner_in(server.all(), text)
+    assert owner is not None
+    assert (owner.role, owner.name) == ("operator", "phone")
+    assert owner.token in server.valid_digests()
     keeper.revoke("phone")
     assert owner_in(server.all(), text) is None
-    assert who.token not in server.valid_digests()
+    assert owner.token not in server.valid_digests()
 
 
 def test_the_token_itself_is_not_stored_on_the_disk(tmp_path: Path) -> None:
     vault = Vault(tmp_path / "state", "robot1")
     text, _ = vault.invite("viewer", "tv", 1)
-    kept = b"".join(path.read_bytes() for path in tmp_path.rglob("*") if path.is_file())
-    assert text.encode() not in kept
+    contents = b"".join(path.read_bytes() for path in tmp_path.rglob("*") if path.is_file())
+    assert text.encode() not in contents
     assert stat.S_IMODE(vault.path.stat().st_mode) == 0o600
     assert stat.S_IMODE(vault.path.parent.stat().st_mode) == 0o700
 
@@ -118,11 +118,11 @@ def test_robots_that_share_the_file_know_their_own_tokens_alone(tmp_path: Path) 
     assert owner_in(first.all(), ours) is not None
     assert owner_in(second.all(), ours) is None
     assert owner_in(first.all(), theirs) is None
-    assert [one.robot for one in second.all()] == ["robot2"]
+    assert [entry.robot for entry in second.all()] == ["robot2"]
     assert second.valid_digests() == {token.digest}
     assert first.left_s(token.digest) == 0
     first.revoke("phone")
-    assert (first.all(), [one.name for one in second.all()]) == ([], ["phone"])
+    assert (first.all(), [entry.name for entry in second.all()]) == ([], ["phone"])
     with pytest.raises(UsageError, match="the robot's tokens: none"):
         first.revoke("phone")
 

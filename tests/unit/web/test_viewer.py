@@ -58,10 +58,10 @@ def test_a_command_is_put_with_the_stamp_and_the_clock_of_its_sender() -> None:
         assert commands.give("joe", "teleop", commander, sender, wish)
         commands.outbox.flush(PATIENCE_S)
     assert [(x, z) for x, z, _ in put] == [(0.2, -0.5)] * 2
-    signed = [one for *_, one in put]
-    assert [one.stamp for one in signed] == [1000, 2000]
-    assert [one.sequence for one in signed] == [1, 2]
-    assert {(one.sender, one.steady) for one in signed} == {("joe/aa", True)}
+    signed = [item for *_, item in put]
+    assert [item.stamp for item in signed] == [1000, 2000]
+    assert [item.sequence for item in signed] == [1, 2]
+    assert {(item.sender, item.steady) for item in signed} == {("joe/aa", True)}
     assert counts.all() == {"commands": 2}
 
 
@@ -72,8 +72,8 @@ def test_a_token_that_commands_without_end_is_refused_except_a_zero_after_a_spee
     flooding, driving, other = Commander(), Commander(), Commander()
     rest = Wish(Twist(0.0, 0.0), 1000, steady=True)
     assert commands.give("token", "teleop", driving, sender, AHEAD)
-    given = [commands.give("token", "app", flooding, sender, rest) for _ in range(1000)]
-    assert COMMAND_RATE.burst - 1 <= given.count(True) < COMMAND_RATE.burst + 100
+    results = [commands.give("token", "app", flooding, sender, rest) for _ in range(1000)]
+    assert COMMAND_RATE.burst - 1 <= results.count(True) < COMMAND_RATE.burst + 100
     assert not commands.give("token", "teleop", driving, sender, AHEAD)
     # A source may have a timeout of 10 s, so a zero matters for that long.
     later_ns = clock.mono_ns() + 9 * NS_PER_S
@@ -111,8 +111,8 @@ async def test_a_zero_is_obeyed_beyond_the_limit_on_messages() -> None:
         socket, request, Identity("operator", "bob", "token", "1.2.3.4"), parts, camera=False
     )
 
-    def take(said: dict[str, Any]) -> None:
-        message: Any = SimpleNamespace(type=aiohttp.WSMsgType.TEXT, data=json.dumps(said))
+    def take(frame: dict[str, Any]) -> None:
+        message: Any = SimpleNamespace(type=aiohttp.WSMsgType.TEXT, data=json.dumps(frame))
         viewer._take(message)
 
     def drive(speed: float, stamp: float) -> None:

@@ -57,11 +57,11 @@ class Drive:
         left: Array,
         right: Array,
         dt: Array,
-        kept: npt.NDArray[np.bool_] | None = None,
+        mask: npt.NDArray[np.bool_] | None = None,
     ) -> Told:
         """Integrate the speeds of the lines as odometry does, and return lines and final error.
 
-        `at` has the timestamps of the lines. `kept` marks the lines that arrive.
+        `at` has the timestamps of the lines. `mask` marks the lines that arrive.
         """
         x, y, _ = _path(np.diff(self.left), np.diff(self.right))
         moved = left * dt, right * dt
@@ -69,10 +69,10 @@ class Drive:
         lines = []
         positions = np.cumsum(moved, axis=1)
         for k in range(len(at)):
-            one, other = float(left[k]), float(right[k])
+            first, other = float(left[k]), float(right[k])
             a, b = float(positions[0, k]), float(positions[1, k])
             lines.append(
-                Line(float(at[k]), (other, one, one, other), (b, a, a, b), float(eyaw[k]), 0.0)
+                Line(float(at[k]), (other, first, first, other), (b, a, a, b), float(eyaw[k]), 0.0)
             )
         metres = float(np.abs(np.diff(self.left) + np.diff(self.right)).sum()) * RADIUS / 2
         return Told(lines, metres, float(np.hypot(x[-1] - ex[-1], y[-1] - ey[-1])))
@@ -97,8 +97,8 @@ def late(seed: int, seconds: float, how: str) -> Told:
         for begin in np.arange(1.0, seconds, 3.0) + rng.uniform(
             0, 1.0, len(np.arange(1.0, seconds, 3.0))
         ):
-            held = (at >= begin) & (at < begin + 0.08)
-            at[held] = begin + 0.08
+            in_stall = (at >= begin) & (at < begin + 0.08)
+            at[in_stall] = begin + 0.08
     else:
         at = true + rng.exponential(0.002, len(true))
     at = np.maximum.accumulate(at)
@@ -131,14 +131,14 @@ def lost(seed: int, seconds: float, share: float, longest: int, stands: bool = F
     """
     drive = Drive(seed, seconds)
     left, right = drive.speeds()
-    kept = np.ones(len(left), dtype=bool)
+    mask = np.ones(len(left), dtype=bool)
     for begin in drive.rng.integers(10, len(left) - 60, int(share * len(left) / longest * 2)):
-        kept[begin : begin + int(drive.rng.integers(1, longest + 1))] = False
-    at = drive.t[1:][kept]
+        mask[begin : begin + int(drive.rng.integers(1, longest + 1))] = False
+    at = drive.t[1:][mask]
     dt = np.diff(at, prepend=at[0] - PERIOD)
     if stands:
         dt[dt > 0.1] = 0.0
-    return drive.told(at, left[kept], right[kept], dt)
+    return drive.told(at, left[mask], right[mask], dt)
 
 
 def _path(left: Array, right: Array) -> tuple[Array, Array, Array]:

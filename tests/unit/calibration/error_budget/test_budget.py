@@ -38,8 +38,8 @@ CASES: dict[str, tuple[Cause, Make]] = {
 }
 
 
-def share(found: Budget, cause: Cause) -> Share:
-    return next(one for one in found.shares if one.cause == cause)
+def share(result: Budget, cause: Cause) -> Share:
+    return next(entry for entry in result.shares if entry.cause == cause)
 
 
 def as_predicted(case: str, seconds: float, seeds: int) -> float:
@@ -50,11 +50,11 @@ def as_predicted(case: str, seconds: float, seeds: int) -> float:
     cause, make = CASES[case]
     ratios = []
     for seed in range(seeds):
-        told = make(seed, seconds)
-        found = budget(Received(told.lines, []), CONFIG, metres=told.metres * 0.999)
-        millimetres = share(found, cause).mm_per_100_m
+        drive = make(seed, seconds)
+        result = budget(Received(drive.lines, []), CONFIG, metres=drive.metres * 0.999)
+        millimetres = share(result, cause).mm_per_100_m
         assert millimetres
-        ratios.append(1e3 * told.off / millimetres)
+        ratios.append(1e3 * drive.off / millimetres)
     return math.sqrt(sum(ratio**2 for ratio in ratios) / seeds)
 
 
@@ -84,15 +84,15 @@ def driven() -> Told:
 def test_the_budget_of_a_standing_robot_has_only_shares_from_settings() -> None:
     still = [Line(n / 100, (0.0,) * 4, (1.0,) * 4, 0.0, 0.0) for n in range(300)]
     known = replace(CONFIG, odometry=OdometryConfig(wheel_separation_multiplier_std=0.02))
-    found = budget(Received(still, []), known)
-    assert found.still
-    assert {one.cause: one.basis for one in found.shares} == {
+    result = budget(Received(still, []), known)
+    assert result.still
+    assert {entry.cause: entry.basis for entry in result.shares} == {
         "slip": "settings",
         "parameters": "settings",
     }
-    assert share(found, "parameters").deg_per_turn == pytest.approx(0.02 * 360, rel=0.01)
-    assert share(found, "parameters").mm_per_100_m == pytest.approx(0.0, abs=1e-6)
-    assert found.at_rest[1] > 0.0
+    assert share(result, "parameters").deg_per_turn == pytest.approx(0.02 * 360, rel=0.01)
+    assert share(result, "parameters").mm_per_100_m == pytest.approx(0.0, abs=1e-6)
+    assert result.at_rest[1] > 0.0
 
 
 def test_without_lines_the_robot_counts_as_standing_still() -> None:
@@ -100,42 +100,42 @@ def test_without_lines_the_robot_counts_as_standing_still() -> None:
 
 
 def test_parameters_that_were_not_measured_have_an_unknown_share_and_not_zero() -> None:
-    found = share(budget(Received(driven().lines, []), CONFIG), "parameters")
-    assert (found.basis, found.mm_per_100_m, found.deg_per_turn) == ("unknown", None, None)
+    result = share(budget(Received(driven().lines, []), CONFIG), "parameters")
+    assert (result.basis, result.mm_per_100_m, result.deg_per_turn) == ("unknown", None, None)
 
 
 def test_a_track_learned_by_the_gyro_is_a_measured_error() -> None:
-    found = share(budget(Received(driven().lines, [], learned=1.1), CONFIG), "parameters")
-    assert found.basis == "measured"
-    assert found.deg_per_turn == pytest.approx(36.0, rel=0.02)
+    result = share(budget(Received(driven().lines, [], learned=1.1), CONFIG), "parameters")
+    assert result.basis == "measured"
+    assert result.deg_per_turn == pytest.approx(36.0, rel=0.02)
 
 
 def test_the_error_of_a_learned_track_in_use_is_its_own_deviation() -> None:
     received = Received(driven().lines, [], learned=1.1, deviation=0.02, used=True)
-    found = share(budget(received, CONFIG), "parameters")
-    assert found.basis == "measured"
-    assert found.deg_per_turn == pytest.approx(7.2, rel=0.02)
+    result = share(budget(received, CONFIG), "parameters")
+    assert result.basis == "measured"
+    assert result.deg_per_turn == pytest.approx(7.2, rel=0.02)
 
 
 def test_the_learned_track_is_given_as_a_multiplier_like_the_configured_one() -> None:
     config = replace(CONFIG, drive=replace(CONFIG.drive, wheel_separation_multiplier=1.5))
-    found = budget(Received(driven().lines, [], learned=1.1, deviation=0.02), config)
-    assert found.multiplier == 1.5
-    assert found.learned_std == pytest.approx(0.033)
-    assert found.learned == pytest.approx(1.65)
+    result = budget(Received(driven().lines, [], learned=1.1, deviation=0.02), config)
+    assert result.multiplier == 1.5
+    assert result.learned_std == pytest.approx(0.033)
+    assert result.learned == pytest.approx(1.65)
     assert budget(Received(driven().lines, []), config).learned is None
 
 
 def test_with_a_gyro_no_error_of_the_wheels_changes_the_heading() -> None:
     lines = [replace(line, yaw_variance=1e-6 * n) for n, line in enumerate(driven().lines)]
-    found = budget(Received(lines, [], gyro=True), CONFIG)
+    result = budget(Received(lines, [], gyro=True), CONFIG)
     for cause in ("time", "quantization", "gaps", "slip"):
-        assert share(found, cause).deg_per_turn == 0.0
-    turns = found.turned / 360
+        assert share(result, cause).deg_per_turn == 0.0
+    turns = result.turned / 360
     grown = math.degrees(
         math.sqrt(lines[-1].yaw_variance / turns + (GYRO_SCALE_STD * math.tau) ** 2)
     )
-    assert share(found, "gyro").deg_per_turn == pytest.approx(grown, rel=0.05)
+    assert share(result, "gyro").deg_per_turn == pytest.approx(grown, rel=0.05)
 
 
 def with_a_gyro(lines: list[Line], before: float = 0.0) -> Share:
@@ -155,8 +155,8 @@ def with_a_gyro(lines: list[Line], before: float = 0.0) -> Share:
 @pytest.mark.slow
 @pytest.mark.parametrize("before", [-10, 10])
 def test_the_error_of_a_gyro_per_turn_does_not_depend_on_earlier_turns(before: int) -> None:
-    found, fresh = (with_a_gyro(driven().lines, turns) for turns in (before, 0.0))
-    assert found.deg_per_turn == pytest.approx(fresh.deg_per_turn, rel=0.02)
+    result, fresh = (with_a_gyro(driven().lines, turns) for turns in (before, 0.0))
+    assert result.deg_per_turn == pytest.approx(fresh.deg_per_turn, rel=0.02)
 
 
 @pytest.mark.slow
@@ -165,8 +165,8 @@ def test_a_rest_before_the_drive_does_not_change_the_error_of_the_gyro() -> None
     still = [
         replace(lines[0], at=lines[0].at - 3.0 + n / 100, speeds=(0.0,) * 4) for n in range(300)
     ]
-    found, rested = with_a_gyro(lines), with_a_gyro([*still, *lines])
-    assert rested.deg_per_turn == pytest.approx(found.deg_per_turn, rel=0.05)
+    result, rested = with_a_gyro(lines), with_a_gyro([*still, *lines])
+    assert rested.deg_per_turn == pytest.approx(result.deg_per_turn, rel=0.05)
 
 
 def test_one_long_spin_does_not_separate_gyro_noise_from_its_scale_error() -> None:
@@ -181,15 +181,15 @@ def test_one_long_spin_does_not_separate_gyro_noise_from_its_scale_error() -> No
 
 def test_with_counts_the_shares_of_time_and_gaps_are_zero_and_quantization_remains() -> None:
     counted = replace(CONFIG, mcu=McuConfig(link_check="require", encoder_counts=400))
-    found = budget(Received(drives.late(1, 10.0, "batches").lines, [], counted=True), counted)
-    assert share(found, "time").mm_per_100_m == share(found, "gaps").mm_per_100_m == 0.0
-    assert (share(found, "quantization").mm_per_100_m or 0.0) > 0.0
-    assert found.counts == 400
+    result = budget(Received(drives.late(1, 10.0, "batches").lines, [], counted=True), counted)
+    assert share(result, "time").mm_per_100_m == share(result, "gaps").mm_per_100_m == 0.0
+    assert (share(result, "quantization").mm_per_100_m or 0.0) > 0.0
+    assert result.counts == 400
 
 
 def test_if_lines_are_missing_here_the_shares_of_time_and_gaps_are_unknown() -> None:
-    found = budget(Received(driven().lines, [], complete=False), CONFIG)
-    assert {share(found, cause).basis for cause in ("time", "quantization", "gaps")} == {"unknown"}
+    result = budget(Received(driven().lines, [], complete=False), CONFIG)
+    assert {share(result, cause).basis for cause in ("time", "quantization", "gaps")} == {"unknown"}
 
 
 def test_a_wheel_that_contradicts_its_neighbour_is_measured_slip() -> None:
@@ -198,9 +198,9 @@ def test_a_wheel_that_contradicts_its_neighbour_is_measured_slip() -> None:
         replace(line, positions=(0.0, *line.positions[1:]), speeds=(0.0, *line.speeds[1:]))
         for line in driven().lines
     ]
-    found = share(budget(Received(lines, []), CONFIG), "slip")
-    assert found.basis == "measured"
-    assert (found.mm_per_100_m or 0.0) > 10_000
+    result = share(budget(Received(lines, []), CONFIG), "slip")
+    assert result.basis == "measured"
+    assert (result.mm_per_100_m or 0.0) > 10_000
 
 
 def test_wheels_that_contradict_each_other_in_a_turn_in_place_are_measured_slip() -> None:
@@ -208,22 +208,22 @@ def test_wheels_that_contradict_each_other_in_a_turn_in_place_are_measured_slip(
         Line(n / 100, (1.0, -1.0, -2.0, 2.0), (n / 100, -n / 100, -n / 50, n / 50), n / 200, 0.0)
         for n in range(3000)
     ]
-    found = share(budget(Received(lines, []), CONFIG), "slip")
-    assert found.mm_per_100_m is None
-    assert found.basis == "measured"
-    assert (found.deg_per_turn or 0.0) > 60.0
+    result = share(budget(Received(lines, []), CONFIG), "slip")
+    assert result.mm_per_100_m is None
+    assert result.basis == "measured"
+    assert (result.deg_per_turn or 0.0) > 60.0
 
 
 def test_the_largest_cause_is_chosen_among_the_requested_bases() -> None:
-    found = budget(Received(driven().lines, []), CONFIG)
-    quantization, slip = found.largest("measured"), found.largest("measured", "settings")
+    result = budget(Received(driven().lines, []), CONFIG)
+    quantization, slip = result.largest("measured"), result.largest("measured", "settings")
     assert quantization is not None
     assert slip is not None
     assert (quantization.cause, slip.cause) == ("quantization", "slip")
-    assert found.largest() is None
-    millimetres, _ = found.total()
+    assert result.largest() is None
+    millimetres, _ = result.total()
     assert millimetres is not None
-    assert millimetres >= max(one.mm_per_100_m or 0.0 for one in found.shares)
+    assert millimetres >= max(entry.mm_per_100_m or 0.0 for entry in result.shares)
 
 
 @pytest.mark.parametrize("back", [1.0, 0.9])
@@ -237,5 +237,5 @@ def test_a_robot_that_only_moved_to_and_fro_within_a_step_has_no_measured_errors
         speed = round(0.1 * (ahead - back * behind) / radius, 2)
         angle += 0.01 * speed
         lines.append(Line(0.01 * number, (speed,) * 4, (angle,) * 4, 0.0, 0.0))
-    found = budget(Received(lines, [line.at - 0.001 for line in lines]), CONFIG)
-    assert found.still
+    result = budget(Received(lines, [line.at - 0.001 for line in lines]), CONFIG)
+    assert result.still

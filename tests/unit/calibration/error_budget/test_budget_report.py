@@ -32,7 +32,7 @@ KNOWN: tuple[Cause, float, Basis] = ("parameters", 5.0, "settings")
 
 
 @each(
-    ("cause", "says"),
+    ("cause", "phrase"),
     [
         ("time", "latency_timer"),
         ("quantization", "link_check"),
@@ -42,10 +42,10 @@ KNOWN: tuple[Cause, float, Basis] = ("parameters", 5.0, "settings")
         ("parameters", "acsard calibrate"),
     ],
 )
-def test_one_sentence_advises_on_the_largest_measured_cause(cause: Cause, says: str) -> None:
-    told = advice(of((cause, 100.0, "measured"), KNOWN))
-    assert told.startswith(f"the largest measured cause of errors is {cause}: ")
-    assert says in told
+def test_one_sentence_advises_on_the_largest_measured_cause(cause: Cause, phrase: str) -> None:
+    sentence = advice(of((cause, 100.0, "measured"), KNOWN))
+    assert sentence.startswith(f"the largest measured cause of errors is {cause}: ")
+    assert phrase in sentence
 
 
 def test_the_counts_of_coarse_encoders_are_named() -> None:
@@ -53,23 +53,25 @@ def test_the_counts_of_coarse_encoders_are_named() -> None:
 
 
 def test_coarse_encoders_without_configured_counts_come_first() -> None:
-    told = advice(of(("time", 100.0, "measured"), KNOWN, coarse=True))
-    assert told.startswith("the encoders are coarse")
-    assert "as mcu.encoder_counts" in told
+    sentence = advice(of(("time", 100.0, "measured"), KNOWN, coarse=True))
+    assert sentence.startswith("the encoders are coarse")
+    assert "as mcu.encoder_counts" in sentence
 
 
 def test_a_larger_cause_from_the_settings_does_not_hide_the_measured_one() -> None:
-    told = advice(of(("slip", 900.0, "settings"), ("time", 50.0, "measured"), KNOWN))
-    assert told.startswith(
+    sentence = advice(of(("slip", 900.0, "settings"), ("time", 50.0, "measured"), KNOWN))
+    assert sentence.startswith(
         "according to the settings in [odometry], the largest cause of errors is slip"
     )
-    assert "the largest measured cause of errors is time" in told
+    assert "the largest measured cause of errors is time" in sentence
 
 
 def test_the_advice_for_a_robot_without_calibration_comes_first() -> None:
-    told = advice(of(("time", 50.0, "measured"), ("parameters", None, "unknown")))
-    assert told.startswith("the errors of the configured wheel radii and track width are unknown")
-    assert "the largest measured cause of errors is time" in told
+    sentence = advice(of(("time", 50.0, "measured"), ("parameters", None, "unknown")))
+    assert sentence.startswith(
+        "the errors of the configured wheel radii and track width are unknown"
+    )
+    assert "the largest measured cause of errors is time" in sentence
 
 
 def test_the_advice_says_if_there_is_no_error() -> None:
@@ -92,23 +94,25 @@ def test_an_unknown_share_is_a_dash_and_a_tiny_share_is_not_a_zero() -> None:
 
 @pytest.mark.parametrize("still", [False, True])
 def test_the_table_states_the_track_learned_by_the_gyro_and_the_configured_one(still: bool) -> None:
-    found = of(KNOWN, learned=1.7, learned_std=0.05, multiplier=1.5, still=still)
-    told = " ".join(text(found).split())
+    result = of(KNOWN, learned=1.7, learned_std=0.05, multiplier=1.5, still=still)
+    output = " ".join(text(result).split())
     assert (
         "multiplier should be 1.700 (standard deviation 0.050). Odometry uses the configured value,"
-        in told
+        in output
     )
-    assert "value, 1.500. If the two values differ" in told
+    assert "value, 1.500. If the two values differ" in output
     assert "should be" not in text(of(KNOWN, still=still))
-    told = " ".join(text(replace(found, learned_used=True)).split())
-    assert "multiplier should be 1.700 (standard deviation 0.050). Odometry uses this value" in told
-    assert "the configured value is 1.500." in told
+    output = " ".join(text(replace(result, learned_used=True)).split())
+    assert (
+        "multiplier should be 1.700 (standard deviation 0.050). Odometry uses this value" in output
+    )
+    assert "the configured value is 1.500." in output
 
 
 def test_the_table_of_a_standing_robot_has_the_shares_by_settings_and_asks_to_drive() -> None:
-    told = text(of(("parameters", 7.2, "settings"), still=True))
-    assert "stands still" in told
-    assert "0.10 mm/s" in told
-    assert "7.20 deg in a full turn" in told
-    assert "Drive the robot" in told
+    output = text(of(("parameters", 7.2, "settings"), still=True))
+    assert "stands still" in output
+    assert "0.10 mm/s" in output
+    assert "7.20 deg in a full turn" in output
+    assert "Drive the robot" in output
     assert "never calibrated" in text(of(("parameters", None, "unknown"), still=True))

@@ -62,10 +62,14 @@ def test_two_messages_of_one_stamp_make_a_line_in_any_order() -> None:
     feed = Feed(Config(), state(10))
     for message in (wheels(0.01), odom(0.01), odom(0.02, 1.5), wheels(0.02)):
         feed.add(message)
-    one, other = feed.received(state(12), diagnostics()).lines
-    assert (one.at, one.speeds, one.positions) == (0.01, (1.0, 2.0, 3.0, 4.0), (5.0, 6.0, 7.0, 8.0))
-    assert one.yaw == pytest.approx(0.5)
-    assert one.yaw_variance == 0.25
+    first, other = feed.received(state(12), diagnostics()).lines
+    assert (first.at, first.speeds, first.positions) == (
+        0.01,
+        (1.0, 2.0, 3.0, 4.0),
+        (5.0, 6.0, 7.0, 8.0),
+    )
+    assert first.yaw == pytest.approx(0.5)
+    assert first.yaw_variance == 0.25
     assert other.yaw == pytest.approx(1.5)
 
 

@@ -28,10 +28,10 @@ EVEN = np.asarray(np.arange(600) * PERIOD, dtype=np.float64)
 
 
 def test_evenly_spaced_lines_are_neither_late_nor_missing() -> None:
-    found = line_times(EVEN, NONE)
-    assert np.abs(found.late).max() < 1e-9
-    assert found.period == pytest.approx(PERIOD)
-    assert not found.missing.any()
+    timing = line_times(EVEN, NONE)
+    assert np.abs(timing.late).max() < 1e-9
+    assert timing.period == pytest.approx(PERIOD)
+    assert not timing.missing.any()
 
 
 @each("period", [0.00997, 0.01, 0.0102, 0.05])
@@ -43,34 +43,34 @@ def test_the_period_is_found_from_the_times_of_the_lines(period: float) -> None:
 def test_a_line_that_is_read_late_is_late_and_not_missing() -> None:
     late = EVEN.copy()
     late[300:308] = late[308]  # a stall of the host delays all reads to its end
-    found = line_times(late, NONE)
-    assert not found.missing.any()
-    assert found.late[300] == pytest.approx(0.08, abs=0.002)
-    assert abs(found.late[400]) < 0.002
+    timing = line_times(late, NONE)
+    assert not timing.missing.any()
+    assert timing.late[300] == pytest.approx(0.08, abs=0.002)
+    assert abs(timing.late[400]) < 0.002
 
 
 def test_lines_that_an_adapter_holds_back_are_not_missing() -> None:
-    found = line_times(np.ceil(EVEN / 0.016) * 0.016, NONE)
-    assert not found.missing.any()
-    assert 0.003 < float(np.std(found.late)) < 0.006  # a uniform delay over 16 ms has 4.6
+    timing = line_times(np.ceil(EVEN / 0.016) * 0.016, NONE)
+    assert not timing.missing.any()
+    assert 0.003 < float(np.std(timing.late)) < 0.006  # a uniform delay over 16 ms has 4.6
 
 
-@each("gone", [1, 2, 5, 20])
-def test_missing_lines_are_counted_at_their_place(gone: int) -> None:
+@each("count", [1, 2, 5, 20])
+def test_missing_lines_are_counted_at_their_place(count: int) -> None:
     rng = np.random.default_rng(1)
-    kept = np.delete(EVEN, np.arange(300, 300 + gone)) + rng.uniform(0, 0.001, 600 - gone)
-    found = line_times(np.sort(kept), NONE)
-    assert np.flatnonzero(found.missing).tolist() == [300]
-    assert found.missing[300] == gone
-    assert np.abs(found.late).max() < 0.002
+    arrivals = np.delete(EVEN, np.arange(300, 300 + count)) + rng.uniform(0, 0.001, 600 - count)
+    timing = line_times(np.sort(arrivals), NONE)
+    assert np.flatnonzero(timing.missing).tolist() == [300]
+    assert timing.missing[300] == count
+    assert np.abs(timing.late).max() < 0.002
 
 
 def test_replies_are_timed_from_their_sent_lines_however_unevenly_these_left() -> None:
     rng = np.random.default_rng(2)
     sent = np.cumsum(rng.choice([0.004, 0.01, 0.013], 600))
-    found = line_times(sent[3:] + 0.006, sent)
-    assert np.abs(found.late).max() < 1e-9
-    assert not found.missing.any()
+    timing = line_times(sent[3:] + 0.006, sent)
+    assert np.abs(timing.late).max() < 1e-9
+    assert not timing.missing.any()
     assert not line_times(np.delete(sent[3:], 200) + 0.002, sent).missing[:190].any()
 
 
@@ -98,48 +98,48 @@ def even(count: int) -> list[float]:
 
 
 def test_distance_and_time_are_those_of_the_drive() -> None:
-    found = motion(ahead(even(101)), NONE, KINEMATICS, whole=True)
-    assert found.distance.sum() == pytest.approx(0.5)
-    assert found.seconds == pytest.approx(1.0)
-    assert (found.missing, found.unseen) == (0, 0.0)
-    assert not found.late.any() or np.abs(found.late).max() < 1e-12
+    result = motion(ahead(even(101)), NONE, KINEMATICS, whole=True)
+    assert result.distance.sum() == pytest.approx(0.5)
+    assert result.seconds == pytest.approx(1.0)
+    assert (result.missing, result.unseen) == (0, 0.0)
+    assert not result.late.any() or np.abs(result.late).max() < 1e-12
 
 
 def test_a_gap_without_motion_of_the_pose_is_unfilled_by_the_way_driven_in_it() -> None:
     at = even(100) + [1.5 + t for t in even(100)]
     moved = [SPEED * PERIOD] * 200
     moved[100] = 0.0
-    found = motion(ahead(at, moved), NONE, KINEMATICS, whole=True)
-    (unfilled,) = found.unfilled[found.unfilled.any(axis=1)]
+    result = motion(ahead(at, moved), NONE, KINEMATICS, whole=True)
+    (unfilled,) = result.unfilled[result.unfilled.any(axis=1)]
     assert unfilled[0] == pytest.approx(0.5 * 0.51)
-    assert found.unseen == pytest.approx(0.51)
+    assert result.unseen == pytest.approx(0.51)
 
 
 def test_missing_lines_over_which_the_pose_continued_make_a_filled_gap() -> None:
     at, moved = even(200), [SPEED * PERIOD] * 197
     del at[100:103]
     moved[100] = 4 * SPEED * PERIOD
-    found = motion(ahead(at, moved), NONE, KINEMATICS, whole=True)
-    assert found.missing == 3
-    assert found.unseen == pytest.approx(0.03)
-    assert np.flatnonzero(found.filled[:, 0]).tolist() == [99]
-    assert not found.unfilled.any()
+    result = motion(ahead(at, moved), NONE, KINEMATICS, whole=True)
+    assert result.missing == 3
+    assert result.unseen == pytest.approx(0.03)
+    assert np.flatnonzero(result.filled[:, 0]).tolist() == [99]
+    assert not result.unfilled.any()
 
 
 def test_lines_that_only_this_program_missed_are_not_a_gap() -> None:
     at, moved = even(200), [SPEED * PERIOD] * 197
     del at[100:103]
     moved[100] = 4 * SPEED * PERIOD
-    found = motion(ahead(at, moved), NONE, KINEMATICS, whole=False)
-    assert (found.missing, found.unseen) == (0, 0.0)
+    result = motion(ahead(at, moved), NONE, KINEMATICS, whole=False)
+    assert (result.missing, result.unseen) == (0, 0.0)
 
 
 def test_late_lines_at_a_constant_speed_cause_no_error() -> None:
     rng = np.random.default_rng(1)
     at = np.sort(np.array(even(300)) + rng.exponential(0.002, 300)).tolist()
-    found = motion(ahead(at), NONE, KINEMATICS, whole=True)
-    assert found.lateness == pytest.approx(0.002, rel=0.3)
-    assert not found.late.any()
+    result = motion(ahead(at), NONE, KINEMATICS, whole=True)
+    assert result.lateness == pytest.approx(0.002, rel=0.3)
+    assert not result.late.any()
 
 
 COUNT = 4000
@@ -157,26 +157,26 @@ def test_the_variance_is_that_of_the_sum_of_the_rounding_errors(ripple: float) -
     A wheel whose speed varies has a new rounding error in each line.
     """
     rng = np.random.default_rng(1)
-    errors, told = [], []
+    errors, sums = [], []
     for _ in range(60):
         true = rng.uniform(5, 15) + rng.normal(0, ripple, COUNT)
-        said = np.round(true, 2)
-        errors.append(float((said - true).sum()) * PERIOD)
-        told.append(float(rounding(four(said, said, said, said), PERIOD).variance[:, 0].sum()))
-    assert np.mean(np.square(errors)) == pytest.approx(np.mean(told), rel=0.6)
+        speed = np.round(true, 2)
+        errors.append(float((speed - true).sum()) * PERIOD)
+        sums.append(float(rounding(four(speed, speed, speed, speed), PERIOD).variance[:, 0].sum()))
+    assert np.mean(np.square(errors)) == pytest.approx(np.mean(sums), rel=0.6)
 
 
 def test_the_rounding_errors_of_a_wheel_with_changing_speed_cancel_out() -> None:
     true = np.linspace(0.0, 10.0, 20_000)  # twenty lines for each hundredth
-    said = np.round(true, 2)
-    found = rounding(four(said, said, said, said), PERIOD)
-    assert math.sqrt(found.variance[:, 0].sum()) < 20 * 0.01 * PERIOD
+    speed = np.round(true, 2)
+    result = rounding(four(speed, speed, speed, speed), PERIOD)
+    assert math.sqrt(result.variance[:, 0].sum()) < 20 * 0.01 * PERIOD
 
 
 def test_only_wheels_with_equal_speeds_have_equal_rounding_errors() -> None:
     rng = np.random.default_rng(2)
-    one, other = (np.round(rng.uniform(5, 9, COUNT), 2) for _ in range(2))
-    alike = rounding(four(one, other, other, one), PERIOD).equal_errors
+    first, other = (np.round(rng.uniform(5, 9, COUNT), 2) for _ in range(2))
+    alike = rounding(four(first, other, other, first), PERIOD).equal_errors
     assert alike.tolist() == [[1, 0, 0, 1], [0, 1, 1, 0], [0, 1, 1, 0], [1, 0, 0, 1]]
 
 
@@ -189,24 +189,24 @@ def test_firmware_that_counts_in_each_period_is_recognized_by_its_speeds(counts:
     rng = np.random.default_rng(counts)
     step = math.tau / counts
     turned = np.cumsum(8.0 + 6.0 * np.sin(np.arange(COUNT) / 300) + rng.normal(0, 0.1, COUNT))
-    said = np.round(np.diff(np.floor(turned * PERIOD / step)) * step / PERIOD, 2)
-    found = rounding(four(said, said, said, said), PERIOD)
-    assert found.count == pytest.approx(step, rel=1e-3)
+    speed = np.round(np.diff(np.floor(turned * PERIOD / step)) * step / PERIOD, 2)
+    result = rounding(four(speed, speed, speed, speed), PERIOD)
+    assert result.count == pytest.approx(step, rel=1e-3)
     counted = np.diff(np.floor(turned * PERIOD / step)) * step
-    assert found.offset[:, 0].sum() == pytest.approx((said * PERIOD - counted).sum(), abs=0.1)
+    assert result.offset[:, 0].sum() == pytest.approx((speed * PERIOD - counted).sum(), abs=0.1)
 
 
 @each("seed", range(20))
 def test_firmware_that_filters_is_not_taken_for_firmware_that_counts(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    said: Floats = np.cumsum(rng.normal(0, 0.2, (300, 4)), axis=0).round(2)
-    assert rounding(said, PERIOD).count == 0.0
+    speeds: Floats = np.cumsum(rng.normal(0, 0.2, (300, 4)), axis=0).round(2)
+    assert rounding(speeds, PERIOD).count == 0.0
 
 
-def driving(told: Told, gyro: bool = False) -> Driving:
-    moved = motion(told.lines, np.zeros(0), KINEMATICS, whole=True)
-    found = rounding(np.array([line.speeds for line in told.lines]), moved.period)
-    return Driving(told.lines, moved, found, KINEMATICS, 0.1, gyro)
+def driving(drive: Told, gyro: bool = False) -> Driving:
+    moved = motion(drive.lines, np.zeros(0), KINEMATICS, whole=True)
+    result = rounding(np.array([line.speeds for line in drive.lines]), moved.period)
+    return Driving(drive.lines, moved, result, KINEMATICS, 0.1, gyro)
 
 
 @pytest.fixture(scope="module")

@@ -98,13 +98,13 @@ class Player:
         noise = float(self.robot.rng.normal(0, READ_M))
         off = math.remainder(self.yaw, math.pi)
         half = math.sin(off) / 2
-        for told, value in (
+        for phrase, value in (
             ("front left and the rear left", LENGTH), ("apart", WIDTH), ("front corners?", WIDTH),
             ("wide", WIDTH),
         ):  # fmt: skip
-            if told in words:
+            if phrase in words:
                 return value
-        for told, value in (
+        for phrase, value in (
             ("front left wheel", 0.3 - LENGTH * half), ("rear left wheel", 0.3 + LENGTH * half),
             ("rear left corner", 0.3 - WIDTH * half), ("rear right corner", 0.3 + WIDTH * half),
             ("front left corner", 0.3 + WIDTH * half), ("front right corner", 0.3 - WIDTH * half),
@@ -113,7 +113,7 @@ class Player:
             ("left of its marks", self.place.imag),
             ("from the wall now", self.place.real), ("How far is", abs(self.place)),
         ):  # fmt: skip
-            if told in words:
+            if phrase in words:
                 return value + noise
         assert "degrees" in words, words
         return round(math.degrees(off) + float(self.robot.rng.normal(0, 2.0)))
@@ -137,8 +137,8 @@ def play(way: str, player: Player) -> Calibration:
 
 def leg(way: str, name: str, track: float = 1.6) -> Leg:
     """Return the leg with this name of a calibration method, for a robot with this track."""
-    (found,) = [one for one in METHODS[way].legs(usual_setup(), track) if one.name == name]
-    return found
+    (match,) = [entry for entry in METHODS[way].legs(usual_setup(), track) if entry.name == name]
+    return match
 
 
 def usual_setup() -> Setup:

@@ -71,14 +71,14 @@ def places(drive: Drive, setup: Setup, track: float, bend: float) -> Iterator[co
                 yield place
 
 
-def beyond(way: str, setup: Setup, track: float, taken: float, bend: float) -> float:
+def beyond(way: str, setup: Setup, track: float, estimate: float, bend: float) -> float:
     """Return the distance by which a part of the robot leaves the room in the worst case, m.
 
     The distance is negative if the whole robot stays inside. The robot may touch the wall where the
     person pushes it against that wall.
     """
     most = -SIDE
-    for drive in drives(way, setup, taken):
+    for drive in drives(way, setup, estimate):
         for place in places(drive, setup, track, bend):
             for where in (place.real, SIDE - place.real, place.imag, SIDE - place.imag):
                 most = max(most, setup.reach - where)

@@ -72,7 +72,7 @@ def changed(**fields: object) -> Late:
 
 def test_a_leg_begins_with_zeros_drives_its_moves_and_ends_when_the_wheels_stand() -> None:
     world = World(LEG).run(5.0)
-    times = {said: world.said.count(said) * TICK for said in world.said}
+    times = {twist: world.said.count(twist) * TICK for twist in world.said}
     assert world.said[0] == REST
     assert times[Twist(0.3, 0.0)] == pytest.approx(1.0, abs=2 * TICK)
     assert times[Twist(0.0, 0.5)] == pytest.approx(2.0, abs=2 * TICK)
@@ -253,8 +253,8 @@ def test_a_leg_continues_after_a_brief_interruption_of_its_commands() -> None:
 
 def test_progress_is_the_elapsed_share_of_the_time() -> None:
     world = World(LEG).until_moving()
-    told = [world.run(0.5).driver.progress(world.now) for _ in range(5)]
-    assert told == pytest.approx([share / 6 for share in range(1, 6)], abs=0.02)
+    shares = [world.run(0.5).driver.progress(world.now) for _ in range(5)]
+    assert shares == pytest.approx([share / 6 for share in range(1, 6)], abs=0.02)
 
 
 def test_a_key_halts_the_leg_in_the_same_step() -> None:

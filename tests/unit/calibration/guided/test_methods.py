@@ -47,8 +47,8 @@ def robots(way: str, count: int) -> list[tuple[Robot, Calibration, Player, Drive
     for seed in range(count):
         robot = anyone(seed)
         player = Player(robot, gyro=way == "gyro", places=way == "positions")
-        found = play(way, player)
-        made.append((robot, found, player, drive(robot, wander(robot.rng, 300.0))))
+        calibration = play(way, player)
+        made.append((robot, calibration, player, drive(robot, wander(robot.rng, 300.0))))
     return made
 
 
@@ -71,8 +71,8 @@ def test_heading_is_ten_times_better_than_geometric(way: str, count: int) -> Non
 @each_way
 def test_standard_deviations_cover_the_truth(way: str, count: int) -> None:
     z = []
-    for robot, found, player, _ in robots(way, count):
-        values, std = found.multipliers.values, found.multipliers.std
+    for robot, calibration, player, _ in robots(way, count):
+        values, std = calibration.multipliers.values, calibration.multipliers.std
         # The track is the best constant one, at the mean rate of all turns.
         turned = np.concatenate([np.diff(made.yaw) for made in player.drives])
         seconds = np.concatenate([np.diff(made.t) for made in player.drives])
@@ -106,8 +106,8 @@ def test_no_track_makes_a_method_longer_than_its_limit(way: str, separation: flo
 
 @each_way
 def test_the_improvement_is_reported(way: str) -> None:
-    for _, found, _, _ in robots(way, FEW):
-        worth = found.improvement
+    for _, calibration, _, _ in robots(way, FEW):
+        worth = calibration.improvement
         # Only a heading sensor or a tape measures a turn itself.
         error = worth.place if way == "positions" else worth.turn
         now, then = error.before, error.after
@@ -162,10 +162,10 @@ def test_the_names_of_a_method_are_unique_and_refer_to_its_earlier_legs(way: str
     legs = table.legs(usual_setup(), 1.6)
     names = [leg.name for leg in legs]
     assert len(set(names)) == len(names)
-    for number, one in enumerate(legs):
-        asked = [ask.name for ask in one.asks]
+    for number, stage in enumerate(legs):
+        asked = [ask.name for ask in stage.asks]
         assert len(set(asked)) == len(asked)
-        for measure in one.measures:
+        for measure in stage.measures:
             assert set(measure.over) <= set(names[: number + 1])
             if isinstance(measure, Slant):
                 assert {measure.near, measure.far} <= set(asked)
@@ -178,9 +178,9 @@ def test_the_names_of_a_method_are_unique_and_refer_to_its_earlier_legs(way: str
 @each_way
 def test_legs_before_the_track_is_known_do_not_depend_on_it(way: str) -> None:
     narrow, wide = (METHODS[way].legs(usual_setup(), track) for track in (1.0, MAX_TRACK_RATIO))
-    for one, other in zip(narrow, wide, strict=True):
-        assert one == other
-        if any(measure.quantity == "turned" for measure in one.measures):
+    for first, other in zip(narrow, wide, strict=True):
+        assert first == other
+        if any(measure.quantity == "turned" for measure in first.measures):
             break
 
 
@@ -205,8 +205,8 @@ def test_short_lengths_are_asked_in_mm_and_the_long_one_in_m() -> None:
 def test_a_drive_between_two_half_turns_separates_left_from_right() -> None:
     robot = anyone(1)
     robot.left, robot.right = 1.005, 0.995
-    found = play("wall", Player(robot)).multipliers
-    ratio = found.values[1] / found.values[2]
+    multipliers = play("wall", Player(robot)).multipliers
+    ratio = multipliers.values[1] / multipliers.values[2]
     assert ratio == pytest.approx(1.01, abs=0.006)
 
 
@@ -238,14 +238,14 @@ def test_small_errors_give_the_ratio_of_borenstein_and_feng() -> None:
     """
     robot = replace(Robot(chi=1.3, left=0.999, right=1.001), **IDEAL)  # type: ignore[arg-type]
     player = Exact(robot)
-    found = play("umbmark", player).multipliers
+    multipliers = play("umbmark", player).multipliers
     side = side_of_square(usual_setup())
     left, right = player.ends
     # Left is counter-clockwise. In the frame of their paper the first side is along x, and y is to
     # the left.
     beta = (right.real - left.real) / (-4 * side)
     ratio = math.tan(beta / 2) * SEPARATION * 1.3 / side
-    assert found.values[2] / found.values[1] - 1 == pytest.approx(2 * ratio, abs=1.2e-3)
+    assert multipliers.values[2] / multipliers.values[1] - 1 == pytest.approx(2 * ratio, abs=1.2e-3)
 
 
 def test_two_squares_end_near_enough_to_their_start_to_be_measured() -> None:
@@ -265,15 +265,15 @@ class Blind(Player):
 
 def test_a_tape_beside_the_gyro_measures_the_wheels() -> None:
     robot = replace(anyone(3), left=0.95, right=0.952)
-    found = play("gyro", Player(robot, gyro=True))
-    assert found.scale == "distance"
-    assert found.multipliers.values[1] == pytest.approx(0.95, rel=0.02)
+    calibration = play("gyro", Player(robot, gyro=True))
+    assert calibration.scale == "distance"
+    assert calibration.multipliers.values[1] == pytest.approx(0.95, rel=0.02)
 
 
 def test_without_a_tape_the_mean_wheel_radius_stays_as_configured() -> None:
-    found = play("gyro", Blind(anyone(3), gyro=True))
-    assert found.scale == ""
-    assert found.multipliers.values[1:].mean() == pytest.approx(1.0, abs=1e-6)
+    calibration = play("gyro", Blind(anyone(3), gyro=True))
+    assert calibration.scale == ""
+    assert calibration.multipliers.values[1:].mean() == pytest.approx(1.0, abs=1e-6)
 
 
 def test_a_gyro_with_a_constant_value_is_refused() -> None:

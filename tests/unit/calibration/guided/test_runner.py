@@ -38,7 +38,7 @@ def test_a_drive_resumes_at_the_last_leg_whose_measurement_stands_alone(
 ) -> None:
     method = METHODS[way]
     legs = method.legs(usual_setup(), 1.6)
-    number = [one.name for one in legs].index(leg)
+    number = [stage.name for stage in legs].index(leg)
     assert legs[begins_again(legs, number, sensor=not method.tool)].name == again
 
 
@@ -77,9 +77,9 @@ def test_a_disturbed_leg_is_repeated_and_the_result_is_right(
     assert drive.driven.count(leg) == 1 + MAX_REPEATS
     assert values[0] == pytest.approx(robot.chi * (1 + 0.5 * robot.rate), rel=0.05)
     assert np.all(np.abs(values - expected.values) < 4 * expected.std)
-    said = " ".join(capsys.readouterr().err.split())
-    assert "was disturbed: a person stood in the way" in said
-    assert "put the robot back" in said
+    output = " ".join(capsys.readouterr().err.split())
+    assert "was disturbed: a person stood in the way" in output
+    assert "put the robot back" in output
 
 
 def test_a_leg_that_is_disturbed_three_times_ends_the_drive() -> None:

@@ -63,18 +63,18 @@ def readings() -> list[Reading]:
 
 
 def test_exact_readings_give_the_parameters_of_the_robot() -> None:
-    told = fit_readings(readings(), BASE)
-    assert 1 / told.parameters[Parameter.INVERSE_TRACK] == pytest.approx(1.5, rel=2e-3)
-    assert told.parameters[Parameter.LEFT] == pytest.approx(0.98, rel=1e-3)
-    assert told.parameters[Parameter.RIGHT] == pytest.approx(1.01, rel=1e-3)
-    assert np.all(np.abs(told.residuals) < 3e-3)
+    result = fit_readings(readings(), BASE)
+    assert 1 / result.parameters[Parameter.INVERSE_TRACK] == pytest.approx(1.5, rel=2e-3)
+    assert result.parameters[Parameter.LEFT] == pytest.approx(0.98, rel=1e-3)
+    assert result.parameters[Parameter.RIGHT] == pytest.approx(1.01, rel=1e-3)
+    assert np.all(np.abs(result.residuals) < 3e-3)
 
 
 def test_whole_turns_that_were_not_counted_do_not_matter() -> None:
-    given = readings()
+    samples = readings()
     spin, _, turned = driven(SPIN)
-    given.append(Reading((spin,), "angle", math.remainder(turned, 2 * math.pi), 0.01))
-    assert fit_readings(given, BASE).parameters == pytest.approx(
+    samples.append(Reading((spin,), "angle", math.remainder(turned, 2 * math.pi), 0.01))
+    assert fit_readings(samples, BASE).parameters == pytest.approx(
         fit_readings(readings(), BASE).parameters, abs=3e-3
     )
 
@@ -87,12 +87,12 @@ def test_derivatives_are_those_of_small_steps(what: Quantity) -> None:
     """
     steps = joined([driven(CURVE)[0]])
     start = np.array([0.99, 1.01, 0.7, 0.03, 0.0, 0.0, 0.0])
-    told = predicted(steps, what, BASE, start)
+    result = predicted(steps, what, BASE, start)
     for index in range(4):
         more = start.copy()
         more[index] += 1e-6
-        derivative = (predicted(steps, what, BASE, more).value - told.value) / 1e-6
-        assert told.derivatives[index] == pytest.approx(derivative, rel=0.02)
+        derivative = (predicted(steps, what, BASE, more).value - result.value) / 1e-6
+        assert result.derivatives[index] == pytest.approx(derivative, rel=0.02)
 
 
 def test_rides_that_follow_each_other_are_joined_into_one() -> None:
@@ -114,22 +114,22 @@ def test_readings_that_contradict_each_other_widen_the_deviation() -> None:
     for measured, wrong in ((exact, 0.0), (worse, 0.6)):
         measured += [Reading((spin,), "turned", turned + side * wrong, 0.01) for side in (1, -1)]
     sure, unsure = (
-        fit_readings(one, BASE).covariance[Parameter.INVERSE_TRACK, Parameter.INVERSE_TRACK]
-        for one in (exact, worse)
+        fit_readings(series, BASE).covariance[Parameter.INVERSE_TRACK, Parameter.INVERSE_TRACK]
+        for series in (exact, worse)
     )
     assert unsure > 4 * sure
 
 
 def test_readings_without_a_turn_are_refused() -> None:
     with pytest.raises(RefusedError, match="hardly turned"):
-        fit_readings([one for one in readings() if one.quantity == "distance"], BASE)
+        fit_readings([reading for reading in readings() if reading.quantity == "distance"], BASE)
 
 
 def test_a_turn_to_the_other_side_than_that_of_the_wheels_is_refused() -> None:
-    given = readings()
-    given[0] = Reading(given[0].rides, "turned", -given[0].value, 0.01)
+    samples = readings()
+    samples[0] = Reading(samples[0].rides, "turned", -samples[0].value, 0.01)
     with pytest.raises(RefusedError, match="to the left"):
-        fit_readings(given, BASE)
+        fit_readings(samples, BASE)
 
 
 @given(angle=st.floats(-1.3, 1.3), apart=st.floats(0.1, 1.0))
@@ -193,15 +193,18 @@ def test_the_errors_before_and_after_are_those_of_the_configured_and_found_value
 
 def test_the_report_names_the_tape_and_the_configuration_accepts_the_result() -> None:
     made = calibrated("a tape", readings(), DRIVE, OdometryConfig())
-    told = plain(*parts(report("the drive", made, DRIVE, ""), made, "acsard.toml", guided=True))
-    assert "compared with a tape" in told
-    assert "heading error after a turn of 360 deg" in told
+    text = plain(*parts(report("the drive", made, DRIVE, ""), made, "acsard.toml", guided=True))
+    assert "compared with a tape" in text
+    assert "heading error after a turn of 360 deg" in text
     config = parse("\n".join(excerpt(keys(made))).encode())
     assert config.drive.wheel_separation_multiplier == pytest.approx(1.5, rel=0.02)
     assert 0 < config.odometry.wheel_separation_multiplier_std < 0.2
 
 
 def test_inaccurate_readings_are_refused() -> None:
-    vague = [Reading(one.rides, one.quantity, one.value, 100 * one.deviation) for one in readings()]
+    vague = [
+        Reading(reading.rides, reading.quantity, reading.value, 100 * reading.deviation)
+        for reading in readings()
+    ]
     with pytest.raises(RefusedError, match="too inaccurate"):
         calibrated("a tape", vague, DRIVE, OdometryConfig())

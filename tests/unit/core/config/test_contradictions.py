@@ -106,8 +106,8 @@ def test_the_check_refuses_the_addresses_that_the_page_refuses(
     addresses: tuple[str, ...], tls: str
 ) -> None:
     try:
-        found = [parse_listen(address) for address in addresses]
-        refused = any(address.secure for address in found) and not tls
+        endpoints = [parse_listen(address) for address in addresses]
+        refused = any(address.secure for address in endpoints) and not tls
     except UsageError:
         refused = True
     bus, web = BusConfig(tls=tls), WebConfig(address=addresses)
@@ -199,9 +199,9 @@ def test_a_rate_so_high_that_lines_repeat_counts_is_a_warning(
 ) -> None:
     mcu = McuConfig(encoder_counts=counts, link_check=check)
     sim = SimConfig(encoder_counts=counts)
-    found = warnings(Config(mcu=mcu, control=ControlConfig(rate=rate), sim=sim))
+    messages = warnings(Config(mcu=mcu, control=ControlConfig(rate=rate), sim=sim))
     expected = "control.rate = 200 with mcu.encoder_counts = 96: lines follow each other so soon"
-    assert any(expected in line for line in found) == warned
+    assert any(expected in line for line in messages) == warned
 
 
 @each(

@@ -39,7 +39,11 @@ def by_file(wishes: dict[str, object]) -> Config | list[str]:
         *path, name = key.split(".")
         inner: Any = tables
         for part in path:
-            named = (one for one in inner if one["name"] == part) if isinstance(inner, list) else ()
+            named = (
+                (entry for entry in inner if entry["name"] == part)
+                if isinstance(inner, list)
+                else ()
+            )
             inner = next(iter(named)) if isinstance(inner, list) else inner[part]
         inner[name] = value
     try:
@@ -49,9 +53,9 @@ def by_file(wishes: dict[str, object]) -> Config | list[str]:
 
 
 def test_every_live_setting_is_a_key_and_every_source_has_a_live_timeout() -> None:
-    found = {key for key in KEYS if live(key)}
-    sources = {f"commands.sources.{one.name}.timeout" for one in CONFIG.commands.sources}
-    assert found == {key for key in LIVE if "*" not in key} | sources
+    keys = {key for key in KEYS if live(key)}
+    sources = {f"commands.sources.{source.name}.timeout" for source in CONFIG.commands.sources}
+    assert keys == {key for key in LIVE if "*" not in key} | sources
     assert all(row.what for row in LIVE.values())
 
 

@@ -14,7 +14,7 @@ SOFT = 0.5
 
 
 @each(
-    ("now", "kept"),
+    ("now", "limits"),
     [
         (FILE, {}),
         (LimitsConfig(linear_speed=0.3, linear_jerk=5.0), {"limits.linear_speed": 0.3}),
@@ -28,8 +28,10 @@ SOFT = 0.5
         (LimitsConfig(linear_jerk=0.0), {}),
     ],
 )
-def test_a_limit_below_that_of_the_file_is_kept(now: LimitsConfig, kept: dict[str, float]) -> None:
-    assert lowered(FILE, now) == kept
+def test_a_limit_below_that_of_the_file_is_kept(
+    now: LimitsConfig, limits: dict[str, float]
+) -> None:
+    assert lowered(FILE, now) == limits
 
 
 def test_a_jerk_limit_is_lower_than_no_jerk_limit() -> None:
@@ -46,21 +48,21 @@ def test_without_kept_limits_the_configuration_is_unchanged_without_an_event() -
 
 
 @pytest.mark.parametrize(
-    "kept",
+    "limits",
     [
         {"limits.linear_speed": 1.5},
         {"limits.flying_height": 0.1},
         {"limits.linear_deceleration": 0.5},
     ],
 )
-def test_a_kept_limit_that_lowers_nothing_now_is_left_out(kept: dict[str, float]) -> None:
+def test_a_kept_limit_that_lowers_nothing_now_is_left_out(limits: dict[str, float]) -> None:
     config = Config()
-    assert with_lowered(config, kept) == (config, [])
+    assert with_lowered(config, limits) == (config, [])
 
 
 def test_a_limit_that_contradicts_the_rest_is_dropped_and_an_event_names_it() -> None:
-    kept = {"limits.linear_acceleration": 0.001, "limits.angular_speed": 2.0}
-    config, events = with_lowered(Config(), kept)
+    limits = {"limits.linear_acceleration": 0.001, "limits.angular_speed": 2.0}
+    config, events = with_lowered(Config(), limits)
     assert config.limits == LimitsConfig(angular_speed=2.0)
     dropped, used = events
     assert (dropped.name, dropped.level) == ("set", "warning")
@@ -73,8 +75,8 @@ def test_a_limit_that_contradicts_the_rest_is_dropped_and_an_event_names_it() ->
 
 
 def test_several_limits_that_stay_lowered_are_reported_together() -> None:
-    kept = {"limits.linear_speed": 0.5, "limits.angular_speed": 2.0}
-    _, (event,) = with_lowered(Config(), kept)
+    limits = {"limits.linear_speed": 0.5, "limits.angular_speed": 2.0}
+    _, (event,) = with_lowered(Config(), limits)
     assert event.text == (
         "limits.linear_speed = 0.5 (was 1.0), limits.angular_speed = 2.0 (was 4.0): they were "
         "lowered before the restart and stay lowered"

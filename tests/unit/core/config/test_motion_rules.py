@@ -56,9 +56,9 @@ limits = st.builds(
 
 def mended(config: Config, line: str) -> Config:
     """Return the configuration with the number that the error message proposes."""
-    found = re.match(r"(\w+)\.(\w+) = .*?write ([0-9.]+)", line)
-    assert found is not None
-    table, key, number = found.groups()
+    match = re.match(r"(\w+)\.(\w+) = .*?write ([0-9.]+)", line)
+    assert match is not None
+    table, key, number = match.groups()
     changed = replace(getattr(config, table), **{key: float(number)})
     return replace(config, **{table: changed})
 
@@ -150,8 +150,8 @@ def test_the_largest_feedback_speed_must_exceed_the_commanded_speed_by_a_tenth(
     wheel_speed: float, good: bool
 ) -> None:
     # The limits ask for (1.0 m/s + 4.0 rad/s x 0.15 m) / 0.05 m = 32 rad/s, and a tenth is added.
-    found = problems(Config(feedback=FeedbackConfig(wheel_speed=wheel_speed)))
-    assert (found == []) is good
+    messages = problems(Config(feedback=FeedbackConfig(wheel_speed=wheel_speed)))
+    assert (messages == []) is good
 
 
 def test_the_largest_speed_of_a_line_is_sufficient_for_any_limit() -> None:
@@ -174,7 +174,7 @@ def test_a_smaller_wheel_has_to_turn_faster() -> None:
 def test_a_reply_period_that_is_too_long_for_the_fault_time_is_refused(
     period: float, fault_s: float, most: float | None
 ) -> None:
-    found = problems(
+    messages = problems(
         Config(mcu=McuConfig(reply_period=period), feedback=FeedbackConfig(fault_time=fault_s))
     )
-    assert [f"write {most} or less" in line for line in found] == [True] * (most is not None)
+    assert [f"write {most} or less" in line for line in messages] == [True] * (most is not None)

@@ -94,14 +94,14 @@ def test_the_configuration_accepts_several_simulator_faults() -> None:
 def test_a_name_that_is_not_a_fault_is_reported_with_its_key_and_place(
     text: str, words: str
 ) -> None:
-    (told,) = problems(f'["ftdi", "{text}"]')
-    assert told.startswith(f'sim.faults[1] = "{text}": ')
-    assert words in told
+    (message,) = problems(f'["ftdi", "{text}"]')
+    assert message.startswith(f'sim.faults[1] = "{text}": ')
+    assert words in message
 
 
 def test_every_mistake_is_reported() -> None:
-    told = problems('["mut", "ftdi", "stalls=5"]')
-    assert [line.partition(" ")[0] for line in told] == ["sim.faults[0]", "sim.faults[2]"]
+    messages = problems('["mut", "ftdi", "stalls=5"]')
+    assert [line.partition(" ")[0] for line in messages] == ["sim.faults[0]", "sim.faults[2]"]
 
 
 def test_a_fault_that_needs_a_timer_is_refused_with_the_command_that_accepts_it() -> None:
@@ -115,9 +115,9 @@ def test_a_fault_that_needs_a_timer_is_refused_with_the_command_that_accepts_it(
 def test_a_value_that_is_not_a_list_of_short_texts_is_refused_with_the_expected_type(
     faults: str,
 ) -> None:
-    (told,) = problems(faults)
-    assert told.startswith("sim.faults = ")
-    assert "expected a list, each a fault that `acsard sim --fault` accepts, in quotes" in told
+    (message,) = problems(faults)
+    assert message.startswith("sim.faults = ")
+    assert "expected a list, each a fault that `acsard sim --fault` accepts, in quotes" in message
 
 
 def test_faults_of_the_simulator_are_a_warning_but_not_for_a_real_device() -> None:

@@ -12,12 +12,12 @@ KNOWN = ["odom", "state", "tf_static", "limits.linear_speed"]
 
 
 @pytest.mark.parametrize(
-    ("word", "meant"),
+    ("word", "suggestion"),
     [("oddom", "odom"), ("tf-static", "tf_static"), ("linear_speed", "limits.linear_speed")],
 )
-def test_a_misspelt_word_gets_a_suggestion(word: str, meant: str) -> None:
-    assert nearest(word, KNOWN) == [meant]
-    assert hint(word, KNOWN, "look there") == f"did you mean {meant}?"
+def test_a_misspelt_word_gets_a_suggestion(word: str, suggestion: str) -> None:
+    assert nearest(word, KNOWN) == [suggestion]
+    assert hint(word, KNOWN, "look there") == f"did you mean {suggestion}?"
 
 
 @pytest.mark.parametrize("word", ["nonsense", "", "x" * 1000])

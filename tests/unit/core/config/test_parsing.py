@@ -60,7 +60,7 @@ def test_the_reference_file_gives_each_key_its_default(key: Key) -> None:
     for table in tables:
         place = place[table]
     if isinstance(place, list):
-        assert all(name in one for one in place)
+        assert all(name in entry for entry in place)
     else:
         assert msgspec.convert(place[name], key.field.type) == key.field.default
 
@@ -358,7 +358,7 @@ def test_a_mistake_gives_exactly_one_line_with_key_value_and_remedy(
 
 
 def test_each_of_many_mistakes_gives_one_line() -> None:
-    found = problems_of(
+    messages = problems_of(
         """
         colour = 1
         [robot]
@@ -377,12 +377,12 @@ def test_each_of_many_mistakes_gives_one_line() -> None:
     )
     starts = ["colour", "robot.id", "mcu.baudrate", "mcu.port", "drive.wheel_radius"]
     starts += ["drive.wheel_separation", "commands.sources[0].priority", "bus.insecure"]
-    assert len(found) == len(starts)
-    assert all(sum(line.startswith(start) for line in found) == 1 for start in starts)
+    assert len(messages) == len(starts)
+    assert all(sum(line.startswith(start) for line in messages) == 1 for start in starts)
 
 
 def test_all_contradictions_are_reported_together() -> None:
-    found = problems_of(
+    messages = problems_of(
         """
         [mcu]
         baud_rate = 9600
@@ -395,11 +395,11 @@ def test_all_contradictions_are_reported_together() -> None:
         listen = ["nonsense", "tcp/0.0.0.0:7448"]
         """
     )
-    assert len(found) == 6
+    assert len(messages) == 6
 
 
 def test_broken_rules_between_keys_are_reported_with_the_mistakes_of_other_keys() -> None:
-    found = problems_of(
+    messages = problems_of(
         """
         colour = 1
         [drive]
@@ -424,8 +424,8 @@ def test_broken_rules_between_keys_are_reported_with_the_mistakes_of_other_keys(
     )
     starts = ["colour", "drive.wheel_radius", "control.rate", "mcu.wheels.front_right"]
     starts += ["joints.rear_left", "limits.linear_jerk", "limits.angular_jerk", "bus.listen"]
-    assert [next(s for s in starts if line.startswith(s)) for line in found]
-    assert sorted(line.split(" = ")[0] for line in found) == sorted(starts)
+    assert [next(s for s in starts if line.startswith(s)) for line in messages]
+    assert sorted(line.split(" = ")[0] for line in messages) == sorted(starts)
 
 
 def test_a_rule_is_not_applied_to_a_key_with_an_unknown_value() -> None:
@@ -495,8 +495,8 @@ def test_bytes_that_are_not_utf8_give_one_line(text: bytes) -> None:
 
 
 def wire(baud: int, rate: object, comma: bool = False) -> str:
-    shown = str(comma).lower()
-    return f"[mcu]\nbaud_rate = {baud}\ntrailing_comma = {shown}\n[control]\nrate = {rate}\n"
+    flag = str(comma).lower()
+    return f"[mcu]\nbaud_rate = {baud}\ntrailing_comma = {flag}\n[control]\nrate = {rate}\n"
 
 
 @each(
@@ -662,10 +662,10 @@ def outcome(data: bytes) -> Config | list[str]:
         return error.problems
 
 
-def is_config_or_lines(found: Config | list[str]) -> bool:
-    if isinstance(found, Config):
-        return from_builtins(effective(found)) == found
-    return bool(found) and not any("\n" in line for line in found)
+def is_config_or_lines(result: Config | list[str]) -> bool:
+    if isinstance(result, Config):
+        return from_builtins(effective(result)) == result
+    return bool(result) and not any("\n" in line for line in result)
 
 
 @pytest.mark.slow

@@ -9,10 +9,10 @@ from acsard.core.config.settings import Config
 
 
 def test_valid_keys_are_readable_beside_invalid_ones() -> None:
-    seen = view_without(Config(), {"mcu.wheels.front_left", "limits"})
-    assert seen.mcu.baud_rate == 115200
-    assert seen.mcu.wheels.front_right == "+a"
-    assert seen.drive is seen.drive
+    view = view_without(Config(), {"mcu.wheels.front_left", "limits"})
+    assert view.mcu.baud_rate == 115200
+    assert view.mcu.wheels.front_right == "+a"
+    assert view.drive is view.drive
 
 
 @pytest.mark.parametrize(
@@ -24,10 +24,10 @@ def test_valid_keys_are_readable_beside_invalid_ones() -> None:
     ],
 )
 def test_invalid_keys_and_values_derived_from_them_cannot_be_read(read: object) -> None:
-    seen = view_without(Config(), {"mcu.baud_rate", "mcu.link_check", "limits"})
+    view = view_without(Config(), {"mcu.baud_rate", "mcu.link_check", "limits"})
     assert callable(read)
     with pytest.raises(InvalidKeyError):
-        read(seen)
+        read(view)
 
 
 def test_rules_that_need_no_invalid_key_are_applied() -> None:

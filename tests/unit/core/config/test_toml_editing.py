@@ -57,7 +57,7 @@ def test_an_edit_that_makes_the_file_invalid_is_refused(text: str, keys: dict[st
 
 
 @each(
-    ("names", "kept"),
+    ("names", "comments"),
     [
         (["anna", "eve", "carl"], ["anna", "hall 3", "bob"]),
         (["eve", "carl"], ["bob"]),
@@ -65,7 +65,9 @@ def test_an_edit_that_makes_the_file_invalid_is_refused(text: str, keys: dict[st
         ([], []),
     ],
 )
-def test_a_changed_list_keeps_the_comments_of_its_items(names: list[str], kept: list[str]) -> None:
+def test_a_changed_list_keeps_the_comments_of_its_items(
+    names: list[str], comments: list[str]
+) -> None:
     text = """[access]
 operators = [
     "anna",   # hall 3, until May
@@ -75,7 +77,7 @@ operators = [
 """
     after = edited(text, {"access.operators": names})
     assert parse(after.encode()).access.operators == tuple(names)
-    assert all(words in after for words in kept)
+    assert all(words in after for words in comments)
 
 
 @each("text", ["", "[bus]\n", "bus.tls = ''\n", '[bus]\nlisten = [\n  "tcp/[::1]:1",  # here\n]\n'])

@@ -121,7 +121,7 @@ def test_a_number_that_is_not_finite_is_refused_also_in_lists_and_tables(bad: fl
 
 
 def test_all_mistakes_are_reported_together() -> None:
-    found = problems_of({"toes": 9, "wood": "elm", "legs": [{}, {"nam": 1}], "x": 0})
+    messages = problems_of({"toes": 9, "wood": "elm", "legs": [{}, {"nam": 1}], "x": 0})
     starts = (
         "x = 0",
         "toes = 9",
@@ -130,8 +130,8 @@ def test_all_mistakes_are_reported_together() -> None:
         "legs[1].nam = 1",
         "legs[1].name",
     )
-    assert len(found) == len(starts)
-    assert all(any(line.startswith(start) for line in found) for start in starts)
+    assert len(messages) == len(starts)
+    assert all(any(line.startswith(start) for line in messages) for start in starts)
 
 
 def test_a_long_value_is_shown_truncated_to_80_characters() -> None:

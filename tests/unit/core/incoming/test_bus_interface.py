@@ -23,8 +23,8 @@ class GatewayDaemon:
         self.told, self.counters = GatewayFollower(), Counter[str]()
 
     def hears(self, state: GatewayState) -> int | None:
-        heard = arrival(encode(state, "msgpack"), encoding_name("msgpack", "GatewayState"))
-        return self.told.receive(heard, self.counters)
+        sample = arrival(encode(state, "msgpack"), encoding_name("msgpack", "GatewayState"))
+        return self.told.receive(sample, self.counters)
 
 
 def test_each_gateway_start_and_each_check_that_found_it_full_is_counted_once() -> None:
@@ -110,13 +110,15 @@ def test_only_the_missing_router_of_two_is_reported() -> None:
 
 
 def test_a_peer_in_the_place_of_a_router_is_reported_once_with_its_consequence() -> None:
-    told, counters = RouterFollower(), Counter[str]()
+    follower, counters = RouterFollower(), Counter[str]()
     events: list[Event] = []
-    told.receive(RoutersStatus((A,)), counters, events)  # the type of this peer is not known yet
-    told.receive(RoutersStatus((A,), peers=(A,)), counters, events)
-    told.receive(RoutersStatus((A,), peers=(A,)), counters, events)
-    found = [(event.name, event.level) for event in events]
-    assert found == [("router_found", "info"), ("not_a_router", "warning")]
+    follower.receive(
+        RoutersStatus((A,)), counters, events
+    )  # the type of this peer is not known yet
+    follower.receive(RoutersStatus((A,), peers=(A,)), counters, events)
+    follower.receive(RoutersStatus((A,), peers=(A,)), counters, events)
+    pairs = [(event.name, event.level) for event in events]
+    assert pairs == [("router_found", "info"), ("not_a_router", "warning")]
     assert events[-1].text.startswith(f"these endpoints are peers, not routers: {A}. A peer, ")
     assert "call stop --id '*'" in events[-1].text
 

@@ -52,8 +52,8 @@ NOT_FINITE = [math.nan, math.inf, -math.inf]
 
 
 def arrival(payload: bytes, key: str = "cmd/app", **changes: Any) -> Arrival:
-    given: dict[str, Any] = {"put": True, "encoding": "", "stamp_ns": None, "sender": ""} | changes
-    return Arrival(key=key, payload=payload, arrived_ns=ARRIVED_NS, **given)
+    fields: dict[str, Any] = {"put": True, "encoding": "", "stamp_ns": None, "sender": ""} | changes
+    return Arrival(key=key, payload=payload, arrived_ns=ARRIVED_NS, **fields)
 
 
 def written(body: dict[str, Any], form: Format) -> bytes:
@@ -182,9 +182,9 @@ def test_one_axis_that_is_not_finite_refuses_the_whole_command(
 
 @pytest.mark.parametrize("form", FORMATS)
 def test_wheel_speeds_are_converted_to_a_twist(form: Format) -> None:
-    got = wheels(joints(4.0, 2.0, 2.0, 4.0), form).twist
-    assert got.linear == pytest.approx(0.05 * 3.0)
-    assert got.angular == pytest.approx(0.05 * 2.0 / 0.30)
+    result = wheels(joints(4.0, 2.0, 2.0, 4.0), form).twist
+    assert result.linear == pytest.approx(0.05 * 3.0)
+    assert result.angular == pytest.approx(0.05 * 2.0 / 0.30)
 
 
 def test_wheels_are_found_by_their_names_in_any_order() -> None:
@@ -200,8 +200,8 @@ def test_wheels_that_differ_on_one_side_give_the_mean_of_the_side() -> None:
 def test_wheel_commands_use_the_configured_joint_names() -> None:
     receiver = Receiver(JointsConfig("fr", "fl", "rl", "rr"), KINEMATICS)
     body = joints(1.0, 1.0, 1.0, 1.0, names=["rl", "fr", "rr", "fl"])
-    got = receiver.command(arrival(msgspec.msgpack.encode(body), key="wheel_cmd/app"))
-    assert got.twist.linear == pytest.approx(0.05)
+    result = receiver.command(arrival(msgspec.msgpack.encode(body), key="wheel_cmd/app"))
+    assert result.twist.linear == pytest.approx(0.05)
     assert refused(body, key="wheel_cmd/app") == "wrong_wheels"
 
 
@@ -240,8 +240,8 @@ def test_the_joints_of_an_arm_among_the_wheels_are_ignored(form: Format, place: 
 
 
 def test_the_speed_of_an_arm_does_not_count_as_a_wheel_speed() -> None:
-    got = wheels(joints(0.0, 0.0, 0.0, 0.0, 3.0, names=[*JOINTS, "arm"]))
-    assert (got.twist, got.cancelled) == (Twist(), False)
+    result = wheels(joints(0.0, 0.0, 0.0, 0.0, 3.0, names=[*JOINTS, "arm"]))
+    assert (result.twist, result.cancelled) == (Twist(), False)
 
 
 @each("bad", NOT_FINITE)
@@ -286,9 +286,9 @@ def test_a_twist_on_a_wheel_key_and_wheels_on_a_twist_key_are_refused() -> None:
 def test_wheel_speeds_that_cancel_out_are_marked_and_do_not_count_as_neutral(
     form: Format, speeds: tuple[float, ...], cancelled: bool
 ) -> None:
-    got = wheels(joints(*speeds), form)
-    assert got.cancelled is cancelled
-    assert (got.twist == Twist(0.0, 0.0)) is (cancelled or not any(speeds))
+    result = wheels(joints(*speeds), form)
+    assert result.cancelled is cancelled
+    assert (result.twist == Twist(0.0, 0.0)) is (cancelled or not any(speeds))
 
 
 @each("form", FORMATS)
@@ -298,9 +298,9 @@ def test_a_twist_on_axes_that_the_base_cannot_follow_does_not_count_as_neutral(
 ) -> None:
     body = twist(0.0, 0.0)
     body[part][axis] = 0.5
-    for one in (body, {"header": {}, "twist": body}):
-        got = command(one, form)
-        assert got.cancelled is (got.twist == Twist(0.0, 0.0))
+    for message in (body, {"header": {}, "twist": body}):
+        result = command(message, form)
+        assert result.cancelled is (result.twist == Twist(0.0, 0.0))
     assert not command(twist(0.0, 0.0), form).cancelled
 
 
@@ -340,9 +340,9 @@ def native_joints(header: bytes, velocity: list[float]) -> bytes:
 def test_a_native_twist_of_52_bytes_is_a_command(header: bytes, encoding: str) -> None:
     payload = native_twist(header)
     assert len(payload) == 52
-    got = RECEIVER.command(arrival(payload, encoding=encoding, stamp_ns=5))
+    result = RECEIVER.command(arrival(payload, encoding=encoding, stamp_ns=5))
     plain = Command("app", Twist(0.5, 0.2), ARRIVED_NS, 5, "native/app", "native/app", shared=True)
-    assert got == plain
+    assert result == plain
 
 
 @each("header", ORDERS)
@@ -352,8 +352,12 @@ def test_a_native_stamped_twist_is_a_command_with_its_stamp(
 ) -> None:
     payload = native_stamped(header, frame)
     assert len(payload) == size
-    got = RECEIVER.command(arrival(payload, stamp_ns=5))
-    assert (got.twist, got.stamp_ns, got.clock) == (Twist(0.5, 0.2), 3_000_000_004, HEADER_S)
+    result = RECEIVER.command(arrival(payload, stamp_ns=5))
+    assert (result.twist, result.stamp_ns, result.clock) == (
+        Twist(0.5, 0.2),
+        3_000_000_004,
+        HEADER_S,
+    )
 
 
 @each("frame", [b"f" * n for n in (1, 2, 3, 4, 8, 16, 200)])
@@ -367,8 +371,8 @@ def test_the_padding_of_dds_does_not_change_the_command(surplus: int, fill: byte
     more = fill * surplus
     assert RECEIVER.command(arrival(native_twist() + more)).twist == Twist(0.5, 0.2)
     for frame in (b"", b"base_link"):
-        got = RECEIVER.command(arrival(native_stamped(ORDERS[1], frame) + more))
-        assert (got.twist, got.stamp_ns) == (Twist(0.5, 0.2), 3_000_000_004)
+        result = RECEIVER.command(arrival(native_stamped(ORDERS[1], frame) + more))
+        assert (result.twist, result.stamp_ns) == (Twist(0.5, 0.2), 3_000_000_004)
 
 
 TOLD = {
@@ -391,8 +395,8 @@ def test_surplus_bytes_do_not_change_a_command_whose_type_is_given(
     )
     for frame in (b"", b"base_link"):
         payload = native_stamped(header, frame) + more
-        got = RECEIVER.command(arrival(payload, encoding=TOLD["TwistStamped"]))
-        assert (got.twist, got.stamp_ns) == (Twist(0.5, 0.2), 3_000_000_004)
+        result = RECEIVER.command(arrival(payload, encoding=TOLD["TwistStamped"]))
+        assert (result.twist, result.stamp_ns) == (Twist(0.5, 0.2), 3_000_000_004)
 
 
 @each("size", range(4, 68))
@@ -419,8 +423,8 @@ def test_a_truncated_native_stamped_twist_is_never_read_as_a_stamped_twist(
 @pytest.mark.parametrize("header", ORDERS)
 def test_native_wheel_speeds_are_converted_to_a_twist(header: bytes) -> None:
     payload = native_joints(header, [4.0, 2.0, 2.0, 4.0])
-    got = RECEIVER.command(arrival(payload, key="wheel_cmd/app"))
-    assert got.twist == wheels(joints(4.0, 2.0, 2.0, 4.0)).twist
+    result = RECEIVER.command(arrival(payload, key="wheel_cmd/app"))
+    assert result.twist == wheels(joints(4.0, 2.0, 2.0, 4.0)).twist
 
 
 @each("header", ORDERS)
@@ -667,14 +671,14 @@ def test_twenty_thousand_damaged_payloads_raise_nothing_but_decode_errors() -> N
         key, payload = rnd.choice(VALID)
         data = damage(payload, rnd.choice(VALID)[1], rnd)
         try:
-            got = RECEIVER.command(arrival(data, key, encoding=rnd.choice(encodings)))
+            result = RECEIVER.command(arrival(data, key, encoding=rnd.choice(encodings)))
         except DecodeError as error:
             reasons[error.reason] = reasons.get(error.reason, 0) + 1
             msgspec.json.encode(str(error))  # its text is published
         else:
-            assert math.isfinite(got.twist.linear)
-            assert math.isfinite(got.twist.angular)
-            assert got.arrived_ns == ARRIVED_NS
+            assert math.isfinite(result.twist.linear)
+            assert math.isfinite(result.twist.angular)
+            assert result.arrived_ns == ARRIVED_NS
             reasons["accepted"] = reasons.get("accepted", 0) + 1
     expected = {"accepted", "malformed", "wrong_shape", "unknown_encoding", "wrong_wheels"}
     assert expected | {"not_finite", "too_big"} == set(reasons)
@@ -690,10 +694,10 @@ def test_a_stamp_beyond_any_clock_is_refused(digits: int) -> None:
 def test_a_huge_stamp_never_makes_the_arbiter_raise() -> None:
     body = '{"header":{"stamp":{"sec":%s}},"twist":{"linear":{},"angular":{}}}' % ("9" * 400)
     try:
-        got = RECEIVER.command(arrival(body.encode()))
+        result = RECEIVER.command(arrival(body.encode()))
     except DecodeError:
         return
-    Arbiter(CommandsConfig()).accept(got)
+    Arbiter(CommandsConfig()).accept(result)
 
 
 def test_a_header_beside_a_bare_twist_is_refused() -> None:
@@ -708,10 +712,10 @@ SENT_NS = 1_700_000_000_000_000_000
 
 
 def by_ros(via: str, body: dict[str, Any], **changes: Any) -> Arrival:
-    given: dict[str, Any] = {"key": "cmd/nav", "encoding": "application/cdr", "via": via} | changes
+    fields: dict[str, Any] = {"key": "cmd/nav", "encoding": "application/cdr", "via": via} | changes
     if via == "rmw":
-        given.setdefault("attachment", Attachment(1, SENT_NS, GID).pack())
-    return arrival(written(body, "cdr"), **given)
+        fields.setdefault("attachment", Attachment(1, SENT_NS, GID).pack())
+    return arrival(written(body, "cdr"), **fields)
 
 
 def test_over_rmw_the_attachment_gives_the_sender_and_the_stamp() -> None:
@@ -775,10 +779,10 @@ def test_the_clock_of_a_header_is_kept_apart_from_that_of_a_stamping_router() ->
         now_ns = SENT_NS + step * 50_000_000
         slow = stamped(*divmod(now_ns - 10**9, 10**9))
         for body, key in ((twist(), "cmd/nav"), (slow, "cmd/teleop")):
-            came = replace(
+            sample = replace(
                 by_ros("bridge", body, key=key, stamp_ns=now_ns, sender="router"), arrived_ns=at_ns
             )
-            reasons.append(arbiter.accept(RECEIVER.command(came)))
+            reasons.append(arbiter.accept(RECEIVER.command(sample)))
     assert set(reasons[:10]) == {"unproven"}
     assert set(reasons[12:]) == {""}
 
@@ -814,8 +818,8 @@ def test_half_a_gid_is_not_taken_for_another_sender() -> None:
 JOYSTICK = public_name("joystick/s3cret")
 
 
-def signed(**told: Any) -> bytes:
-    return msgspec.msgpack.encode({"sender": "joystick/s3cret"} | told)
+def signed(**fields: Any) -> bytes:
+    return msgspec.msgpack.encode({"sender": "joystick/s3cret"} | fields)
 
 
 @pytest.mark.parametrize(
@@ -825,9 +829,9 @@ def test_a_stamp_more_than_half_a_second_ahead_counts_as_replaced_by_zenoh(
     ahead_ns: int, replaced: bool
 ) -> None:
     attachment = signed(stamp=SENT_NS + ahead_ns)
-    told = command(twist(), attachment=attachment, received_ns=SENT_NS)
-    assert told.stamp_replaced == replaced
-    assert told.stamp_ns == SENT_NS + ahead_ns
+    result = command(twist(), attachment=attachment, received_ns=SENT_NS)
+    assert result.stamp_replaced == replaced
+    assert result.stamp_ns == SENT_NS + ahead_ns
     assert not command(twist(), attachment=attachment).stamp_replaced
     assert not command(twist(), received_ns=SENT_NS).stamp_replaced
 
@@ -891,14 +895,14 @@ IDENTITIES: dict[str, tuple[Arrival, str, str, int | None, bool]] = {
 
 @each("case", IDENTITIES)
 def test_a_sample_gives_its_sender_clock_and_stamp(case: str) -> None:
-    came, *expected = IDENTITIES[case]
-    told = RECEIVER.command(came)
-    assert [told.sender, told.clock, told.stamp_ns, told.shared] == expected
+    sample, *expected = IDENTITIES[case]
+    result = RECEIVER.command(sample)
+    assert [result.sender, result.clock, result.stamp_ns, result.shared] == expected
 
 
 def test_an_attachment_without_a_stamp_uses_the_stamp_of_zenoh() -> None:
-    told = command(twist(), attachment=signed(sequence=3), sender="z1", stamp_ns=5)
-    assert (told.stamp_ns, told.sequence) == (5, 3)
+    result = command(twist(), attachment=signed(sequence=3), sender="z1", stamp_ns=5)
+    assert (result.stamp_ns, result.sequence) == (5, 3)
 
 
 # certificates
@@ -906,25 +910,25 @@ def test_an_attachment_without_a_stamp_uses_the_stamp_of_zenoh() -> None:
 
 def test_the_certificate_in_the_key_is_part_of_the_sender_name() -> None:
     receiver = Receiver(JointsConfig(), KINEMATICS)
-    came = arrival(written(twist(), "json"), key="cmd/app/anna", attachment=signed(stamp=9))
-    told = receiver.command(came)
-    assert (told.source, told.sender, told.clock) == ("app", *[f"{JOYSTICK} [anna]"] * 2)
-    assert claimed_identity(came).sender == told.sender
-    by_zenoh = receiver.command(replace(came, attachment=b"", sender="z1", stamp_ns=5))
+    sample = arrival(written(twist(), "json"), key="cmd/app/anna", attachment=signed(stamp=9))
+    result = receiver.command(sample)
+    assert (result.source, result.sender, result.clock) == ("app", *[f"{JOYSTICK} [anna]"] * 2)
+    assert claimed_identity(sample).sender == result.sender
+    by_zenoh = receiver.command(replace(sample, attachment=b"", sender="z1", stamp_ns=5))
     assert by_zenoh.sender == f"{Z1} [anna]"
-    by_key = receiver.command(replace(came, attachment=b""))
+    by_key = receiver.command(replace(sample, attachment=b""))
     assert (by_key.sender, by_key.shared) == ("native/app/anna", True)
 
 
 @pytest.mark.parametrize(("first", "second"), [("", "/anna"), ("/anna", ""), ("/anna", "/ben")])
 def test_a_sender_id_under_a_second_certificate_is_refused(first: str, second: str) -> None:
     receiver = Receiver(JointsConfig(), KINEMATICS)
-    came = arrival(written(twist(), "json"), key=f"cmd/app{first}", attachment=signed())
-    receiver.command(came)
+    sample = arrival(written(twist(), "json"), key=f"cmd/app{first}", attachment=signed())
+    receiver.command(sample)
     with pytest.raises(DecodeError, match="already in use") as raised:
-        receiver.command(replace(came, key=f"cmd/app{second}"))
+        receiver.command(replace(sample, key=f"cmd/app{second}"))
     assert raised.value.reason == "other_certificate"
-    assert receiver.command(came).sender == claimed_identity(came).sender
+    assert receiver.command(sample).sender == claimed_identity(sample).sender
 
 
 def test_shared_and_ros_senders_are_not_bound_to_a_certificate() -> None:
@@ -934,8 +938,8 @@ def test_shared_and_ros_senders_are_not_bound_to_a_certificate() -> None:
     assert receiver.command(bridged).sender == "bridge/app"
     for key, session in product(("cmd/app", "cmd/app/anna", "cmd/app/ben"), ("", "z1")):
         stamp_ns = 5 if session else None
-        came = arrival(written(twist(), "json"), key=key, sender=session, stamp_ns=stamp_ns)
-        assert receiver.command(came).shared
+        sample = arrival(written(twist(), "json"), key=key, sender=session, stamp_ns=stamp_ns)
+        assert receiver.command(sample).shared
 
 
 def test_a_sender_id_is_never_taken_for_a_session_that_stamps_for_others() -> None:
@@ -1022,7 +1026,7 @@ def test_a_caller_through_a_bridge_is_unnamed() -> None:
 
 
 @each(
-    ("name", "kept"),
+    ("name", "public"),
     [
         ("mallory (rmw 00)", "mallory ?rmw 00?"),
         ("a, b", "a? b"),
@@ -1032,16 +1036,16 @@ def test_a_caller_through_a_bridge_is_unnamed() -> None:
         ("Jürgen", "Jürgen"),
     ],
 )
-def test_a_caller_name_cannot_imitate_the_text_around_it(name: str, kept: str) -> None:
-    who = caller_name("native", signed_as(f"{name}/s3cret"))
-    assert who == f"{kept}/{public_name(f'{name}/s3cret')[-HASH_DIGITS:]} (native)"
+def test_a_caller_name_cannot_imitate_the_text_around_it(name: str, public: str) -> None:
+    caller = caller_name("native", signed_as(f"{name}/s3cret"))
+    assert caller == f"{public}/{public_name(f'{name}/s3cret')[-HASH_DIGITS:]} (native)"
 
 
 @given(st.binary(max_size=100) | st.text(max_size=100).map(signed_as))
 def test_any_attachment_gives_a_short_printable_name(attachment: bytes) -> None:
-    who = caller_name("native", attachment)
-    name = who.removesuffix(" (native)")
-    assert who == f"{name} (native)"
+    caller = caller_name("native", attachment)
+    name = caller.removesuffix(" (native)")
+    assert caller == f"{name} (native)"
     assert 1 <= len(name) <= MAX_NAME_LENGTH + 1 + HASH_DIGITS
     assert name.isprintable()
     assert not set(name) & set('(),="\n')

@@ -44,21 +44,21 @@ def arrival(
     return Arrival("imu", put, payload, encoding, at_ns, None, who)
 
 
-def said(at_ns: int = 7, who: str = "imu", **fields: Any) -> Arrival:
+def said(at_ns: int = 7, sender: str = "imu", **fields: Any) -> Arrival:
     """Return a sample in hand-written JSON."""
-    return arrival(json.dumps(fields).encode(), at_ns=at_ns, who=who)
+    return arrival(json.dumps(fields).encode(), at_ns=at_ns, who=sender)
 
 
-def turning(rate: float, at_ns: int = 7, who: str = "imu") -> Arrival:
-    return said(at_ns, who, angular_velocity={"z": rate})
+def turning(rate: float, at_ns: int = 7, sender: str = "imu") -> Arrival:
+    return said(at_ns, sender, angular_velocity={"z": rate})
 
 
 @each("named", [True, False])
 @each("form", FORMATS)
 def test_an_imu_is_read_in_every_encoding(form: Format, named: bool) -> None:
     encoding = encoding_name(form, "Imu") if named else ""
-    got = reading(arrival(encode(FULL, form), encoding))
-    assert got == GyroSample(7, 12_000_000_005, 0.75, 4e-4)
+    sample = reading(arrival(encode(FULL, form), encoding))
+    assert sample == GyroSample(7, 12_000_000_005, 0.75, 4e-4)
 
 
 def test_in_json_only_the_angular_velocity_is_required() -> None:
@@ -117,10 +117,10 @@ class Daemon:
     def __init__(self) -> None:
         self.told, self.counters, self.events = GyroFollower(), Counter[str](), list[Event]()
 
-    def hears(self, rate: float, at_ns: int, who: str) -> bool:
-        got = self.told.receive(turning(rate, at_ns, who), self.counters, self.events)
-        assert got is None or got.rate == rate
-        return got is not None
+    def hears(self, rate: float, at_ns: int, sender: str) -> bool:
+        sample = self.told.receive(turning(rate, at_ns, sender), self.counters, self.events)
+        assert sample is None or sample.rate == rate
+        return sample is not None
 
 
 def test_the_first_of_two_gyros_is_followed_until_it_is_silent() -> None:
@@ -135,24 +135,24 @@ def test_the_first_of_two_gyros_is_followed_until_it_is_silent() -> None:
 
 
 def test_the_first_sample_of_another_gyro_is_marked_as_new() -> None:
-    told, anew = GyroFollower(), []
-    heard = [
+    follower, marks = GyroFollower(), []
+    arrivals = [
         (0, "one"),
         (1, "one"),
         (SILENCE_TIMEOUT_NS + 1, "other"),
         (SILENCE_TIMEOUT_NS + 2, "other"),
     ]
-    for at_ns, who in heard:
-        sample = told.receive(turning(0.1, at_ns, who), Counter(), [])
+    for at_ns, sender in arrivals:
+        sample = follower.receive(turning(0.1, at_ns, sender), Counter(), [])
         assert sample is not None
-        anew.append(sample.anew)
-    assert anew == [False, False, True, False]
+        marks.append(sample.anew)
+    assert marks == [False, False, True, False]
 
 
 def test_a_gyro_that_returns_after_a_silence_is_not_marked_as_new() -> None:
-    told = GyroFollower()
+    follower = GyroFollower()
     for at_ns in (0, 10 * SILENCE_TIMEOUT_NS):
-        sample = told.receive(turning(0.1, at_ns, "one"), Counter(), [])
+        sample = follower.receive(turning(0.1, at_ns, "one"), Counter(), [])
         assert sample == GyroSample(at_ns, None, 0.1)
 
 
@@ -182,15 +182,17 @@ def test_a_second_gyro_without_a_name_is_refused_in_words() -> None:
 
 def test_a_robot_with_its_own_gyro_never_follows_another_one() -> None:
     counters, events = Counter[str](), list[Event]()
-    told = GyroFollower(own=True)
-    for who in ("other", SIMULATOR_SENDER):
+    follower = GyroFollower(own=True)
+    for sender in ("other", SIMULATOR_SENDER):
         # The second one has the simulator's secret as the id of its session.
-        assert told.receive(turning(0.2, 0, who), counters, events) is None
+        assert follower.receive(turning(0.2, 0, sender), counters, events) is None
     own = replace(
         turning(0.1, 10 * SILENCE_TIMEOUT_NS, ""), attachment=Signature(SIMULATOR_SENDER).pack()
     )
-    assert told.receive(own, counters, events) is not None
-    assert told.receive(turning(0.2, 20 * SILENCE_TIMEOUT_NS, "other"), counters, events) is None
+    assert follower.receive(own, counters, events) is not None
+    assert (
+        follower.receive(turning(0.2, 20 * SILENCE_TIMEOUT_NS, "other"), counters, events) is None
+    )
     assert counters == {"imu_second_sender": 3}
     assert "simulat" in events[0].text
 

@@ -75,15 +75,15 @@ def nothing(_: str) -> Message | None:
 
 
 def query(topic: str, asked: str | None = None, fmt: str = "", **changes: Any) -> Query:
-    given: dict[str, Any] = {"ticket": 7, "payload": b"", "encoding": ""} | changes
-    return Query(topic=topic, asked=topic if asked is None else asked, fmt=fmt, **given)
+    fields: dict[str, Any] = {"ticket": 7, "payload": b"", "encoding": ""} | changes
+    return Query(topic=topic, asked=topic if asked is None else asked, fmt=fmt, **fields)
 
 
 def answers(asked: Query, outputs: Outputs | None = OUTPUTS) -> list[Reply]:
     made = report()
-    got = queries().serve(asked, lambda key: made.current(key, lambda: SNAPSHOT), outputs)
-    assert isinstance(got, list)
-    return got
+    replies = queries().serve(asked, lambda key: made.current(key, lambda: SNAPSHOT), outputs)
+    assert isinstance(replies, list)
+    return replies
 
 
 def answer(asked: Query, outputs: Outputs | None = OUTPUTS) -> Reply:
@@ -118,8 +118,8 @@ def test_a_ros_message_is_also_answered_as_cdr(topic: Any) -> None:
     assert (reply.ticket, reply.key, reply.ok) == (7, topic.key, True)
     assert reply.encoding == f"application/cdr;acsard.{topic.type}.v1"
     assert reply.payload[:4] == b"\x00\x01\x00\x00"
-    told = Cdr(MESSAGES[topic.type]).decode(reply.payload)
-    assert told == report().current(topic.key, lambda: SNAPSHOT)
+    message = Cdr(MESSAGES[topic.type]).decode(reply.payload)
+    assert message == report().current(topic.key, lambda: SNAPSHOT)
 
 
 @each(
@@ -240,7 +240,7 @@ def test_a_wildcard_for_all_types_gives_every_schema(asked: str) -> None:
 
 
 @each(
-    ("asked", "found"),
+    ("asked", "types"),
     [
         ("schema/Odo$*", ["Odometry"]),
         ("schema/Twist$*", [name for name in SCHEMAS if name.startswith("Twist")]),
@@ -256,9 +256,9 @@ def test_a_wildcard_for_all_types_gives_every_schema(asked: str) -> None:
         ("**/" + "$*a" * 10_000, []),
     ],
 )
-def test_a_wildcard_gives_the_schemas_whose_keys_it_includes(asked: str, found: list[str]) -> None:
+def test_a_wildcard_gives_the_schemas_whose_keys_it_includes(asked: str, types: list[str]) -> None:
     assert [reply.key for reply in answers(query("schema/<Type>", asked))] == [
-        f"schema/{name}" for name in found
+        f"schema/{name}" for name in types
     ]
 
 
@@ -298,12 +298,12 @@ def test_without_a_format_the_answer_is_json(key: str) -> None:
 
 
 def interfaces(config: Config, outputs: Outputs | None) -> list[dict[str, Any]]:
-    got = queries(config).serve(query("interfaces"), nothing, outputs)
-    assert isinstance(got, list)
-    assert got[0].encoding == encoding_name("json", "Interfaces")
+    replies = queries(config).serve(query("interfaces"), nothing, outputs)
+    assert isinstance(replies, list)
+    assert replies[0].encoding == encoding_name("json", "Interfaces")
     return [
-        msgspec.to_builtins(one)
-        for one in msgspec.json.decode(got[0].payload, type=Interfaces).interfaces
+        msgspec.to_builtins(interface)
+        for interface in msgspec.json.decode(replies[0].payload, type=Interfaces).interfaces
     ]
 
 
@@ -346,12 +346,12 @@ def payload_for(verb: str) -> bytes:
 
 @each("verb", SERVICES)
 def test_a_service_query_with_its_exact_key_makes_a_request_to_the_robot(verb: Any) -> None:
-    got = queries().serve(query(f"srv/{verb}", payload=payload_for(verb)), nothing, OUTPUTS)
+    request = queries().serve(query(f"srv/{verb}", payload=payload_for(verb)), nothing, OUTPUTS)
     pose = Pose(1.0, 2.0, 3.0) if verb == "set_pose" else None
-    told: dict[str, Plain] = {"limits.linear_speed": 0.8, "log.level": "debug"}
-    settings = told if verb == "set" else {}
+    values: dict[str, Plain] = {"limits.linear_speed": 0.8, "log.level": "debug"}
+    settings = values if verb == "set" else {}
     latch = 5 if verb == "clear" else None
-    assert got == Request(verb, 7, pose, by="unnamed (native)", settings=settings, latch=latch)
+    assert request == Request(verb, 7, pose, by="unnamed (native)", settings=settings, latch=latch)
 
 
 @each("asked", WILDCARDS)
@@ -437,8 +437,8 @@ def test_a_service_called_in_cdr_answers_like_a_ros_trigger() -> None:
     "verb", [verb for verb, service in SERVICES.items() if not service.payload]
 )
 def test_a_service_without_arguments_runs_whatever_the_payload(verb: str) -> None:
-    got = queries().serve(query(f"srv/{verb}", payload=b"\xff nonsense"), nothing, None)
-    assert isinstance(got, Request)
+    request = queries().serve(query(f"srv/{verb}", payload=b"\xff nonsense"), nothing, None)
+    assert isinstance(request, Request)
 
 
 @each(
@@ -459,15 +459,15 @@ def test_an_invalid_pose_is_answered_with_a_text_and_makes_no_request_to_the_rob
     payload: bytes, words: str
 ) -> None:
     made = queries()
-    got = made.serve(query("srv/set_pose", payload=payload, fmt="json"), nothing, None)
-    assert isinstance(got, list)
-    (reply,) = got
+    replies = made.serve(query("srv/set_pose", payload=payload, fmt="json"), nothing, None)
+    assert isinstance(replies, list)
+    (reply,) = replies
     assert reply.ok
     assert (reply.ticket, reply.key) == (7, "srv/set_pose")
-    said = msgspec.json.decode(reply.payload, type=ServiceReply)
-    assert not said.success
-    assert words in said.message
-    assert said.message.endswith('; send {"x": 0, "y": 0, "yaw": 0}')
+    result = msgspec.json.decode(reply.payload, type=ServiceReply)
+    assert not result.success
+    assert words in result.message
+    assert result.message.endswith('; send {"x": 0, "y": 0, "yaw": 0}')
     assert made.answered(Answer(7, True, ""), WALL_NS) is None
 
 
@@ -478,10 +478,10 @@ EMPTY = b"\x00\x01\x00\x00\x00"
 
 
 def ros_query(topic: str, via: str = "rmw", payload: bytes = EMPTY, **changes: Any) -> Query:
-    given: dict[str, Any] = {"via": via, "payload": payload, "arrived_ns": 99} | changes
+    fields: dict[str, Any] = {"via": via, "payload": payload, "arrived_ns": 99} | changes
     if via == "rmw":
-        given.setdefault("attachment", ASKED.pack())
-    return query(topic, **given)
+        fields.setdefault("attachment", ASKED.pack())
+    return query(topic, **fields)
 
 
 @each("via", ["bridge", "rmw"])
@@ -490,9 +490,9 @@ def test_a_ros_trigger_makes_a_request_to_the_robot_and_its_answer_is_cdr(
     verb: str, via: str
 ) -> None:
     made = queries()
-    got = made.serve(ros_query(f"srv/{verb}", via), nothing, OUTPUTS)
+    request = made.serve(ros_query(f"srv/{verb}", via), nothing, OUTPUTS)
     by = f"unnamed (rmw {ASKED.gid.hex()})" if via == "rmw" else "unnamed (bridge)"
-    assert got == Request(verb, 7, asked_ns=99, by=by)  # type: ignore[arg-type]
+    assert request == Request(verb, 7, asked_ns=99, by=by)  # type: ignore[arg-type]
     reply = made.answered(Answer(7, True, "done"), WALL_NS)
     assert reply is not None
     assert Cdr(ServiceReply).decode(reply.payload) == ServiceReply(True, "done")
@@ -517,8 +517,8 @@ def test_a_reply_through_a_bridge_has_no_attachment() -> None:
 
 @each("payload", [b"", EMPTY[:4], EMPTY, EMPTY + bytes(3)])
 def test_a_ros_trigger_accepts_a_request_of_any_length(payload: bytes) -> None:
-    got = queries().serve(ros_query("srv/stop", "bridge", payload), nothing, OUTPUTS)
-    assert isinstance(got, Request)
+    request = queries().serve(ros_query("srv/stop", "bridge", payload), nothing, OUTPUTS)
+    assert isinstance(request, Request)
 
 
 @each("topic", ["srv/clear", "parameters/list_parameters"])
@@ -638,8 +638,8 @@ def test_replies_to_ros_callers_name_the_services_as_ros_does(
     words = "call srv/clear first; srv/activate switches it on, not srv/clearance"
     reply = made.answered(Answer(7, True, words), WALL_NS)
     assert reply is not None
-    told = Cdr(ServiceReply).decode(reply.payload).message
-    assert told == f"call {clear} first; {activate} switches it on, not srv/clearance"
+    message = Cdr(ServiceReply).decode(reply.payload).message
+    assert message == f"call {clear} first; {activate} switches it on, not srv/clearance"
 
 
 def test_replies_to_native_callers_name_the_services_by_their_keys() -> None:
@@ -660,9 +660,9 @@ def test_a_request_to_set_parameters_goes_to_the_robot_and_returns_its_answer(
         rcl.SetRequest([rcl.Parameter("limits.linear_speed", value)])
     )
     made = queries()
-    got = made.serve(ros_query(f"parameters/{service}", via, payload), nothing, OUTPUTS)
-    assert isinstance(got, Request)
-    assert (got.verb, got.id, got.settings) == ("set", 7, {"limits.linear_speed": 0.7})
+    request = made.serve(ros_query(f"parameters/{service}", via, payload), nothing, OUTPUTS)
+    assert isinstance(request, Request)
+    assert (request.verb, request.id, request.settings) == ("set", 7, {"limits.linear_speed": 0.7})
     reply = made.answered(Answer(7, False, "call srv/clear first"), WALL_NS)
     assert reply is not None
     no = rcl.SetParametersResult(False, "call /acsard/clear first")
@@ -677,8 +677,8 @@ def test_a_request_to_set_parameters_goes_to_the_robot_and_returns_its_answer(
 def test_config_and_the_parameter_services_return_a_changed_setting() -> None:
     made = queries()
     made.use(replace(CONFIG, limits=LimitsConfig(linear_speed=0.7)))
-    (told,) = made.serve(query("config"), nothing, OUTPUTS)  # type: ignore[misc]
-    assert from_builtins(msgspec.json.decode(told.payload)).limits.linear_speed == 0.7
+    (config_reply,) = made.serve(query("config"), nothing, OUTPUTS)  # type: ignore[misc]
+    assert from_builtins(msgspec.json.decode(config_reply.payload)).limits.linear_speed == 0.7
     payload = Cdr(rcl.Names).encode(rcl.Names(["limits.linear_speed"]))
     asked = ros_query("parameters/get_parameters", "bridge", payload)
     (reply,) = made.serve(asked, nothing, OUTPUTS)  # type: ignore[misc]
@@ -686,6 +686,6 @@ def test_config_and_the_parameter_services_return_a_changed_setting() -> None:
 
 
 def reply_to(asked: Query) -> list[Reply]:
-    got = queries().serve(asked, nothing, OUTPUTS)
-    assert isinstance(got, list)
-    return got
+    replies = queries().serve(asked, nothing, OUTPUTS)
+    assert isinstance(replies, list)
+    return replies

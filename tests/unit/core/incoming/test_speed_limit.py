@@ -87,11 +87,11 @@ REFUSED: dict[str, list[Arrival]] = {
 def test_a_refused_message_is_reported_with_its_reason_and_keeps_the_earlier_limit(
     reason: str,
 ) -> None:
-    for one in REFUSED[reason]:
+    for message in REFUSED[reason]:
         limiter, refusals = SpeedLimiter(Config()), list[Refusal]()
         limiter.receive(said(0.5), 1.0, refusals)
         limiter.requests((), MIN_INTERVAL_NS)
-        limiter.receive(one, 1.0, refusals)
+        limiter.receive(message, 1.0, refusals)
         assert [refusal.reason for refusal in refusals] == [reason]
         assert refusals[0].text.startswith("speed_limit: ")
         assert limiter.requests((), 2 * MIN_INTERVAL_NS) == ((), []), "the earlier limit stays"
@@ -137,9 +137,9 @@ class Robot:
         requests = [
             Request("set", number, settings=dict(wish)) for number, wish in enumerate(wishes, 1)
         ]
-        taken, refused = self.limiter.requests(tuple(requests), self.now_ns)
+        batch, refused = self.limiter.requests(tuple(requests), self.now_ns)
         answers, self.peak = list[Answer](), self.config.limits.linear_speed
-        for request in taken:
+        for request in batch:
             try:
                 self.config, news = changed(self.config, request.settings, at_rest)
                 answers.append(Answer(request.id, True, news))
@@ -147,8 +147,8 @@ class Robot:
                 answers.append(Answer(request.id, False, str(error)))
             # The robot drives at the end of a step only.
         self.peak = self.config.limits.linear_speed
-        told = (*refused, *self.limiter.settle(self.config, answers, self.events))
-        return {answer.id: answer for answer in told}
+        results = (*refused, *self.limiter.settle(self.config, answers, self.events))
+        return {answer.id: answer for answer in results}
 
     @property
     def speed(self) -> float:
@@ -212,8 +212,8 @@ def test_the_answer_also_names_the_settings_that_apply_immediately() -> None:
     robot.limit(0.3)
     robot.step()
     answer = robot.step({LOWERED_SETTING: 0.8, "limits.linear_acceleration": 0.5})[1]
-    told = "limits.linear_acceleration = 0.5 (was 1.0); limits.linear_speed = 0.8 will apply when"
-    assert told in answer.message
+    text = "limits.linear_acceleration = 0.5 (was 1.0); limits.linear_speed = 0.8 will apply when"
+    assert text in answer.message
 
 
 def test_a_limit_and_a_higher_set_in_one_step_leave_the_limit_in_force() -> None:
@@ -276,10 +276,10 @@ def test_a_flood_of_messages_changes_the_limit_at_most_ten_times_a_second() -> N
     limiter, changes = SpeedLimiter(Config()), 0
     for step in range(200):
         limiter.receive(said(0.2 + 0.001 * step), 1.0, [])
-        taken, _ = limiter.requests((), 10 * MIN_INTERVAL_NS + step * MIN_INTERVAL_NS // 10)
-        changes += len(taken)
-        config = Config() if not taken else changed(Config(), taken[0].settings, True)[0]
-        if taken:
+        batch, _ = limiter.requests((), 10 * MIN_INTERVAL_NS + step * MIN_INTERVAL_NS // 10)
+        changes += len(batch)
+        config = Config() if not batch else changed(Config(), batch[0].settings, True)[0]
+        if batch:
             limiter.settle(config, [], [])
     assert changes == 20
 

@@ -61,8 +61,8 @@ def counted(wheels: Array, counts: int | NDArray[np.int_]) -> Array:
 
     `counts` is the number of counts per turn.
     """
-    told: Array = np.diff(np.floor(wheels / math.tau * counts), axis=0)
-    return told
+    deltas: Array = np.diff(np.floor(wheels / math.tau * counts), axis=0)
+    return deltas
 
 
 def end(turned: Array) -> tuple[float, float]:

@@ -175,8 +175,8 @@ class Host:
 
     def lost(self, line: Line) -> bool:
         """Return whether the connection loses this line completely."""
-        gone = any(begin <= line.at < end for begin, end in self._bursts)
-        return gone or self.rng.random() < self.case.lost
+        in_burst = any(begin <= line.at < end for begin, end in self._bursts)
+        return in_burst or self.rng.random() < self.case.lost
 
     def delivered(self, line: Line) -> float:
         """Return the time at which the kernel has the line's bytes."""

@@ -3,6 +3,6 @@
 from __future__ import annotations
 
 
-def print_row(name: str, goal: str, found: str) -> None:
+def print_row(name: str, goal: str, result: str) -> None:
     """Print one row on its own line."""
-    print(f"\n{name:46} goal {goal:38} found {found}", end="")
+    print(f"\n{name:46} goal {goal:38} found {result}", end="")

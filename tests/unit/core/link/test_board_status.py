@@ -135,9 +135,9 @@ def test_a_status_line_is_not_a_reply_in_any_dialect(line: bytes) -> None:
 def test_no_reply_with_two_wrong_bits_or_a_cut_is_a_status_line(reply: bytes) -> None:
     whole = int.from_bytes(reply, "big")
     bits = 8 * len(reply)
-    for one in range(bits):
-        for other in range(one):
-            damaged = (whole ^ 1 << one ^ 1 << other).to_bytes(len(reply), "big")
+    for bit in range(bits):
+        for other in range(bit):
+            damaged = (whole ^ 1 << bit ^ 1 << other).to_bytes(len(reply), "big")
             assert not damaged.startswith(STATUS)
     assert not any(reply[cut:].startswith(STATUS) for cut in range(len(reply)))
 
@@ -176,7 +176,7 @@ def damaged(line: bytes, others: tuple[bytes, ...], dice: random.Random) -> byte
 
 def wrongly_taken(count: int, check: bool) -> Counter[str]:
     """Damage `count` lines, and count the accepted lines with a wrong emergency stop."""
-    dice, taken = random.Random(33), Counter[str]()
+    dice, tally = random.Random(33), Counter[str]()
     extra = (b"", b" volts=24.31", b" bumpers=..X. volts=24.31 charge=87%")
     for _ in range(count):
         pressed = dice.random() < 0.5
@@ -184,19 +184,19 @@ def wrongly_taken(count: int, check: bool) -> Counter[str]:
         word = PRESSED if pressed else OK
         line = word + dice.choice(extra)
         others = (word, *REPLIES)
-        heard = damaged(sealed(line) if check else line, others, dice)
-        if not heard.startswith(STATUS):
+        frame = damaged(sealed(line) if check else line, others, dice)
+        if not frame.startswith(STATUS):
             continue
         try:
-            status = decode_status.__wrapped__(heard, check)
+            status = decode_status.__wrapped__(frame, check)
         except FrameError:
             continue
         if status.estop is not None:
             right = (
                 "right" if status.estop is pressed else "pressed" if status.estop else "released"
             )
-            taken[right] += 1
-    return taken
+            tally[right] += 1
+    return tally
 
 
 @each("check", [False, True])
@@ -205,10 +205,10 @@ def wrongly_taken(count: int, check: bool) -> Counter[str]:
     [20_000, pytest.param(1_000_000, marks=[pytest.mark.soak, pytest.mark.timeout(600)])],
 )
 def test_damage_never_changes_the_emergency_stop_state(count: int, check: bool) -> None:
-    taken = wrongly_taken(count, check)
-    print(f"\n{count} damaged status lines, checked {check}: {dict(taken)}")
-    assert taken["released"] == 0
-    assert taken["pressed"] == 0
+    tally = wrongly_taken(count, check)
+    print(f"\n{count} damaged status lines, checked {check}: {dict(tally)}")
+    assert tally["released"] == 0
+    assert tally["pressed"] == 0
 
 
 @each("check", [False, True])
@@ -233,12 +233,12 @@ def test_damage_never_changes_the_state_of_a_bumper(
         # Without places the number of the bumpers counts from the second line on.
         bumpers.look(whole * 2, number)
         for _ in range(4):
-            heard = damaged(line, (line, *REPLIES), dice)
-            if heard.startswith(STATUS):
+            frame = damaged(line, (line, *REPLIES), dice)
+            if frame.startswith(STATUS):
                 with suppress(FrameError):
-                    status = decode_status.__wrapped__(heard, check)
+                    status = decode_status.__wrapped__(frame, check)
                     bumpers.look([(number, status)], number)
-            assert bumpers.state == state, (number, line, heard)
+            assert bumpers.state == state, (number, line, frame)
             if not places:
                 # Without places only a single damaged line is known by its number of bumpers.
                 bumpers.look(whole, number)

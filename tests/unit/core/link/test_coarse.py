@@ -65,9 +65,9 @@ def drive(counts: int, seed: int, seconds: float, configured: int = 0) -> Driven
 @pytest.mark.slow
 @pytest.mark.parametrize("counts", COUNTS)
 def test_no_true_line_is_dropped_and_a_short_drive_ends_where_the_reports_say(counts: int) -> None:
-    one = drive(counts, 1, 25.0)
-    assert one.dropped == 0
-    assert one.ours == pytest.approx(one.plain, abs=0.004)
+    result = drive(counts, 1, 25.0)
+    assert result.dropped == 0
+    assert result.ours == pytest.approx(result.plain, abs=0.004)
 
 
 @pytest.mark.variations(8)
@@ -75,9 +75,9 @@ def test_no_true_line_is_dropped_and_a_short_drive_ends_where_the_reports_say(co
 def test_with_configured_counts_a_drive_ends_exactly_where_the_raw_counter_says(
     counts: int,
 ) -> None:
-    one = drive(counts, 2, 60.0, counts)
-    assert one.dropped == 0
-    assert one.ours == pytest.approx(one.raw, abs=0.0002)
+    result = drive(counts, 2, 60.0, counts)
+    assert result.dropped == 0
+    assert result.ours == pytest.approx(result.raw, abs=0.0002)
 
 
 @pytest.mark.soak
@@ -88,9 +88,10 @@ def test_the_error_after_450_m_is_that_of_the_raw_counter(counts: int, configure
     """Without configured counts, speeds in two decimals add 1 m of error at most."""
     drives = [drive(counts, seed, 600.0, counts if configured else 0) for seed in range(20)]
     raw, plain, ours = (
-        float(np.mean([getattr(one, what) for one in drives])) for what in ("raw", "plain", "ours")
+        float(np.mean([getattr(result, what) for result in drives]))
+        for what in ("raw", "plain", "ours")
     )
-    dropped = sum(one.dropped for one in drives)
+    dropped = sum(result.dropped for result in drives)
     print_row(
         f"{counts} counts a turn{', configured' if configured else ''}",
         "1.05 x raw counter" if configured else "raw counter + 1 m",
@@ -154,8 +155,8 @@ def wild(wheels: int, seed: int) -> Host:
 
 
 def test_a_wheel_that_jumps_at_random_is_suspected_because_the_other_wheels_step_finely() -> None:
-    found = sorted(wild(1, seed).lines for seed in range(7))
-    assert found[3] <= 60
+    line_counts = sorted(wild(1, seed).lines for seed in range(7))
+    assert line_counts[3] <= 60
 
 
 def test_two_wheels_that_jump_at_random_are_not_suspected() -> None:

@@ -130,8 +130,8 @@ def test_every_line_written_has_four_padded_tokens_and_no_negative_zero(
 
 @given(speed=st.floats(-120.0, 120.0))
 def test_a_written_speed_is_at_most_half_a_hundredth_off(speed: float) -> None:
-    said = Codec(WheelMap()).encode(WheelSpeeds(speed))[1:7]
-    value = Decimal(said[1:].decode()) * (1 if said[:1] == b"p" else -1)
+    token = Codec(WheelMap()).encode(WheelSpeeds(speed))[1:7]
+    value = Decimal(token[1:].decode()) * (1 if token[:1] == b"p" else -1)
     clamped = max(Decimal("-99.99"), min(Decimal("99.99"), Decimal(speed)))
     assert abs(value - clamped) <= Decimal("0.005000001")
 
@@ -204,8 +204,8 @@ def test_a_written_speed_is_read_back_within_half_a_hundredth(
 ) -> None:
     codec = Codec(wiring, trailing_comma)
     back = codec.decode(codec.encode(wheels).removesuffix(b"\r\n"))
-    for said, read in zip(wheels.as_tuple(), back.as_tuple(), strict=True):
-        assert read == pytest.approx(max(-99.99, min(99.99, said)), abs=0.005 + 1e-9)
+    for speed, read in zip(wheels.as_tuple(), back.as_tuple(), strict=True):
+        assert read == pytest.approx(max(-99.99, min(99.99, speed)), abs=0.005 + 1e-9)
 
 
 @given(wheels=small_speeds, wiring=wirings)
@@ -230,7 +230,7 @@ def independent(line: bytes) -> Motors | None:
         tokens.pop()
     if len(tokens) != 4:
         return None
-    found: dict[int, float] = {}
+    values: dict[int, float] = {}
     for number, token in enumerate(tokens):
         if number:
             token = token.lstrip(b" ")
@@ -243,10 +243,10 @@ def independent(line: bytes) -> Motors | None:
         thousandths = int(whole) * 1000 + int(decimals.ljust(3, b"0"))
         if token[0] not in b"abcd" or token[1] not in b"pn" or thousandths > 99_990:
             return None
-        found[token[0]] = (thousandths if token[1] == ord("p") else -thousandths) / 1000
-    if len(found) != 4:
+        values[token[0]] = (thousandths if token[1] == ord("p") else -thousandths) / 1000
+    if len(values) != 4:
         return None
-    return found[97], found[98], found[99], found[100]
+    return values[97], values[98], values[99], values[100]
 
 
 @each(("line", "motors"), ACCEPTED)
@@ -303,16 +303,16 @@ def damaged(rng: random.Random, line: bytes, other: bytes) -> bytes:
 
 def wire(rng: random.Random, count: int) -> Iterator[bytes]:
     """Yield `count` lines in random pieces. One in five lines is undamaged."""
-    other, held = valid(rng), b""
+    other, buffer = valid(rng), b""
     for _ in range(count):
         line = valid(rng)
         sent = line if rng.random() < 0.2 else damaged(rng, line, other)
-        held += sent + rng.choice((b"\r\n", b"\r\n", b"\n"))
+        buffer += sent + rng.choice((b"\r\n", b"\r\n", b"\n"))
         other = line
-        cut = rng.randrange(len(held) + 1)
-        yield held[:cut]
-        held = held[cut:]
-    yield held
+        cut = rng.randrange(len(buffer) + 1)
+        yield buffer[:cut]
+        buffer = buffer[cut:]
+    yield buffer
 
 
 @pytest.mark.parametrize(
@@ -325,20 +325,20 @@ def wire(rng: random.Random, count: int) -> Iterator[bytes]:
 )
 def test_a_damaged_line_is_rejected_whole_or_is_itself_a_well_formed_line(count: int) -> None:
     rng, reader, codec = random.Random(20_240_229), LineReader(), Codec(WheelMap())
-    seen = {"read": 0, "malformed": 0, "duplicate_wheel": 0, "over_range": 0}
+    tally = {"read": 0, "malformed": 0, "duplicate_wheel": 0, "over_range": 0}
     for piece in wire(rng, count):
         for line, _ in reader.feed(piece):
             expected = independent(line)
             try:
-                got = codec.decode(line).as_tuple()
+                values = codec.decode(line).as_tuple()
             except FrameError as error:
-                seen[error.reason] += 1
+                tally[error.reason] += 1
                 assert expected is None, line
             else:
-                seen["read"] += 1
-                assert got == expected, line
-    assert sum(seen.values()) > 0.95 * count
-    assert all(seen.values()), seen
+                tally["read"] += 1
+                assert values == expected, line
+    assert sum(tally.values()) > 0.95 * count
+    assert all(tally.values()), tally
 
 
 def test_motor_values_are_put_in_the_order_of_the_wheels_with_their_signs() -> None:

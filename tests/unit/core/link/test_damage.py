@@ -86,9 +86,9 @@ def test_damage_raises_no_exception_and_is_rarely_accepted(count: int) -> None:
         sent = hurt(kind, line, after, chance(), int(chance() * PLACES[kind]))
         tried[kind] += 1
         # A further line end keeps an accident from reaching the next line.
-        for got, _ in feed(sent + b"\n"):
+        for frame, _ in feed(sent + b"\n"):
             try:
-                speeds = decode(got)
+                speeds = decode(frame)
             except FrameError:
                 continue
             if speeds != truth[at] and not (kind == 3 and speeds == truth[min(at + 1, last)]):

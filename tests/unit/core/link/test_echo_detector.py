@@ -58,8 +58,8 @@ def test_twenty_equal_reports_through_a_change_of_speed_are_an_echo() -> None:
 
 def test_fewer_than_twenty_equal_reports_are_not_an_echo_despite_speed_changes() -> None:
     bench = Echoes()
-    found = [bench.exchange(speed) for speed in (0, *range(MIN_REPEATED_LINES - 1))]
-    assert found == [False] * (MIN_REPEATED_LINES - 1) + [True]
+    flags = [bench.exchange(speed) for speed in (0, *range(MIN_REPEATED_LINES - 1))]
+    assert flags == [False] * (MIN_REPEATED_LINES - 1) + [True]
 
 
 @pytest.mark.parametrize("speed", [0.0, 10.0])
@@ -70,11 +70,11 @@ def test_without_a_change_of_speed_no_report_is_an_echo(speed: float) -> None:
 
 def test_small_speed_changes_add_up_to_an_echo() -> None:
     bench = Echoes()
-    found = [bench.exchange(step % 2 * 0.5) for step in range(40)]
-    assert found.index(True) == MIN_REPEATED_LINES - 1
+    flags = [bench.exchange(step % 2 * 0.5) for step in range(40)]
+    assert flags.index(True) == MIN_REPEATED_LINES - 1
     bench = Echoes()
-    found = [bench.exchange(5.0 + step % 2 * 0.05) for step in range(80)]
-    assert found.index(True) in (40, 41)  # 40 changes of 0.05 rad/s, with float rounding
+    flags = [bench.exchange(5.0 + step % 2 * 0.05) for step in range(80)]
+    assert flags.index(True) in (40, 41)  # 40 changes of 0.05 rad/s, with float rounding
 
 
 def test_a_differing_report_restarts_the_count_of_equal_reports() -> None:
@@ -82,26 +82,26 @@ def test_a_differing_report_restarts_the_count_of_equal_reports() -> None:
     for speed in range(MIN_REPEATED_LINES - 1):
         assert not bench.exchange(speed)
     assert not bench.exchange(30.0, 29.99)
-    found = [bench.exchange(speed) for speed in (0, *range(MIN_REPEATED_LINES - 1))]
-    assert found == [False] * (MIN_REPEATED_LINES - 1) + [True]
+    flags = [bench.exchange(speed) for speed in (0, *range(MIN_REPEATED_LINES - 1))]
+    assert flags == [False] * (MIN_REPEATED_LINES - 1) + [True]
 
 
 @each("lag", range(COMPARED_LINES))
 def test_an_echo_is_found_at_every_lag_of_the_kept_lines(lag: int) -> None:
     bench = Echoes()
-    found = [bench.exchange(step // 7 % 40 * 0.5, lag=lag) for step in range(200)]
-    assert any(found)
-    assert found.index(True) < 40 + lag
+    flags = [bench.exchange(step // 7 % 40 * 0.5, lag=lag) for step in range(200)]
+    assert any(flags)
+    assert flags.index(True) < 40 + lag
 
 
 def test_an_echo_that_arrives_in_batches_is_found() -> None:
     bench = Echoes()
-    found = []
+    flags = []
     for step in range(0, 60, 2):
         bench.send(step)
         bench.send(step)
-        found += [bench.report(step), bench.report(step)]
-    assert found.index(True) == MIN_REPEATED_LINES - 1
+        flags += [bench.report(step), bench.report(step)]
+    assert flags.index(True) == MIN_REPEATED_LINES - 1
 
 
 DRIVE = [*[0.0] * 30, *[0.2 * n for n in range(50)]]
@@ -116,8 +116,8 @@ def test_board_replies_between_the_echoes_do_not_delay_the_detection(
     bench = Echoes()
     for number, speed in enumerate(DRIVE):
         measured = 0.9 * DRIVE[max(0, number - 4)]
-        found = bench.exchange(speed, lag=late)
-        if found:
+        echo = bench.exchange(speed, lag=late)
+        if echo:
             break
         assert not any(bench.report(measured) for _ in range(others))
     assert number - late - 30 == 10  # lines after the start of the ramp: 10 changes of 0.2 rad/s
@@ -149,7 +149,7 @@ def test_a_motor_that_lags_by_a_whole_number_of_lines_is_not_an_echo(
     acceleration: float, lag: int, reports: int
 ) -> None:
     """The board reports the exact mean speed since its last report."""
-    bench, speed, kept = Echoes(), 0.0, math.exp(-1.0 / (lag * reports))
+    bench, speed, decay = Echoes(), 0.0, math.exp(-1.0 / (lag * reports))
     sent = 0.0
     for goal in (0.0, 4.0, 9.0, -3.0, 0.0):
         for _ in range(round(1200.0 / acceleration) + 60):
@@ -157,8 +157,8 @@ def test_a_motor_that_lags_by_a_whole_number_of_lines_is_not_an_echo(
             bench.send(sent)
             line = round(sent, 2)
             for _ in range(reports):
-                behind, speed = speed - line, line + (speed - line) * kept
-                assert not bench.report(line + behind * (1.0 - kept) * lag * reports)
+                behind, speed = speed - line, line + (speed - line) * decay
+                assert not bench.report(line + behind * (1.0 - decay) * lag * reports)
 
 
 @each("others", [1, 2, 3])

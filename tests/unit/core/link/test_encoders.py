@@ -62,10 +62,10 @@ def test_the_first_reading_gives_no_movement() -> None:
 def test_a_whole_turn_is_2_pi_of_the_configured_counts() -> None:
     bench = Bench()
     bench.read()
-    found = bench.read(200, (COUNTS, -COUNTS, COUNTS // 2, 0))
-    assert isinstance(found, Turned)
-    assert found.motors == pytest.approx((math.tau, -math.tau, math.pi, 0.0))
-    assert found.dt == 0.2
+    result = bench.read(200, (COUNTS, -COUNTS, COUNTS // 2, 0))
+    assert isinstance(result, Turned)
+    assert result.motors == pytest.approx((math.tau, -math.tau, math.pi, 0.0))
+    assert result.dt == 0.2
 
 
 def test_movement_is_exact_across_a_wrap_of_counts_and_milliseconds(bench: Bench) -> None:
@@ -89,12 +89,12 @@ def test_the_returned_angles_add_up_to_all_counts(
         moved = int(share * FASTEST / math.tau * COUNTS * ms / 1000)
         host_ms = ms + later_ms - late_ms  # each reading has a different delay
         late_ms = later_ms
-        found = bench.read(ms, (moved, -moved, moved // 2, 0), max(host_ms, 0.0))
+        result = bench.read(ms, (moved, -moved, moved // 2, 0), max(host_ms, 0.0))
         if host_ms < 0:
             late_ms -= host_ms
-        assert isinstance(found, Turned)
-        total = [t + m for t, m in zip(total, found.motors, strict=True)]
-        clock += found.dt
+        assert isinstance(result, Turned)
+        total = [t + m for t, m in zip(total, result.motors, strict=True)]
+        clock += result.dt
     counted = [now - then for now, then in zip(bench.counts, began, strict=True)]
     assert total == pytest.approx([c * math.tau / COUNTS for c in counted], abs=1e-6)
     assert clock == pytest.approx(sum(ms for ms, _, _ in steps) / 1000)
@@ -154,8 +154,8 @@ def test_an_mcu_clock_that_leaps_ahead_of_the_hosts_clock_is_a_restart(bench: Be
 def test_a_reading_read_late_does_not_make_the_next_one_a_restart(bench: Bench) -> None:
     assert bench.read(10, (50, 50, 50, 50), host_ms=300) == turned(50, 50, 50, 50)
     # the MCU made no reading while the host slept
-    found = bench.read(295, (50, 50, 50, 50), host_ms=15)
-    assert isinstance(found, Turned)
+    result = bench.read(295, (50, 50, 50, 50), host_ms=15)
+    assert isinstance(result, Turned)
     bench.mcu_ms = 0.0
     assert bench.read(3, host_ms=10.0) == "restarted"
 
@@ -182,9 +182,9 @@ def test_a_restart_is_missed_only_if_the_mcu_clock_happens_to_match(
 ) -> None:
     encoders = Encoders(COUNTS, FASTEST, 100 * MS)
     encoders.turned(Reading(old_ms, (9, 9, 9, 9)), 0)
-    found = encoders.turned(Reading(since_ms, (0, 0, 0, 0)), host_ms * MS)
+    result = encoders.turned(Reading(since_ms, (0, 0, 0, 0)), host_ms * MS)
     missed = (since_ms - old_ms) % 65536 <= host_ms + 100  # it was up for a whole number of 65.5 s
-    assert (found == "restarted") is not missed
+    assert (result == "restarted") is not missed
 
 
 def test_after_forgetting_the_next_reading_counts_as_the_first(bench: Bench) -> None:

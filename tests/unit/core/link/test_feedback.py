@@ -55,10 +55,15 @@ class Bench:
 
 def test_the_first_line_has_a_time_but_neither_dt_nor_gap() -> None:
     bench = Bench()
-    found = bench.line()
+    sample = bench.line()
     made_ns = bench.now_ns - WIRE_NS
-    assert found.at == Instant(made_ns, made_ns + 7)
-    assert (found.speeds, found.dt, found.gap, found.heard_ns) == (SPEEDS, 0.0, 0.0, bench.now_ns)
+    assert sample.at == Instant(made_ns, made_ns + 7)
+    assert (sample.speeds, sample.dt, sample.gap, sample.heard_ns) == (
+        SPEEDS,
+        0.0,
+        0.0,
+        bench.now_ns,
+    )
 
 
 def test_bytes_that_follow_a_line_make_it_older() -> None:
@@ -69,30 +74,30 @@ def test_bytes_that_follow_a_line_make_it_older() -> None:
 def test_without_counts_dt_comes_from_the_hosts_clock() -> None:
     bench = Bench()
     bench.line()
-    found = bench.line(ms=12)
-    assert (found.dt, found.turned) == (0.012, None)
+    sample = bench.line(ms=12)
+    assert (sample.dt, sample.turned) == (0.012, None)
 
 
 def test_with_counts_dt_comes_from_the_mcu_and_the_angles_come_from_the_counts() -> None:
     bench = Bench()
     bench.line(0, 0, 0, 0)
-    found = bench.line(10, -20, 30, 0, ms=17, mcu_ms=10)
-    assert found.dt == 0.01
-    assert found.turned == pytest.approx((DEGREE, -2 * DEGREE, 3 * DEGREE, 0.0))
+    sample = bench.line(10, -20, 30, 0, ms=17, mcu_ms=10)
+    assert sample.dt == 0.01
+    assert sample.turned == pytest.approx((DEGREE, -2 * DEGREE, 3 * DEGREE, 0.0))
 
 
 def test_the_wheel_map_assigns_counts_and_signs_to_the_wheels() -> None:
     bench = Bench(WheelMap("-d", "+c", "-b", "+a"))
     bench.line(0, 0, 0, 0)
-    found = bench.line(10, 20, 30, 40)
-    assert found.turned == pytest.approx((-4 * DEGREE, 3 * DEGREE, -2 * DEGREE, DEGREE))
+    sample = bench.line(10, 20, 30, 40)
+    assert sample.turned == pytest.approx((-4 * DEGREE, 3 * DEGREE, -2 * DEGREE, DEGREE))
 
 
 def test_the_first_counts_fall_back_to_speed_times_time() -> None:
     bench = Bench()
     bench.line()
-    found = bench.line(5, 5, 5, 5)
-    assert (found.dt, found.turned) == (0.01, None)
+    sample = bench.line(5, 5, 5, 5)
+    assert (sample.dt, sample.turned) == (0.01, None)
 
 
 def test_counts_are_not_compared_across_a_line_without_counts() -> None:
@@ -106,25 +111,25 @@ def test_counts_are_not_compared_across_a_line_without_counts() -> None:
 def test_counts_fill_a_gap_that_is_short_enough() -> None:
     bench = Bench()
     bench.line(0, 0, 0, 0)
-    found = bench.line(100, 100, 100, 100, ms=300, gap=True)
-    assert (found.dt, found.gap) == (0.0, 0.3)
-    assert found.turned == pytest.approx((10 * DEGREE,) * 4)
+    sample = bench.line(100, 100, 100, 100, ms=300, gap=True)
+    assert (sample.dt, sample.gap) == (0.0, 0.3)
+    assert sample.turned == pytest.approx((10 * DEGREE,) * 4)
 
 
 def test_counts_do_not_fill_a_gap_in_which_they_could_have_wrapped() -> None:
     bench = Bench()
     bench.line(0, 0, 0, 0)
-    found = bench.line(100, 100, 100, 100, ms=3000, gap=True)
-    assert (found.dt, found.gap, found.turned) == (0.0, 3.0, None)
+    sample = bench.line(100, 100, 100, 100, ms=3000, gap=True)
+    assert (sample.dt, sample.gap, sample.turned) == (0.0, 3.0, None)
     assert not bench.timeline.restarted
 
 
 def test_a_restarted_clock_is_reported_and_is_a_gap() -> None:
     bench = Bench()
     bench.line(900, 0, 0, 0)
-    found = bench.line(0, 0, 0, 0, ms=10, mcu_ms=-500)
+    sample = bench.line(0, 0, 0, 0, ms=10, mcu_ms=-500)
     assert bench.timeline.restarted
-    assert (found.dt, found.gap, found.turned) == (0.0, 0.01, None)
+    assert (sample.dt, sample.gap, sample.turned) == (0.0, 0.01, None)
     bench.line(0, 0, 0, 0)
     assert not bench.timeline.restarted
 
@@ -132,8 +137,8 @@ def test_a_restarted_clock_is_reported_and_is_a_gap() -> None:
 def test_after_a_leap_of_the_counts_the_speeds_are_used_and_the_leap_is_counted() -> None:
     bench = Bench()
     bench.line(0, 0, 0, 0)
-    found = bench.line(9000, 0, 0, 0)
-    assert (found.dt, found.turned) == (0.01, None)
+    sample = bench.line(9000, 0, 0, 0)
+    assert (sample.dt, sample.turned) == (0.01, None)
     assert (bench.timeline.leaps, bench.timeline.restarted) == (1, False)
 
 
@@ -178,41 +183,41 @@ def read(bench: Bench, ms: float, lines: int, silent: bool = False) -> list[Feed
 @pytest.mark.parametrize("lines", [5, 15, 25, 28])
 def test_each_line_that_waited_in_the_kernel_has_its_own_slot(lines: int) -> None:
     bench = reporting(Bench(counts=0))
-    found = read(bench, lines * 10, lines, silent=True)
-    assert [(f.dt, f.gap, f.bridged) for f in found] == [(0.01, 0.0, 0.0)] * lines
+    samples = read(bench, lines * 10, lines, silent=True)
+    assert [(f.dt, f.gap, f.bridged) for f in samples] == [(0.01, 0.0, 0.0)] * lines
 
 
 def test_the_time_between_arrivals_is_kept_for_the_wheel_checks() -> None:
     bench = reporting(Bench(counts=0))
-    found = read(bench, 250, 25, silent=True)
-    assert found[0].since == 0.0
-    assert sum(f.since for f in found[1:]) == pytest.approx(24 * WIRE_NS / 1e9)
+    samples = read(bench, 250, 25, silent=True)
+    assert samples[0].since == 0.0
+    assert sum(f.since for f in samples[1:]) == pytest.approx(24 * WIRE_NS / 1e9)
 
 
 def test_stamps_of_lines_that_waited_in_the_kernel_are_a_period_apart() -> None:
     bench = reporting(Bench(counts=0))
-    found = read(bench, 250, 25, silent=True)
-    stamps = [f.at.mono_ns for f in found]
+    samples = read(bench, 250, 25, silent=True)
+    stamps = [f.at.mono_ns for f in samples]
     assert [b - a for a, b in pairwise(stamps)] == pytest.approx([10 * MS] * 24, abs=1000)
     assert stamps[-1] == pytest.approx(bench.now_ns - WIRE_NS, abs=1000)
-    assert {f.at.wall_ns - f.at.mono_ns for f in found} == {7}
+    assert {f.at.wall_ns - f.at.mono_ns for f in samples} == {7}
 
 
 def test_missing_lines_are_filled_and_are_not_a_gap() -> None:
     bench = reporting(Bench(counts=0))
     for ms in range(0, 310, 10):
         bench.timeline.written(bench.now_ns + ms * MS)
-    found = bench.line(ms=310, gap=True)
-    assert found.dt == pytest.approx(0.31)
-    assert found.gap == 0.0
-    assert found.bridged == pytest.approx(0.3)
+    sample = bench.line(ms=310, gap=True)
+    assert sample.dt == pytest.approx(0.31)
+    assert sample.gap == 0.0
+    assert sample.bridged == pytest.approx(0.3)
 
 
 def test_lines_missing_for_a_second_are_a_gap() -> None:
     bench = reporting(Bench(counts=0))
-    found = bench.line(ms=1200, gap=True)
-    assert (found.dt, found.bridged) == (0.0, 0.0)
-    assert found.gap == pytest.approx(1.2)
+    sample = bench.line(ms=1200, gap=True)
+    assert (sample.dt, sample.bridged) == (0.0, 0.0)
+    assert sample.gap == pytest.approx(1.2)
     assert bench.line().dt == 0.01
 
 
@@ -220,9 +225,9 @@ def test_in_a_backlog_with_missing_lines_each_dt_is_the_distance_of_the_stamps()
     bench = reporting(Bench(counts=0))
     for ms in range(0, 390, 10):
         bench.timeline.written(bench.now_ns + ms * MS)
-    found = read(bench, 390, 3, silent=True)
-    stamps = [f.at.mono_ns / 1e9 for f in found]
-    assert [f.dt for f in found] == pytest.approx([0.38 / 3] * 3)
+    samples = read(bench, 390, 3, silent=True)
+    stamps = [f.at.mono_ns / 1e9 for f in samples]
+    assert [f.dt for f in samples] == pytest.approx([0.38 / 3] * 3)
     assert [b - a for a, b in pairwise(stamps)] == pytest.approx([0.38 / 3] * 2, abs=1e-3)
 
 
@@ -240,8 +245,8 @@ def test_a_spoilt_line_still_occupies_its_slot() -> None:
     bench.now_ns += 10 * MS
     bench.timeline.read(Instant(bench.now_ns, bench.now_ns), LENGTH, 1, 0)
     bench.timeline.skip_bad()
-    found = bench.line()
-    assert (found.dt, found.bridged) == (0.02, 0.01)
+    sample = bench.line()
+    assert (sample.dt, sample.bridged) == (0.02, 0.01)
 
 
 @pytest.mark.parametrize("ignored", [0, 3])
@@ -257,17 +262,17 @@ def test_the_first_prompted_reply_fills_the_time_of_the_ignored_replies(
         bench.timeline.skip_bad()
     bench.now_ns += (4 - ignored) * 50 * MS
     bench.timeline.written(bench.now_ns)
-    found = bench.line()
-    assert found.dt == pytest.approx(0.21, abs=0.002)
-    assert found.bridged == pytest.approx(0.2 if ignored else 0.0, abs=0.002)
+    sample = bench.line()
+    assert sample.dt == pytest.approx(0.21, abs=0.002)
+    assert sample.bridged == pytest.approx(0.2 if ignored else 0.0, abs=0.002)
 
 
 def test_without_a_period_the_lines_of_a_read_share_the_time_since_the_last_read() -> None:
     bench = Bench(counts=0)
     bench.line()
-    found = read(bench, 60, 3)
-    assert [f.dt for f in found] == pytest.approx([0.02] * 3)
-    stamps = [f.at.mono_ns for f in found]
+    samples = read(bench, 60, 3)
+    assert [f.dt for f in samples] == pytest.approx([0.02] * 3)
+    stamps = [f.at.mono_ns for f in samples]
     assert [b - a for a, b in pairwise(stamps)] == pytest.approx([20 * MS] * 2)
     assert stamps[-1] == bench.now_ns - WIRE_NS
 
@@ -284,8 +289,8 @@ def test_a_board_with_its_own_rate_has_its_own_period(period: int) -> None:
     bench = Bench(counts=0)
     for _ in range(80):
         bench.line(ms=period)
-    found = read(bench, period * 6, 6, silent=True)
-    assert [(f.dt, f.gap) for f in found] == [(period / 1000, 0.0)] * 6
+    samples = read(bench, period * 6, 6, silent=True)
+    assert [(f.dt, f.gap) for f in samples] == [(period / 1000, 0.0)] * 6
 
 
 # boards that answer each line
@@ -307,9 +312,9 @@ def prompted(bench: Bench, lines: int = 60) -> Bench:
 def test_the_dt_of_an_answer_is_the_time_between_the_prompting_lines() -> None:
     bench = prompted(Bench(counts=0), 80)
     bench.timeline.written(bench.now_ns + 202 * MS)
-    found = bench.line(ms=210, gap=True)
-    assert found.dt == pytest.approx(0.21, abs=1e-3)
-    assert (found.gap, found.bridged) == (0.0, 0.0)
+    sample = bench.line(ms=210, gap=True)
+    assert sample.dt == pytest.approx(0.21, abs=1e-3)
+    assert (sample.gap, sample.bridged) == (0.0, 0.0)
 
 
 def test_replies_that_waited_in_a_stall_beyond_the_open_commands_cover_no_time_of_it() -> None:
@@ -318,9 +323,9 @@ def test_replies_that_waited_in_a_stall_beyond_the_open_commands_cover_no_time_o
     bench.timeline.written(bench.now_ns + 2 * MS)
     bench.now_ns += 1200 * MS
     bench.timeline.read(Instant(bench.now_ns, bench.now_ns), 3 * LENGTH, 3, 0)
-    found = [bench.timeline.place(SPEEDS, None, 0, LENGTH, False) for _ in range(3)]
-    assert sum(line.dt for line in found) < 0.02
-    assert all(line.gap == line.bridged == 0.0 for line in found)
+    samples = [bench.timeline.place(SPEEDS, None, 0, LENGTH, False) for _ in range(3)]
+    assert sum(line.dt for line in samples) < 0.02
+    assert all(line.gap == line.bridged == 0.0 for line in samples)
 
 
 def test_the_dt_of_an_answer_that_names_its_line_is_that_of_the_named_lines() -> None:
@@ -329,9 +334,9 @@ def test_the_dt_of_an_answer_that_names_its_line_is_that_of_the_named_lines() ->
         bench.timeline.written(10**9 + ms * MS)
         bench.now_ns += (10, 3, 25, 1)[number] * MS
         bench.timeline.read(Instant(bench.now_ns, bench.now_ns), LENGTH, 1, 0)
-        found = bench.timeline.place(SPEEDS, None, 0, LENGTH, False, 10**9 + ms * MS)
-        assert found.asked_ns == 10**9 + ms * MS
-        assert found.dt == pytest.approx((0.0, 0.01, 0.01, 0.017)[number])
+        sample = bench.timeline.place(SPEEDS, None, 0, LENGTH, False, 10**9 + ms * MS)
+        assert sample.asked_ns == 10**9 + ms * MS
+        assert sample.dt == pytest.approx((0.0, 0.01, 0.01, 0.017)[number])
 
 
 def test_a_stall_counts_once_if_replies_name_their_line_and_many_are_lost() -> None:

@@ -27,16 +27,16 @@ def errors(name: str, goal: str, case: Case, seconds: float, seeds: int) -> np.n
 
     The poses come from the session, from true times (the floor), and from arrival times.
     """
-    found = np.mean([drive(case, seed, seconds).errors() for seed in range(seeds)], axis=0)
-    (m, deg), (times, times_deg) = found[FOUND], found[FOUND] / found[FLOOR]
-    by, by_deg = found[ARRIVAL]
+    means = np.mean([drive(case, seed, seconds).errors() for seed in range(seeds)], axis=0)
+    (m, deg), (times, times_deg) = means[FOUND], means[FOUND] / means[FLOOR]
+    by, by_deg = means[ARRIVAL]
     print_row(
         name,
         goal,
         f"{m:.3f} m {deg:.3f} deg, {times:.2f} and {times_deg:.2f} x floor; "
         f"arrival {by:.2f} m {by_deg:.2f} deg",
     )
-    return np.asarray(found)
+    return np.asarray(means)
 
 
 def link(prompted: bool) -> str:
@@ -50,14 +50,14 @@ def link(prompted: bool) -> str:
 def test_host_stalls_add_no_pose_error(
     prompted: bool, stall: float, seconds: float, seeds: int
 ) -> None:
-    found = errors(
+    result = errors(
         f"stalls of {stall} s, {link(prompted)}",
         "1.1 x floor",
         Case(stall=stall, prompted=prompted),
         seconds,
         seeds,
     )
-    assert np.all(found[FOUND] <= 1.1 * found[FLOOR] + slack(seeds))
+    assert np.all(result[FOUND] <= 1.1 * result[FLOOR] + slack(seeds))
 
 
 SLACK = np.array([0.02, 0.05])
@@ -80,8 +80,8 @@ def test_an_adapter_that_holds_lines_back_adds_no_pose_error(
 ) -> None:
     case = Case("ftdi", prompted, stall=0.15)
     name = f"FTDI 16 ms, 12 stalls a minute, {link(prompted)}"
-    found = errors(name, "1.05 x floor", case, seconds, seeds)
-    assert np.all(found[FOUND] <= 1.05 * found[FLOOR] + slack(seeds))
+    result = errors(name, "1.05 x floor", case, seconds, seeds)
+    assert np.all(result[FOUND] <= 1.05 * result[FLOOR] + slack(seeds))
 
 
 @pytest.mark.slow
@@ -92,8 +92,8 @@ def test_losing_a_fifth_of_the_lines_adds_little_pose_error(
 ) -> None:
     case = Case(prompted=prompted, lost=0.2, stall=0.15, stall_every=60.0)
     name = f"20 % lost, a stall a minute, {link(prompted)}"
-    found = errors(name, "0.45 m", case, seconds, seeds)
-    assert found[FOUND, 0] <= 0.45
+    result = errors(name, "0.45 m", case, seconds, seeds)
+    assert result[FOUND, 0] <= 0.45
 
 
 @pytest.mark.slow
@@ -107,8 +107,8 @@ def test_answers_that_take_1_to_5_ms_give_half_the_error_of_arrival_times(
     """
     case = Case(prompted=True, thinking=0.004, stall=0.09)
     name = "stalls of 0.09 s, answers 1 to 5 ms late"
-    found = errors(name, "half of arrival times'", case, seconds, seeds)
-    assert np.all(found[FOUND] <= found[ARRIVAL] / 2)
+    result = errors(name, "half of arrival times'", case, seconds, seeds)
+    assert np.all(result[FOUND] <= result[ARRIVAL] / 2)
 
 
 @pytest.mark.parametrize(
@@ -126,8 +126,8 @@ def test_losses_on_a_batched_link_give_no_more_error_than_arrival_times(
 ) -> None:
     case = Case("ftdi", prompted, lost=0.2, stall=0.15, stall_every=60.0)
     name = f"FTDI 16 ms, 20 % lost, {link(prompted)}"
-    found = errors(name, "never worse than arrival times", case, seconds, seeds)
-    assert np.all(found[FOUND] <= found[ARRIVAL])
+    result = errors(name, "never worse than arrival times", case, seconds, seeds)
+    assert np.all(result[FOUND] <= result[ARRIVAL])
 
 
 @pytest.mark.slow
@@ -144,8 +144,8 @@ def test_a_batched_link_that_loses_one_answer_in_a_hundred_keeps_its_clock() -> 
 @EFFORT
 def test_the_gaps_of_bursts_of_lost_lines_are_filled(seconds: float, seeds: int) -> None:
     case = Case(burst_every=30.0)
-    found = errors("bursts of 0.1 to 0.5 s, 2 a minute", "7.5 m", case, seconds, seeds)
-    assert found[FOUND, 0] <= 7.5
+    result = errors("bursts of 0.1 to 0.5 s, 2 a minute", "7.5 m", case, seconds, seeds)
+    assert result[FOUND, 0] <= 7.5
 
 
 @pytest.mark.slow
@@ -168,20 +168,20 @@ def test_every_slot_of_a_drive_is_counted_once() -> None:
     ],
 )
 def test_line_times_never_go_backwards(case: Case) -> None:
-    heard = drive(case, 2, 30.0).heard
-    assert all(f.dt >= f.bridged >= 0.0 and f.since >= 0.0 for f in heard)
-    assert all(a.at.mono_ns <= b.at.mono_ns for a, b in pairwise(heard))
-    assert all(f.at.mono_ns <= f.heard_ns for f in heard)
+    samples = drive(case, 2, 30.0).heard
+    assert all(f.dt >= f.bridged >= 0.0 and f.since >= 0.0 for f in samples)
+    assert all(a.at.mono_ns <= b.at.mono_ns for a, b in pairwise(samples))
+    assert all(f.at.mono_ns <= f.heard_ns for f in samples)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("adapter", ["acm", "ftdi"])
 def test_a_stamp_is_the_time_at_which_the_sample_was_made(adapter: str) -> None:
     host = drive(Case("ftdi" if adapter == "ftdi" else "acm", stall=0.15), 3, 40.0)
-    late, came = [], []
+    late, arrivals = [], []
     for line, feedback in list(zip(host.lines, host.heard, strict=True))[1000:]:
         late.append(feedback.at.mono_ns / 1e9 - 1000 - line.at)
-        came.append(feedback.heard_ns / 1e9 - 1000 - line.at)
-    assert np.std(late) < np.std(came) / 8
+        arrivals.append(feedback.heard_ns / 1e9 - 1000 - line.at)
+    assert np.std(late) < np.std(arrivals) / 8
     assert abs(np.mean(late)) < 0.002
     assert isinstance(host.heard[0].at, Instant)

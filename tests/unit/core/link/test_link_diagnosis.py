@@ -61,10 +61,10 @@ def test_a_board_that_only_prints_noise_is_reported_with_its_noise() -> None:
     for tick in range(500):
         bench.wait(10, *([b"\x00\xff~" + GOOD] if tick % 2 else []))
         texts += [event.text for event in bench.session.events if event.name == "link_booting"]
-    told = [text for text in texts if "none good" in text]
-    assert len(told) == 1
-    assert "150 lines received, none good, the last one is `" in told[0]
-    assert bench.session.words() == told[0]
+    reports = [text for text in texts if "none good" in text]
+    assert len(reports) == 1
+    assert "150 lines received, none good, the last one is `" in reports[0]
+    assert bench.session.words() == reports[0]
     bench.wait(10, GOOD * 3)
     assert bench.session.words() == "the link to the microcontroller is up"
 
@@ -83,7 +83,7 @@ def test_a_silent_link_is_reported_first_and_the_received_data_later() -> None:
 
 
 @pytest.mark.parametrize(
-    ("apart", "longest", "told", "untold"),
+    ("apart", "longest", "advice", "untold"),
     [
         (20, 0.25, "set mcu.reply_period = 0.20", "no value"),
         (20, 0.15, "at least every 0.15 s", "set mcu.reply_period"),
@@ -92,7 +92,7 @@ def test_a_silent_link_is_reported_first_and_the_received_data_later() -> None:
     ],
 )
 def test_lines_too_far_apart_are_reported_with_a_setting_only_if_it_is_valid(
-    apart: int, longest: float, told: str, untold: str
+    apart: int, longest: float, advice: str, untold: str
 ) -> None:
     bench = Bench(McuConfig(port="/dev/board"), longest_reply=longest).open()
     for tick in range(600):
@@ -100,7 +100,7 @@ def test_lines_too_far_apart_are_reported_with_a_setting_only_if_it_is_valid(
     words = bench.session.words()
     seconds = f"{apart / 100:.2f} s"
     assert re.search(rf"lines come {seconds} apart|a line only every {seconds}", words)
-    assert told in words
+    assert advice in words
     assert untold not in words
 
 
@@ -115,14 +115,14 @@ def test_a_single_silence_does_not_suggest_a_reply_period() -> None:
 @pytest.mark.parametrize("port", ["sim", "/dev/board"])
 def test_lines_that_the_host_read_late_give_no_advice_about_the_board(port: str) -> None:
     bench = Bench(McuConfig(port=port)).up()
-    told = set()
+    texts = set()
     for _ in range(20):  # this computer runs a step late and finds the bytes that arrived meanwhile
         bench.wait(300)
-        told.add(bench.session.words())
+        texts.add(bench.session.words())
         bench.wait(10, GOOD)
-        told.add(bench.session.words())
-    assert not [words for words in told if "reply_period" in words or "seldom" in words]
-    assert any(blames_host(words) for words in told)
+        texts.add(bench.session.words())
+    assert not [words for words in texts if "reply_period" in words or "seldom" in words]
+    assert any(blames_host(words) for words in texts)
 
 
 def after(*steps_ms: int, good: bool = False, simulated: bool = False) -> Lateness:
@@ -146,12 +146,12 @@ def test_silence_during_punctual_steps_is_blamed_on_the_board() -> None:
 
 def test_a_host_stall_is_reported_with_its_length() -> None:
     for steps in ((800,), (10, 800, 10), (60, 800)):
-        told = after(*steps).words("stale")
-        assert told.startswith(
+        text = after(*steps).words("stale")
+        assert text.startswith(
             "this computer did not run the daemon for 0.80 s, so the daemon received nothing from "
             "the microcontroller: "
         )
-        assert "which other program" in told
+        assert "which other program" in text
 
 
 def test_a_good_line_ends_the_host_stall() -> None:
@@ -179,35 +179,35 @@ def test_the_text_of_a_silence_shows_whether_the_host_caused_it() -> None:
 
 
 def heard(data: bytes) -> Heard:
-    found = Heard()
-    found.take(data)
+    diagnosis = Heard()
+    diagnosis.take(data)
     for line, _ in LineReader().feed(data):
-        found.line(line, line + b"\r\n" == STILL)
-    return found
+        diagnosis.line(line, line + b"\r\n" == STILL)
+    return diagnosis
 
 
 @pytest.mark.parametrize(("data", "looks", "counted"), HEARD.values(), ids=HEARD)
 def test_the_diagnosis_says_what_was_received_how_it_looks_and_what_to_do(
     data: bytes, looks: ReceivedClass, counted: str
 ) -> None:
-    found = heard(data)
-    assert found.looks == looks
-    assert counted in found.counted
-    told = f"no link to the microcontroller: {found.counted}; {RECEIVED_ADVICE[looks]}"
-    assert found.words.startswith(told)
-    assert "`acsard mcu check`" in found.words
+    diagnosis = heard(data)
+    assert diagnosis.looks == looks
+    assert counted in diagnosis.counted
+    text = f"no link to the microcontroller: {diagnosis.counted}; {RECEIVED_ADVICE[looks]}"
+    assert diagnosis.words.startswith(text)
+    assert "`acsard mcu check`" in diagnosis.words
 
 
 def test_the_diagnosis_comes_after_three_seconds_and_again_only_when_it_changes() -> None:
-    hearing, told = SilenceDiagnosis(), []
+    hearing, reports = SilenceDiagnosis(), []
     for tick in range(100):
         now_ns = tick * FIRST_DIAGNOSIS_NS // 10
         if tick > 50:
             hearing.now.take(b"\x00")
         if hearing.judge(now_ns):
             assert hearing.heard is not None
-            told.append((tick, hearing.heard.looks))
-    assert told == [(10, "nothing"), (60, "garbage")]
+            reports.append((tick, hearing.heard.looks))
+    assert reports == [(10, "nothing"), (60, "garbage")]
     hearing.forget()
     assert hearing.heard is None
     assert not hearing.judge(10 * FIRST_DIAGNOSIS_NS)
@@ -217,10 +217,10 @@ def sparse(bench: Bench) -> Heard:
     """Return the first diagnosis of a board that sends three good lines and then nothing."""
     for tick in range(3 * 100 + 2):
         bench.wait(10, *([GOOD] if tick % 20 == 1 and tick < 50 else []))
-    found = bench.session._hearing.heard
-    assert found is not None
-    assert found.looks == "sparse"
-    return found
+    diagnosis = bench.session._hearing.heard
+    assert diagnosis is not None
+    assert diagnosis.looks == "sparse"
+    return diagnosis
 
 
 def test_a_stall_while_the_link_was_up_does_not_explain_later_sparse_lines() -> None:
@@ -246,12 +246,12 @@ def test_a_stall_within_the_time_of_the_sparse_lines_explains_them() -> None:
     bench = Bench(McuConfig(port="/dev/board")).open()
     bench.wait(10)
     bench.wait(800)
-    found = sparse(bench)
-    assert found.words.startswith(
+    diagnosis = sparse(bench)
+    assert diagnosis.words.startswith(
         "this computer did not run the daemon for 0.80 s, so the daemon received too few lines for "
         "a link: "
     )
-    assert blames_host(found.words)
+    assert blames_host(diagnosis.words)
 
 
 def test_lines_that_came_while_the_output_was_blocked_are_not_counted_afterwards() -> None:

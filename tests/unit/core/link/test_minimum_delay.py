@@ -67,9 +67,9 @@ def test_the_remembered_lateness_has_an_upper_limit() -> None:
 def test_without_drift_the_lateness_is_the_delay_above_the_minimum_at_any_clock_offset(
     offset: int, delays: list[int]
 ) -> None:
-    promptest, left, came = MinimumDelay(0.0), offset, delays[0]
+    promptest, left, last_arrival = MinimumDelay(0.0), offset, delays[0]
     for number, delay in enumerate(delays):
         departure, arrival = offset + 50 * number, 50 * number + delay
-        promptest.add(arrival - came, departure - left)
-        left, came = departure, arrival
+        promptest.add(arrival - last_arrival, departure - left)
+        left, last_arrival = departure, arrival
         assert promptest.late == delay - min(delays[: number + 1])

@@ -441,9 +441,9 @@ def test_undoing_a_line_that_was_not_sent_restores_the_earlier_wait() -> None:
 def test_any_two_lines_that_the_throttle_lets_through_are_the_wait_apart(
     steps: list[int], wait_ns: int
 ) -> None:
-    throttle, now_ns, went = Throttle(), 0, []
+    throttle, now_ns, times = Throttle(), 0, []
     for step in steps:
         now_ns += step
         if throttle.lets(now_ns, wait_ns):
-            went.append(now_ns)
-    assert all(b - a >= wait_ns for a, b in pairwise(went))
+            times.append(now_ns)
+    assert all(b - a >= wait_ns for a, b in pairwise(times))

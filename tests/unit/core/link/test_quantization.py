@@ -19,8 +19,8 @@ AT = Instant(0, 0)
 def speeds(counts: int) -> Array:
     """Return the speeds that firmware reports in half a minute, in two decimals."""
     whole = counted(angles(np.random.default_rng(1), 30.0), counts)
-    told: Array = np.round(whole * math.tau / counts / PERIOD, 2)
-    return told
+    values: Array = np.round(whole * math.tau / counts / PERIOD, 2)
+    return values
 
 
 def look(recovery: CountRecovery, rows: Array, counts: bool = False) -> list[Feedback]:
@@ -55,9 +55,9 @@ def test_after_forgetting_no_step_is_known() -> None:
 
 
 def test_no_counts_are_derived_from_speeds_if_the_line_has_its_own_counts() -> None:
-    seen = look(CountRecovery(20), speeds(20), counts=True)
-    assert all(line.counted is None for line in seen)
-    assert max(seen[-1].steps) == pytest.approx(math.tau / 20 / PERIOD, abs=0.01)
+    lines = look(CountRecovery(20), speeds(20), counts=True)
+    assert all(line.counted is None for line in lines)
+    assert max(lines[-1].steps) == pytest.approx(math.tau / 20 / PERIOD, abs=0.01)
 
 
 def test_no_counts_are_derived_from_a_line_after_a_gap() -> None:

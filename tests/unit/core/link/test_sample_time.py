@@ -118,8 +118,8 @@ def test_a_lossless_link_counts_each_line_once_despite_host_stalls(
 ) -> None:
     chance = random.Random(seed)
     bench = Bench(PERIOD * (1 + drift)).found()
-    for held, late_ms in stalls:
-        for _ in range(held):
+    for count, late_ms in stalls:
+        for _ in range(count):
             bench.line(held=True)
         bench.line(late_ms)
         for _ in range(chance.randint(20, 90)):
@@ -372,13 +372,13 @@ class Prompted:
         `cut` says whether the read also contains the beginning of the next reply.
         """
         self.prompts.read(int(ms * MS), lines, cut)
-        said = []
+        times = []
         for _ in range(lines):
             asked = None if asked_ms is None else int(asked_ms * MS)
             answered = self.prompts.place(asked)
             assert answered is not None
-            said += [round((answered.dt or 0.0) * 1000, 3), round(answered.bridged * 1000, 3)]
-        return said
+            times += [round((answered.dt or 0.0) * 1000, 3), round(answered.bridged * 1000, 3)]
+        return times
 
     def talk(self, count: int = 20) -> Prompted:
         """Send `count` lines, one every 10 ms from time 0, and answer each of them."""
@@ -604,7 +604,7 @@ def batched(
     for each reply the distance, in lines, between its true line and the matched line, plus a
     constant.
     """
-    chance, told = random.Random(seed), 0.0
+    chance, total = random.Random(seed), 0.0
     answers, leaves = [i for i in range(lines) if i not in lost], list(range(lines))
     for batch in range(1, lines * 10 // 16 + 3):
         at = batch * 16.0 + chance.uniform(0.0, 0.5)
@@ -617,10 +617,10 @@ def batched(
         for number in ready:
             answered = bench.prompts.place()
             if number > 100 and answered is not None:
-                told += 1000 * (answered.dt or 0.0)
+                total += 1000 * (answered.dt or 0.0)
                 if offs is not None:
-                    offs.append(round(told / 10) - number)
-    return told
+                    offs.append(round(total / 10) - number)
+    return total
 
 
 @each("seed", range(5))

@@ -37,9 +37,9 @@ class Wire:
         data = self.gate.prepare(line, made_ns, now_ns, kernel)
         if data is None:
             return "superseded"
-        taken = min(takes, len(data))
-        self.out += data[:taken]
-        return self.gate.record_write(line, data, taken, now_ns)
+        size = min(takes, len(data))
+        self.out += data[:size]
+        return self.gate.record_write(line, data, size, now_ns)
 
     def started(self) -> Wire:
         assert self.offer(self._stop, 0) == "sent"
@@ -143,6 +143,6 @@ def test_the_gate_never_lets_bytes_queue_on_the_wire(
         data = gate.prepare(GO, now_ns, now_ns, 0)
         if data is not None:
             assert now_ns >= busy_until_ns
-            taken = min(takes, len(data))
-            gate.record_write(GO, data, taken, now_ns)
-            busy_until_ns = now_ns + taken * 10 * 1_000_000_000 // baud
+            size = min(takes, len(data))
+            gate.record_write(GO, data, size, now_ns)
+            busy_until_ns = now_ns + size * 10 * 1_000_000_000 // baud

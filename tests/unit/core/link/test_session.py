@@ -56,12 +56,12 @@ class Bench:
 
     def talk(self, ms: int = 10, count: int = 1) -> list[Feedback]:
         """Send a line and receive its answer `ms` later, `count` times."""
-        heard = []
+        samples = []
         for _ in range(count):
             line = self.line()
             checked = line is not None and b"#" in line
-            heard += self.wait(ms, self.answer(line)) if checked else self.wait(ms)
-        return heard
+            samples += self.wait(ms, self.answer(line)) if checked else self.wait(ms)
+        return samples
 
     def checked(self) -> Bench:
         """Open the port and talk until the link is up and checked."""
@@ -288,16 +288,16 @@ def test_without_gaps_the_dts_add_up_to_the_time_between_first_and_last_line(
     reads: list[tuple[float, int, int]], baud: int
 ) -> None:
     bench = Bench(McuConfig(baud_rate=115200 if baud == 115200 else 9600)).open()
-    heard = bench.wait(10, GOOD)
+    samples = bench.wait(10, GOOD)
     for ms, lines, cut in reads:
         data = GOOD * (lines + 1)
-        heard += bench.wait(ms, data[: 33 * lines + cut], data[33 * lines + cut :])
-    total = (heard[-1].at.mono_ns - heard[0].at.mono_ns) / NS_PER_S
-    apart = len(heard) * MIN_INTERVAL_NS / NS_PER_S
-    assert sum(f.dt for f in heard) == pytest.approx(total, abs=apart)
-    assert all(f.dt >= 0.0 and f.gap == 0.0 for f in heard)
-    assert all(a.at.mono_ns < b.at.mono_ns for a, b in pairwise(heard))
-    assert all(f.at.mono_ns <= bench.now_ns for f in heard)
+        samples += bench.wait(ms, data[: 33 * lines + cut], data[33 * lines + cut :])
+    total = (samples[-1].at.mono_ns - samples[0].at.mono_ns) / NS_PER_S
+    apart = len(samples) * MIN_INTERVAL_NS / NS_PER_S
+    assert sum(f.dt for f in samples) == pytest.approx(total, abs=apart)
+    assert all(f.dt >= 0.0 and f.gap == 0.0 for f in samples)
+    assert all(a.at.mono_ns < b.at.mono_ns for a, b in pairwise(samples))
+    assert all(f.at.mono_ns <= bench.now_ns for f in samples)
 
 
 def test_a_line_split_over_two_reads_has_the_time_of_the_second_read() -> None:
@@ -581,11 +581,11 @@ def test_the_identity_line_of_an_mcu_that_is_still_booting_is_not_a_restart_even
 
 def test_the_outcome_of_the_negotiation_is_an_event() -> None:
     bench = Bench(AUTO).open()
-    told = []
+    events = []
     for _ in range(40):
         bench.talk()
-        told += bench.session.events
-    (outcome,) = [event for event in told if event.name == "link_check"]
+        events += bench.session.events
+    (outcome,) = [event for event in events if event.name == "link_check"]
     assert (outcome.level, outcome.text) == (
         "info",
         "the lines on the serial port are now checked",
@@ -594,12 +594,12 @@ def test_the_outcome_of_the_negotiation_is_an_event() -> None:
 
 def test_a_refused_check_is_an_event_and_the_reason_of_the_link() -> None:
     bench = Bench(REQUIRE).open()
-    told = []
+    events = []
     for _ in range(100):
         bench.wait(10, GOOD)
         bench.line()
-        told += bench.session.events
-    (outcome,) = [event for event in told if event.name == "link_check"]
+        events += bench.session.events
+    (outcome,) = [event for event in events if event.name == "link_check"]
     assert outcome.level == "error"
     assert bench.session.words() == outcome.text
 
@@ -679,8 +679,8 @@ def test_the_bad_lines_of_an_update_make_one_event_for_each_reason(reads: int) -
     bench = Bench().open()
     bench.wait(10)
     bench.wait(10, *([b"x\r\n" * 200 + b"ap99.99\r\n" + b"y" * 300 + b"\r\n"] * reads))
-    told = [(event.kind, event.count, event.text) for event in bench.session.events]
-    assert told == [("malformed", 201 * reads, "b'ap99.99'"), ("too_long", reads, "")]
+    rows = [(event.kind, event.count, event.text) for event in bench.session.events]
+    assert rows == [("malformed", 201 * reads, "b'ap99.99'"), ("too_long", reads, "")]
     assert bench.session.rejects == {"malformed": 201 * reads, "too_long": reads}
 
 

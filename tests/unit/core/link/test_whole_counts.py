@@ -42,11 +42,11 @@ def lines(
 
 def missed(counts: int, jitter: float, nominal: bool = False) -> Array:
     """Return the final error of each wheel's angle in counts."""
-    found, total = WholeCounts(counts), np.zeros(4)
+    counter, total = WholeCounts(counts), np.zeros(4)
     for speeds, own, number in lines(counts, jitter, nominal=nominal):
-        turned = found.turned(speeds, own)
-        total += np.array(turned or [speed * own for speed in speeds]) / found.angle - number
-    assert found.believed
+        turned = counter.turned(speeds, own)
+        total += np.array(turned or [speed * own for speed in speeds]) / counter.angle - number
+    assert counter.believed
     off: Array = np.abs(total)
     return off
 
@@ -62,66 +62,66 @@ def test_a_fine_encoder_loses_few_counts() -> None:
 
 
 def test_speed_times_time_alone_is_more_than_one_count_off() -> None:
-    found = sum(
+    error = sum(
         np.array(speeds) * own / (math.tau / 16) - number
         for speeds, own, number in lines(16, 0.002)
     )
-    assert np.abs(found).max() > 1.0
+    assert np.abs(error).max() > 1.0
 
 
 def test_a_line_that_repeats_the_previous_one_turns_no_wheel() -> None:
-    found, speed = WholeCounts(16), round(math.tau / 16 / 0.008, 2)
-    one = (speed, 0.0, speed, 0.0)
-    assert found.turned(one, 0.008) == (found.angle, 0.0, found.angle, 0.0)
-    assert found.turned(one, 0.003) == (0.0, 0.0, 0.0, 0.0)
-    assert found.turned(one, 0.005) == (found.angle, 0.0, found.angle, 0.0)
+    counter, speed = WholeCounts(16), round(math.tau / 16 / 0.008, 2)
+    speeds = (speed, 0.0, speed, 0.0)
+    assert counter.turned(speeds, 0.008) == (counter.angle, 0.0, counter.angle, 0.0)
+    assert counter.turned(speeds, 0.003) == (0.0, 0.0, 0.0, 0.0)
+    assert counter.turned(speeds, 0.005) == (counter.angle, 0.0, counter.angle, 0.0)
 
 
 def test_the_other_wheels_decide_between_two_possible_numbers_of_counts() -> None:
-    found = WholeCounts(96)
-    true = [round(n * found.angle / 0.0139, 2) for n in (3, 3, 2, -3)]
-    turned = found.turned((true[0], true[1], true[2], true[3]), 0.0105)
+    counter = WholeCounts(96)
+    true = [round(n * counter.angle / 0.0139, 2) for n in (3, 3, 2, -3)]
+    turned = counter.turned((true[0], true[1], true[2], true[3]), 0.0105)
     assert turned is not None
-    assert [round(angle / found.angle, 6) for angle in turned] == [3, 3, 2, -3]
+    assert [round(angle / counter.angle, 6) for angle in turned] == [3, 3, 2, -3]
 
 
 def test_a_wrong_number_of_counts_is_corrected_by_the_next_line() -> None:
-    found, total = WholeCounts(96), 0.0
+    counter, total = WholeCounts(96), 0.0
     for number, time, own in ((3, 0.010, 0.010), (3, 0.0139, 0.0112), (2, 0.0077, 0.0104)):
-        speed = round(number * found.angle / time, 2)
-        turned = found.turned((speed, speed, speed, speed), own)
+        speed = round(number * counter.angle / time, 2)
+        turned = counter.turned((speed, speed, speed, speed), own)
         assert turned is not None
         total += turned[0]
-    assert total / found.angle == pytest.approx(8)
+    assert total / counter.angle == pytest.approx(8)
 
 
 def test_whole_counts_are_refuted_for_firmware_that_filters() -> None:
-    found, speeds, dice = WholeCounts(96), np.zeros(4), random.Random(1)
+    counter, speeds, dice = WholeCounts(96), np.zeros(4), random.Random(1)
     for row, own, _ in lines(96, 0.0):
         speeds = speeds + dice.uniform(0.2, 0.4) * (np.array(row) - speeds)
         a, b, c, d = np.round(speeds, 2).tolist()
-        found.turned((a, b, c, d), own)
-    assert not found.believed
+        counter.turned((a, b, c, d), own)
+    assert not counter.believed
 
 
 def test_a_repeated_line_of_firmware_that_filters_gives_no_whole_counts() -> None:
-    found, speeds, dice, refuted = WholeCounts(96), np.zeros(4), random.Random(1), 0
+    counter, speeds, dice, refuted = WholeCounts(96), np.zeros(4), random.Random(1), 0
     for row, own, _ in lines(96, 0.0):
         speeds = speeds + dice.uniform(0.2, 0.4) * (np.array(row) - speeds)
         a, b, c, d = np.round(speeds, 2).tolist()
-        found.turned((a, b, c, d), own)
-        if not found.believed and any((a, b, c, d)):
+        counter.turned((a, b, c, d), own)
+        if not counter.believed and any((a, b, c, d)):
             refuted += 1
-            assert found.turned((a, b, c, d), 0.3 * own) is None
+            assert counter.turned((a, b, c, d), 0.3 * own) is None
     assert refuted > 1000
 
 
 def test_slow_wheels_with_edge_timing_firmware_do_not_turn_a_count_in_each_line() -> None:
-    found, total = WholeCounts(16), 0.0
+    counter, total = WholeCounts(16), 0.0
     for _ in range(200):
-        turned = found.turned((0.5, 0.5, 0.5, 0.5), 0.01)
+        turned = counter.turned((0.5, 0.5, 0.5, 0.5), 0.01)
         total += turned[0] if turned else 0.5 * 0.01
-    assert total == pytest.approx(1.0, abs=found.angle)
+    assert total == pytest.approx(1.0, abs=counter.angle)
 
 
 @pytest.mark.parametrize("counts", [96, 400, 3200])
@@ -130,23 +130,23 @@ def test_equal_lines_at_uneven_times_lose_no_time(counts: int) -> None:
 
     It must not take a line after a short time for a repetition of the last line.
     """
-    found, dice, turned, seconds = WholeCounts(counts), random.Random(1), 0.0, 0.0
+    counter, dice, turned, seconds = WholeCounts(counts), random.Random(1), 0.0, 0.0
     for _ in range(1000):
         own = dice.uniform(0.004, 0.014)
         seconds += own
-        angles = found.turned((13.45,) * 4, own)
+        angles = counter.turned((13.45,) * 4, own)
         turned += 13.45 * own if angles is None else angles[0]
     assert turned == pytest.approx(13.45 * seconds, rel=0.005)
 
 
 def test_one_damaged_line_does_not_refute_whole_counts() -> None:
-    found = WholeCounts(16)
+    counter = WholeCounts(16)
     for number, (speeds, own, whole) in enumerate(lines(16, 0.001)):
         damaged = number == 300
-        turned = found.turned((speeds[0] + 7.13, 11.11, *speeds[2:]) if damaged else speeds, own)
+        turned = counter.turned((speeds[0] + 7.13, 11.11, *speeds[2:]) if damaged else speeds, own)
         if number > 302 and turned is not None:
-            assert [round(angle / found.angle) for angle in turned] == whole.tolist()
-    assert found.believed
+            assert [round(angle / counter.angle) for angle in turned] == whole.tolist()
+    assert counter.believed
 
 
 def test_zero_speeds_give_zero_angles() -> None:
@@ -160,9 +160,9 @@ def off_by(lost: str, counts: int, jitter: float) -> float:
     at = n * PERIOD + dice.uniform(0.0, jitter, len(wheels))
     way = np.array([np.interp(at, n * PERIOD, wheel) for wheel in wheels.T]).T
     whole = np.floor(way * counts / math.tau)
-    heard = np.flatnonzero(n % 3 != 0)
-    found, total, before = CountRecovery(counts), np.zeros(4), np.zeros(4)
-    for last, this in itertools.pairwise(heard.tolist()):
+    indices = np.flatnonzero(n % 3 != 0)
+    recovery, total, before = CountRecovery(counts), np.zeros(4), np.zeros(4)
+    for last, this in itertools.pairwise(indices.tolist()):
         began = last if lost == "command" else this - 1
         speeds = (whole[this] - whole[began]) * math.tau / counts / (at[this] - at[began])
         bridged = (this - last - 1) * PERIOD
@@ -170,12 +170,12 @@ def off_by(lost: str, counts: int, jitter: float) -> float:
             Instant(0, 0), WheelSpeeds(*np.round(speeds, 2).tolist()), bridged + PERIOD,
             bridged=bridged,
         )  # fmt: skip
-        seen = found.look(line)
-        said = np.array(seen.speeds.as_tuple())
-        counted = seen.counted or said * (seen.dt - seen.bridged)
-        total += np.array(counted) + seen.bridged * (before + said) / 2
-        before = said
-    true = way[heard[-1]] - way[heard[0]]
+        result = recovery.look(line)
+        rates = np.array(result.speeds.as_tuple())
+        counted = result.counted or rates * (result.dt - result.bridged)
+        total += np.array(counted) + result.bridged * (before + rates) / 2
+        before = rates
+    true = way[indices[-1]] - way[indices[0]]
     return float(np.max(np.abs(total - true) / np.abs(true)))
 
 

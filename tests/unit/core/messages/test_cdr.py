@@ -99,7 +99,7 @@ def built_field(value: Any, desc: Any) -> Any:
         return math.nan if value is None else value
     (item_kind, item), _ = inner
     if item_kind == Nodetype.NAME:
-        return [built(one, item) for one in value]
+        return [built(element, item) for element in value]
     return value if item[0] == "string" else np.array(value, dtype=item[0])
 
 
@@ -110,7 +110,7 @@ def plain(value: Any) -> Any:
         return {name: plain(getattr(value, name)) for name, _ in fields}
     if hasattr(value, "tolist"):
         return value.tolist()
-    return [plain(one) for one in value] if isinstance(value, list) else value
+    return [plain(element) for element in value] if isinstance(value, list) else value
 
 
 def oracle_bytes(message: Struct, little: bool = True) -> bytes:
@@ -125,7 +125,7 @@ def oracle_value(payload: bytes, cls: type[Message]) -> Message:
 
 def without_nan(value: dict[str, Any]) -> dict[str, Any]:
     """Return the fields of a message with null in place of NaN."""
-    return {name: None if one != one else one for name, one in value.items()}
+    return {name: None if field != field else field for name, field in value.items()}
 
 
 def encoded(message: Struct) -> bytes:
@@ -331,9 +331,9 @@ def test_a_very_long_text_is_encoded_like_in_ros(length: int) -> None:
 @each("value", [math.inf, -math.inf, -0.0, 5e-324, 1.7976931348623157e308])
 def test_special_floats_are_decoded_and_encoded_bit_for_bit(value: float) -> None:
     message = Twist(Vector3(value), Vector3(z=value))
-    got = Cdr(Twist).decode(oracle_bytes(message))
-    assert struct.pack("<d", got.linear.x) == struct.pack("<d", value)
-    assert encoded(got) == oracle_bytes(message)
+    result = Cdr(Twist).decode(oracle_bytes(message))
+    assert struct.pack("<d", result.linear.x) == struct.pack("<d", value)
+    assert encoded(result) == oracle_bytes(message)
 
 
 def test_nan_is_decoded_as_nan_and_not_refused_by_the_decoder() -> None:
@@ -911,26 +911,26 @@ def damaged(payload: bytes, dice: random.Random) -> bytes:
 def test_damaged_payloads_raise_only_cdr_errors_and_decode_to_no_more_than_their_size(
     count: int,
 ) -> None:
-    dice, began, seen = random.Random(8), time.perf_counter(), Counter[str]()
+    dice, began, tally = random.Random(8), time.perf_counter(), Counter[str]()
     payloads = [(payload, cast(Cdr[Message], Cdr(type(message)))) for payload, message in valid()]
     for i in range(count):
         payload, codec = payloads[i % len(payloads)]
         data = damaged(payload, dice)
         try:
-            got = codec.decode(data)
+            result = codec.decode(data)
         except CdrError as error:
             words = re.split(":|, has", str(error))[0]
-            seen[re.sub(r"-?\d+", "n", words)] += 1
+            tally[re.sub(r"-?\d+", "n", words)] += 1
             continue
-        assert weight(got) <= len(data) + 72  # the two covariances have a fixed length
-        again = codec.encode(got)
+        assert weight(result) <= len(data) + 72  # the two covariances have a fixed length
+        again = codec.encode(result)
         assert codec.encode(codec.decode(again)) == again
-        seen["accepted"] += 1
+        tally["accepted"] += 1
     took = time.perf_counter() - began
     print(f"\n{count} damaged payloads in {took:.0f} s, no exception but CdrError")
-    for what, times in seen.most_common():
+    for what, times in tally.most_common():
         print(f"  {times:8} {what}")
-    assert count * 0.2 < seen["accepted"] < count * 0.8
+    assert count * 0.2 < tally["accepted"] < count * 0.8
 
 
 @pytest.mark.slow
@@ -938,7 +938,7 @@ def test_damaged_payloads_raise_only_cdr_errors_and_decode_to_no_more_than_their
 @settings(max_examples=300)
 def test_any_bytes_give_a_message_or_a_cdr_error(body: bytes, head: bytes, like: Message) -> None:
     try:
-        got = Cdr(type(like)).decode(head + body)
+        result = Cdr(type(like)).decode(head + body)
     except CdrError:
         return
-    assert isinstance(got, type(like))
+    assert isinstance(result, type(like))

@@ -46,7 +46,7 @@ def test_variances_of_unmeasured_axes_are_limited_to_a_usable_range(
 
 
 def test_each_message_has_a_matrix_of_its_own() -> None:
-    one = covariances(covariance="constant")
-    first, second = one.of_pose(OF_POSE), one.of_pose(OF_POSE)
+    model = covariances(covariance="constant")
+    first, second = model.of_pose(OF_POSE), model.of_pose(OF_POSE)
     assert first == second
     assert first is not second

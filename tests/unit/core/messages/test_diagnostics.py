@@ -54,25 +54,25 @@ def rows(
 
 
 def row(name: str, *args: Any, **changes: Any) -> DiagnosticStatus:
-    (one,) = [one for one in rows(*args, **changes) if one.name == f"acsard: {name}"]
-    return one
+    (status,) = [status for status in rows(*args, **changes) if status.name == f"acsard: {name}"]
+    return status
 
 
 def seen(**changes: Any) -> Snapshot:
     return replace(SNAPSHOT, **changes)
 
 
-def values(one: DiagnosticStatus) -> dict[str, str]:
-    return {pair.key: pair.value for pair in one.values}
+def values(status: DiagnosticStatus) -> dict[str, str]:
+    return {pair.key: pair.value for pair in status.values}
 
 
 # names, by which rqt_robot_monitor identifies its rows
 
 
 def test_every_status_names_its_robot() -> None:
-    found = rows()
-    assert {one.hardware_id for one in found} == {"r7"}
-    assert len({one.name for one in found}) == len(found)
+    statuses = rows()
+    assert {status.hardware_id for status in statuses} == {"r7"}
+    assert len({status.name for status in statuses}) == len(statuses)
 
 
 @each("mode", ["inactive", "waiting", "stopped", "fault", "shutdown"])
@@ -80,14 +80,16 @@ def test_every_status_names_its_robot() -> None:
 def test_no_row_appears_or_disappears_in_any_state_of_the_robot(mode: str, link: str) -> None:
     outputs = replace(OUTPUTS, mode=mode, link=link, source="", reason="words")
     snapshot = seen(figures={}, counters={}, sources=(), refused_age_s=0.0, missed_last_minute=9)
-    names = [(one.name, one.hardware_id) for one in rows()]
-    assert [(one.name, one.hardware_id) for one in rows(CONFIG, outputs, snapshot)] == names
+    names = [(status.name, status.hardware_id) for status in rows()]
+    assert [
+        (status.name, status.hardware_id) for status in rows(CONFIG, outputs, snapshot)
+    ] == names
 
 
 @each("does", ["waiting for rest", "waiting for turn", "used", "silent", "dead", "not believed"])
 def test_a_configured_gyro_has_a_row_in_each_of_its_states(does: Any) -> None:
-    assert [one.name for one in rows(snapshot=seen(gyro=GyroStatus(does)))] == [
-        *(one.name for one in rows()),
+    assert [status.name for status in rows(snapshot=seen(gyro=GyroStatus(does)))] == [
+        *(status.name for status in rows()),
         "acsard: gyro",
     ]
 
@@ -103,17 +105,17 @@ def test_a_configured_gyro_has_a_row_in_each_of_its_states(does: Any) -> None:
 )
 def test_a_board_that_sends_status_lines_has_a_row(estop: Any, level: int, message: str) -> None:
     counters = {"line_status_malformed": 2, "emergency_stops": 1, "lines": 9}
-    one = row("board", snapshot=seen(estop=estop, board={"volts": "24.31"}, counters=counters))
-    assert (one.level, one.message) == (level, message)
-    assert values(one) == {
+    status = row("board", snapshot=seen(estop=estop, board={"volts": "24.31"}, counters=counters))
+    assert (status.level, status.message) == (level, message)
+    assert values(status) == {
         "volts": "24.31", "line_status_malformed": "2", "emergency_stops": "1",
     }  # fmt: skip
 
 
 def test_a_required_emergency_stop_has_a_row_before_the_board_reports_it() -> None:
     config = replace(CONFIG, safety=SafetyConfig(estop="required"))
-    one = row("board", config)
-    assert (one.level, one.message) == (ERROR, MISSING_REASON)
+    status = row("board", config)
+    assert (status.level, status.message) == (ERROR, MISSING_REASON)
     assert row("board", config, snapshot=seen(estop="released")).level == OK
 
 
@@ -131,19 +133,22 @@ def test_the_row_of_the_board_shows_the_state_of_its_bumpers(
 ) -> None:
     counters = {"bumper_presses": 1, "lines": 9}
     snapshot = seen(estop="released", bumpers=bumpers, bumper=why, counters=counters)
-    one = row("board", BUMPERS, snapshot=snapshot)
-    assert (one.level, one.message) == (level, f"emergency stop released; {message}")
-    assert values(one) == {"bumper_presses": "1"}
+    status = row("board", BUMPERS, snapshot=snapshot)
+    assert (status.level, status.message) == (level, f"emergency stop released; {message}")
+    assert values(status) == {"bumper_presses": "1"}
 
 
 def test_ignored_bumpers_need_no_row() -> None:
     off = replace(BUMPERS, safety=replace(BUMPERS.safety, bumper="off"))
-    assert "acsard: board" not in [one.name for one in rows(off)]
+    assert "acsard: board" not in [status.name for status in rows(off)]
 
 
 def test_a_motor_drivers_fault_is_an_error_of_the_board() -> None:
-    one = row("board", snapshot=seen(board={"motor_driver": "fault"}))
-    assert (one.level, one.message) == (ERROR, f"no emergency-stop input; {DRIVER_FAULT_REASON}")
+    status = row("board", snapshot=seen(board={"motor_driver": "fault"}))
+    assert (status.level, status.message) == (
+        ERROR,
+        f"no emergency-stop input; {DRIVER_FAULT_REASON}",
+    )
 
 
 BATTERY = replace(CONFIG, battery=BatteryConfig(warning_below=22.0, stop_below=21.0))
@@ -177,20 +182,20 @@ def test_a_battery_that_the_board_reports_has_a_row(
     level: BatteryLevel, number: int, message: str
 ) -> None:
     status = BatteryStatus(level, 0, 22.5, 40.0, -1.5, 21.756)
-    one = row("battery", BATTERY, snapshot=seen(battery=status))
-    assert (one.level, one.message) == (number, message)
-    assert values(one) == {
+    entry = row("battery", BATTERY, snapshot=seen(battery=status))
+    assert (entry.level, entry.message) == (number, message)
+    assert values(entry) == {
         "level": level, "volts": "22.50", "percent": "40.00", "amperes": "-1.50", "mean": "21.76",
         "warning_below": "22", "stop_below": "21",
     }  # fmt: skip
 
 
 def test_a_battery_has_a_row_once_it_is_reported_or_has_thresholds() -> None:
-    assert "acsard: battery" not in {one.name for one in rows(snapshot=seen(battery=None))}
-    one = row("battery", BATTERY, snapshot=seen(battery=None))
-    assert (one.level, one.message) == (WARN, MISSING_BATTERY)
-    one = row("battery", snapshot=seen(battery=BatteryStatus("ok", 0, 24.0, mean=24.0)))
-    assert values(one) == {"level": "ok", "volts": "24.00"}
+    assert "acsard: battery" not in {status.name for status in rows(snapshot=seen(battery=None))}
+    status = row("battery", BATTERY, snapshot=seen(battery=None))
+    assert (status.level, status.message) == (WARN, MISSING_BATTERY)
+    status = row("battery", snapshot=seen(battery=BatteryStatus("ok", 0, 24.0, mean=24.0)))
+    assert values(status) == {"level": "ok", "volts": "24.00"}
 
 
 def test_a_router_has_a_row_before_the_first_check_of_its_connection() -> None:
@@ -199,18 +204,18 @@ def test_a_router_has_a_row_before_the_first_check_of_its_connection() -> None:
     Without a row from the start, a new row would appear in the monitor after this time.
     """
     config = replace(CONFIG, bus=BusConfig(connect=("tcp/a:7447",)))
-    one = row("router", config)
-    assert (one.level, one.message) == (OK, "not connected yet")
-    assert values(one) == {"tcp/a:7447": "not connected yet"}
+    status = row("router", config)
+    assert (status.level, status.message) == (OK, "not connected yet")
+    assert values(status) == {"tcp/a:7447": "not connected yet"}
     looked = seen(routers=RoutersStatus(missing=("tcp/a:7447",)))
     assert [of.name for of in rows(config, snapshot=looked)] == [of.name for of in rows(config)]
 
 
 def test_a_lost_router_is_named_although_another_one_was_never_connected() -> None:
     config = replace(CONFIG, bus=BusConfig(connect=("tcp/a:7447", "tcp/b:7447")))
-    one = row("router", config, snapshot=seen(routers=RoutersStatus(missing=("tcp/a:7447",))))
-    assert (one.level, one.message) == (WARN, "not connected to tcp/a:7447")
-    assert values(one) == {"tcp/a:7447": "not connected", "tcp/b:7447": "not connected yet"}
+    status = row("router", config, snapshot=seen(routers=RoutersStatus(missing=("tcp/a:7447",))))
+    assert (status.level, status.message) == (WARN, "not connected to tcp/a:7447")
+    assert values(status) == {"tcp/a:7447": "not connected", "tcp/b:7447": "not connected yet"}
 
 
 # mode
@@ -229,9 +234,9 @@ def test_a_lost_router_is_named_although_another_one_was_never_connected() -> No
     ],
 )
 def test_a_latched_mode_is_not_ok_and_its_reason_is_the_message(mode: str, level: int) -> None:
-    one = row("mode", outputs=replace(OUTPUTS, mode=mode, reason="words"))
-    assert (one.level, one.message) == (level, "words")
-    assert values(one) == {"mode": mode, "source": "app"}
+    status = row("mode", outputs=replace(OUTPUTS, mode=mode, reason="words"))
+    assert (status.level, status.message) == (level, "words")
+    assert values(status) == {"mode": mode, "source": "app"}
 
 
 # link
@@ -239,14 +244,14 @@ def test_a_latched_mode_is_not_ok_and_its_reason_is_the_message(mode: str, level
 
 @each(("link", "level"), [("up", OK), ("stale", ERROR), ("booting", ERROR), ("down", ERROR)])
 def test_a_link_that_is_not_up_is_an_error(link: str, level: int) -> None:
-    one = row("serial link", outputs=replace(OUTPUTS, link=link))
-    assert (one.level, one.message) == (level, link)
+    status = row("serial link", outputs=replace(OUTPUTS, link=link))
+    assert (status.level, status.message) == (level, link)
 
 
 @pytest.mark.parametrize(("link", "level"), [("up", WARN), ("down", ERROR)])
 def test_the_row_of_the_link_says_that_the_robot_is_simulated(link: str, level: int) -> None:
-    one = row("serial link", Config(), replace(OUTPUTS, link=link))
-    assert (one.level, one.message) == (
+    status = row("serial link", Config(), replace(OUTPUTS, link=link))
+    assert (status.level, status.message) == (
         level,
         f"{link}: this is the simulator, no real wheel turns",
     )
@@ -254,8 +259,8 @@ def test_the_row_of_the_link_says_that_the_robot_is_simulated(link: str, level: 
 
 def test_the_link_shows_its_port_its_wire_use_and_its_rejects_by_reason() -> None:
     mcu, control = McuConfig(port="/dev/x", baud_rate=38400), ControlConfig(rate=50)
-    one = row("serial link", replace(CONFIG, mcu=mcu, control=control))
-    assert values(one) == {
+    status = row("serial link", replace(CONFIG, mcu=mcu, control=control))
+    assert values(status) == {
         "port": "/dev/x",
         "wire_use": "0.43",  # 50 lines a second of 33 bytes with 10 bits each, on 38400 baud
         "check": "plain",
@@ -271,10 +276,10 @@ def test_the_link_shows_its_port_its_wire_use_and_its_rejects_by_reason() -> Non
 def test_more_than_one_period_in_a_hundred_missed_in_the_last_minute_is_a_warning(
     missed: int, level: int
 ) -> None:
-    one = row("control loop", snapshot=seen(missed_last_minute=missed))
-    assert one.level == level
-    assert one.message == f"{missed} of {100 + missed} periods missed in the last minute"
-    assert values(one) == {
+    status = row("control loop", snapshot=seen(missed_last_minute=missed))
+    assert status.level == level
+    assert status.message == f"{missed} of {100 + missed} periods missed in the last minute"
+    assert values(status) == {
         "period_lateness_p50_us": "50",
         "period_lateness_p99_us": "400",
         "period_lateness_max_us": "900",
@@ -285,8 +290,8 @@ def test_more_than_one_period_in_a_hundred_missed_in_the_last_minute_is_a_warnin
 
 
 def test_periods_missed_an_hour_ago_are_counted_but_cause_no_warning() -> None:
-    one = row("control loop", snapshot=seen(counters={"missed_periods": 100_000}))
-    assert (one.level, values(one)["missed_periods"]) == (OK, "100000")
+    status = row("control loop", snapshot=seen(counters={"missed_periods": 100_000}))
+    assert (status.level, values(status)["missed_periods"]) == (OK, "100000")
 
 
 def test_a_bad_minute_is_a_warning_after_any_number_of_good_hours() -> None:
@@ -298,9 +303,9 @@ def test_a_bad_minute_is_a_warning_after_any_number_of_good_hours() -> None:
 
 
 def test_the_commands_show_what_each_source_waits_for_and_what_was_refused() -> None:
-    one = row("commands")
-    assert (one.level, one.message) == (OK, "commanded by app")
-    assert values(one) == {
+    status = row("commands")
+    assert (status.level, status.message) == (OK, "commanded by app")
+    assert values(status) == {
         "app": "driving",
         "nav": "a command",
         "commands": "7",
@@ -310,34 +315,40 @@ def test_the_commands_show_what_each_source_waits_for_and_what_was_refused() -> 
 
 
 def test_the_commands_name_the_speed_limit_that_slows_the_robot() -> None:
-    (one,) = [
-        one
-        for one in diagnostics(
+    (status,) = [
+        status
+        for status in diagnostics(
             CONFIG, OUTPUTS, SNAPSHOT, NO_CERTIFICATE, "0.3 m/s, set by x"
         ).status
-        if one.name == "acsard: commands"
+        if status.name == "acsard: commands"
     ]
-    assert (one.level, one.message) == (OK, "commanded by app; speed limit: 0.3 m/s, set by x")
+    assert (status.level, status.message) == (
+        OK,
+        "commanded by app; speed limit: 0.3 m/s, set by x",
+    )
 
 
 def test_two_senders_of_one_source_are_a_warning_that_names_the_source() -> None:
     two = SourceStatus("nav", 10, 0.1, Wait("senders", senders=1))
     alone = SourceStatus("app", 50, 0.1, Wait("nothing"))
-    one = row("commands", snapshot=seen(sources=(alone, two)))
-    assert (one.level, one.message) == (
+    status = row("commands", snapshot=seen(sources=(alone, two)))
+    assert (status.level, status.message) == (
         WARN,
         "commanded by app; 2 programs send as nav, and the robot follows one of them: end the "
         "other programs, or give each program its own source",
     )
     assert (
-        values(one)["nav"]
+        values(status)["nav"]
         == "1 other sender of this source must wait until the sender that drives falls silent"
     )
     assert row("commands", snapshot=seen(sources=(alone,))).level == OK
 
 
 def test_a_refused_source_makes_the_commands_a_warning_with_the_reason() -> None:
-    one = row("commands", snapshot=seen(refused_age_s=SHOW_REFUSAL_S / 2))
-    assert (one.level, one.message) == (WARN, "commanded by app; refused: source nav: held up")
+    status = row("commands", snapshot=seen(refused_age_s=SHOW_REFUSAL_S / 2))
+    assert (status.level, status.message) == (
+        WARN,
+        "commanded by app; refused: source nav: held up",
+    )
     later = row("commands", snapshot=seen(refused_age_s=SHOW_REFUSAL_S))
     assert (later.level, later.message) == (OK, "commanded by app")

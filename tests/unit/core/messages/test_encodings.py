@@ -271,10 +271,10 @@ headed = st.builds(
 @settings(max_examples=400)
 def test_any_bytes_give_a_message_or_a_decode_error(payload: bytes, encoding: str) -> None:
     try:
-        got = twists.decode(encoding, payload)
+        result = twists.decode(encoding, payload)
     except DecodeError:
         return
-    assert isinstance(got, Twist)
+    assert isinstance(result, Twist)
 
 
 axis = st.floats(allow_nan=False, allow_infinity=False)
@@ -289,7 +289,7 @@ def test_every_finite_twist_is_decoded_exactly_as_it_was_encoded(
 
 
 @pytest.mark.parametrize(
-    ("payload", "says"),
+    ("payload", "text"),
     [
         (b'{"linear": {"x": NaN}}', "line 1, column 18: JSON cannot contain NaN or infinity"),
         (
@@ -300,8 +300,8 @@ def test_every_finite_twist_is_decoded_exactly_as_it_was_encoded(
     ],
 )
 def test_text_that_is_not_json_is_reported_with_its_line_and_column(
-    payload: bytes, says: str
+    payload: bytes, text: str
 ) -> None:
     with pytest.raises(DecodeError) as refused:
         Decoder(Twist).decode("application/json", payload)
-    assert (refused.value.reason, str(refused.value)) == ("malformed", says)
+    assert (refused.value.reason, str(refused.value)) == ("malformed", text)

@@ -36,7 +36,7 @@ OUTGOING = set(SCHEMAS) - INCOMING
 def parts(name: str) -> list[dict[str, Any]]:
     """Return the schema and all its nested schemas that have fields."""
     schema = SCHEMAS[name]
-    return [one for one in (schema, *schema["$defs"].values()) if "properties" in one]
+    return [part for part in (schema, *schema["$defs"].values()) if "properties" in part]
 
 
 def refused(name: str, value: object) -> list[str]:
@@ -82,13 +82,13 @@ def test_the_incoming_and_outgoing_schemas_are_those_of_the_topic_table() -> Non
 
     An incoming type gets the suffix `In` if it is published too.
     """
-    said = {topic.direction: set[str]() for topic in TOPICS}
+    types = {topic.direction: set[str]() for topic in TOPICS}
     for topic in TOPICS:
-        said[topic.direction] |= {name for name in topic.type.split(" or ") if name in MESSAGES}
-    out = said["out"] | said["service"] | said["query"] | {"Imu"}  # published by the simulator
-    came = said["in"] | {"SetPose", "Release", "Settings"}
-    assert {name.removesuffix("In") for name in INCOMING} == came
-    assert {name for name in INCOMING if name.endswith("In")} == {f"{n}In" for n in came & out}
+        types[topic.direction] |= {name for name in topic.type.split(" or ") if name in MESSAGES}
+    out = types["out"] | types["service"] | types["query"] | {"Imu"}  # published by the simulator
+    inputs = types["in"] | {"SetPose", "Release", "Settings"}
+    assert {name.removesuffix("In") for name in INCOMING} == inputs
+    assert {name for name in INCOMING if name.endswith("In")} == {f"{n}In" for n in inputs & out}
     assert out | {"Config"} == OUTGOING
 
 
@@ -132,7 +132,7 @@ def test_a_published_message_is_valid_and_invalid_without_any_of_its_fields(topi
     assert refused(topic.type, value) == []
     assert refused(topic.type, value | {"later": 1}) == []
     for field in value:
-        assert refused(topic.type, {key: one for key, one in value.items() if key != field})
+        assert refused(topic.type, {key: entry for key, entry in value.items() if key != field})
 
 
 @each("mode", [*Mode])
@@ -147,14 +147,14 @@ def test_the_schema_of_the_state_accepts_each_mode_and_no_other(mode: str) -> No
 
 
 def test_answers_are_valid_by_their_schemas() -> None:
-    told = {
+    answers = {
         "Interfaces": interfaces(Config(), OUTPUTS),
         "Topics": topic_table(Config()),
         "ServiceReply": ServiceReply(True, "stopped"),
         "Info": Info("acsar", "1", 7, "sim", True, 100.0, ["tcp/127.0.0.1:7448"], []),
     }
-    assert {name: refused(name, as_json(value)) for name, value in told.items()} == {
-        name: [] for name in told
+    assert {name: refused(name, as_json(value)) for name, value in answers.items()} == {
+        name: [] for name in answers
     }
 
 
@@ -166,7 +166,7 @@ def test_the_effective_configuration_is_valid_by_its_schema(config: Config) -> N
     value = msgspec.json.decode(msgspec.json.encode(effective(config)))
     assert refused("Config", value) == []
     assert refused("Config", value | {"mcu": value["mcu"] | {"baud_rate": 300}})
-    assert refused("Config", {key: one for key, one in value.items() if key != "limits"})
+    assert refused("Config", {key: entry for key, entry in value.items() if key != "limits"})
 
 
 # messages that the daemon accepts

@@ -112,8 +112,8 @@ def test_the_imu_topic_is_offered_only_if_the_gyro_is_enabled(config: Config) ->
 
 
 def test_the_simulator_publishes_its_gyro() -> None:
-    said = {topic.key for topic in published(Config(odometry=GYRO))}
-    assert said - {topic.key for topic in PUBLISHED} == {"imu"}
+    keys = {topic.key for topic in published(Config(odometry=GYRO))}
+    assert keys - {topic.key for topic in PUBLISHED} == {"imu"}
 
 
 @each("service", SERVICES)

@@ -15,13 +15,13 @@ def at(seconds: float) -> Instant:
 
 
 def told(happened: RecentEvents) -> Events:
-    said = happened.message()
-    assert said is not None
-    return said
+    message = happened.message()
+    assert message is not None
+    return message
 
 
 def names(happened: RecentEvents) -> list[str]:
-    return [one.name for one in told(happened).events]
+    return [event.name for event in told(happened).events]
 
 
 def test_without_events_there_is_no_message() -> None:
@@ -48,7 +48,7 @@ def test_a_repeated_event_gets_a_new_row_after_a_minute_without_it() -> None:
     happened = RecentEvents()
     for second in (0, 60, 121):
         happened.add([missed(1)], at(second))
-    assert [one.count for one in told(happened).events] == [2, 1]
+    assert [event.count for event in told(happened).events] == [2, 1]
 
 
 def test_a_repeated_event_moves_after_newer_events() -> None:
@@ -73,5 +73,7 @@ def test_the_oldest_events_are_dropped_when_the_list_is_full() -> None:
     happened = RecentEvents()
     for second in range(MAX_ROWS + 5):
         happened.add([Event("commander", f"{second}")], at(second))
-    assert [one.text for one in told(happened).events] == [str(n) for n in range(5, MAX_ROWS + 5)]
+    assert [event.text for event in told(happened).events] == [
+        str(n) for n in range(5, MAX_ROWS + 5)
+    ]
     assert told(happened).total == MAX_ROWS + 5

@@ -112,28 +112,28 @@ def times_of(key: str, config: Config, steps: int = 1000, **changes: Any) -> lis
 
 
 def test_all_messages_of_a_sample_carry_the_samples_own_stamp() -> None:
-    found = published()
+    messages = published()
     stamp = Time(1_700_000_003, 250_000_001)
-    assert found["odom"].header.stamp == stamp
-    assert found["wheel_states"].header.stamp == stamp
-    assert [t.header.stamp for t in found["tf"].transforms] == [stamp]
+    assert messages["odom"].header.stamp == stamp
+    assert messages["wheel_states"].header.stamp == stamp
+    assert [t.header.stamp for t in messages["tf"].transforms] == [stamp]
 
 
 def test_commands_state_and_diagnostics_carry_the_time_of_the_step() -> None:
-    found = published()
+    messages = published()
     stamp = Time(1_700_000_003, 254_000_002)
-    assert found["cmd_vel_out"].header.stamp == stamp
-    assert found["state"].stamp == stamp
-    assert found["diagnostics"].header.stamp == stamp
+    assert messages["cmd_vel_out"].header.stamp == stamp
+    assert messages["state"].stamp == stamp
+    assert messages["diagnostics"].header.stamp == stamp
 
 
 def test_the_frames_are_the_configured_ones() -> None:
-    found = published()
-    assert found["odom"].header.frame_id == "r7/odom"
-    assert found["odom"].child_frame_id == "r7/base"
-    (transform,) = found["tf"].transforms
+    messages = published()
+    assert messages["odom"].header.frame_id == "r7/odom"
+    assert messages["odom"].child_frame_id == "r7/base"
+    (transform,) = messages["tf"].transforms
     assert (transform.header.frame_id, transform.child_frame_id) == ("r7/odom", "r7/base")
-    assert found["cmd_vel_out"].header.frame_id == "r7/base"
+    assert messages["cmd_vel_out"].header.frame_id == "r7/base"
 
 
 def test_each_message_has_the_type_of_its_topic() -> None:
@@ -177,10 +177,10 @@ def test_the_twist_covariance_has_measured_axes_of_the_sample_and_configured_oth
 
 
 def test_tf_has_the_same_pose_as_odom() -> None:
-    found = published()
-    (transform,) = found["tf"].transforms
-    assert transform.transform.translation == found["odom"].pose.pose.position
-    assert transform.transform.rotation == found["odom"].pose.pose.orientation
+    messages = published()
+    (transform,) = messages["tf"].transforms
+    assert transform.transform.translation == messages["odom"].pose.pose.position
+    assert transform.transform.rotation == messages["odom"].pose.pose.orientation
 
 
 def test_without_publish_tf_only_odom_is_published() -> None:
@@ -357,8 +357,8 @@ def test_state_is_the_summary_of_outputs_and_snapshot() -> None:
     )
 
 
-def values(one: DiagnosticStatus) -> dict[str, str]:
-    return {pair.key: pair.value for pair in one.values}
+def values(status: DiagnosticStatus) -> dict[str, str]:
+    return {pair.key: pair.value for pair in status.values}
 
 
 def test_estimated_encoder_counts_are_in_the_state_and_in_the_row_of_the_link() -> None:
@@ -372,13 +372,13 @@ def test_estimated_encoder_counts_are_in_the_state_and_in_the_row_of_the_link() 
     assert isinstance(state, RobotState)
     assert isinstance(array, DiagnosticArray)
     assert state.encoder_counts == [20, 0, 0, 400]
-    (row,) = (one for one in array.status if one.name == "acsard: serial link")
-    shown = {key: value for key, value in values(row).items() if key.startswith("counts")}
-    assert shown == {"counts_front_right": "20", "counts_rear_right": "400"}
+    (row,) = (status for status in array.status if status.name == "acsard: serial link")
+    counts = {key: value for key, value in values(row).items() if key.startswith("counts")}
+    assert counts == {"counts_front_right": "20", "counts_rear_right": "400"}
 
 
 @pytest.mark.parametrize(
-    ("routers", "level", "message", "shown"),
+    ("routers", "level", "message", "fields"),
     [
         (RoutersStatus(("a",)), 0, "connected", {"a": "connected"}),
         (
@@ -396,18 +396,18 @@ def test_estimated_encoder_counts_are_in_the_state_and_in_the_row_of_the_link() 
     ],
 )
 def test_a_router_that_is_missing_is_a_warning(
-    routers: RoutersStatus, level: int, message: str, shown: dict[str, str]
+    routers: RoutersStatus, level: int, message: str, fields: dict[str, str]
 ) -> None:
     report = Report(CONFIG, START)
     list(report.due(OUTPUTS, ALL, look))
     array = report.current("diagnostics", lambda: replace(SNAPSHOT, routers=routers))
     assert isinstance(array, DiagnosticArray)
-    (row,) = (one for one in array.status if one.name == "acsard: router")
-    assert (row.level, row.message, values(row)) == (level, message, shown)
+    (row,) = (status for status in array.status if status.name == "acsard: router")
+    assert (row.level, row.message, values(row)) == (level, message, fields)
 
 
 def test_a_daemon_without_routers_has_no_router_row() -> None:
-    assert "acsard: router" not in {one.name for one in published()["diagnostics"].status}
+    assert "acsard: router" not in {status.name for status in published()["diagnostics"].status}
 
 
 # keys without subscribers
@@ -415,8 +415,8 @@ def test_a_daemon_without_routers_has_no_router_row() -> None:
 
 @each("wanted", [set(), *({key} for key in ALL), {"odom", "state"}, ALL])
 def test_only_topics_with_subscribers_are_published(wanted: set[str]) -> None:
-    found = Report(CONFIG, START).due(OUTPUTS, wanted, look)
-    assert sorted(key for key, _ in found) == sorted(wanted - {"tf_static"})
+    messages = Report(CONFIG, START).due(OUTPUTS, wanted, look)
+    assert sorted(key for key, _ in messages) == sorted(wanted - {"tf_static"})
 
 
 def test_feedback_is_published_before_the_summary_is_built() -> None:
@@ -442,30 +442,35 @@ def test_events_are_kept_without_subscribers_and_published_with_earlier_events()
     assert not list(report.due(replace(OUTPUTS, events=many, due=False), set(), look))
     assert not list(report.due(replace(OUTPUTS, events=()), {"events"}, look))
     quiet = replace(OUTPUTS, now=later(7), due=False, estimates=())
-    ((key, told),) = report.due(quiet, {"events"}, never)
-    assert isinstance(told, Events)
-    assert (key, told.total, len(told.events)) == ("events", 26, 20)
-    assert told.events[0].text == "the 6. takes over"
-    assert told.events[0].count == 2
-    assert told.events[0].stamp == Time.from_ns(OUTPUTS.now.wall_ns)
-    assert told.events[-1] == LogEvent(told.stamp, "stop", "info", "stopped", "phone", 1)
-    assert told.stamp == Time.from_ns(quiet.now.wall_ns)
-    assert report.current("events", never) == told
+    ((key, message),) = report.due(quiet, {"events"}, never)
+    assert isinstance(message, Events)
+    assert (key, message.total, len(message.events)) == ("events", 26, 20)
+    assert message.events[0].text == "the 6. takes over"
+    assert message.events[0].count == 2
+    assert message.events[0].stamp == Time.from_ns(OUTPUTS.now.wall_ns)
+    assert message.events[-1] == LogEvent(message.stamp, "stop", "info", "stopped", "phone", 1)
+    assert message.stamp == Time.from_ns(quiet.now.wall_ns)
+    assert report.current("events", never) == message
 
 
 def test_a_fault_stays_in_the_list_during_a_repeated_event() -> None:
     report, fault = Report(CONFIG, START), Event("fault", "a wheel is dead", "error")
     for second, event in enumerate([fault, *[missed(3)] * 100]):
         list(report.due(replace(OUTPUTS, events=(event,), now=later(second)), set(), look))
-    told = report.current("events", never)
-    assert isinstance(told, Events)
-    assert [(one.name, one.count) for one in told.events] == [("fault", 1), ("missed_periods", 300)]
+    message = report.current("events", never)
+    assert isinstance(message, Events)
+    assert [(row.name, row.count) for row in message.events] == [
+        ("fault", 1),
+        ("missed_periods", 300),
+    ]
 
 
 def test_every_sample_of_a_step_is_published_in_order() -> None:
     estimates: list[Estimate] = [replace(ESTIMATE, at=Instant(n, n)) for n in (1_000, 2_000, 3_000)]
-    found = Report(CONFIG, START).due(replace(OUTPUTS, estimates=tuple(estimates)), {"odom"}, look)
-    stamps = [m.header.stamp.nanosec for _, m in found if isinstance(m, Odometry)]
+    messages = Report(CONFIG, START).due(
+        replace(OUTPUTS, estimates=tuple(estimates)), {"odom"}, look
+    )
+    stamps = [m.header.stamp.nanosec for _, m in messages if isinstance(m, Odometry)]
     assert stamps == [1_000, 2_000, 3_000]
 
 
@@ -507,12 +512,12 @@ def test_steps_a_little_early_or_late_do_not_change_the_average(hz: float) -> No
 def test_steps_a_little_early_or_late_do_not_make_the_intervals_uneven(
     hz: float, steps: int
 ) -> None:
-    report, found = Report(rates(odom=hz), START), []
+    report, indices = Report(rates(odom=hz), START), []
     for step in range(1000):
         late = (5 - step * 7 % 11) * 1e-5  # the first step is the latest of all
         if list(report.due(at(later(1.0 + step / 100 + late)), {"odom"}, look)):
-            found.append(step)
-    assert {b - a for a, b in pairwise(found)} == {steps}
+            indices.append(step)
+    assert {b - a for a, b in pairwise(indices)} == {steps}
 
 
 def test_a_rate_above_the_sample_rate_publishes_every_sample() -> None:
@@ -542,22 +547,22 @@ def test_a_change_of_the_status_is_published_immediately(key: str) -> None:
 
 def test_after_a_change_the_next_state_comes_a_period_later() -> None:
     report = Report(CONFIG, START)
-    found = [
+    steps = [
         step
         for step in range(60)
         if list(report.due(at(later(step / 100), status_changed=step == 25), {"state"}, look))
     ]
-    after = [step for step in found if step > 25]
-    assert 25 in found
+    after = [step for step in steps if step > 25]
+    assert 25 in steps
     assert 9 <= after[0] - 25 <= 10
 
 
 def test_no_burst_of_messages_follows_a_pause() -> None:
     report = Report(CONFIG, START)
     list(report.due(at(later(0)), {"state"}, look))
-    found = [s for s in range(500, 520) if list(report.due(at(later(s / 100)), {"state"}, look))]
-    assert found[0] == 500
-    assert len(found) <= 3
+    steps = [s for s in range(500, 520) if list(report.due(at(later(s / 100)), {"state"}, look))]
+    assert steps[0] == 500
+    assert len(steps) <= 3
 
 
 # last values
@@ -605,12 +610,12 @@ def test_a_topic_that_is_not_published_has_no_current_value(key: str) -> None:
 
 def test_state_at_10_hz_has_even_intervals_despite_jitter() -> None:
     report, rnd = Report(Config(), START), random.Random(1)
-    found: list[int] = []
+    steps: list[int] = []
     for step in range(3000):
         late = rnd.uniform(0, 1e-4)
         if list(report.due(at(later(1.0 + step / 100 + late)), {"state"}, look)):
-            found.append(step)
-    assert {b - a for a, b in pairwise(found[2:])} == {10}
+            steps.append(step)
+    assert {b - a for a, b in pairwise(steps[2:])} == {10}
 
 
 # the battery
@@ -667,7 +672,7 @@ def with_gyro(status: GyroStatus) -> tuple[RobotState, list[DiagnosticStatus]]:
     state, array = report.current("state", seen), report.current("diagnostics", seen)
     assert isinstance(state, RobotState)
     assert isinstance(array, DiagnosticArray)
-    return state, [one for one in array.status if one.name == "acsard: gyro"]
+    return state, [row for row in array.status if row.name == "acsard: gyro"]
 
 
 def test_without_a_gyro_the_state_is_off_and_diagnostics_have_no_row() -> None:
@@ -698,20 +703,20 @@ def test_the_state_of_the_gyro_is_reported_with_its_level(does: GyroDoes, level:
 def test_the_learned_track_is_shown_beside_the_configured_one() -> None:
     learned = GyroStatus("used", bias=-0.0123, delay=0.02, track=1.2, track_deviation=0.05)
     state, (row,) = with_gyro(learned)
-    shown = {
+    fields = {
         "delay_s": "0.020",
         "bias_rad_s": "-0.01230",
         "wheel_separation_multiplier": "1.500",
         "learned_multiplier": "1.800",
         "learned_multiplier_std": "0.090",
     }
-    assert {pair.key: pair.value for pair in row.values} == shown | {"multiplier_in_use": "1.500"}
+    assert {pair.key: pair.value for pair in row.values} == fields | {"multiplier_in_use": "1.500"}
     assert (
         state.effective_track == "learned 1.800 ± 0.090 (only reported), configured 1.500 (in use)"
     )
     assert row.message == f"{STATUS_TEXTS['used']}; effective track: {state.effective_track}"
     state, (row,) = with_gyro(replace(learned, track_use="used"))
-    assert {pair.key: pair.value for pair in row.values} == shown | {"multiplier_in_use": "1.800"}
+    assert {pair.key: pair.value for pair in row.values} == fields | {"multiplier_in_use": "1.800"}
     assert state.effective_track == "learned 1.800 ± 0.090 (in use), configured 1.500"
     assert with_gyro(GyroStatus("used"))[0].effective_track == ""
 
@@ -722,21 +727,21 @@ def test_the_learned_track_is_shown_beside_the_configured_one() -> None:
 def test_the_comparison_of_front_and_rear_wheels_is_reported() -> None:
     slow = ("front_right 60%",)
     doubt = WheelsStatus("rear_left is left out", ("rear_left",), ("right",), (0.01, -0.02), slow)
-    for said, level in ((WheelsStatus(), 0), (WheelsStatus(slow=slow), 1), (doubt, 1)):
-        report, snapshot = Report(CONFIG, START), replace(SNAPSHOT, doubt=said)
+    for status, level in ((WheelsStatus(), 0), (WheelsStatus(slow=slow), 1), (doubt, 1)):
+        report, snapshot = Report(CONFIG, START), replace(SNAPSHOT, doubt=status)
         list(report.due(OUTPUTS, set(), never))
-        seen = partial(replace, snapshot)
-        state, array = report.current("state", seen), report.current("diagnostics", seen)
+        provider = partial(replace, snapshot)
+        state, array = report.current("state", provider), report.current("diagnostics", provider)
         assert isinstance(state, RobotState)
         assert isinstance(array, DiagnosticArray)
-        (row,) = [one for one in array.status if one.name == "acsard: wheels"]
-        assert (state.wheel_fault, row.level) == (said.text, level)
+        (row,) = [entry for entry in array.status if entry.name == "acsard: wheels"]
+        assert (state.wheel_fault, row.level) == (status.text, level)
         calm = (
             "wheels are slower than commanded: front_right reaches 60% of its expected speed"
-            if said.slow
+            if status.slow
             else "front and rear wheels agree"
         )
-        assert row.message == (said.text or calm)
+        assert row.message == (status.text or calm)
     assert {pair.key: pair.value for pair in row.values} == {
         "left_out": "rear_left",
         "slipping": "right",
@@ -770,7 +775,7 @@ def test_a_certificate_that_expires_soon_is_reported(days: int, level: int, word
     assert state.certificate_days == days
     array = made.current("diagnostics", lambda: SNAPSHOT)
     assert isinstance(array, DiagnosticArray)
-    (status,) = [one for one in array.status if one.name == "acsard: certificate"]
+    (status,) = [entry for entry in array.status if entry.name == "acsard: certificate"]
     assert (status.level, status.message) == (level, state.certificate_expiry)
 
 

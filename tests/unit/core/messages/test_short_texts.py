@@ -51,15 +51,15 @@ def figures(line: str) -> list[float]:
 
 def test_odometry_is_shown_as_pose_and_speeds_with_units() -> None:
     line = short(odometry(1.25, -0.5, math.radians(90.0), 0.5, -0.2))
-    told = "x +1.250 m y -0.500 m yaw +90.0° forward +0.50 m/s turn -0.20 rad/s"
-    assert " ".join(line.split()) == told
+    text = "x +1.250 m y -0.500 m yaw +90.0° forward +0.50 m/s turn -0.20 rad/s"
+    assert " ".join(line.split()) == text
 
 
 @each("yaw", [-3.1, -0.4, 0.0, 1.0, 3.1, 3.2, 6.0])
 def test_the_heading_is_within_half_a_turn(yaw: float) -> None:
-    told = figures(short(PoseStamped(HEADER, pose(0.0, 0.0, yaw))))[2]
-    assert -180.0 <= told <= 180.0
-    assert math.remainder(told - math.degrees(yaw), 360.0) == pytest.approx(0.0, abs=0.051)
+    angle = figures(short(PoseStamped(HEADER, pose(0.0, 0.0, yaw))))[2]
+    assert -180.0 <= angle <= 180.0
+    assert math.remainder(angle - math.degrees(yaw), 360.0) == pytest.approx(0.0, abs=0.051)
 
 
 def test_a_stamped_twist_is_shown_as_its_two_speeds() -> None:
@@ -69,7 +69,7 @@ def test_a_stamped_twist_is_shown_as_its_two_speeds() -> None:
 
 def test_lines_of_odometry_have_the_same_width() -> None:
     far = [odometry(x, 0.0, 0.0, v, 0.0) for x, v in ((0.0, 0.5), (999.9, -0.5), (-99.0, 0.0))]
-    assert len({len(short(one)) for one in far}) == 1
+    assert len({len(short(message)) for message in far}) == 1
 
 
 @each("value", [1e300, -1e12, math.inf, math.nan])

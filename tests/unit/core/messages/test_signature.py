@@ -26,15 +26,15 @@ def test_a_packed_signature_is_unpacked_unchanged() -> None:
     assert unpack(signature.pack()) == signature
 
 
-@each("form", [lambda told: json.dumps(told).encode(), msgspec.msgpack.encode])
+@each("form", [lambda fields: json.dumps(fields).encode(), msgspec.msgpack.encode])
 @each("left_out", [(), ("stamp",), ("sequence",), ("stamp", "sequence")])
 def test_a_map_in_json_or_msgpack_with_a_sender_is_a_signature(
     form: object, left_out: tuple[str, ...]
 ) -> None:
     assert callable(form)
-    told = {name: value for name, value in WHOLE.items() if name not in left_out}
-    signature = unpack(form(told))
-    assert signature == Signature("joystick-7", told.get("stamp"), told.get("sequence"))  # type: ignore[arg-type]
+    fields = {name: value for name, value in WHOLE.items() if name not in left_out}
+    signature = unpack(form(fields))
+    assert signature == Signature("joystick-7", fields.get("stamp"), fields.get("sequence"))  # type: ignore[arg-type]
 
 
 @each(

@@ -63,17 +63,17 @@ def commands(rng: np.random.Generator, seconds: float, stops: float = 0.15) -> A
     return np.round(np.array(rows[: round(seconds / PERIOD)]), 2)
 
 
-def rolled(told: Array, robot: Robot, rng: np.random.Generator) -> Array:
+def rolled(speeds: Array, robot: Robot, rng: np.random.Generator) -> Array:
     """Return the angle that each wheel has turned since the start, rad, shape (lines, 4)."""
     lag = robot.lag * (1 + robot.lags * rng.standard_normal(4))
     size = 1 + robot.tyres * rng.standard_normal(4)
     rest = np.exp(-PERIOD / lag)
-    turning = abs(told[:, 0] - told[:, 1]) * RADIUS / TRACK
+    turning = abs(speeds[:, 0] - speeds[:, 1]) * RADIUS / TRACK
     loaded = 1 - robot.load * rng.uniform(0, 1, 4) * np.minimum(turning, 1.0)[:, None]
     speed = np.zeros(4)
-    angles = np.empty_like(told)
+    angles = np.empty_like(speeds)
     angle = rng.uniform(0, 1, 4)
-    for i, goal in enumerate(told * size * loaded):
+    for i, goal in enumerate(speeds * size * loaded):
         error = speed - goal
         angle = angle + goal * PERIOD + error * lag * (1 - rest)
         speed = goal + error * rest
@@ -123,8 +123,8 @@ def lines(speeds: Array, counts: int = 0) -> list[Feedback]:
     return [Feedback(AT, WheelSpeeds(*row), PERIOD, steps=(step,) * 4) for row in speeds.tolist()]
 
 
-def wishes(told: Array) -> list[WheelSpeeds]:
-    return [WheelSpeeds(*row) for row in told.tolist()]
+def wishes(speeds: Array) -> list[WheelSpeeds]:
+    return [WheelSpeeds(*row) for row in speeds.tolist()]
 
 
 def odometry(counts: int = 0) -> Odometry:

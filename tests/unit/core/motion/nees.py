@@ -193,5 +193,5 @@ def study(
     paths = [reports(scenario(rng)) for _ in range(drives)]
     ends = true_ends(paths, runs // drives, model, rng)
     lines = [heard(path, rng) if heard else plain(path) for path in paths]
-    found = [fold(one, model, counts) for one in lines]
-    return np.concatenate([nees(*one, ends[:, i]) for i, one in enumerate(found)])
+    results = [fold(entry, model, counts) for entry in lines]
+    return np.concatenate([nees(*entry, ends[:, i]) for i, entry in enumerate(results)])

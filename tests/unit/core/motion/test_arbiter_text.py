@@ -129,11 +129,11 @@ def test_the_first_mode_is_not_reported() -> None:
 
 
 def test_a_change_of_mode_is_reported_once_with_its_reason() -> None:
-    told = CommandEvents(Mode.WAITING)
-    assert told.changes(Mode.READY, NOBODY, "waiting for a command") == [
+    reporter = CommandEvents(Mode.WAITING)
+    assert reporter.changes(Mode.READY, NOBODY, "waiting for a command") == [
         Event("mode", "waiting for a command", kind="waiting -> ready")
     ]
-    assert told.changes(Mode.READY, NOBODY, "another reason") == []
+    assert reporter.changes(Mode.READY, NOBODY, "another reason") == []
 
 
 def test_a_new_commander_is_reported_with_the_mode_and_as_the_commander() -> None:
@@ -145,34 +145,34 @@ def test_a_new_commander_is_reported_with_the_mode_and_as_the_commander() -> Non
 
 
 def test_a_change_of_commander_is_reported_with_the_previous_commander() -> None:
-    told = CommandEvents(Mode.READY)
-    told.changes(Mode.DRIVING, by("app", "joe"), "")
-    (source,) = told.changes(Mode.DRIVING, by("nav", "joe"), "")
-    (sender,) = told.changes(Mode.DRIVING, by("nav", "ann"), "")
+    reporter = CommandEvents(Mode.READY)
+    reporter.changes(Mode.DRIVING, by("app", "joe"), "")
+    (source,) = reporter.changes(Mode.DRIVING, by("nav", "joe"), "")
+    (sender,) = reporter.changes(Mode.DRIVING, by("nav", "ann"), "")
     assert (source.kind, source.by) == ("app (joe) -> nav (joe)", "nav (joe)")
     assert sender.kind == "nav (joe) -> nav (ann)"
 
 
 def test_a_commander_that_drives_on_after_a_rest_is_not_reported_again() -> None:
-    told = CommandEvents(Mode.READY)
-    told.changes(Mode.DRIVING, by("app", "joe"), "")
-    told.changes(Mode.READY, NOBODY, "waiting for a command")
-    (event,) = told.changes(Mode.DRIVING, by("app", "joe"), "")
+    reporter = CommandEvents(Mode.READY)
+    reporter.changes(Mode.DRIVING, by("app", "joe"), "")
+    reporter.changes(Mode.READY, NOBODY, "waiting for a command")
+    (event,) = reporter.changes(Mode.DRIVING, by("app", "joe"), "")
     assert event.name == "mode"
 
 
 def test_a_sender_to_a_stopped_robot_is_not_reported_as_commander() -> None:
-    told = CommandEvents(Mode.STOPPED)
+    reporter = CommandEvents(Mode.STOPPED)
     choice = Choice("app", Twist(1.0, 0.0), Wait("nothing"), 1, "joe")
-    assert told.changes(Mode.STOPPED, choice, "stopped") == []
+    assert reporter.changes(Mode.STOPPED, choice, "stopped") == []
 
 
 def test_a_source_whose_speeds_have_no_effect_for_three_seconds_is_reported_once() -> None:
-    told = CommandEvents(Mode.READY)
+    reporter = CommandEvents(Mode.READY)
     early = Choice("nav", None, Wait("neutral", "nav", 1.0, ros=True), sender="joe")
-    assert told.changes(Mode.READY, early, "") == []
+    assert reporter.changes(Mode.READY, early, "") == []
     late = Choice("nav", None, Wait("neutral", "nav", 1.0, lasts=3.0, ros=True), sender="joe")
-    (event,) = told.changes(Mode.READY, late, "")
+    (event,) = reporter.changes(Mode.READY, late, "")
     assert (event.name, event.level, event.by) == (
         "commands_without_effect",
         "warning",
@@ -180,18 +180,18 @@ def test_a_source_whose_speeds_have_no_effect_for_three_seconds_is_reported_once
     )
     assert "ros2 topic pub" in event.text
     later = Choice("nav", None, Wait("neutral", "nav", 1.0, lasts=10.0, ros=True), sender="joe")
-    assert told.changes(Mode.READY, later, "") == []
-    told.changes(Mode.READY, NOBODY, "")
-    assert len(told.changes(Mode.READY, late, "")) == 1
+    assert reporter.changes(Mode.READY, later, "") == []
+    reporter.changes(Mode.READY, NOBODY, "")
+    assert len(reporter.changes(Mode.READY, late, "")) == 1
 
 
 def test_a_source_held_up_by_zeros_is_reported_once_however_often_it_pauses() -> None:
-    told = CommandEvents(Mode.READY)
-    told.changes(Mode.DRIVING, by("app", "joe"), "")
+    reporter = CommandEvents(Mode.READY)
+    reporter.changes(Mode.DRIVING, by("app", "joe"), "")
 
-    def zeros(kept: str) -> list[Event]:
-        choice = Choice("app", REST, Wait("zeros", "app", lasts=3.0, kept=kept), 1, "joe")
-        return told.changes(Mode.DRIVING, choice, "")
+    def zeros(source: str) -> list[Event]:
+        choice = Choice("app", REST, Wait("zeros", "app", lasts=3.0, kept=source), 1, "joe")
+        return reporter.changes(Mode.DRIVING, choice, "")
 
     assert zeros("") == []
     (event,) = zeros("nav")

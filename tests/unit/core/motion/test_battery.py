@@ -39,9 +39,9 @@ class Pack:
     def step(self, *lines: BoardStatus, ms: int = 100) -> BatteryLevel | None:
         """Process these status lines `ms` after the last step, and return the level."""
         self.now_ms += ms
-        told = [(self.now_ms * MS, line) for line in lines]
-        found = self.battery.look(told, self.now_ms * MS)
-        self.events += [(event.name, event.text) for event in found]
+        reports = [(self.now_ms * MS, line) for line in lines]
+        events = self.battery.look(reports, self.now_ms * MS)
+        self.events += [(event.name, event.text) for event in events]
         self.stops += self.battery.stopped_now
         return None if self.battery.status is None else self.battery.status.level
 
@@ -108,11 +108,11 @@ def test_thresholds_in_per_cent_compare_the_charge(charge: float, level: Battery
 
 def test_a_level_ends_above_its_threshold_by_the_hysteresis() -> None:
     pack = Pack()
-    found = [
+    levels = [
         pack.at(volts, 60.0)
         for volts in (21.9, 22.39, 22.41, 21.4, 21.89, 21.91, 20.9, 21.39, 21.41, 21.8, 22.5)
     ]
-    assert found == [
+    assert levels == [
         "warning", "warning", "ok", "return", "return", "warning", "stop", "stop", "return",
         "return", "ok",
     ]  # fmt: skip

@@ -185,8 +185,8 @@ def test_a_release_says_that_a_stop_stays_only_if_there_is_one() -> None:
     assert pins.events[-1].text == "the bumpers are released and allow every direction again"
     pins.quiet(600)
     pins.step("..")
-    told = "the bumpers are released; a latched stop lasts until srv/clear is called"
-    assert pins.events[-1].text == told
+    text = "the bumpers are released; a latched stop lasts until srv/clear is called"
+    assert pins.events[-1].text == text
 
 
 def test_bumpers_with_places_are_missing_until_the_board_reports_their_number() -> None:

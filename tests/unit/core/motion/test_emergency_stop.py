@@ -44,8 +44,8 @@ class Input:
     def step(self, *reports: bool | None, ms: int = 10) -> str:
         """Process these reports `ms` after the last step, and return the state."""
         self.now_ms += ms
-        told = [(self.now_ms * MS, BoardStatus(estop=pressed)) for pressed in reports]
-        self.events += [event.name for event in self.estop.look(told, self.now_ms * MS)]
+        statuses = [(self.now_ms * MS, BoardStatus(estop=pressed)) for pressed in reports]
+        self.events += [event.name for event in self.estop.look(statuses, self.now_ms * MS)]
         return self.estop.state
 
     def quiet(self, ms: int) -> str:

@@ -42,8 +42,8 @@ def test_a_noise_of_each_side_can_be_expressed_by_the_settings(
     distance: float, turn: float
 ) -> None:
     left, right = abs(distance - turn * L / 2), abs(distance + turn * L / 2)
-    got = noise(K / 2, 2 * K / L**2, 0.0).of(distance, turn, abs(turn))
-    assert got == pytest.approx(
+    result = noise(K / 2, 2 * K / L**2, 0.0).of(distance, turn, abs(turn))
+    assert result == pytest.approx(
         (K * (left + right) / 4, K * (left + right) / L**2, K * (right - left) / (2 * L)), abs=1e-18
     )
 
@@ -162,10 +162,10 @@ def test_counts_are_coarser_than_decimals() -> None:
 
 
 def test_counts_that_the_lines_show_are_as_coarse_as_those_that_are_configured() -> None:
-    shown = uncertainty().of(Twist(0.5, 0.0), 0.01, step=1.570796)
+    result = uncertainty().of(Twist(0.5, 0.0), 0.01, step=1.570796)
     configured = uncertainty(counts=400).of(Twist(0.5, 0.0), 0.01)
-    assert shown.linear == pytest.approx(configured.linear)
-    assert shown.angular == pytest.approx(configured.angular)
+    assert result.linear == pytest.approx(configured.linear)
+    assert result.angular == pytest.approx(configured.angular)
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
@@ -199,10 +199,10 @@ def test_parameters_scale_the_speed() -> None:
 def test_lines_that_are_read_together_have_the_period_of_the_others() -> None:
     steady, batched = uncertainty(OdometryConfig()), uncertainty(OdometryConfig())
     for i in range(400):
-        one = steady.of(Twist(0.5, 0.0), 0.01)
+        first = steady.of(Twist(0.5, 0.0), 0.01)
         other = batched.of(Twist(0.5, 0.0), 0.02 if i % 2 else 0.0)
         other = batched.of(Twist(0.5, 0.0), 1e-6 if i % 2 else 0.01)
-    assert other.linear < 3 * one.linear
+    assert other.linear < 3 * first.linear
 
 
 def test_a_line_that_came_late_makes_no_longer_period() -> None:

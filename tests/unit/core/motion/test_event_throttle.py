@@ -125,9 +125,9 @@ def test_a_line_is_news_only_if_its_event_is_news() -> None:
 
 
 def test_two_joined_lines_have_the_total_count_and_the_last_text() -> None:
-    one = Event("command_refused", "12 x stale; the last: late", "info", "joe, ann", count=12)
+    first = Event("command_refused", "12 x stale; the last: late", "info", "joe, ann", count=12)
     other = Event("command_refused", "3 x wildcard: a star", "warning", "ann, eve", count=3)
-    line = merge(one, other)
+    line = merge(first, other)
     assert (line.text, line.count) == ("15 times; the last: a star", 15)
     assert (line.by, line.level) == ("joe, ann, eve", "warning")
     assert merge(line, refused()).text == "16 times; the last: late"

@@ -416,13 +416,13 @@ def test_a_foreign_clock_is_forgiven_a_second_and_a_second_more_each_minute() ->
 def test_a_jump_of_over_a_second_is_forgiven_only_where_the_clock_shows_it(
     step: float,
 ) -> None:
-    held = Clock()
-    held.now += step  # nothing arrives during the step, and afterwards everything is late
+    late_clock = Clock()
+    late_clock.now += step  # nothing arrives during the step, and afterwards everything is late
     waited = 58 * (step - 1000) - 1000  # the budget starts at 1 s and grows by 1 s each minute
-    assert set(held.steadily(step, waited)) == {"stale"}
-    assert "set" in held.steadily(step, 20_000), "it is never locked out for ever"
-    shown = Clock()
-    assert "set" in shown.steadily(step, 2000), "a network does not set stamps back"
+    assert set(late_clock.steadily(step, waited)) == {"stale"}
+    assert "set" in late_clock.steadily(step, 20_000), "it is never locked out for ever"
+    set_clock = Clock()
+    assert "set" in set_clock.steadily(step, 2000), "a network does not set stamps back"
 
 
 def test_a_foreign_clock_that_pauses_by_its_own_stamps_may_have_been_adjusted() -> None:

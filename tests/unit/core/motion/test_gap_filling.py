@@ -308,9 +308,9 @@ def test_the_line_that_differs_much_from_two_others_is_dropped(
 ) -> None:
     """Only one wheel of the side changes, because the encoder of the other wheel is dead."""
     doubtful = Doubtful(STILL)
-    said = [doubtful.hear(one(3, speed, 0.0), 0.01 + gap, bridged=gap)
+    results = [doubtful.hear(one(3, speed, 0.0), 0.01 + gap, bridged=gap)
             for speed, gap in zip(speeds, (0.5, 0.0, 0.0), strict=True)]  # fmt: skip
-    assert said == [([], []), ([], []), (used, dropped)]
+    assert results == [([], []), ([], []), (used, dropped)]
 
 
 def test_a_wheel_that_is_known_to_be_faulty_makes_no_line_doubtful() -> None:

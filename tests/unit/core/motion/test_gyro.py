@@ -78,14 +78,15 @@ class Bench:
                 self.now_ns += LINE_NS // 10
                 self.true += now * DT / 10
                 self._sample()
-            heard: tuple[GyroSample, ...] = ()
+            samples: tuple[GyroSample, ...] = ()
             if self.now_ns > self.held_back_ns:
-                heard = tuple(one for one in self._way if one.at_ns <= self.now_ns)
-                heard = tuple(
-                    replace(one, at_ns=max(one.at_ns, self.held_back_ns)) for one in heard
+                samples = tuple(sample for sample in self._way if sample.at_ns <= self.now_ns)
+                samples = tuple(
+                    replace(sample, at_ns=max(sample.at_ns, self.held_back_ns))
+                    for sample in samples
                 )
-                self._way = [one for one in self._way if one.at_ns > self.now_ns]
-            self.gyro.add_samples(heard)
+                self._way = [sample for sample in self._way if sample.at_ns > self.now_ns]
+            self.gyro.add_samples(samples)
             wheels = now * (self.skid if skid is None else skid) * DT
             stands = now == 0.0 if still is None else still
             turn = self.gyro.turn(self.now_ns, DT, wheels, stands)
@@ -99,11 +100,11 @@ class Bench:
         if span_ns < self.sample_ns:
             return
         mean = (self.true - self._sampled) * NS_PER_S / span_ns
-        said = self.distort(self.sign * mean + self.bias + self.noise * gauss(3, self._samples))
+        rate = self.distort(self.sign * mean + self.bias + self.noise * gauss(3, self._samples))
         at_ns = self.now_ns + self.late_ns
         stamp_ns = self.now_ns + self.clock_ns if self.stamped else None
         if not self.silent:
-            self._way.append(GyroSample(at_ns, stamp_ns, said, anew=self.other))
+            self._way.append(GyroSample(at_ns, stamp_ns, rate, anew=self.other))
             self.other = False
         self._sampled_ns, self._sampled, self._samples = self.now_ns, self.true, self._samples + 1
 
@@ -436,10 +437,10 @@ def test_the_deviation_of_the_learned_track_is_a_share_of_the_track() -> None:
         bench.run(REST_FIRST)
         for n in range(12):
             bench.run(5.0, 0.8, skid=None if bench is even else 1.5 if n % 2 else 1.9)
-    one, other = even.gyro.learned, uneven.gyro.learned
-    assert one is not None
+    first, other = even.gyro.learned, uneven.gyro.learned
+    assert first is not None
     assert other is not None
-    assert one.deviation == MIN_TRACK_STD
+    assert first.deviation == MIN_TRACK_STD
     assert other.share == pytest.approx(1.7, rel=0.05)
     assert other.deviation == pytest.approx(0.2 / 1.7, rel=0.3)
 
@@ -542,11 +543,11 @@ def test_a_jump_counts_in_the_line_of_the_sample_after_it() -> None:
 
 def frozen(bench: Bench) -> None:
     """Let the gyro report one value from now on."""
-    kept: list[float] = []
+    rates: list[float] = []
 
     def repeated(rate: float) -> float:
-        kept.append(rate)
-        return kept[0]
+        rates.append(rate)
+        return rates[0]
 
     bench.distort = repeated
 
@@ -565,10 +566,10 @@ def test_the_turn_of_a_gyro_that_repeats_one_rate_is_taken_back_at_rest(
     assert abs(bench.told - bench.true) < 3.0 * math.sqrt(bench.variance) < 0.4 * abs(rate) + 0.02
     assert bench.told == pytest.approx(bench.true, abs=0.05 * abs(rate) + 0.01)
     assert bench.says() == "not believed"
-    told, true = bench.told, bench.true
+    angle, true = bench.told, bench.true
     bench.run(4.0)
     bench.run(2.0, 0.5)
-    assert bench.told - told == pytest.approx(bench.true - true)
+    assert bench.told - angle == pytest.approx(bench.true - true)
     bench.distort = lambda rate: rate
     bench.run(1.0, 0.5)
     bench.run(2.0)
@@ -815,9 +816,9 @@ def test_a_long_contradiction_of_gyro_and_wheels_is_in_the_variance(moving: bool
     bench.run(6.0, still=not moving)
     assert bench.says() == "not believed"
     assert 4.0 < bench.told < 1.1 * math.sqrt(bench.variance) < 6.0
-    told, variance = bench.told, bench.variance
+    angle, variance = bench.told, bench.variance
     bench.run(0.5, still=False)
-    assert (bench.told, bench.variance) == (told, variance)
+    assert (bench.told, bench.variance) == (angle, variance)
 
 
 def test_an_ordinary_slip_does_not_widen_the_variance() -> None:

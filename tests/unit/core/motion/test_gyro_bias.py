@@ -92,9 +92,9 @@ def test_a_bias_that_has_jumped_is_learned_again_at_rest(jump: float, noise: flo
     learned, off = rested(10.0, noise=noise), 0.0
     for n in range(6000):
         learned.drift(DT)
-        said = 0.01 + jump + noise * gauss(2, n)
-        if not learned.rest(said, 0.0, DT):
-            off += (said - learned.value) * DT
+        rate = 0.01 + jump + noise * gauss(2, n)
+        if not learned.rest(rate, 0.0, DT):
+            off += (rate - learned.value) * DT
     assert learned.value == pytest.approx(0.01 + jump, abs=0.002)
     assert abs(off) < 1.2 * abs(jump)  # the error of one second, not of the whole minute
 

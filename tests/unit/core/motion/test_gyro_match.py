@@ -25,12 +25,12 @@ def stirring(t: float) -> float:
 
 
 def matched(seconds: float, ratio: float = 0.6, delay: float = 0.0, rate: Rate = stirring) -> Match:
-    match, said = Match(), 0.0
+    match, total = Match(), 0.0
     turned = 0.0
     for n in range(round(seconds / DT)):
         turned += rate(n * DT) * DT
-        wheels = round(turned / QUANTUM) * QUANTUM - said
-        said += wheels
+        wheels = round(turned / QUANTUM) * QUANTUM - total
+        total += wheels
         match.add(wheels, ratio * rate(n * DT - delay) * DT, DT, slips=False)
     return match
 
@@ -51,9 +51,9 @@ def test_the_ratio_is_found_whatever_the_delay(ratio: float, delay: float) -> No
 @settings(max_examples=20, deadline=None)
 @given(st.floats(0.4, 1.5), st.floats(-0.05, 0.05))
 def test_the_delay_is_found_to_a_few_milliseconds(ratio: float, delay: float) -> None:
-    found = matched(20.0, ratio, delay).delay()
-    assert found is not None
-    assert found == pytest.approx(delay, abs=0.006)
+    result = matched(20.0, ratio, delay).delay()
+    assert result is not None
+    assert result == pytest.approx(delay, abs=0.006)
 
 
 def test_a_delay_is_reported_only_once() -> None:
@@ -77,8 +77,8 @@ def test_the_encoder_counts_of_a_straight_drive_show_no_delay() -> None:
         now = dice.choice((0, 1))
         match.add((now - before) * count, dice.gauss(0.0, 1e-4), 0.05, slips=False)
         before = now
-    found = match.delay()
-    assert found is None or abs(found) < 0.005
+    result = match.delay()
+    assert result is None or abs(result) < 0.005
 
 
 @pytest.mark.parametrize("delay", [-0.04, 0.12])
@@ -108,19 +108,19 @@ def test_nothing_is_learned_while_the_robot_rests() -> None:
 
 
 def slipping(match: Match, seconds: float, wheels: float, gyro: float) -> list[bool]:
-    found = []
+    flags = []
     for _ in range(round(seconds / DT)):
         match.add(wheels * DT, gyro * DT, DT, slips=True)
-        found.append(match.contradiction(1e-6))
-    return found
+        flags.append(match.contradiction(1e-6))
+    return flags
 
 
 def test_a_gyro_at_rest_contradicts_turning_wheels_within_a_quarter_of_a_second() -> None:
     match = matched(20.0)
     slipping(match, 1.0, 1.0, 0.6)
-    found = slipping(match, 0.25, 1.0, 0.0)
-    assert found[-1]
-    assert not found[0]
+    flags = slipping(match, 0.25, 1.0, 0.0)
+    assert flags[-1]
+    assert not flags[0]
 
 
 @pytest.mark.parametrize("share", [0.85, 1.0, 1.15])
@@ -130,12 +130,12 @@ def test_a_slightly_different_floor_is_no_contradiction(share: float) -> None:
 
 
 def test_a_late_gyro_does_not_contradict_the_wheels() -> None:
-    match, found = Match(), 0
+    match, count = Match(), 0
     for n in range(3000):
         t = n * DT
         match.add(stirring(t) * DT, 0.6 * stirring(t - 0.05) * DT, DT, slips=False)
-        found += match.contradiction(1e-6)
-    assert found == 0
+        count += match.contradiction(1e-6)
+    assert count == 0
 
 
 def test_the_ratio_is_not_learned_during_slip() -> None:
@@ -164,12 +164,12 @@ def test_the_spread_is_the_variation_of_the_ratio_between_turns() -> None:
 
 def test_a_changing_delay_of_the_gyro_does_not_make_the_ratio_less_certain() -> None:
     """The samples are up to 50 ms late, each by a different time."""
-    match, told, true = Match(), 0.0, 0.0
+    match, gyro_angle, true = Match(), 0.0, 0.0
     for n in range(6000):
         late = (n * 7 % 11) * 0.005
         true = 0.6 * (math.cos(0.0) - math.cos(0.4 * (n * DT - late))) / 0.4
-        match.add(math.sin(0.4 * n * DT) * DT, true - told, DT, slips=False)
-        told = true
+        match.add(math.sin(0.4 * n * DT) * DT, true - gyro_angle, DT, slips=False)
+        gyro_angle = true
     assert match.spread < 0.05 * match.ratio
 
 

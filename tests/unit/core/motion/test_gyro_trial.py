@@ -18,8 +18,8 @@ def turned(trial: Trial, rate: float, share: float, seconds: float, late_s: floa
     The wheels report `rate`, rad/s, and the gyro reports `share` times this rate.
     """
     for line in range(round(seconds / DT)):
-        told = rate * share if line * DT >= late_s else 0.0
-        trial.add(rate * DT, told * DT, DT)
+        gyro_rate = rate * share if line * DT >= late_s else 0.0
+        trial.add(rate * DT, gyro_rate * DT, DT)
     return trial.verdict
 
 
@@ -42,12 +42,12 @@ def test_the_verdict_on_a_gyro_depends_on_its_share_of_the_wheels_turn(
 def test_a_good_gyro_is_never_refuted_however_late_it_reports(
     rate: float, share: float, late_s: float
 ) -> None:
-    trial, seen = Trial(), set()
+    trial, verdicts = Trial(), set()
     for line in range(round(8.0 / rate / DT)):
-        told = rate * share if line * DT >= late_s else 0.0
-        trial.add(rate * DT, told * DT, DT)
-        seen.add(trial.verdict)
-    assert seen - {"none yet", "dead"} == {"good"}
+        gyro_rate = rate * share if line * DT >= late_s else 0.0
+        trial.add(rate * DT, gyro_rate * DT, DT)
+        verdicts.add(trial.verdict)
+    assert verdicts - {"none yet", "dead"} == {"good"}
 
 
 def test_a_turn_of_a_tenth_of_a_radian_proves_a_gyro() -> None:
@@ -89,8 +89,8 @@ def test_slow_lines_add_up_to_a_verdict(rate: float, share: float, verdict: Verd
 def test_a_turn_after_a_straight_on_unequal_tyres_proves_a_gyro(seconds: float) -> None:
     trial = Trial()
     turned(trial, 0.08, 0.0, seconds)
-    told = [turned(trial, 0.5, 1.0, DT) for _ in range(1000)]
-    assert set(told) == {"none yet", "good"}
+    verdicts = [turned(trial, 0.5, 1.0, DT) for _ in range(1000)]
+    assert set(verdicts) == {"none yet", "good"}
 
 
 def test_alternating_slow_rates_do_not_add_up_to_a_verdict() -> None:

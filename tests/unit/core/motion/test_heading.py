@@ -54,14 +54,14 @@ class One(Struct):
     skipped: bool = False
 
 
-def said(one: One, dt: float = 0.01) -> Feedback:
-    speeds = WheelSpeeds(one.right, one.left, one.left, one.right)
-    if one.gap:
-        return Feedback(Instant(0, 0), speeds, 0.0, one.gap)
-    if one.counts:
-        turned = (one.right * dt, one.left * dt, one.left * dt, one.right * dt)
+def said(state: One, dt: float = 0.01) -> Feedback:
+    speeds = WheelSpeeds(state.right, state.left, state.left, state.right)
+    if state.gap:
+        return Feedback(Instant(0, 0), speeds, 0.0, state.gap)
+    if state.counts:
+        turned = (state.right * dt, state.left * dt, state.left * dt, state.right * dt)
         return Feedback(Instant(0, 0), speeds, dt, turned=turned)
-    return Feedback(Instant(0, 0), speeds, dt + one.bridged, bridged=one.bridged)
+    return Feedback(Instant(0, 0), speeds, dt + state.bridged, bridged=state.bridged)
 
 
 WHEEL = st.floats(1.0, 20.0)  # never at rest, because counts are held back there
@@ -86,11 +86,11 @@ def test_the_turn_of_the_wheels_that_a_gyro_gets_is_the_turn_of_the_heading(
 ) -> None:
     robot, listening = Odometry(OdometryConfig(), KINEMATICS, 3200), Listening()
     robot.checks.gyro = listening
-    for one in lines:
-        if one.skipped:
-            robot.skip(said(one))
+    for state in lines:
+        if state.skipped:
+            robot.skip(said(state))
         else:
-            robot.fold(said(one))
+            robot.fold(said(state))
     off = math.remainder(robot.pose.yaw - listening.turned, math.tau)
     assert off == pytest.approx(0.0, abs=1e-9)
 
@@ -106,8 +106,8 @@ def test_a_gap_before_a_skipped_line_counts_for_the_next_line() -> None:
 def test_the_gyro_is_compared_with_the_wheels_over_no_unknown_distance() -> None:
     robot, listening = Odometry(OdometryConfig(), KINEMATICS), Listening()
     robot.checks.gyro = listening
-    for one in (One(9.0, 9.0), One(9.0, 9.0, bridged=0.3), One(9.0, 9.0, gap=0.5)):
-        robot.fold(said(one))
+    for state in (One(9.0, 9.0), One(9.0, 9.0, bridged=0.3), One(9.0, 9.0, gap=0.5)):
+        robot.fold(said(state))
     assert listening.seconds == [0.01, pytest.approx(0.31), 0.0]
 
 
@@ -131,8 +131,10 @@ class Turning:
         With `gap` no line arrives until the robot has reached the twist. The next line reports this
         motion.
         """
-        told = KINEMATICS.wheel_speeds(twist)
-        speeds = told if not dead else WheelSpeeds(told.front_right, 0.0, *told.as_tuple()[2:])
+        command = KINEMATICS.wheel_speeds(twist)
+        speeds = (
+            command if not dead else WheelSpeeds(command.front_right, 0.0, *command.as_tuple()[2:])
+        )
         lines = round(100 * seconds)
         before, dt, bridged = self.rate, 0.01, 0.0
         if gap:
@@ -149,7 +151,7 @@ class Turning:
                 continue
             at = Instant(self.now_ns, self.now_ns)
             line = Feedback(at, speeds, dt, bridged=bridged)
-            self.yaw_variance = fold(self.robot, line, told)[0].covariance.yawyaw
+            self.yaw_variance = fold(self.robot, line, command)[0].covariance.yawyaw
             self.does += [event.kind for event in self.gyro.events]
 
     @property

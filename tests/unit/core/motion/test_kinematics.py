@@ -49,8 +49,8 @@ def test_the_wheel_speeds_worked_by_hand_give_the_twist_back(
 def test_four_wheel_speeds_give_the_twist_worked_by_hand(
     robot: DriveConfig, wheels: tuple[float, float, float, float], twist: Pair
 ) -> None:
-    got = Kinematics(robot).twist(WheelSpeeds(*wheels))
-    assert (got.linear, got.angular) == pytest.approx(twist)
+    result = Kinematics(robot).twist(WheelSpeeds(*wheels))
+    assert (result.linear, result.angular) == pytest.approx(twist)
 
 
 def test_rest_is_exactly_still_and_still_is_exactly_rest() -> None:
@@ -87,8 +87,8 @@ def test_a_twist_within_the_wheel_speed_is_left_as_it_is() -> None:
 
 def test_a_twist_beyond_the_wheel_speed_is_scaled_as_a_whole() -> None:
     # The wheels turn at 3 and 9 rad/s; a limit of 6 leaves two thirds of everything.
-    got = Kinematics(DriveConfig()).saturate(Twist(0.3, 1.0), 6.0)
-    assert (got.linear, got.angular) == pytest.approx((0.2, 2 / 3))
+    result = Kinematics(DriveConfig()).saturate(Twist(0.3, 1.0), 6.0)
+    assert (result.linear, result.angular) == pytest.approx((0.2, 2 / 3))
 
 
 def test_the_limit_applies_to_the_faster_side_whichever_side_is_faster() -> None:
@@ -103,11 +103,11 @@ def test_saturation_keeps_the_curvature_and_no_wheel_is_too_fast(
     robot: DriveConfig, twist: Twist, most: float
 ) -> None:
     kinematics = Kinematics(robot)
-    got = kinematics.saturate(twist, most)
-    assert max(map(abs, kinematics.wheel_speeds(got).as_tuple())) <= most * (1 + 1e-9)
-    assert got.linear * twist.angular == pytest.approx(got.angular * twist.linear)
-    assert got.linear * twist.linear >= 0.0
-    assert got.angular * twist.angular >= 0.0
+    result = kinematics.saturate(twist, most)
+    assert max(map(abs, kinematics.wheel_speeds(result).as_tuple())) <= most * (1 + 1e-9)
+    assert result.linear * twist.angular == pytest.approx(result.angular * twist.linear)
+    assert result.linear * twist.linear >= 0.0
+    assert result.angular * twist.angular >= 0.0
 
 
 @given(st.floats(-40.0, 40.0), st.floats(-40.0, 40.0))

@@ -89,27 +89,27 @@ def test_a_learned_track_at_a_bound_is_not_switched_on_and_off(
     track.look(Track(1.0, SURE))
     track.look(Track(bound, SURE))
     assert track.use == "used"
-    seen = []
+    reports = []
     for _ in range(10):
         for learned in (beyond, within):
             track.look(learned)
-            seen.append(told(track))
-    assert seen == ["too far off", *[None] * 19]
+            reports.append(told(track))
+    assert reports == ["too far off", *[None] * 19]
     track.look(Track(bound * (1.0 + inwards * 0.06), SURE))
     assert told(track) == "used"
 
 
 def test_a_learned_track_too_far_off_is_reported_once_while_it_is_nearly_certain() -> None:
-    track, seen = LearnedTrack(1.0), []
+    track, reports = LearnedTrack(1.0), []
     for _ in range(10):
         for deviation in (0.99 * CERTAIN, 1.01 * CERTAIN):
             track.look(Track(2 * TRACK_RATIO_RANGE[1], deviation))
-            seen.append(told(track))
-    assert seen == ["too far off", *[None] * 19]
+            reports.append(told(track))
+    assert reports == ["too far off", *[None] * 19]
 
 
 @pytest.mark.parametrize(
-    ("use", "says"),
+    ("use", "text"),
     [
         ("shown", "learned 1.800 ± 0.090 (only reported), configured 1.500 (in use)"),
         ("uncertain", "learned 1.800 ± 0.090 (uncertain), configured 1.500 (in use)"),
@@ -117,7 +117,7 @@ def test_a_learned_track_too_far_off_is_reported_once_while_it_is_nearly_certain
     ],
 )
 def test_the_text_compares_the_learned_and_the_configured_multiplier(
-    use: TrackUse, says: str
+    use: TrackUse, text: str
 ) -> None:
-    assert tracks(GyroStatus("used", track=1.2, track_deviation=0.05, track_use=use), 1.5) == says
+    assert tracks(GyroStatus("used", track=1.2, track_deviation=0.05, track_use=use), 1.5) == text
     assert tracks(GyroStatus("used", track_use=use), 1.5) == ""

@@ -156,9 +156,9 @@ def test_a_number_is_the_wall_time_in_ms_and_grows_even_if_the_clock_does_not() 
     early = ready()
     early.stop("ann", ns(1.0), Instant(ns(1.0), 0))
     assert number(early) == 1001  # 0 means that there is no stop
-    kept = Lifecycle(active=True, latches=Latches(stop=STOP, inactive=OFF))
-    kept.stop("ann", ns(1.0), Instant(ns(1.0), 0))
-    assert number(kept) == OFF.number + 1001
+    lifecycle = Lifecycle(active=True, latches=Latches(stop=STOP, inactive=OFF))
+    lifecycle.stop("ann", ns(1.0), Instant(ns(1.0), 0))
+    assert number(lifecycle) == OFF.number + 1001
 
 
 def test_a_number_is_not_used_again_after_its_latch_is_released() -> None:
@@ -211,13 +211,13 @@ def test_a_stop_after_a_clear_counts_even_if_it_arrived_before_the_last_stop() -
 def test_a_press_keeps_the_name_of_the_client_that_stopped_the_robot() -> None:
     life = ready()
     stop(life, 1.0)
-    seen = number(life)
+    latch = number(life)
     press(life, 2.0)
     life.hold("", "", ns(3.0))
     both = f"{PRESSED_REASON} (latched at {AT}:02 UTC); also stopped by ann at {AT}:01 UTC"
     assert life.why == f"{both}; call srv/clear"
     with pytest.raises(RefusedError) as caught:
-        clear(life, 9.0, seen)
+        clear(life, 9.0, latch)
     assert f"still stopped ({PRESSED_REASON}) and stopped by ann: look at" in str(caught.value)
     assert clear(life, 9.0, number(life)).startswith("cleared; ")
     assert mode(life) is Mode.READY
@@ -382,12 +382,12 @@ def test_a_release_without_a_number_is_refused_until_two_seconds_after_the_latch
 def test_a_release_that_names_another_latch_is_refused(held: Held, none: bool) -> None:
     life = ready()
     held.hold(life, 1.0, "ann")
-    seen = 0 if none else number(life)
+    latch = 0 if none else number(life)
     held.hold(life, 10.0, "joe")
     with pytest.raises(RefusedError) as caught:
-        {"clear": clear, "activate": activate}[held.verb](life, 20.0, seen)
+        {"clear": clear, "activate": activate}[held.verb](life, 20.0, latch)
     assert str(caught.value) == (
-        f"latch {seen} is not the latch that srv/{held.verb} would release now; the robot "
+        f"latch {latch} is not the latch that srv/{held.verb} would release now; the robot "
         f"is still {held.said} by joe{held.before}: look at the robot, then call srv/{held.verb} "
         "again with the present `latch` in `state`"
     )
@@ -410,16 +410,16 @@ def test_a_step_of_the_wall_clock_does_not_end_the_two_seconds() -> None:
 
 
 @each("wall_s", [-3e8, 0.0, 1.5, 3e8])
-@each("kept", [True, False])
+@each("saved", [True, False])
 def test_the_two_seconds_of_a_stop_from_the_start_count_from_the_first_step(
-    kept: bool, wall_s: float
+    saved: bool, wall_s: float
 ) -> None:
     """A `clear` without a number releases a latch only after two seconds.
 
     For a latch from the file they begin with the first step, because a booting computer's clock may
     be wrong by years.
     """
-    stop_at_start = Latch(7, WALL_NS, "ann", "stopped by ann", kept)
+    stop_at_start = Latch(7, WALL_NS, "ann", "stopped by ann", saved)
     life = Lifecycle(active=True, latches=Latches(stop=stop_at_start))
     for step_s in (10.0, 10.01, 11.5):
         life.begin(Instant(ns(step_s), WALL_NS + ns(wall_s)))
@@ -510,8 +510,8 @@ def test_a_fault_keeps_the_stop_and_each_is_cleared_separately() -> None:
 def test_a_stop_keeps_the_fault() -> None:
     life = ready()
     life.fault("a wheel is dead", at(1.0))
-    said = stop(life, 2.0)
-    assert said == (
+    message = stop(life, 2.0)
+    assert message == (
         "stopped and latched; call srv/clear twice, 2 s apart: the first call releases the fault, "
         "the second call releases the stop"
     )
@@ -523,10 +523,10 @@ def test_a_stop_keeps_the_fault() -> None:
 def test_a_clear_named_for_a_stop_is_refused_when_a_fault_has_come() -> None:
     life = ready()
     stop(life, 1.0)
-    seen = number(life)
+    latch = number(life)
     life.fault("a wheel is dead", at(2.0))
     with pytest.raises(RefusedError, match=r"still in fault \(a wheel is dead\)"):
-        clear(life, 9.0, seen)
+        clear(life, 9.0, latch)
     assert life.latches.stop is not None
 
 
@@ -654,14 +654,14 @@ def test_a_fault_beside_one_that_the_board_reports_names_both() -> None:
 def test_a_press_after_a_release_is_a_new_latch() -> None:
     life = ready()
     press(life, 1.0)
-    seen = number(life)
+    latch = number(life)
     life.hold("", "", ns(8.0))
     press(life, 5.0)
     life.hold("", "", ns(8.0))
     with pytest.raises(RefusedError) as caught:
-        clear(life, 9.0, seen)
+        clear(life, 9.0, latch)
     assert str(caught.value) == (
-        f"latch {seen} is not the latch that srv/clear would release now; the robot is "
+        f"latch {latch} is not the latch that srv/clear would release now; the robot is "
         f"still stopped ({PRESSED_REASON}): look at the robot, then call srv/clear again with the "
         "present `latch` in `state`"
     )
@@ -839,7 +839,7 @@ def explore() -> list[Edge]:
     These are all triggers, each early and late, in each reachable state.
     """
     edges: list[Edge] = []
-    seen: set[tuple[State, tuple[bool, ...]]] = set()
+    visited: set[tuple[State, tuple[bool, ...]]] = set()
     queue = deque((Lifecycle(active), 10.0) for active in (True, False))
     while queue:
         life, now = queue.popleft()
@@ -847,9 +847,9 @@ def explore() -> list[Edge]:
         # there.
         times = life._stopped_ns, life._faulted_ns, life._cleared_ns, life._off_ns
         young = tuple([now - then_ns / NS_PER_S < LATCH_REQUIRED_S for then_ns in times])
-        if (state_of(life), young) in seen:
+        if (state_of(life), young) in visited:
             continue
-        seen.add((state_of(life), young))
+        visited.add((state_of(life), young))
         for name, do in TRIGGERS.items():
             for pause_s in PAUSES:
                 after, then, refused = copy(life), now + pause_s, False
@@ -876,8 +876,8 @@ def test_every_combination_of_facts_and_latches_is_reached() -> None:
 
 def test_the_mode_always_follows_from_the_facts_and_the_latches() -> None:
     for edge in explore():
-        *held, inactive, linked, commanded, dormant, _ = edge.after
-        shutting_down, fault, stopped = held
+        *flags, inactive, linked, commanded, dormant, _ = edge.after
+        shutting_down, fault, stopped = flags
         assert edge.mode is mode_of(
             shutting_down=shutting_down, fault=fault, stopped=stopped, inactive=inactive or dormant,
             linked=linked, commanded=commanded,
@@ -945,8 +945,8 @@ def test_a_clear_that_names_another_latch_or_came_before_it_releases_nothing() -
     for edge in explore():
         if edge.trigger in wrong:
             assert edge.before == edge.after
-            held = edge.before.fault or edge.before.stopped or edge.before.shutting_down
-            assert edge.refused == held
+            latched = edge.before.fault or edge.before.stopped or edge.before.shutting_down
+            assert edge.refused == latched
 
 
 def test_a_plain_clear_is_refused_until_two_seconds_after_a_stop() -> None:

@@ -57,14 +57,14 @@ def limiter(limits: LimitsConfig = FREE) -> Limiter:
 
 def moving(linear: float, angular: float = 0.0, limits: LimitsConfig = FREE) -> Limiter:
     """Return a limiter that has reached this twist and holds it."""
-    found = limiter(limits)
-    followed(found, Twist(linear, angular), 2, dt=1000.0)
-    assert found.twist == Twist(linear, angular)
-    return found
+    ramp = limiter(limits)
+    followed(ramp, Twist(linear, angular), 2, dt=1000.0)
+    assert ramp.twist == Twist(linear, angular)
+    return ramp
 
 
-def followed(found: Limiter, wish: Twist, steps: int, dt: float = DT) -> list[Twist]:
-    return [found.follow(wish, dt) for _ in range(steps)]
+def followed(ramp: Limiter, wish: Twist, steps: int, dt: float = DT) -> list[Twist]:
+    return [ramp.follow(wish, dt) for _ in range(steps)]
 
 
 def approx(linear: float, angular: float) -> object:
@@ -140,10 +140,10 @@ def test_a_wheel_that_would_be_too_fast_slows_the_whole_twist() -> None:
 def test_no_wheel_is_too_fast_on_the_way_between_two_allowed_twists() -> None:
     # At 0.8 m/s all wheels have 16 rad/s; 4 rad/s take 12 rad/s. The robot turns before it has
     # slowed down.
-    found = moving(0.8, 0.0, LimitsConfig(wheel_speed=16.0, linear_deceleration=0.1))
-    for twist in followed(found, Twist(0.0, 4.0), 800):
+    ramp = moving(0.8, 0.0, LimitsConfig(wheel_speed=16.0, linear_deceleration=0.1))
+    for twist in followed(ramp, Twist(0.0, 4.0), 800):
         assert max(map(abs, KINEMATICS.wheel_speeds(twist).as_tuple())) <= 16.0 + EPS
-    assert found.twist == Twist(0.0, 4.0)
+    assert ramp.twist == Twist(0.0, 4.0)
 
 
 @given(wishes=st.lists(st.tuples(mixed, periods), max_size=40), most=st.floats(0.1, 40.0))
@@ -171,11 +171,11 @@ linear speed."""
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_at_the_wheel_limit_a_turn_waits_until_the_robot_has_slowed_down(sign: float) -> None:
-    found = moving(1.0, 0.0, TALL)
-    first = found.follow(Twist(1.0, sign * 4.0), 0.1)
+    ramp = moving(1.0, 0.0, TALL)
+    first = ramp.follow(Twist(1.0, sign * 4.0), 0.1)
     # 0.04 m/s of the rim are free when the robot has slowed down by 0.04 m/s.
     assert pair(first) == approx(0.96, sign * 0.04 / 0.15)
-    last = followed(found, Twist(1.0, sign * 4.0), 2000)[-1]
+    last = followed(ramp, Twist(1.0, sign * 4.0), 2000)[-1]
     assert pair(last) == approx(1.0 / 1.6, sign * 4.0 / 1.6)
 
 
@@ -207,10 +207,10 @@ def test_at_the_wheel_limit_too_each_axis_changes_by_no_more_than_its_limit(
     wishes: list[tuple[Twist, float]], start: Twist, left: float, braking: float
 ) -> None:
     kinematics = Kinematics(DriveConfig(left_wheel_radius_multiplier=left))
-    found = Limiter(msgspec.structs.replace(TALL, linear_deceleration=braking), kinematics)
-    before = found.follow(start, 1000.0)
+    ramp = Limiter(msgspec.structs.replace(TALL, linear_deceleration=braking), kinematics)
+    before = ramp.follow(start, 1000.0)
     for wish, dt in wishes:
-        after = found.follow(wish, dt)
+        after = ramp.follow(wish, dt)
         assert max(map(abs, kinematics.wheel_speeds(after).as_tuple())) <= 20.0 * (1 + EPS)
         assert abs(before.linear) - abs(after.linear) <= braking * dt + EPS
         assert abs(before.angular) - abs(after.angular) <= 8.0 * dt + EPS
@@ -225,10 +225,10 @@ def test_wheels_of_unequal_size_never_keep_the_robot_from_its_goal(
     side: str, wishes: list[tuple[Twist, float]], goal: Twist
 ) -> None:
     kinematics = Kinematics(DriveConfig(**{f"{side}_wheel_radius_multiplier": 0.8}))
-    found = Limiter(TALL, kinematics)
+    ramp = Limiter(TALL, kinematics)
     for wish, dt in wishes:
-        found.follow(wish, dt)
-    last = followed(found, goal, 2000)[-1]
+        ramp.follow(wish, dt)
+    last = followed(ramp, goal, 2000)[-1]
     fresh = Limiter(TALL, kinematics).follow(goal, 1000.0)
     assert pair(last) == approx(*pair(fresh))
 
@@ -237,10 +237,10 @@ def test_a_small_wheel_at_its_limit_turns_the_robot_until_it_has_slowed_down() -
     # Without the turn the right wheel would be too fast, so the turn falls only as fast as the
     # speed allows.
     kinematics = Kinematics(DriveConfig(right_wheel_radius_multiplier=0.9))
-    found = Limiter(TALL, kinematics)
-    start = found.follow(Twist(-1.0, 0.2), 1000.0)
+    ramp = Limiter(TALL, kinematics)
+    start = ramp.follow(Twist(-1.0, 0.2), 1000.0)
     assert kinematics.wheel_speeds(start).front_right == pytest.approx(-20.0)
-    after = found.follow(Twist(-0.8, 0.0), 0.01)
+    after = ramp.follow(Twist(-0.8, 0.0), 0.01)
     assert abs(start.linear) - abs(after.linear) == pytest.approx(0.004)
     assert kinematics.wheel_speeds(after).front_right == pytest.approx(-20.0)
     assert 0.0 < after.angular < start.angular
@@ -254,12 +254,12 @@ def test_a_very_small_wheel_at_its_limit_never_stops_the_way_to_the_goal(
     wheel_speed: float, start: Twist, goal: Twist, dt: float
 ) -> None:
     kinematics = Kinematics(DriveConfig(left_wheel_radius_multiplier=0.1))
-    found = Limiter(LimitsConfig(wheel_speed=wheel_speed), kinematics)
+    ramp = Limiter(LimitsConfig(wheel_speed=wheel_speed), kinematics)
     for step in range(1, 21):
-        found.follow(Twist(start.linear * step / 20, start.angular * step / 20), dt)
+        ramp.follow(Twist(start.linear * step / 20, start.angular * step / 20), dt)
     for _ in range(1000):
-        found.follow(goal, dt)
-    assert pair(found.twist) == approx(goal.linear, goal.angular)
+        ramp.follow(goal, dt)
+    assert pair(ramp.twist) == approx(goal.linear, goal.angular)
 
 
 # acceleration and deceleration
@@ -267,9 +267,9 @@ def test_a_very_small_wheel_at_its_limit_never_stops_the_way_to_the_goal(
 
 def test_speed_grows_by_the_acceleration_and_lands_on_the_goal() -> None:
     # Each step adds 1 m/s2 x 10 ms.
-    got = followed(limiter(), Twist(0.035, 0.0), 5)
-    assert [t.linear for t in got] == pytest.approx([0.01, 0.02, 0.03, 0.035, 0.035])
-    assert got[-1].linear == 0.035
+    series = followed(limiter(), Twist(0.035, 0.0), 5)
+    assert [t.linear for t in series] == pytest.approx([0.01, 0.02, 0.03, 0.035, 0.035])
+    assert series[-1].linear == 0.035
 
 
 def test_the_two_axes_have_their_own_accelerations() -> None:
@@ -292,18 +292,18 @@ def test_only_slowing_down_uses_the_deceleration_in_both_directions(
 
 
 def test_a_step_of_zero_duration_changes_nothing() -> None:
-    found = moving(0.5, 1.0)
-    assert found.follow(REST, 0.0) == Twist(0.5, 1.0)
+    ramp = moving(0.5, 1.0)
+    assert ramp.follow(REST, 0.0) == Twist(0.5, 1.0)
 
 
 @given(wishes=st.lists(st.tuples(mixed, periods), max_size=40), start=twists)
 def test_each_axis_changes_by_no_more_than_its_limit(
     wishes: list[tuple[Twist, float]], start: Twist
 ) -> None:
-    found = limiter(UNEVEN)
-    before = found.follow(start, 1000.0)
+    ramp = limiter(UNEVEN)
+    before = ramp.follow(start, 1000.0)
     for wish, dt in wishes:
-        after = found.follow(wish, dt)
+        after = ramp.follow(wish, dt)
         for old, new, up, down in (
             (before.linear, after.linear, 0.5, 2.0),
             (before.angular, after.angular, 1.0, 6.0),
@@ -317,18 +317,18 @@ def test_each_axis_changes_by_no_more_than_its_limit(
 def test_a_goal_within_the_limits_is_reached_exactly_and_held(
     wish: Twist, start: Twist, dt: float
 ) -> None:
-    found = limiter()
-    found.follow(start, 1000.0)
-    followed(found, wish, int(2.1 / dt) + 2, dt)
-    assert found.twist == wish
-    assert found.follow(wish, dt) == wish
+    ramp = limiter()
+    ramp.follow(start, 1000.0)
+    followed(ramp, wish, int(2.1 / dt) + 2, dt)
+    assert ramp.twist == wish
+    assert ramp.follow(wish, dt) == wish
 
 
 @pytest.mark.parametrize("limits", [FREE, UNEVEN, JERKY], ids=["free", "uneven", "jerky"])
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_a_change_of_direction_passes_through_zero(limits: LimitsConfig, sign: float) -> None:
-    found = moving(sign * 0.505, sign * 2.0, limits)
-    path = followed(found, Twist(sign * -0.5, sign * -2.0), 800)
+    ramp = moving(sign * 0.505, sign * 2.0, limits)
+    path = followed(ramp, Twist(sign * -0.5, sign * -2.0), 800)
     assert path[-1] == Twist(sign * -0.5, sign * -2.0)
     assert min(abs(twist.linear) for twist in path) < EPS
     assert min(abs(twist.angular) for twist in path) < EPS
@@ -365,17 +365,17 @@ def test_jerk_lets_the_slope_grow_step_by_step() -> None:
 def test_jerk_lets_the_slope_fall_as_late_as_it_may(
     goal: float, path: list[float], sign: float
 ) -> None:
-    got = followed(limiter(JERKY), Twist(sign * goal, 0.0), 5)
-    assert [sign * twist.linear for twist in got] == pytest.approx(path)
+    series = followed(limiter(JERKY), Twist(sign * goal, 0.0), 5)
+    assert [sign * twist.linear for twist in series] == pytest.approx(path)
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_the_slope_falls_no_faster_than_jerk_unless_the_goal_would_be_passed(sign: float) -> None:
-    found = limiter(JERKY)
-    assert followed(found, Twist(sign, 0.0), 10)[-1].linear == pytest.approx(sign * 0.0275)
+    ramp = limiter(JERKY)
+    assert followed(ramp, Twist(sign, 0.0), 10)[-1].linear == pytest.approx(sign * 0.0275)
     # The slope falls from 10 steps to 9; then the goal is one step away.
-    got = followed(found, Twist(sign * 0.0325, 0.0), 2)
-    assert [sign * twist.linear for twist in got] == pytest.approx([0.032, 0.0325])
+    series = followed(ramp, Twist(sign * 0.0325, 0.0), 2)
+    assert [sign * twist.linear for twist in series] == pytest.approx([0.032, 0.0325])
 
 
 def test_a_large_change_of_speed_with_jerk_takes_the_time_worked_by_hand() -> None:
@@ -392,11 +392,11 @@ def slopes(speeds: list[float]) -> list[float]:
 
 def rising(speeds: list[float]) -> list[tuple[float, float]]:
     """Return, for each step that speeds up, its slope and the slope of the next step."""
-    found = []
+    pairs = []
     for (a, b), (_, c) in pairwise(pairwise([speeds[0], *speeds])):
         if abs(c) > abs(b):
-            found.append(((b - a) / DT, (c - b) / DT))
-    return found
+            pairs.append(((b - a) / DT, (c - b) / DT))
+    return pairs
 
 
 @given(start=millimetres, goal=millimetres, way=st.sampled_from((1.0, -1.0)))
@@ -405,8 +405,8 @@ def test_jerk_bounds_the_change_of_slope_on_the_way_to_a_goal(
 ) -> None:
     # The slope may change by 5 m/s3 x 10 ms in a step.
     start, goal = (way * speed for speed in sorted((abs(start), abs(goal))))
-    found = moving(start, 0.0, JERKY)
-    path = [start, *(twist.linear for twist in followed(found, Twist(goal, 0.0), 400))]
+    ramp = moving(start, 0.0, JERKY)
+    path = [start, *(twist.linear for twist in followed(ramp, Twist(goal, 0.0), 400))]
     assert path[-1] == goal
     for before, after in rising(path):
         assert abs(after - before) <= 0.05 + 1e-9
@@ -416,27 +416,27 @@ def test_jerk_bounds_the_change_of_slope_on_the_way_to_a_goal(
 def test_jerk_bounds_how_much_steeper_a_slope_gets_whatever_is_commanded(
     wishes: list[tuple[Twist, int]],
 ) -> None:
-    found = limiter(JERKY)
+    ramp = limiter(JERKY)
     path = [REST]
     for wish, steps in wishes:
-        path += followed(found, wish, steps)
+        path += followed(ramp, wish, steps)
     for step, speeds in (
         (0.05, [twist.linear for twist in path]),
         (0.2, [twist.angular for twist in path]),
     ):
         for before, after in rising(speeds):
-            kept = abs(before) if before * after > 0.0 else 0.0
-            assert abs(after) <= kept + step + 1e-9
+            slope = abs(before) if before * after > 0.0 else 0.0
+            assert abs(after) <= slope + step + 1e-9
 
 
 @given(goals=st.lists(st.tuples(millimetres, st.integers(1, 40)), max_size=8))
 def test_jerk_bounds_how_fast_a_slope_levels_out_short_of_the_goal(
     goals: list[tuple[float, int]],
 ) -> None:
-    found = limiter(JERKY)
+    ramp = limiter(JERKY)
     speed, slope = 0.0, 0.0
     for goal, steps in goals:
-        for twist in followed(found, Twist(goal, 0.0), steps):
+        for twist in followed(ramp, Twist(goal, 0.0), steps):
             before, slope = slope, (twist.linear - speed) / DT
             speed = twist.linear
             if speed not in (goal, 0.0) and slope * before > 0.0 and slope * speed > 0.0:
@@ -444,19 +444,19 @@ def test_jerk_bounds_how_fast_a_slope_levels_out_short_of_the_goal(
 
 
 def test_jerk_never_delays_braking() -> None:
-    found = limiter(JERKY)
-    fast = followed(found, Twist(1.0, 0.0), 30)[-1].linear
-    assert found.follow(REST, DT).linear == pytest.approx(fast - 0.01)
+    ramp = limiter(JERKY)
+    fast = followed(ramp, Twist(1.0, 0.0), 30)[-1].linear
+    assert ramp.follow(REST, DT).linear == pytest.approx(fast - 0.01)
 
 
 @given(wishes=st.lists(st.tuples(mixed, st.integers(1, 60), periods), max_size=8))
 def test_with_jerk_no_speed_or_acceleration_limit_is_exceeded(
     wishes: list[tuple[Twist, int, float]],
 ) -> None:
-    found = limiter(JERKY)
+    ramp = limiter(JERKY)
     before = REST
     for wish, steps, dt in wishes:
-        for after in followed(found, wish, steps, dt):
+        for after in followed(ramp, wish, steps, dt):
             assert abs(after.linear) <= 1.0 + EPS
             assert abs(after.angular) <= 4.0 + EPS
             assert abs(after.linear - before.linear) <= 1.0 * dt + EPS
@@ -468,8 +468,8 @@ def test_with_jerk_no_speed_or_acceleration_limit_is_exceeded(
 def test_with_jerk_the_goal_is_approached_from_one_side_reached_and_never_overshot(
     start: float, goal: float, dt: float, jerk: float
 ) -> None:
-    found = moving(start, 0.0, LimitsConfig(linear_jerk=jerk, wheel_speed=99.99))
-    path = [twist.linear for twist in followed(found, Twist(goal, 0.0), int(6.0 / dt), dt)]
+    ramp = moving(start, 0.0, LimitsConfig(linear_jerk=jerk, wheel_speed=99.99))
+    path = [twist.linear for twist in followed(ramp, Twist(goal, 0.0), int(6.0 / dt), dt)]
     assert path[-1] == pytest.approx(goal, abs=EPS)
     for before, after in pairwise([start, *path]):
         assert (after - before) * (goal - start) >= -EPS
@@ -477,11 +477,11 @@ def test_with_jerk_the_goal_is_approached_from_one_side_reached_and_never_oversh
 
 
 def test_with_jerk_a_lowered_acceleration_applies_from_the_next_step() -> None:
-    one = limiter(JERKY)
-    followed(one, Twist(1.0, 0.0), 30)
-    one.use(msgspec.structs.replace(JERKY, linear_acceleration=0.3))
-    before = one.twist.linear
-    assert one.follow(Twist(1.0, 0.0), DT).linear <= before + 0.3 * DT + EPS
+    ramp = limiter(JERKY)
+    followed(ramp, Twist(1.0, 0.0), 30)
+    ramp.use(msgspec.structs.replace(JERKY, linear_acceleration=0.3))
+    before = ramp.twist.linear
+    assert ramp.follow(Twist(1.0, 0.0), DT).linear <= before + 0.3 * DT + EPS
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
@@ -489,13 +489,13 @@ def test_with_jerk_a_reversal_speeds_up_no_faster_than_the_limit(
     sign: float,
 ) -> None:
     harder = msgspec.structs.replace(JERKY, linear_deceleration=2.51)
-    one = moving(sign, 0.0, harder)
+    ramp = moving(sign, 0.0, harder)
     for _ in range(200):
-        before = one.twist.linear
-        now = one.follow(Twist(-sign, 0.0), DT).linear
+        before = ramp.twist.linear
+        now = ramp.follow(Twist(-sign, 0.0), DT).linear
         if before * sign <= 0.0:
             assert abs(now - before) <= harder.linear_acceleration * DT + EPS
-    assert one.twist.linear == pytest.approx(-sign)
+    assert ramp.twist.linear == pytest.approx(-sign)
 
 
 # coasting
@@ -503,9 +503,9 @@ def test_with_jerk_a_reversal_speeds_up_no_faster_than_the_limit(
 
 def test_coasting_falls_by_the_deceleration() -> None:
     # Each step removes 1 m/s2 x 10 ms.
-    found = moving(0.035)
-    assert [found.coast(DT).linear for _ in range(5)] == pytest.approx([0.025, 0.015, 0.005, 0, 0])
-    assert found.twist == REST
+    ramp = moving(0.035)
+    assert [ramp.coast(DT).linear for _ in range(5)] == pytest.approx([0.025, 0.015, 0.005, 0, 0])
+    assert ramp.twist == REST
 
 
 def test_coasting_brings_both_axes_down_together_by_the_slower_of_them() -> None:
@@ -516,9 +516,9 @@ def test_coasting_brings_both_axes_down_together_by_the_slower_of_them() -> None
 
 
 def test_coasting_for_a_negative_time_changes_nothing() -> None:
-    found = moving(0.5, 4.0)
-    assert pair(found.coast(-0.1)) == approx(0.5, 4.0)
-    assert pair(found.coast(-1e9, stop=True)) == approx(0.5, 4.0)
+    ramp = moving(0.5, 4.0)
+    assert pair(ramp.coast(-0.1)) == approx(0.5, 4.0)
+    assert pair(ramp.coast(-1e9, stop=True)) == approx(0.5, 4.0)
 
 
 def test_coasting_ends_at_rest_without_a_negative_zero() -> None:
@@ -535,13 +535,13 @@ def test_a_stop_falls_by_its_own_higher_deceleration() -> None:
 def test_coasting_ends_at_rest_in_the_time_the_decelerations_take(
     start: Twist, dt: float, stop: bool
 ) -> None:
-    found = limiter()
-    found.follow(start, 1000.0)
+    ramp = limiter()
+    ramp.follow(start, 1000.0)
     by = 3.0 if stop else 1.0
     seconds = max(abs(start.linear) / by, abs(start.angular) / (4 * by))
     steps = 0
-    while found.twist != REST:
-        found.coast(dt, stop)
+    while ramp.twist != REST:
+        ramp.coast(dt, stop)
         steps += 1
         assert steps <= seconds / dt + 2
     assert steps >= seconds / dt - 1
@@ -551,10 +551,10 @@ def test_coasting_ends_at_rest_in_the_time_the_decelerations_take(
 def test_coasting_never_makes_a_wheel_faster_nor_turns_it_round(
     start: Twist, dts: list[tuple[float, bool]]
 ) -> None:
-    found = limiter()
-    before = KINEMATICS.wheel_speeds(found.follow(start, 1000.0)).as_tuple()
+    ramp = limiter()
+    before = KINEMATICS.wheel_speeds(ramp.follow(start, 1000.0)).as_tuple()
     for dt, stop in dts:
-        after = KINEMATICS.wheel_speeds(found.coast(dt, stop)).as_tuple()
+        after = KINEMATICS.wheel_speeds(ramp.coast(dt, stop)).as_tuple()
         for old, new in zip(before, after, strict=True):
             assert abs(new) <= abs(old) + 1e-12
             assert new * old >= -1e-12
@@ -565,10 +565,10 @@ def test_coasting_never_makes_a_wheel_faster_nor_turns_it_round(
 def test_coasting_keeps_each_axis_within_its_deceleration(
     start: Twist, dts: list[tuple[float, bool]]
 ) -> None:
-    found = limiter()
-    before = found.follow(start, 1000.0)
+    ramp = limiter()
+    before = ramp.follow(start, 1000.0)
     for dt, stop in dts:
-        after, by = found.coast(dt, stop), 3.0 if stop else 1.0
+        after, by = ramp.coast(dt, stop), 3.0 if stop else 1.0
         assert abs(after.linear - before.linear) <= by * dt + EPS
         assert abs(after.angular - before.angular) <= 4 * by * dt + EPS
         before = after
@@ -581,28 +581,28 @@ def test_jerk_never_delays_coasting() -> None:
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_after_coasting_jerk_begins_from_a_level_slope(sign: float) -> None:
     # The first step adds 5 m/s3 x 10 ms x 10 ms and 20 rad/s3 x 10 ms x 10 ms.
-    found, wish = limiter(JERKY), Twist(sign * 0.5, sign * 2.0)
-    followed(found, wish, 20)
-    left = found.coast(DT)
+    ramp, wish = limiter(JERKY), Twist(sign * 0.5, sign * 2.0)
+    followed(ramp, wish, 20)
+    left = ramp.coast(DT)
     expected = approx(left.linear + sign * 0.0005, left.angular + sign * 0.002)
-    assert pair(found.follow(wish, DT)) == expected
+    assert pair(ramp.follow(wish, DT)) == expected
 
 
 # cut and restore
 
 
 def test_a_cut_brings_the_robot_to_rest_in_one_step() -> None:
-    found = moving(1.0, 4.0)
-    assert found.cut() == REST
-    assert found.twist == REST
+    ramp = moving(1.0, 4.0)
+    assert ramp.cut() == REST
+    assert ramp.twist == REST
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_after_a_cut_jerk_begins_from_a_level_slope(sign: float) -> None:
-    found, wish = limiter(JERKY), Twist(sign * 0.5, sign * 2.0)
-    followed(found, wish, 20)
-    found.cut()
-    assert pair(found.follow(wish, DT)) == approx(sign * 0.0005, sign * 0.002)
+    ramp, wish = limiter(JERKY), Twist(sign * 0.5, sign * 2.0)
+    followed(ramp, wish, 20)
+    ramp.cut()
+    assert pair(ramp.follow(wish, DT)) == approx(sign * 0.0005, sign * 0.002)
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
@@ -613,10 +613,10 @@ def test_a_new_limiter_begins_from_a_level_slope(sign: float) -> None:
 
 @pytest.mark.parametrize("limits", [FREE, JERKY])
 def test_putting_the_state_back_undoes_a_step(limits: LimitsConfig) -> None:
-    found = limiter(limits)
-    followed(found, Twist(1.0, 2.0), 20)
-    before = found.state
-    once = found.follow(Twist(1.0, 2.0), DT)
-    found.state = before
-    assert found.twist == before.twist
-    assert found.follow(Twist(1.0, 2.0), DT) == once
+    ramp = limiter(limits)
+    followed(ramp, Twist(1.0, 2.0), 20)
+    before = ramp.state
+    once = ramp.follow(Twist(1.0, 2.0), DT)
+    ramp.state = before
+    assert ramp.twist == before.twist
+    assert ramp.follow(Twist(1.0, 2.0), DT) == once

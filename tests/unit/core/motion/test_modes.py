@@ -58,6 +58,6 @@ def test_every_other_request_is_allowed() -> None:
     cells = set(product(Mode, get_args(Verb)))
     for mode, verb in cells - set(REFUSALS):
         require_allowed(mode, verb)
-    held = (Mode.FAULT, Mode.STOPPED, Mode.SHUTDOWN)
-    refused = {(mode, verb) for mode in held for verb in ("activate", "deactivate")}
+    modes = (Mode.FAULT, Mode.STOPPED, Mode.SHUTDOWN)
+    refused = {(mode, verb) for mode in modes for verb in ("activate", "deactivate")}
     assert set(REFUSALS) == refused | {(Mode.SHUTDOWN, "clear")}

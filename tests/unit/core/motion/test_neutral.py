@@ -29,13 +29,13 @@ def sent(twist: Twist, at_ms: float, shared: bool = False) -> Command:
 
 
 def test_a_zero_of_an_unshared_sender_arms_immediately_even_right_after_a_speed() -> None:
-    one = sender()
-    one.take(sent(GO, 0), 0)
-    assert not one.armed(0)
-    one.take(sent(REST, 0), 0)
-    assert one.armed(0)
-    one.take(sent(GO, 1), 0)
-    assert one.armed(MS)
+    peer = sender()
+    peer.take(sent(GO, 0), 0)
+    assert not peer.armed(0)
+    peer.take(sent(REST, 0), 0)
+    assert peer.armed(0)
+    peer.take(sent(GO, 1), 0)
+    assert peer.armed(MS)
 
 
 @pytest.mark.parametrize("after_ms", [1, 250, 999.999])
@@ -49,39 +49,39 @@ def test_a_shared_zero_that_a_speed_follows_too_soon_does_not_arm(after_ms: floa
 
 
 def test_a_shared_zero_arms_if_no_speed_follows_during_the_pause() -> None:
-    one = sender()
-    one.take(sent(REST, 0, shared=True), 0)
-    assert not one.armed(1000 * MS - 1)
-    assert one.armed(1000 * MS)
-    one.take(sent(GO, 1001, shared=True), 0)
-    assert one.armed(1001 * MS)
+    peer = sender()
+    peer.take(sent(REST, 0, shared=True), 0)
+    assert not peer.armed(1000 * MS - 1)
+    assert peer.armed(1000 * MS)
+    peer.take(sent(GO, 1001, shared=True), 0)
+    assert peer.armed(1001 * MS)
 
 
 def test_more_zeros_do_not_restart_the_pause() -> None:
-    one = sender()
+    peer = sender()
     for at_ms in range(0, 1000, 100):
-        one.take(sent(REST, at_ms, shared=True), 0)
-    one.take(sent(GO, 1000, shared=True), 0)
-    assert one.armed(1000 * MS)
+        peer.take(sent(REST, at_ms, shared=True), 0)
+    peer.take(sent(GO, 1000, shared=True), 0)
+    assert peer.armed(1000 * MS)
 
 
 @pytest.mark.parametrize("shared", [False, True])
 def test_a_zero_that_arrived_before_zeros_were_required_does_not_arm(shared: bool) -> None:
-    one = sender()
-    one.take(sent(REST, 0, shared), since_ns=1)
-    assert not one.armed(HOUR_NS)
-    assert (one.arrived_ns, one.noticed_ns) == (0, 0)
-    one.take(sent(REST, 0, shared), since_ns=0)
-    assert one.armed(1000 * MS)
+    peer = sender()
+    peer.take(sent(REST, 0, shared), since_ns=1)
+    assert not peer.armed(HOUR_NS)
+    assert (peer.arrived_ns, peer.noticed_ns) == (0, 0)
+    peer.take(sent(REST, 0, shared), since_ns=0)
+    assert peer.armed(1000 * MS)
 
 
 @pytest.mark.parametrize("pause_ms", [1, 2000, 3_600_000])
 def test_a_pause_without_a_zero_does_not_arm_however_long(pause_ms: int) -> None:
     for shared in (False, True):
-        one = sender()
+        peer = sender()
         for number in range(10):
-            one.take(sent(GO, number * pause_ms, shared), 0)
-            assert not one.armed(number * pause_ms * MS)
+            peer.take(sent(GO, number * pause_ms, shared), 0)
+            assert not peer.armed(number * pause_ms * MS)
 
 
 @pytest.mark.parametrize("other", ["speed", "cancelled", "not finite", "unreadable", "stale"])
@@ -154,57 +154,57 @@ def test_messages_that_were_lost_unread_end_the_wait_of_a_shared_zero() -> None:
 @pytest.mark.parametrize("shared", [False, True])
 def test_an_unproven_zero_arms_unless_its_clock_proves_wrong(shared: bool) -> None:
     for wrong in (False, True):
-        one = sender()
-        one.take(sent(REST, 0, shared), 0, "unproven")
+        peer = sender()
+        peer.take(sent(REST, 0, shared), 0, "unproven")
         if wrong:
-            one.unlearn()
+            peer.unlearn()
         if not shared:
-            one.take(sent(GO, 500, shared), 0, "unproven")
-        one.take(sent(GO, 1100, shared), 0)
-        assert one.armed(1100 * MS) is not wrong
-        one.unlearn()
-        assert one.armed(1100 * MS) is not wrong, "a proven zero is never forgotten"
+            peer.take(sent(GO, 500, shared), 0, "unproven")
+        peer.take(sent(GO, 1100, shared), 0)
+        assert peer.armed(1100 * MS) is not wrong
+        peer.unlearn()
+        assert peer.armed(1100 * MS) is not wrong, "a proven zero is never forgotten"
 
 
 def test_a_proven_shared_zero_arms_after_the_pause_even_if_later_zeros_prove_wrong() -> None:
-    one = sender()
-    one.take(sent(REST, 0, shared=True), 0)
-    one.take(sent(REST, 900, shared=True), 0, "unproven")
-    one.take(sent(REST, 1100, shared=True), 0, "unproven")
-    one.unlearn()
-    assert one.armed(1100 * MS)
+    peer = sender()
+    peer.take(sent(REST, 0, shared=True), 0)
+    peer.take(sent(REST, 900, shared=True), 0, "unproven")
+    peer.take(sent(REST, 1100, shared=True), 0, "unproven")
+    peer.unlearn()
+    assert peer.armed(1100 * MS)
 
 
 def test_a_shared_zero_that_armed_is_not_forgotten_when_a_later_speed_proves_wrong() -> None:
     for refused in (False, True):
-        one = sender()
-        one.take(sent(REST, 0, shared=True), 0)
+        peer = sender()
+        peer.take(sent(REST, 0, shared=True), 0)
         if refused:
-            one.refuse(sent(GO, 1100, shared=True), "stale")
+            peer.refuse(sent(GO, 1100, shared=True), "stale")
         else:
-            one.take(sent(GO, 1100, shared=True), 0, "unproven")
-        one.unlearn()
-        assert one.armed(1100 * MS)
+            peer.take(sent(GO, 1100, shared=True), 0, "unproven")
+        peer.unlearn()
+        assert peer.armed(1100 * MS)
 
 
 @pytest.mark.parametrize("shared", [False, True])
 def test_a_speed_before_an_unproven_zero_is_not_followed_once_the_zero_arms(shared: bool) -> None:
-    one = Sender(5000 * MS, 1000 * MS, neutral_first=True)
-    one.take(sent(GO, 0, shared), 0)
-    one.take(sent(REST, 10, shared), 0, "unproven")
-    assert one.armed(1010 * MS if shared else 10 * MS)
-    assert one.twist == REST
+    peer = Sender(5000 * MS, 1000 * MS, neutral_first=True)
+    peer.take(sent(GO, 0, shared), 0)
+    peer.take(sent(REST, 10, shared), 0, "unproven")
+    assert peer.armed(1010 * MS if shared else 10 * MS)
+    assert peer.twist == REST
 
 
 @pytest.mark.parametrize("shared", [False, True])
 def test_an_unproven_zero_leaves_an_unarmed_sender_live_so_its_source_keeps_priority(
     shared: bool,
 ) -> None:
-    one = sender()
-    one.take(sent(GO, 0, shared), 0)
-    one.take(sent(REST, 10, shared), 0, "unproven")
-    assert one.live(20 * MS)
-    assert one.armed(20 * MS) is not shared
+    peer = sender()
+    peer.take(sent(GO, 0, shared), 0)
+    peer.take(sent(REST, 10, shared), 0, "unproven")
+    assert peer.live(20 * MS)
+    assert peer.armed(20 * MS) is not shared
 
 
 @each("proven", [True, False])
@@ -212,58 +212,58 @@ def test_an_unproven_zero_leaves_an_unarmed_sender_live_so_its_source_keeps_prio
 def test_a_stall_does_not_count_as_pause_and_leaves_time_for_commands_that_waited(
     before_ms: int, rest_ms: int, proven: bool
 ) -> None:
-    one = sender()
-    one.take(sent(REST, 0, shared=True), 0, "fresh" if proven else "unproven")
-    one.resume(before_ms * MS, 5000 * MS)
+    peer = sender()
+    peer.take(sent(REST, 0, shared=True), 0, "fresh" if proven else "unproven")
+    peer.resume(before_ms * MS, 5000 * MS)
     end_ns = (5000 + rest_ms) * MS
-    assert not one.armed(end_ns - 1)
-    assert one.armed(end_ns)
-    one.unlearn()
-    assert one.armed(end_ns) is proven
+    assert not peer.armed(end_ns - 1)
+    assert peer.armed(end_ns)
+    peer.unlearn()
+    assert peer.armed(end_ns) is proven
 
 
 def test_a_pause_that_was_over_before_a_stall_stays_over() -> None:
-    one = sender()
-    one.take(sent(REST, 0, shared=True), 0)
-    one.resume(1000 * MS, 1700 * MS)
-    assert one.armed(1700 * MS)
+    peer = sender()
+    peer.take(sent(REST, 0, shared=True), 0)
+    peer.resume(1000 * MS, 1700 * MS)
+    assert peer.armed(1700 * MS)
 
 
 @each(("silent_ms", "stays"), [(250, True), (251, False)])
 def test_a_sender_that_was_not_silent_before_a_stall_keeps_its_place_after_the_stall(
     silent_ms: int, stays: bool
 ) -> None:
-    one = sender()
-    one.take(sent(GO, 0), 0)
-    one.resume(silent_ms * MS, 1000 * MS)
-    assert one.present(1250 * MS) is stays
-    assert not one.live(1000 * MS)
-    assert not one.present(1251 * MS)
+    peer = sender()
+    peer.take(sent(GO, 0), 0)
+    peer.resume(silent_ms * MS, 1000 * MS)
+    assert peer.present(1250 * MS) is stays
+    assert not peer.live(1000 * MS)
+    assert not peer.present(1251 * MS)
 
 
 def test_a_sender_whose_clock_was_set_keeps_its_place_but_must_send_a_zero() -> None:
-    one = sender()
-    one.take(sent(REST, 0), 0)
-    one.disarm(100 * MS)
-    one.take(sent(GO, 100), 0)
-    assert not one.armed(100 * MS)
-    assert one.came_ns == 0
+    peer = sender()
+    peer.take(sent(REST, 0), 0)
+    peer.disarm(100 * MS)
+    peer.take(sent(GO, 100), 0)
+    assert not peer.armed(100 * MS)
+    assert peer.came_ns == 0
     for at_ms in range(200, 5000, 100):
-        one.take(sent(GO, at_ms), 0)
-        assert one.holds(at_ms * MS) is (at_ms <= 4100)
-    assert not one.holds(9000 * MS)
+        peer.take(sent(GO, at_ms), 0)
+        assert peer.holds(at_ms * MS) is (at_ms <= 4100)
+    assert not peer.holds(9000 * MS)
 
 
 def test_commands_in_doubt_count_as_zeros_or_speeds_too() -> None:
-    one = sender()
+    peer = sender()
     marks = []
     for at_ms, twist, late in ((0, GO, 0), (100, GO, 1), (200, REST, 1), (300, REST, 0),
                                (400, GO, 1), (500, GO, 0)):  # fmt: skip
         if late:
-            one.refuse(sent(twist, at_ms), "stale")
+            peer.refuse(sent(twist, at_ms), "stale")
         else:
-            one.take(sent(twist, at_ms), 0)
-        marks.append((one.speeds_ns, one.zeros_ns))
+            peer.take(sent(twist, at_ms), 0)
+        marks.append((peer.speeds_ns, peer.zeros_ns))
     assert marks == [
         (0, None), (0, None), (None, 200 * MS), (None, 200 * MS), (400 * MS, None),
         (400 * MS, None),
@@ -271,29 +271,29 @@ def test_commands_in_doubt_count_as_zeros_or_speeds_too() -> None:
 
 
 def test_a_shared_zero_that_arrived_in_a_stall_begins_its_pause_at_the_end_of_the_stall() -> None:
-    one = sender()
-    one.take(sent(REST, 0, shared=True), 0, watched_ns=800 * MS)
-    one.take(sent(REST, 5, shared=True), 0)
-    assert not one.armed(1700 * MS)
-    assert one.armed(1800 * MS)
+    peer = sender()
+    peer.take(sent(REST, 0, shared=True), 0, watched_ns=800 * MS)
+    peer.take(sent(REST, 5, shared=True), 0)
+    assert not peer.armed(1700 * MS)
+    assert peer.armed(1800 * MS)
 
 
 def test_a_sender_whose_stamps_are_in_doubt_keeps_its_place_for_four_seconds() -> None:
-    one = sender()
-    one.take(sent(GO, 0), 0)
+    peer = sender()
+    peer.take(sent(GO, 0), 0)
     for at_ms in range(200, 5000, 200):
-        one.refuse(sent(GO, at_ms), "stale")
-        assert one.present(at_ms * MS) is (at_ms <= 4000)
-        assert one.live(at_ms * MS) is (at_ms <= 250)
+        peer.refuse(sent(GO, at_ms), "stale")
+        assert peer.present(at_ms * MS) is (at_ms <= 4000)
+        assert peer.live(at_ms * MS) is (at_ms <= 250)
 
 
 def test_a_sender_that_was_silent_gets_no_place_by_a_command_in_doubt() -> None:
-    one = sender()
-    one.take(sent(GO, 0), 0)
-    one.refuse(sent(GO, 200), "stale")
-    assert one.present(450 * MS)
-    one.refuse(sent(GO, 451), "stale")
-    assert not one.present(451 * MS)
+    peer = sender()
+    peer.take(sent(GO, 0), 0)
+    peer.refuse(sent(GO, 200), "stale")
+    assert peer.present(450 * MS)
+    peer.refuse(sent(GO, 451), "stale")
+    assert not peer.present(451 * MS)
 
 
 @each("way", ["unproven", "stale"])
@@ -301,17 +301,17 @@ def test_a_sender_that_was_silent_gets_no_place_by_a_command_in_doubt() -> None:
 def test_a_zero_whose_stamp_is_in_doubt_ends_an_earlier_speed_but_refreshes_no_timeout(
     way: Verdict, stamp: int | None, twist: Twist
 ) -> None:
-    one = sender()
-    one.take(sent(REST, 0), 0)
-    one.take(replace(sent(GO, 10), stamp_ns=15), 0)
+    peer = sender()
+    peer.take(sent(REST, 0), 0)
+    peer.take(replace(sent(GO, 10), stamp_ns=15), 0)
     zero = replace(sent(REST, 20), stamp_ns=stamp)
     if way == "stale":
-        one.refuse(zero, way)
+        peer.refuse(zero, way)
     else:
-        one.take(zero, 0, way)
-    assert one.twist == twist
-    assert one.arrived_ns == 10 * MS
-    assert one.armed(20 * MS)
+        peer.take(zero, 0, way)
+    assert peer.twist == twist
+    assert peer.arrived_ns == 10 * MS
+    assert peer.armed(20 * MS)
 
 
 @each(
@@ -322,81 +322,81 @@ def test_a_speed_that_a_zero_in_doubt_overtook_is_not_followed_again(
     ahead_ms: int, clock: str, twist: Twist
 ) -> None:
     """A stamp that is ahead by more than the timeout of 250 ms is doubtful."""
-    one, stamp_ns = sender(), 5000 * MS
-    one.take(replace(sent(GO, 10), stamp_ns=stamp_ns - MS, clock="a"), 0)
-    one.refuse(replace(sent(REST, 20), stamp_ns=stamp_ns + ahead_ms * MS, clock="a"), "stale")
-    one.take(replace(sent(GO, 30), stamp_ns=stamp_ns, clock=clock), 0)
-    assert one.twist == twist
-    one.take(replace(sent(GO, 40), stamp_ns=stamp_ns + 251 * MS, clock="a"), 0)
-    assert one.twist == GO
+    peer, stamp_ns = sender(), 5000 * MS
+    peer.take(replace(sent(GO, 10), stamp_ns=stamp_ns - MS, clock="a"), 0)
+    peer.refuse(replace(sent(REST, 20), stamp_ns=stamp_ns + ahead_ms * MS, clock="a"), "stale")
+    peer.take(replace(sent(GO, 30), stamp_ns=stamp_ns, clock=clock), 0)
+    assert peer.twist == twist
+    peer.take(replace(sent(GO, 40), stamp_ns=stamp_ns + 251 * MS, clock="a"), 0)
+    assert peer.twist == GO
 
 
 @each(("number", "twist"), [(8, REST), (7, GO), (None, GO)])
 def test_a_zero_in_doubt_whose_number_is_higher_ends_an_earlier_speed(
     number: int | None, twist: Twist
 ) -> None:
-    one = sender()
-    one.take(replace(sent(GO, 10), stamp_ns=15, sequence=7), 0)
-    one.refuse(replace(sent(REST, 20), stamp_ns=5, sequence=number), "stale")
-    assert one.twist == twist
+    peer = sender()
+    peer.take(replace(sent(GO, 10), stamp_ns=15, sequence=7), 0)
+    peer.refuse(replace(sent(REST, 20), stamp_ns=5, sequence=number), "stale")
+    assert peer.twist == twist
 
 
 def test_a_shared_zero_that_armed_unproven_is_forgotten_when_its_clock_proves_wrong() -> None:
-    one = sender()
-    one.take(sent(REST, 0, shared=True), 0, "unproven")
-    assert one.armed(1100 * MS)
-    one.unlearn()
-    assert not one.armed(HOUR_NS)
+    peer = sender()
+    peer.take(sent(REST, 0, shared=True), 0, "unproven")
+    assert peer.armed(1100 * MS)
+    peer.unlearn()
+    assert not peer.armed(HOUR_NS)
 
 
 def test_a_sender_keeps_the_twist_the_name_and_the_kind_of_its_last_command() -> None:
-    one = sender()
+    peer = sender()
     for ros, shared in ((True, False), (False, True)):
         command = Command("high", GO, 5 * MS, sender="joe", ros=ros, shared=shared)
-        one.take(command, 0)
-        assert (one.twist, one.name, one.ros, one.shared) == (GO, "joe", ros, shared)
-        assert (one.arrived_ns, one.noticed_ns) == (5 * MS, 5 * MS)
+        peer.take(command, 0)
+        assert (peer.twist, peer.name, peer.ros, peer.shared) == (GO, "joe", ros, shared)
+        assert (peer.arrived_ns, peer.noticed_ns) == (5 * MS, 5 * MS)
 
 
 def test_the_first_zero_after_a_speed_is_remembered_while_the_sender_is_not_silent() -> None:
-    one, zeros = sender(), []
+    peer, zeros = sender(), []
     for at_ms, twist in ((0, GO), (100, REST), (200, REST), (300, GO), (400, REST), (900, REST)):
-        one.take(sent(twist, at_ms), 0)
-        zeros.append(one.zeros_ns)
+        peer.take(sent(twist, at_ms), 0)
+        zeros.append(peer.zeros_ns)
     assert zeros == [None, 100 * MS, 100 * MS, None, 400 * MS, 900 * MS]
 
 
 def test_requiring_a_zero_again_forgets_the_zeros_that_wait() -> None:
-    one = sender()
-    one.take(sent(REST, 0, shared=True), 0)
-    one.require_neutral()
-    assert not one.armed(HOUR_NS)
-    one.take(sent(REST, 0), 0)
-    one.require_neutral()
-    one.unlearn()
-    assert not one.armed(HOUR_NS)
+    peer = sender()
+    peer.take(sent(REST, 0, shared=True), 0)
+    peer.require_neutral()
+    assert not peer.armed(HOUR_NS)
+    peer.take(sent(REST, 0), 0)
+    peer.require_neutral()
+    peer.unlearn()
+    assert not peer.armed(HOUR_NS)
 
 
 def test_without_neutral_first_every_sender_is_armed() -> None:
-    one = Sender(250 * MS, 1000 * MS, neutral_first=False)
-    assert one.armed(0)
-    one.require_neutral()
-    assert one.armed(0)
+    peer = Sender(250 * MS, 1000 * MS, neutral_first=False)
+    assert peer.armed(0)
+    peer.require_neutral()
+    assert peer.armed(0)
 
 
 def test_a_command_counts_until_its_timeout_unless_its_stamp_is_in_doubt() -> None:
-    one = sender()
-    one.take(sent(GO, 600), 0, "unproven")
-    assert not one.live(600 * MS)
-    assert one.doubtful(850 * MS)
-    assert not one.doubtful(850 * MS + 1)
-    one.take(sent(GO, 610), 0)
-    assert one.live(860 * MS)
-    assert not one.live(860 * MS + 1)
-    assert not one.doubtful(610 * MS)
-    one.refuse(sent(GO, 620), "stale")
-    assert (one.doubtful(620 * MS), one.doubt, one.noticed_ns) == (True, "stale", 620 * MS)
-    assert one.live(860 * MS)
+    peer = sender()
+    peer.take(sent(GO, 600), 0, "unproven")
+    assert not peer.live(600 * MS)
+    assert peer.doubtful(850 * MS)
+    assert not peer.doubtful(850 * MS + 1)
+    peer.take(sent(GO, 610), 0)
+    assert peer.live(860 * MS)
+    assert not peer.live(860 * MS + 1)
+    assert not peer.doubtful(610 * MS)
+    peer.refuse(sent(GO, 620), "stale")
+    assert (peer.doubtful(620 * MS), peer.doubt, peer.noticed_ns) == (True, "stale", 620 * MS)
+    assert peer.live(860 * MS)
 
 
 # neutral first
@@ -652,44 +652,44 @@ def test_a_numbered_speed_of_another_clock_that_a_zero_overtook_does_not_move_th
         at_ns = at_ms * MS
         return Command("high", twist, at_ns, at_ns, clock, "node", sequence=number)
 
-    one = sender()
-    one.take(sent_by("b", 5, REST, 0), 0)
-    one.take(sent_by("b", 6, GO, 50), 0)
-    one.take(sent_by("a", 8, REST, 100), 0, verdict)
-    assert one.twist == REST
-    one.take(sent_by(clock, number, GO, 100 + after_ms), 0)
-    assert one.twist == twist
-    one.take(sent_by("b", 10, GO, 200), 0)
-    assert one.twist == GO
+    peer = sender()
+    peer.take(sent_by("b", 5, REST, 0), 0)
+    peer.take(sent_by("b", 6, GO, 50), 0)
+    peer.take(sent_by("a", 8, REST, 100), 0, verdict)
+    assert peer.twist == REST
+    peer.take(sent_by(clock, number, GO, 100 + after_ms), 0)
+    assert peer.twist == twist
+    peer.take(sent_by("b", 10, GO, 200), 0)
+    assert peer.twist == GO
 
 
 def test_a_speed_that_the_first_zero_of_a_sender_overtook_does_not_move_the_robot() -> None:
     """The zero arms the sender, although the clock that stamps it is not proven yet."""
-    one = sender()
-    one.take(Command("high", GO, 0, 0, "b", "node", sequence=7), 0, "unproven")
-    one.take(Command("high", REST, 100 * MS, 100 * MS, "a", "node", sequence=9), 0, "unproven")
-    assert one.armed(100 * MS)
-    one.take(Command("high", GO, 102 * MS, 50 * MS, "b", "node", sequence=8), 0)
-    assert one.twist == REST
-    one.take(Command("high", GO, 150 * MS, 150 * MS, "b", "node", sequence=10), 0)
-    assert one.twist == GO
+    peer = sender()
+    peer.take(Command("high", GO, 0, 0, "b", "node", sequence=7), 0, "unproven")
+    peer.take(Command("high", REST, 100 * MS, 100 * MS, "a", "node", sequence=9), 0, "unproven")
+    assert peer.armed(100 * MS)
+    peer.take(Command("high", GO, 102 * MS, 50 * MS, "b", "node", sequence=8), 0)
+    assert peer.twist == REST
+    peer.take(Command("high", GO, 150 * MS, 150 * MS, "b", "node", sequence=10), 0)
+    assert peer.twist == GO
 
 
 def test_the_first_zero_after_a_demand_for_zeros_ends_older_speeds_whatever_came_before() -> None:
     """A program has restarted with a new clock and lower sequence numbers."""
-    one = sender()
-    one.take(Command("high", REST, 0, 0, "b", "node", sequence=500), 0)
-    one.require_neutral()
-    one.take(Command("high", REST, 100 * MS, 100 * MS, "a", "node", sequence=11), 0, "unproven")
-    one.take(Command("high", GO, 102 * MS, 50 * MS, "c", "node", sequence=10), 0)
-    assert one.twist == REST
+    peer = sender()
+    peer.take(Command("high", REST, 0, 0, "b", "node", sequence=500), 0)
+    peer.require_neutral()
+    peer.take(Command("high", REST, 100 * MS, 100 * MS, "a", "node", sequence=11), 0, "unproven")
+    peer.take(Command("high", GO, 102 * MS, 50 * MS, "c", "node", sequence=10), 0)
+    assert peer.twist == REST
 
 
 def test_a_doubtful_zero_does_not_stop_a_sender_whose_commands_have_neither_stamp_nor_number() -> (
     None
 ):
-    one = sender()
-    one.take(Command("high", REST, 0, None, "", "node"), 0)
-    one.take(Command("high", GO, 50 * MS, None, "", "node"), 0)
-    one.refuse(Command("high", REST, 60 * MS, 10 * MS, "a", "node", sequence=3), "stale")
-    assert one.twist == GO
+    peer = sender()
+    peer.take(Command("high", REST, 0, None, "", "node"), 0)
+    peer.take(Command("high", GO, 50 * MS, None, "", "node"), 0)
+    peer.refuse(Command("high", REST, 60 * MS, 10 * MS, "a", "node", sequence=3), "stale")
+    assert peer.twist == GO

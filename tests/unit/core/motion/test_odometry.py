@@ -53,10 +53,10 @@ def feedback(left: float, right: float, dt: float, gap: float = 0.0) -> Feedback
 LATER = feedback(20.0, 20.0, 0.01)
 
 
-def same_pose(got: Pose, expected: Three, tolerance: float = 1e-9) -> bool:
+def same_pose(pose: Pose, expected: Three, tolerance: float = 1e-9) -> bool:
     """Return whether poses are equal within `tolerance`, ignoring whole turns of yaw."""
-    turn = math.remainder(got.yaw - expected[2], math.tau)
-    return (got.x, got.y, turn) == pytest.approx((*expected[:2], 0.0), abs=tolerance)
+    turn = math.remainder(pose.yaw - expected[2], math.tau)
+    return (pose.x, pose.y, turn) == pytest.approx((*expected[:2], 0.0), abs=tolerance)
 
 
 def matrix(p: PoseCovariance) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
@@ -886,10 +886,10 @@ def test_another_track_changes_only_later_turns(share: float) -> None:
     pose = asked.pose
     asked.use_track(Track(share, 0.02))
     assert asked.pose == pose == plain.pose
-    came, would = asked.fold(feedback(4.0, 9.0, 0.1)), plain.fold(feedback(4.0, 9.0, 0.1))
-    assert came.twist.linear == would.twist.linear
-    assert came.twist.angular == pytest.approx(would.twist.angular / share)
-    assert came.pose.yaw - pose.yaw == pytest.approx((would.pose.yaw - pose.yaw) / share)
+    estimate, would = asked.fold(feedback(4.0, 9.0, 0.1)), plain.fold(feedback(4.0, 9.0, 0.1))
+    assert estimate.twist.linear == would.twist.linear
+    assert estimate.twist.angular == pytest.approx(would.twist.angular / share)
+    assert estimate.pose.yaw - pose.yaw == pytest.approx((would.pose.yaw - pose.yaw) / share)
     assert asked.travelled == plain.travelled
 
 
@@ -897,8 +897,8 @@ def test_an_enabled_learned_track_changes_nothing_until_it_is_known() -> None:
     asked, plain = odometry(OdometryConfig(learned_track=True)), odometry()
     for n in range(200):
         line = feedback(math.sin(n), 9.0 + math.cos(n), 0.01)
-        came, would = asked.fold(line), plain.fold(line)
-        assert (came.pose, came.twist, came.covariance) == (
+        estimate, would = asked.fold(line), plain.fold(line)
+        assert (estimate.pose, estimate.twist, estimate.covariance) == (
             would.pose,
             would.twist,
             would.covariance,
@@ -912,11 +912,11 @@ def test_a_corrected_turn_is_computed_with_the_track_at_the_time_of_that_turn() 
     """
     asked = OdometryConfig(learned_track=True)
     liar, honest = (Odometry(asked, Kinematics(DriveConfig()), 3200) for _ in range(2))
-    told = Kinematics(DriveConfig()).wheel_speeds(Twist(0.5, 0.8))
-    dead = WheelSpeeds(told.front_right, 0.0, told.rear_left, told.rear_right)
+    speeds = Kinematics(DriveConfig()).wheel_speeds(Twist(0.5, 0.8))
+    dead = WheelSpeeds(speeds.front_right, 0.0, speeds.rear_left, speeds.rear_right)
     for n in range(60):
-        fold(honest, Feedback(AT, told, 0.01), told)
-        fold(liar, Feedback(AT, told if n < 50 else dead, 0.01), told)
+        fold(honest, Feedback(AT, speeds, 0.01), speeds)
+        fold(liar, Feedback(AT, speeds if n < 50 else dead, 0.01), speeds)
         if n == 51:
             assert not liar.checks.wheels.status.left_out
             for robot in (liar, honest):
@@ -939,7 +939,9 @@ def test_a_learned_track_makes_the_estimate_as_uncertain_as_a_configured_one(sha
     plain = Odometry(OdometryConfig(wheel_separation_multiplier_std=0.02 * share), such, 400)
     for n in range(300):
         line = feedback(5.0 + 4.0 * math.sin(n), 9.0 + 4.0 * math.cos(n), 0.01, 0.05 * (n == 150))
-        came, would = asked.fold(line), plain.fold(line)
-        got, expected = came.twist_variances, would.twist_variances
-        assert (got.linear, got.angular) == pytest.approx((expected.linear, expected.angular))
-        assert matrix(came.covariance) == pytest.approx(matrix(would.covariance), rel=1e-6)
+        estimate, would = asked.fold(line), plain.fold(line)
+        variances, expected = estimate.twist_variances, would.twist_variances
+        assert (variances.linear, variances.angular) == pytest.approx(
+            (expected.linear, expected.angular)
+        )
+        assert matrix(estimate.covariance) == pytest.approx(matrix(would.covariance), rel=1e-6)

@@ -61,8 +61,8 @@ DRIVES: dict[str, Drive] = {
 def test_a_million_lines_end_within_a_nanometre(drive: str, lines: int) -> None:
     d, turn = (a.tolist() for a in DRIVES[drive](np.random.default_rng(1), lines))
     path = Path()
-    for one, by in zip(d, turn, strict=True):
-        path.advance(one, by)
+    for step, by in zip(d, turn, strict=True):
+        path.advance(step, by)
     x, y, yaw = long_double_end(d, turn)
     off = (
         abs(path.pose.x - x),

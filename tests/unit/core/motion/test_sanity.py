@@ -82,15 +82,15 @@ def test_the_first_line_and_the_first_after_a_gap_have_no_slew() -> None:
 def test_three_impossible_lines_in_a_row_are_doubtful_and_two_are_not() -> None:
     sanity = Sanity(FeedbackConfig())
     fast = line(only(0, 99.0))
-    found = []
+    flags = []
     for _ in range(2):
         sanity.impossible(fast)
-        found.append(sanity.doubtful)
+        flags.append(sanity.doubtful)
     sanity.impossible(line(STILL))
     for _ in range(3):
         sanity.impossible(fast)
-        found.append(sanity.doubtful)
-    assert found == [False, False, False, False, True]
+        flags.append(sanity.doubtful)
+    assert flags == [False, False, False, False, True]
 
 
 def test_forgetting_starts_over() -> None:
@@ -110,11 +110,11 @@ def test_three_impossible_lines_are_doubtful_at_the_start_and_after_forgetting(
     sanity = Sanity(FeedbackConfig())
     if forget:
         sanity.forget()
-    found = []
+    flags = []
     for _ in range(3):
         sanity.impossible(line(only(0, 99.0)))
-        found.append(sanity.doubtful)
-    assert found == [False, False, True]
+        flags.append(sanity.doubtful)
+    assert flags == [False, False, True]
 
 
 # trust
@@ -185,11 +185,11 @@ def test_a_jump_from_a_speed_that_two_lines_agreed_on_is_a_fault_even_if_it_last
 
 
 def test_lines_that_agree_with_no_other_are_a_fault_from_the_first_on() -> None:
-    sanity, found = Sanity(FeedbackConfig()), []
+    sanity, flags = Sanity(FeedbackConfig()), []
     for speed in (20.0, 79.0, -79.0, -30.0):
         sanity.impossible(line(only(3, speed)))
-        found.append(sanity.doubtful)
-    assert found == [False, False, False, True]
+        flags.append(sanity.doubtful)
+    assert flags == [False, False, False, True]
 
 
 def test_a_line_after_a_gap_is_not_compared_with_lines_before_the_gap() -> None:
@@ -287,11 +287,11 @@ def test_the_step_of_one_wheel_excuses_nothing_before_the_steps_of_the_others_ar
 
 
 def test_a_fine_learned_step_does_not_delay_the_fault() -> None:
-    sanity, found = Sanity(FeedbackConfig(wheel_speed=5.0)), []
+    sanity, flags = Sanity(FeedbackConfig(wheel_speed=5.0)), []
     for _ in range(3):
         sanity.impossible(stepping(only(2, 5.3), 0.2))
-        found.append(sanity.doubtful)
-    assert found == [False, False, True]
+        flags.append(sanity.doubtful)
+    assert flags == [False, False, True]
 
 
 @pytest.mark.parametrize("counts", [16, 40, 96, 200])
@@ -323,8 +323,8 @@ def test_an_unknown_step_excuses_only_one_count_of_a_fast_time() -> None:
     of 22. Of eight lines six prove one, with a mean of 22.5 rad/s.
     """
     sanity = Sanity(FeedbackConfig(wheel_speed=22.0))
-    found = [bool(sanity.impossible(line)) for line in unknown(*[30.0] * 10)]
-    assert found == [False] * 7 + [True] * 3
+    flags = [bool(sanity.impossible(line)) for line in unknown(*[30.0] * 10)]
+    assert flags == [False] * 7 + [True] * 3
     assert sanity.doubtful
 
 
@@ -342,13 +342,13 @@ def test_a_line_within_the_limit_ends_the_fast_time() -> None:
 
 def test_a_slow_line_of_one_wheel_ends_only_the_fast_time_of_that_wheel() -> None:
     sanity = Sanity(FeedbackConfig(wheel_speed=20.0))
-    found = []
+    names = []
     for first in (0.0, 30.0, 30.0, 0.0, 30.0, 30.0, 30.0, 0.0):
         speeds = WheelSpeeds(first, 32.0, 0.0, 0.0)
         line = Feedback(AT, speeds, DT, steps=(math.inf,) * 4)
-        found.append(sanity.impossible(line).partition(" ")[0])
+        names.append(sanity.impossible(line).partition(" ")[0])
     # The limit and 2 / 5 of 32 rad/s are 32.8 rad/s, and with 2 / 6 they are 30.7 rad/s.
-    assert found == [""] * 5 + ["front_left"] * 3
+    assert names == [""] * 5 + ["front_left"] * 3
 
 
 def test_forgetting_ends_the_fast_time() -> None:
@@ -395,11 +395,11 @@ def test_the_time_of_an_unknown_step_does_not_include_lost_lines() -> None:
 
 
 def test_three_impossible_lines_are_doubtful_also_before_the_step_is_known() -> None:
-    sanity, found = Sanity(FeedbackConfig()), []
+    sanity, flags = Sanity(FeedbackConfig()), []
     for line in unknown(99.0, 99.0, 99.0):
         sanity.impossible(line)
-        found.append(sanity.doubtful)
-    assert found == [False, False, True]
+        flags.append(sanity.doubtful)
+    assert flags == [False, False, True]
 
 
 def test_an_unknown_encoder_makes_any_change_possible_but_no_speed_above_the_limit() -> None:

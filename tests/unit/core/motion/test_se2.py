@@ -67,8 +67,8 @@ def test_an_error_that_is_seen_from_a_further_point_is_the_same_motion(
     error: Vector, dx: float, dy: float
 ) -> None:
     moved = np.array([[1.0, 0.0, dx], [0.0, 1.0, dy], [0.0, 0.0, 1.0]])
-    seen = np.linalg.inv(moved) @ hat(error) @ moved
-    assert seen_from(error, dx, dy) == pytest.approx((seen[0, 2], seen[1, 2], seen[1, 0]))
+    result = np.linalg.inv(moved) @ hat(error) @ moved
+    assert seen_from(error, dx, dy) == pytest.approx((result[0, 2], result[1, 2], result[1, 0]))
 
 
 @given(root=roots, dx=number, dy=number)
@@ -95,7 +95,7 @@ def test_the_covariance_of_a_bracket_is_that_of_all_its_directions(
     # The errors lie along the columns of the roots, each at +-1 deviation, in all pairs.
     p, q = np.array(p_root).reshape(3, 3), np.array(q_root).reshape(3, 3)
     every = [ad(tuple(a)) @ b for a in p.T for b in q.T]
-    expected = np.sum([np.outer(one, one) for one in every], axis=0)
+    expected = np.sum([np.outer(vector, vector) for vector in every], axis=0)
     xx, xy, yy = bracket_covariance(covariance(p_root), covariance(q_root))
     assert (xx, xy, yy) == pytest.approx((expected[0, 0], expected[0, 1], expected[1, 1]), abs=1e-6)
 
@@ -107,8 +107,8 @@ def test_the_third_terms_are_those_of_barfoot_and_furgale(
     q, root = matrix(covariance(q_root)), np.array(p_root).reshape(3, 3)
     twice = np.sum([ad(tuple(e)) @ ad(tuple(e)) for e in root.T], axis=0)
     p = covariance(p_root)
-    got = twice_bracketed(packed(q), (p.xyaw, p.yyaw, p.yawyaw))
-    assert matrix(got) == pytest.approx(twice @ q + q @ twice.T, abs=1e-6)
+    result = twice_bracketed(packed(q), (p.xyaw, p.yyaw, p.yawyaw))
+    assert matrix(result) == pytest.approx(twice @ q + q @ twice.T, abs=1e-6)
 
 
 @given(p_root=roots, q_root=roots, c=number, s=number)

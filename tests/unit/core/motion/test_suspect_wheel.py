@@ -180,8 +180,8 @@ def test_a_changed_speed_in_between_restarts_the_evidence_of_a_stuck_wheel() -> 
     stuck = Stuck()
     for line in range(1, 100):
         command = 10.0 + 0.2 * line
-        found = stuck.add(line % 3 != 0, 0.002 * line, DT, FINE, told(command, command - 1.0)[0])
-        assert not found
+        result = stuck.add(line % 3 != 0, 0.002 * line, DT, FINE, told(command, command - 1.0)[0])
+        assert not result
 
 
 @given(st.floats(0.0, 1.0), st.floats(0.02, 0.1), st.sampled_from([16, 96, 400, 3200]))
@@ -190,7 +190,7 @@ def test_a_sound_wheel_with_an_encoder_of_any_kind_is_not_stuck(
 ) -> None:
     stuck, count = Stuck(), math.tau / counts
     slow = command = speed = 10.0
-    angles, said = [phase * count, 0.0], [0, 0]
+    angles, totals = [phase * count, 0.0], [0, 0]
     last = None
     for line in range(300):
         command += 0.2 if 100 <= line < 160 else 0.0
@@ -198,8 +198,8 @@ def test_a_sound_wheel_with_an_encoder_of_any_kind_is_not_stuck(
         speed += (command - speed) * DT / (lag + DT)
         angles = [angle + speed * DT for angle in angles]
         own, other = (  # both are whole counts
-            math.floor(angle / count) - before for angle, before in zip(angles, said, strict=True)
+            math.floor(angle / count) - before for angle, before in zip(angles, totals, strict=True)
         )
-        said = [said[0] + own, said[1] + other]
+        totals = [totals[0] + own, totals[1] + other]
         assert not stuck.add(own == last, (other - own) * count, DT, count, told(command, slow)[0])
         last = own

@@ -111,12 +111,12 @@ def bursts(a_minute: float) -> Heard:
             lost[at : at + length] = True
             at += length
         lines = np.arange(len(drive))
-        heard = drive.copy()
-        for side in heard.T:
+        samples = drive.copy()
+        for side in samples.T:
             side[lost] = np.interp(lines[lost], lines[~lost], side[~lost])
         return [
-            Feedback(AT, WheelSpeeds(r, le, le, r), PERIOD, bridged=PERIOD * bool(gone))
-            for (le, r), gone in zip(heard.tolist(), lost, strict=True)
+            Feedback(AT, WheelSpeeds(r, le, le, r), PERIOD, bridged=PERIOD * bool(missing))
+            for (le, r), missing in zip(samples.tolist(), lost, strict=True)
         ]
 
     return heard
@@ -214,10 +214,10 @@ def test_the_deviation_of_a_wheel_radius_makes_the_pose_less_certain() -> None:
         right_wheel_radius_multiplier_std=0.002,
         pose_covariance_diagonal=(0.0,) * 6,
     )
-    one = PoseUncertainty(ErrorModel(odometry, Kinematics(DriveConfig())), 0)
+    model = PoseUncertainty(ErrorModel(odometry, Kinematics(DriveConfig())), 0)
     for _ in range(1000):
-        one.advance(0.01, 0.0, 0.01, 0.0, 0.0)
-    p = one.covariance
+        model.advance(0.01, 0.0, 0.01, 0.0, 0.0)
+    p = model.covariance
     assert math.sqrt(p.yawyaw) == pytest.approx(0.02 / 0.3)
     assert math.sqrt(p.yy) == pytest.approx(0.02 / 0.3 * 10.0 / 2, rel=1e-3)
     # The length is off by 0.01 m. A circle of 1/15 rad differs from its chord by 10 m x yaw2 / 12:
@@ -227,13 +227,13 @@ def test_the_deviation_of_a_wheel_radius_makes_the_pose_less_certain() -> None:
 
 
 def test_the_yaw_error_of_a_wheel_radius_cancels_on_the_way_back() -> None:
-    one = uncertainty(left_wheel_radius_multiplier_std=0.01)
+    first = uncertainty(left_wheel_radius_multiplier_std=0.01)
     for step in [0.01] * 500 + [-0.01] * 500:
-        one.advance(step, 0.0, step, 0.0, 0.0)
-    two = uncertainty()
+        first.advance(step, 0.0, step, 0.0, 0.0)
+    second = uncertainty()
     for step in [0.01] * 500 + [-0.01] * 500:
-        two.advance(step, 0.0, step, 0.0, 0.0)
-    assert one.covariance.yawyaw == pytest.approx(two.covariance.yawyaw)
+        second.advance(step, 0.0, step, 0.0, 0.0)
+    assert first.covariance.yawyaw == pytest.approx(second.covariance.yawyaw)
 
 
 @pytest.mark.slow
@@ -251,21 +251,21 @@ def test_a_heading_error_that_comes_and_goes_shortens_a_straight() -> None:
 
 @pytest.mark.parametrize("turns", [1.0, -1.0])
 def test_turning_to_and_fro_counts_both_ways(turns: float) -> None:
-    one = uncertainty()
+    model = uncertainty()
     for turn in [0.01 * turns] * 100 + [-0.01 * turns] * 100:
-        one.advance(0.0, turn, 0.0, 0.0, 0.0)
+        model.advance(0.0, turn, 0.0, 0.0, 0.0)
     # The robot turns by 2 rad, less the play at the start and twice that at the reversal.
-    assert one.covariance.yawyaw == pytest.approx(2e-2, rel=0.01)
+    assert model.covariance.yawyaw == pytest.approx(2e-2, rel=0.01)
 
 
 def test_trembling_within_a_count_is_no_turning() -> None:
-    one = uncertainty()
-    start = one.covariance.yawyaw
+    model = uncertainty()
+    start = model.covariance.yawyaw
     for _ in range(10_000):
-        one.advance(0.0, 0.001, 0.0, 0.0, 0.0)
-        one.advance(0.0, -0.001, 0.0, 0.0, 0.0)
+        model.advance(0.0, 0.001, 0.0, 0.0, 0.0)
+        model.advance(0.0, -0.001, 0.0, 0.0, 0.0)
     # The wheels' path of 2 x 1000 m counts as such: 1.5e-5 per radian.
-    assert one.covariance.yawyaw - start < 1e-1 * 20.0 * 1e-2
+    assert model.covariance.yawyaw - start < 1e-1 * 20.0 * 1e-2
 
 
 @pytest.mark.parametrize("counts", [16, 96, 400])
@@ -274,8 +274,8 @@ def test_the_unknown_wheel_angle_within_a_count_adds_to_the_yaw_variance(
 ) -> None:
     kinematics, count = Kinematics(DriveConfig()), RADIUS * math.tau / counts
     known, unknown = (
-        Odometry(OdometryConfig(), kinematics, given).fold(Feedback(AT, STILL, 0.01)).covariance
-        for given in (counts, 0)
+        Odometry(OdometryConfig(), kinematics, setting).fold(Feedback(AT, STILL, 0.01)).covariance
+        for setting in (counts, 0)
     )
     places = 2 * count**2 / 24 * 2 / TRACK**2
     assert known.yawyaw - unknown.yawyaw == pytest.approx(places), "at the start, and now"
@@ -304,20 +304,20 @@ def test_the_yaw_errors_of_the_gyro_and_of_gaps_are_separate_whichever_came_firs
     gaps_first, gyro_first = uncertainty(), uncertainty()
     before = gyro_first.covariance.yawyaw
     gaps_first.stand(0.0, 0.0, 0.0, 0.0)
-    for one in (gaps_first, gyro_first):
-        one.advance(0.0, 10.0, 0.0, 0.0, 0.0, variance=0.0)
-        one.stand(0.0, 0.2, 0.0, 0.0)
-        one.advance(0.0, 10.0, 0.0, 0.0, 0.0, variance=0.0)
-        one.stand(0.0, -0.2, 0.0, 0.0)
+    for model in (gaps_first, gyro_first):
+        model.advance(0.0, 10.0, 0.0, 0.0, 0.0, variance=0.0)
+        model.stand(0.0, 0.2, 0.0, 0.0)
+        model.advance(0.0, 10.0, 0.0, 0.0, 0.0, variance=0.0)
+        model.stand(0.0, -0.2, 0.0, 0.0)
     of_skidding = 0.4 * DEFAULT.skid
-    for one in (gaps_first, gyro_first):
-        grown = one.covariance.yawyaw - before
+    for model in (gaps_first, gyro_first):
+        grown = model.covariance.yawyaw - before
         assert grown == pytest.approx((20.0 * GYRO_SCALE_STD) ** 2 + of_skidding, rel=0.01)
 
 
 def test_a_turn_that_the_wheels_give_has_no_error_of_the_gyro_scale() -> None:
-    one, plain_one = uncertainty(), uncertainty()
-    one.advance(0.0, 0.0, 0.0, 0.0, 0.0, variance=0.0)
-    for each in (one, plain_one):
+    gyro_model, plain_model = uncertainty(), uncertainty()
+    gyro_model.advance(0.0, 0.0, 0.0, 0.0, 0.0, variance=0.0)
+    for each in (gyro_model, plain_model):
         each.advance(0.0, 10.0, 0.0, 0.0, 0.0)
-    assert one.covariance == plain_one.covariance
+    assert gyro_model.covariance == plain_model.covariance

@@ -41,9 +41,9 @@ def test_a_tenth_more_on_one_wheel_is_a_contradiction_within_a_fifth_of_a_second
 ) -> None:
     residual = Residual()
     rolled(residual, speed, speed, 2.0)
-    said = rolled(residual, speed * share, speed, 0.2)
-    assert said[0]
-    assert not said[-1]
+    flags = rolled(residual, speed * share, speed, 0.2)
+    assert flags[0]
+    assert not flags[-1]
     assert residual.slips
 
 
@@ -65,8 +65,8 @@ def test_the_learned_ratio_stays_within_the_limit_for_unequal_tyres() -> None:
 def test_the_wheel_that_replaces_another_one_gives_the_speed_of_that_wheel(front: bool) -> None:
     residual = Residual()
     rolled(residual, 10.4, 10.0, 60.0)
-    said, missing = (10.0, 10.4) if front else (10.4, 10.0)
-    assert said * residual.stand_in(front) == pytest.approx(missing, rel=2e-3)
+    speed, missing = (10.0, 10.4) if front else (10.4, 10.0)
+    assert speed * residual.stand_in(front) == pytest.approx(missing, rel=2e-3)
 
 
 @pytest.mark.parametrize("counts", [16, 96, 400])

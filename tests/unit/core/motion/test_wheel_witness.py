@@ -40,33 +40,34 @@ def noisy(speeds: WheelSpeeds, step: int) -> WheelSpeeds:
 
 
 def watched(
-    sent: WheelSpeeds, seen: WheelSpeeds, seconds: float = 3.0, jitter: float = 0.0
+    sent: WheelSpeeds, feedback: WheelSpeeds, seconds: float = 3.0, jitter: float = 0.0
 ) -> tuple[float, str]:
     """Return the time and text of the fault, or (inf, "") if there is none."""
     robot = watching()
     for step in range(round(seconds / DT)):
-        noisy = WheelSpeeds(*(s + jitter * (step % 2) for s in seen.as_tuple()))
+        noisy = WheelSpeeds(*(s + jitter * (step % 2) for s in feedback.as_tuple()))
         fault = robot.watch(sent, noisy, DT)
         if fault:
             return (step + 1) * DT, fault
     return math.inf, ""
 
 
-def watched_after_driving(wheel: int, sent: float, seen: float, jitter: float = 0.0) -> str:
+def watched_after_driving(wheel: int, sent: float, speed: float, jitter: float = 0.0) -> str:
     """Return the fault within two seconds, after three seconds of correct driving."""
     robot = watching()
-    told = WheelSpeeds(*[sent] * 4)
-    assert not any(robot.watch(told, noisy(told, step), DT) for step in range(300))
-    found = (
-        robot.watch(told, only(wheel, seen + jitter * (step % 2), sent), DT) for step in range(200)
+    target = WheelSpeeds(*[sent] * 4)
+    assert not any(robot.watch(target, noisy(target, step), DT) for step in range(300))
+    faults = (
+        robot.watch(target, only(wheel, speed + jitter * (step % 2), sent), DT)
+        for step in range(200)
     )
-    return next(filter(None, found), "")
+    return next(filter(None, faults), "")
 
 
 def driven(speed: float, settings: FeedbackConfig | None = None) -> WheelFaults:
     """Return a check that has watched a robot follow its commands for three seconds."""
-    robot, told = watching(settings or FeedbackConfig()), WheelSpeeds(speed, speed, speed, speed)
-    assert not any(robot.watch(told, noisy(told, step), DT) for step in range(300))
+    robot, target = watching(settings or FeedbackConfig()), WheelSpeeds(speed, speed, speed, speed)
+    assert not any(robot.watch(target, noisy(target, step), DT) for step in range(300))
     return robot
 
 
@@ -79,7 +80,7 @@ def test_forgetting_drops_the_evidence_against_every_wheel() -> None:
 
 @each("wheel", range(4))
 @each(
-    ("sent", "seen", "word"),
+    ("sent", "speed", "word"),
     [
         (10.0, 0.0, "does not turn"),
         (-10.0, 0.0, "does not turn"),
@@ -90,10 +91,10 @@ def test_forgetting_drops_the_evidence_against_every_wheel() -> None:
     ],
 )
 def test_a_contradiction_is_a_fault_within_a_second_and_names_the_wheel(
-    wheel: int, sent: float, seen: float, word: str
+    wheel: int, sent: float, speed: float, word: str
 ) -> None:
     jitter = 0.0 if "never changes" in word else 0.05
-    after, fault = watched(WheelSpeeds(*[sent] * 4), only(wheel, seen, sent), jitter=jitter)
+    after, fault = watched(WheelSpeeds(*[sent] * 4), only(wheel, speed, sent), jitter=jitter)
     assert 0.49 < after < 1.0
     assert fault.startswith(f"{WHEELS[wheel]} wheel")
     assert word in fault
@@ -101,7 +102,7 @@ def test_a_contradiction_is_a_fault_within_a_second_and_names_the_wheel(
 
 @each("sign", [1.0, -1.0])
 @each(
-    ("sent", "seen", "word"),
+    ("sent", "speed", "word"),
     [
         # A tenth of 10 rad/s does not count as turning.
         (10.0, 0.9, "does not turn"),
@@ -115,22 +116,22 @@ def test_a_contradiction_is_a_fault_within_a_second_and_names_the_wheel(
     ],
 )
 def test_the_limits_of_the_difference_from_the_command_are_those_worked_by_hand(
-    sent: float, seen: float, word: str, sign: float
+    sent: float, speed: float, word: str, sign: float
 ) -> None:
     # A jitter of 0.04 rad/s keeps the wheel from looking stuck.
-    fault = watched_after_driving(1, sign * sent, sign * seen, jitter=0.04)
+    fault = watched_after_driving(1, sign * sent, sign * speed, jitter=0.04)
     assert word in fault if word else fault == ""
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 @pytest.mark.parametrize(
-    ("seen", "stuck"), [(3.9, True), (4.1, False), (15.9, False), (16.1, True)]
+    ("speed", "stuck"), [(3.9, True), (4.1, False), (15.9, False), (16.1, True)]
 )
 def test_a_constant_speed_more_than_two_and_four_tenths_away_is_stuck(
-    seen: float, stuck: bool, sign: float
+    speed: float, stuck: bool, sign: float
 ) -> None:
     # The band is 10 rad/s -+ (2 + 0.4 x 10) rad/s.
-    fault = watched_after_driving(2, sign * 10.0, sign * seen)
+    fault = watched_after_driving(2, sign * 10.0, sign * speed)
     assert ("a speed that never changes" in fault) is stuck
 
 
@@ -140,12 +141,14 @@ def test_a_wheel_that_reports_one_rad_s_and_no_other_speed_is_stuck() -> None:
 
 @pytest.mark.parametrize("wheel", range(4))
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-@pytest.mark.parametrize(("seen", "word"), [(10.0, "faster than"), (2.1, "faster than"), (1.9, "")])
+@pytest.mark.parametrize(
+    ("speed", "word"), [(10.0, "faster than"), (2.1, "faster than"), (1.9, "")]
+)
 def test_a_wheel_that_does_not_come_to_rest_on_command_is_running_away(
-    wheel: int, sign: float, seen: float, word: str
+    wheel: int, sign: float, speed: float, word: str
 ) -> None:
     robot = driven(sign * 10.0)
-    moves = (only(wheel, sign * (seen - 0.04 * (step % 2))) for step in range(200))
+    moves = (only(wheel, sign * (speed - 0.04 * (step % 2))) for step in range(200))
     fault = next(filter(None, (robot.watch(STILL, move, DT) for move in moves)), "")
     assert word in fault
     assert fault.startswith(f"{WHEELS[wheel]} wheel") if word else fault == ""
@@ -155,8 +158,8 @@ def test_a_wheel_that_turns_while_only_other_wheels_are_commanded_is_running_awa
     pivot, robot = WheelSpeeds(10.0, 0.0, 0.0, 10.0), watching()
     assert not any(robot.watch(pivot, noisy(pivot, step), DT) for step in range(300))
     turning = WheelSpeeds(10.0, 5.0, 0.0, 10.0)
-    found = [robot.watch(pivot, noisy(turning, step), DT) for step in range(52)]
-    assert "front_left wheel turns faster" in next(filter(None, found))
+    faults = [robot.watch(pivot, noisy(turning, step), DT) for step in range(52)]
+    assert "front_left wheel turns faster" in next(filter(None, faults))
 
 
 def test_a_dead_wheel_is_found_half_a_second_after_a_healthy_one_would_have_turned() -> None:
@@ -178,40 +181,40 @@ def test_a_robot_pushed_gently_by_hand_is_no_fault() -> None:
 
 def pushed(robot: WheelFaults, speed: float, seconds: float) -> tuple[list[str], list[float]]:
     """Return the faults while a person pushes the robot, and the times of reported pushes, s."""
-    seen = WheelSpeeds(speed, speed, speed, speed)
-    faults, told = [], []
+    speeds = WheelSpeeds(speed, speed, speed, speed)
+    faults, times = [], []
     for step in range(round(seconds / DT)):
-        faults.append(robot.watch(STILL, noisy(seen, step), DT))
+        faults.append(robot.watch(STILL, noisy(speeds, step), DT))
         if robot.pushed:
-            told.append((step + 1) * DT)
-    return list(filter(None, faults)), told
+            times.append((step + 1) * DT)
+    return list(filter(None, faults)), times
 
 
 @pytest.mark.parametrize("speed", [2.4, -2.4, 20.0, -20.0])
 def test_wheels_turned_by_hand_are_reported_once_a_second_and_never_a_fault(speed: float) -> None:
     for robot in (watching(), driven(10.0), driven(-10.0)):
         robot.watch(STILL, STILL, DT)
-        faults, told = pushed(robot, speed, 3.5)
+        faults, times = pushed(robot, speed, 3.5)
         assert faults == []
-        assert told == pytest.approx([0.21, 1.21, 2.21, 3.21], abs=0.011)
+        assert times == pytest.approx([0.21, 1.21, 2.21, 3.21], abs=0.011)
 
 
 def test_a_push_is_reported_again_after_exactly_one_second() -> None:
-    robot, told = watching(), []
+    robot, times = watching(), []
     for step in range(1, 12):
         robot.watch(STILL, noisy(TEN, step), 0.125)
         if robot.pushed:
-            told.append(step * 0.125)
-    assert told == [0.25, 1.25]
+            times.append(step * 0.125)
+    assert times == [0.25, 1.25]
 
 
 def test_one_wheel_turned_by_hand_is_reported_too() -> None:
     robot = driven(10.0)
-    told = [robot.watch(STILL, STILL, DT)]
+    texts = [robot.watch(STILL, STILL, DT)]
     for step in range(30):
         assert not robot.watch(STILL, only(2, -5.0 + step % 2), DT)
-        told.append(robot.pushed)
-    assert "rad/s without a command" in next(filter(None, told))
+        texts.append(robot.pushed)
+    assert "rad/s without a command" in next(filter(None, texts))
 
 
 def test_a_constant_speed_by_hand_is_not_a_stuck_encoder() -> None:
@@ -252,8 +255,8 @@ def test_a_wheel_that_slows_down_slowly_is_no_fault_and_one_that_has_stopped_slo
 def test_a_wheel_that_slows_down_slowly_a_second_time_is_no_fault() -> None:
     robot = watching()
     for _ in range(2):
-        told = both(1, 20.0)
-        assert not any(robot.watch(told, noisy(told, step), DT) for step in range(300))
+        target = both(1, 20.0)
+        assert not any(robot.watch(target, noisy(target, step), DT) for step in range(300))
         speed = 20.0
         while speed > 0.0:
             speed -= 5.0 * DT
@@ -269,14 +272,14 @@ def test_a_slow_wheel_that_sped_up_during_a_stall_and_now_slows_down_is_no_fault
     lines = [(9.29, 0.23, 0.1), (17.52, 1.41, 0.1), (17.95, 4.47, 0.1), (17.95, 7.86, 0.1)]
     lines += [(0.0, 11.83, 0.25), (1.21, 13.48, 0.02), (4.18, 12.63, 0.03)]
     lines += [(0.0, speed, 0.1) for speed in (11.1, 8.77, 6.55, 4.85, 3.6, 2.7, 2.0)]
-    for told, speed, dt in lines:
-        assert robot.watch(both(1, told), both(1, speed), dt) == ""
+    for target, speed, dt in lines:
+        assert robot.watch(both(1, target), both(1, speed), dt) == ""
 
 
 def test_a_runaway_seen_by_a_coarse_encoder_does_not_look_like_slowing_down() -> None:
     robot = driven(10.0)
-    found = [robot.watch(STILL, only(1, 10.0 + 2.5 * (step % 2)), DT) for step in range(100)]
-    assert "faster than" in next(filter(None, found))
+    faults = [robot.watch(STILL, only(1, 10.0 + 2.5 * (step % 2)), DT) for step in range(100)]
+    assert "faster than" in next(filter(None, faults))
 
 
 def test_forgetting_does_not_make_a_runaway_a_push() -> None:
@@ -308,53 +311,53 @@ def test_a_runaway_is_found_soon_after_forgetting() -> None:
 
 def test_a_push_is_reported_even_without_a_fault_time() -> None:
     robot = watching(FeedbackConfig(fault_time=0.0))
-    faults, told = pushed(robot, 5.0, 0.5)
+    faults, times = pushed(robot, 5.0, 0.5)
     assert faults == []
-    assert told == pytest.approx([0.21], abs=0.011)
+    assert times == pytest.approx([0.21], abs=0.011)
 
 
 def test_a_robot_pushed_back_gently_after_it_drove_is_no_fault() -> None:
     robot = watching()
-    for told, seen in ((10.0, 10.0), (0.0, -1.5)):
+    for target, speed in ((10.0, 10.0), (0.0, -1.5)):
         for step in range(300):
-            moved = both(0, seen + step % 2 / 10)
-            assert robot.watch(both(0, told), moved, DT) == ""
+            moved = both(0, speed + step % 2 / 10)
+            assert robot.watch(both(0, target), moved, DT) == ""
 
 
 def test_a_wheel_slowed_by_half_under_load_is_no_fault() -> None:
     robot = watching()
     dice = random.Random(1)
     for _ in range(500):
-        seen = WheelSpeeds(*(5.0 + dice.uniform(-0.2, 0.2) for _ in range(4)))
-        assert robot.watch(TEN, seen, DT) == ""
+        speeds = WheelSpeeds(*(5.0 + dice.uniform(-0.2, 0.2) for _ in range(4)))
+        assert robot.watch(TEN, speeds, DT) == ""
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_a_slow_wheel_that_brakes_by_its_configured_response_time_is_no_fault(sign: float) -> None:
     robot, speed = watching(FeedbackConfig(response_time=2.0)), 0.0
-    for told in (sign * 20.0, 0.0):
+    for target in (sign * 20.0, 0.0):
         for _ in range(1000):
-            speed += (told - speed) * (DT / (2.0 + DT))
-            assert robot.watch(both(3, told), both(3, speed), DT) == ""
+            speed += (target - speed) * (DT / (2.0 + DT))
+            assert robot.watch(both(3, target), both(3, speed), DT) == ""
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_a_wheel_faster_than_its_configured_response_time_is_no_fault(sign: float) -> None:
     robot = watching(FeedbackConfig(response_time=2.0))
-    for told in (sign * 20.0, 0.0):
+    for target in (sign * 20.0, 0.0):
         for step in range(1000):
-            seen = WheelSpeeds(*(told and told + step % 2 / 10 for _ in WHEELS))
-            assert robot.watch(WheelSpeeds(*[told] * 4), seen, DT) == ""
+            speeds = WheelSpeeds(*(target and target + step % 2 / 10 for _ in WHEELS))
+            assert robot.watch(WheelSpeeds(*[target] * 4), speeds, DT) == ""
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_a_wheel_that_slows_to_a_creep_before_its_response_time_is_not_dead(sign: float) -> None:
     """A coarse encoder reports 0 if the wheel turns by less than one count per line."""
     robot = watching(FeedbackConfig(response_time=2.0))
-    for told, reported in ((sign * 20.0, sign * 20.0), (sign * 0.6, 0.0)):
+    for target, reported in ((sign * 20.0, sign * 20.0), (sign * 0.6, 0.0)):
         for step in range(1000):
-            seen = WheelSpeeds(*(reported and reported + step % 2 / 10 for _ in WHEELS))
-            assert robot.watch(WheelSpeeds(*[told] * 4), seen, DT) == ""
+            speeds = WheelSpeeds(*(reported and reported + step % 2 / 10 for _ in WHEELS))
+            assert robot.watch(WheelSpeeds(*[target] * 4), speeds, DT) == ""
 
 
 def test_a_wheel_that_reaches_its_command_before_its_response_time_is_not_stuck() -> None:
@@ -368,31 +371,31 @@ def test_a_healthy_wheel_is_expected_to_follow_by_its_response_time() -> None:
     # Each step covers a sixth of the way. After the second step the model has 10 (1 - (5/6)^2) =
     # 3.06 rad/s, over 2 rad/s. Eight more steps of 1/16 s then exceed half a second.
     robot = watching(FeedbackConfig(response_time=0.3125, fault_time=0.5))
-    found = [bool(robot.watch(TEN, STILL, 0.0625)) for _ in range(10)]
-    assert found == [False] * 9 + [True]
+    flags = [bool(robot.watch(TEN, STILL, 0.0625)) for _ in range(10)]
+    assert flags == [False] * 9 + [True]
 
 
 def test_a_model_that_has_just_reached_the_slack_is_not_yet_moving() -> None:
     # A quarter of the way to 8 rad/s is 2 rad/s, so step 2 is the first of nine that count.
     robot = watching(FeedbackConfig(response_time=0.1875, fault_time=0.5))
     eight = WheelSpeeds(8.0, 8.0, 8.0, 8.0)
-    found = [bool(robot.watch(eight, STILL, 0.0625)) for _ in range(10)]
-    assert found == [False] * 9 + [True]
+    flags = [bool(robot.watch(eight, STILL, 0.0625)) for _ in range(10)]
+    assert flags == [False] * 9 + [True]
 
 
 def test_a_line_without_time_moves_no_model_and_is_no_evidence() -> None:
     robot = watching(FeedbackConfig(response_time=0.3125, fault_time=0.5))
     for _ in range(10):
         assert not robot.watch(TEN, STILL, 0.0)
-    found = [bool(robot.watch(TEN, STILL, 0.0625)) for _ in range(10)]
-    assert found == [False] * 9 + [True]
+    flags = [bool(robot.watch(TEN, STILL, 0.0625)) for _ in range(10)]
+    assert flags == [False] * 9 + [True]
 
 
 def test_evidence_must_last_longer_than_the_fault_time() -> None:
     robot = watching(FeedbackConfig(fault_time=0.5))
     # The first line tells nothing, because the wheel may be nearing its command.
-    found = [bool(robot.watch(TEN, STILL, 0.125)) for _ in range(6)]
-    assert found == [False, False, False, False, False, True]
+    flags = [bool(robot.watch(TEN, STILL, 0.125)) for _ in range(6)]
+    assert flags == [False, False, False, False, False, True]
 
 
 def test_one_line_that_stands_for_a_whole_stall_is_not_enough_evidence() -> None:
@@ -416,45 +419,45 @@ def test_a_healthy_wheel_is_never_a_fault_whatever_its_command(
     wishes: list[tuple[float, int]], lag: float, gain: float
 ) -> None:
     robot, speed, dice = watching(), 0.0, random.Random(2)
-    for told, steps in wishes:
+    for target, steps in wishes:
         for _ in range(steps):
-            speed += (told * gain - speed) * (DT / (lag + DT))
-            seen = speed + dice.uniform(-0.2, 0.2)
-            assert robot.watch(both(0, told), both(0, seen), DT) == ""
+            speed += (target * gain - speed) * (DT / (lag + DT))
+            feedback = speed + dice.uniform(-0.2, 0.2)
+            assert robot.watch(both(0, target), both(0, feedback), DT) == ""
 
 
 @pytest.mark.parametrize(("sent", "pushed"), [(0.0045, True), (0.005, False), (0.006, False)])
 def test_a_wheel_speed_of_5_mrad_a_second_counts_as_a_command(sent: float, pushed: bool) -> None:
     robot = watching(FeedbackConfig(fault_time=0.0))
-    told = [bool(robot.watch(both(0, sent), TEN, 0.1) or robot.pushed) for _ in range(5)]
-    assert any(told) is pushed
+    flags = [bool(robot.watch(both(0, sent), TEN, 0.1) or robot.pushed) for _ in range(5)]
+    assert any(flags) is pushed
 
 
 @pytest.mark.parametrize(("speed", "lines"), [(2.0, 0), (2.5, 3)])
 def test_wheels_are_turned_by_hand_above_2_rad_a_second_for_over_a_fifth_of_a_second(
     speed: float, lines: int
 ) -> None:
-    robot, told = watching(), list[bool]()
+    robot, flags = watching(), list[bool]()
     for _ in range(10):
         robot.watch(STILL, only(0, speed), 0.1)
-        told.append(bool(robot.pushed))
-    assert (told.index(True) + 1 if lines else any(told)) == lines
+        flags.append(bool(robot.pushed))
+    assert (flags.index(True) + 1 if lines else any(flags)) == lines
 
 
 def test_a_wheel_that_has_slowed_to_2_rad_a_second_has_come_to_rest() -> None:
-    robot, told = driven(10.0), list[bool]()
+    robot, flags = driven(10.0), list[bool]()
     robot.watch(STILL, only(0, 1.8), 0.1)  # smoothed 1.96
     for _ in range(4):
         assert robot.watch(STILL, only(0, 3.0), 0.1) == ""
-        told.append(bool(robot.pushed))
-    assert any(told)
+        flags.append(bool(robot.pushed))
+    assert any(flags)
 
 
 def test_a_wheel_at_one_and_a_half_times_its_command_and_2_rad_a_second_is_no_runaway() -> None:
     robot = watching()
     for step in range(1, 81):
-        told, seen = 0.5 * step, 0.75 * step + 2.0
-        assert robot.watch(both(0, told), both(0, seen), DT) == ""
+        target, speed = 0.5 * step, 0.75 * step + 2.0
+        assert robot.watch(both(0, target), both(0, speed), DT) == ""
 
 
 def test_a_wheel_that_is_slower_by_1_rad_a_second_is_not_slowing_down() -> None:
@@ -485,12 +488,12 @@ def test_wheels_that_coast_after_a_lost_link_are_no_fault(counts: int) -> None:
     for line in range(500):
         if line == 200:
             robot.forget()
-        told = WheelSpeeds(*[20.0 if line < 200 else 0.0] * 4)
+        target = WheelSpeeds(*[20.0 if line < 200 else 0.0] * 4)
         speed += 0.0 if line < 200 else -speed * DT / 0.6
         angle += speed * DT
         before, whole = whole, math.floor(angle / step)
-        seen = WheelSpeeds(*[round((whole - before) * step / DT, 2)] * 4)
-        assert robot.watch(told, seen, DT if line != 200 else 0.0) == ""
+        speeds = WheelSpeeds(*[round((whole - before) * step / DT, 2)] * 4)
+        assert robot.watch(target, speeds, DT if line != 200 else 0.0) == ""
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
@@ -505,8 +508,8 @@ def slow(robot: WheelFaults, share: float, seconds: float, wheel: int = 0) -> li
     """Return the logged events while this wheel turns at `share` times the commanded 10 rad/s."""
     events = []
     for step in range(round(seconds / DT)):
-        seen = noisy(only(wheel, 10.0 * share, 10.0), step)
-        assert robot.watch(TEN, seen, DT) == ""
+        speeds = noisy(only(wheel, 10.0 * share, 10.0), step)
+        assert robot.watch(TEN, speeds, DT) == ""
         robot.look((0.1, 0.1, 0.1, 0.1), TEN, DT)
         events += [f"{event.level} {event.kind}: {event.text}" for event in robot.events]
     return events
@@ -535,21 +538,21 @@ def test_a_wheel_below_seven_tenths_of_its_speed_is_slow(share: float, warned: b
 
 
 def test_a_reversed_encoder_that_is_left_out_is_a_fault_at_a_creep_too() -> None:
-    robot, found, out = watching(), math.inf, math.inf
-    told = WheelSpeeds(1.5, 1.5, 1.5, 1.5)
+    robot, fault_s, out = watching(), math.inf, math.inf
+    target = WheelSpeeds(1.5, 1.5, 1.5, 1.5)
     for step in range(400):
         right = 1.5 + 0.1 * (step % 2)
-        seen = only(2, right if step < 200 else -right, right)
-        fault = robot.watch(told, seen, DT)
-        front_right, front_left, rear_left, rear_right = (DT * s for s in seen.as_tuple())
-        robot.look((front_right, front_left, rear_left, rear_right), seen, DT)
+        speeds = only(2, right if step < 200 else -right, right)
+        fault = robot.watch(target, speeds, DT)
+        front_right, front_left, rear_left, rear_right = (DT * s for s in speeds.as_tuple())
+        robot.look((front_right, front_left, rear_left, rear_right), speeds, DT)
         if robot.status.left_out and out == math.inf:
             out = step * DT
         if fault:
-            found = step * DT
+            fault_s = step * DT
             break
     assert "rear_left wheel turns against its command" in fault
-    assert 0.49 < found - out < 0.53
+    assert 0.49 < fault_s - out < 0.53
     assert out < 2.1
 
 

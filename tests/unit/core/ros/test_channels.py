@@ -89,7 +89,7 @@ def test_a_robot_state_is_read_back_from_its_encoding_unchanged() -> None:
     store.register(get_types_from_msg(STATE_CHANNEL.schema, STATE_CHANNEL.schema_name))
     read: Any = store.deserialize_cdr(STATE_CHANNEL.encode(ROBOT_STATE), STATE_CHANNEL.schema_name)
     assert (read.mode, read.x, read.header.stamp.sec) == ("driving", 1.0, 5)
-    assert [one.name for one in read.sources] == ["app", "nav"]
+    assert [source.name for source in read.sources] == ["app", "nav"]
 
 
 def test_topics_have_the_names_of_the_ros_tree() -> None:

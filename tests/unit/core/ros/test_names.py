@@ -182,12 +182,12 @@ def describe(name: str) -> dict[str, Any]:
 
 def referred(name: str) -> set[str]:
     """Return all types that a type contains, at any depth."""
-    found: set[str] = set()
+    type_names: set[str] = set()
     for kind, _ in KNOWN[name]:
         base = parse(kind)[0]
         if base not in BASE:
-            found |= {base} | referred(base)
-    return found
+            type_names |= {base} | referred(base)
+    return type_names
 
 
 def rihs01(name: str) -> str:

@@ -39,13 +39,13 @@ def ask(service: str, request: Any, reply: type[Any]) -> Any:
 
 
 def names(prefixes: list[str], depth: int = 0) -> list[str]:
-    found: rcl.ListReply = ask("list_parameters", rcl.ListRequest(prefixes, depth), rcl.ListReply)
-    return found.names
+    reply: rcl.ListReply = ask("list_parameters", rcl.ListRequest(prefixes, depth), rcl.ListReply)
+    return reply.names
 
 
 def value(name: str) -> rcl.ParameterValue:
-    found: rcl.Values = ask("get_parameters", rcl.Names([name]), rcl.Values)
-    return found.values[0]
+    reply: rcl.Values = ask("get_parameters", rcl.Names([name]), rcl.Values)
+    return reply.values[0]
 
 
 ALL = [
@@ -63,9 +63,9 @@ ALL = [
 
 
 def test_every_parameter_and_its_prefixes_are_listed() -> None:
-    found: rcl.ListReply = ask("list_parameters", rcl.ListRequest([], 0), rcl.ListReply)
-    assert found.names == ALL
-    assert found.prefixes == [
+    reply: rcl.ListReply = ask("list_parameters", rcl.ListRequest([], 0), rcl.ListReply)
+    assert reply.names == ALL
+    assert reply.prefixes == [
         "bus",
         "commands.sources.app",
         "commands.sources.nav",
@@ -120,8 +120,8 @@ def test_an_unknown_parameter_has_no_value_and_no_type() -> None:
 
 def test_the_description_of_a_parameter_is_that_of_its_key() -> None:
     asked = rcl.Names(["drive.wheel_radius", "no.such"])
-    found, nothing = ask("describe_parameters", asked, rcl.Descriptors).descriptors
-    assert found == described("drive.wheel_radius", rcl.DOUBLE)
+    descriptor, nothing = ask("describe_parameters", asked, rcl.Descriptors).descriptors
+    assert descriptor == described("drive.wheel_radius", rcl.DOUBLE)
     assert nothing == ParameterDescriptor("no.such", rcl.NOT_SET)
 
 
@@ -159,8 +159,8 @@ def test_a_set_reply_has_one_result_per_parameter_and_an_atomic_one_has_one() ->
     result = rcl.SetParametersResult(False, "why")
     each = rcl.outcome("set_parameters", payload, False, "why")
     assert Cdr(rcl.SetReply).decode(each) == rcl.SetReply([result, result])
-    one = rcl.outcome("set_parameters_atomically", payload, False, "why")
-    assert Cdr(rcl.SetAtomicallyReply).decode(one) == rcl.SetAtomicallyReply(result)
+    reply = rcl.outcome("set_parameters_atomically", payload, False, "why")
+    assert Cdr(rcl.SetAtomicallyReply).decode(reply) == rcl.SetAtomicallyReply(result)
 
 
 @each("service", PARAMETER_SERVICES)
@@ -186,11 +186,11 @@ def test_every_listed_parameter_of_the_configuration_has_a_value() -> None:
     listed = Cdr(rcl.ListReply).decode(
         serve("list_parameters", Cdr(rcl.ListRequest).encode(rcl.ListRequest([], 0)))
     )
-    got = Cdr(rcl.Values).decode(
+    reply = Cdr(rcl.Values).decode(
         serve("get_parameters", Cdr(rcl.Names).encode(rcl.Names(listed.names)))
     )
     assert "limits.linear_speed" in listed.names
-    assert all(one.type != rcl.NOT_SET for one in got.values)
+    assert all(parameter.type != rcl.NOT_SET for parameter in reply.values)
 
 
 KEYS = [key for key, _ in flat(effective(Config()))]
@@ -219,26 +219,26 @@ def test_a_parameter_that_needs_a_restart_is_read_only_and_described_so() -> Non
 
 
 def test_a_parameter_of_a_source_is_described_under_the_name_of_the_source() -> None:
-    found = described("commands.sources.nav.timeout", DOUBLE)
-    assert found.floating_point_range == [FloatingPointRange(0.02, 10.0, 0.0)]
-    assert (found.read_only, found.additional_constraints) == (
+    descriptor = described("commands.sources.nav.timeout", DOUBLE)
+    assert descriptor.floating_point_range == [FloatingPointRange(0.02, 10.0, 0.0)]
+    assert (descriptor.read_only, descriptor.additional_constraints) == (
         False,
         "only while the robot stands",
     )
 
 
 def test_the_description_of_a_choice_lists_its_values() -> None:
-    found = described("log.level", 4)
-    assert found.description == (
+    descriptor = described("log.level", 4)
+    assert descriptor.description == (
         'lowest level of the events that are logged: one of "debug", "error", "info", "warning"'
     )
 
 
 @each("key", KEYS)
 def test_every_key_has_a_description_and_is_read_only_unless_it_can_be_set(key: str) -> None:
-    found = described(key, DOUBLE)
-    assert found.description
-    assert found.read_only == (live(key) is None)
+    descriptor = described(key, DOUBLE)
+    assert descriptor.description
+    assert descriptor.read_only == (live(key) is None)
 
 
 def test_an_unknown_key_has_no_description() -> None:

@@ -53,8 +53,8 @@ def test_no_count_is_added_to_an_event_text_that_contains_counts(text: str) -> N
 
 
 def test_an_event_of_the_topic_gives_the_same_log_line() -> None:
-    seen = LogEvent(Time(1), "fault", "error", "dead motor", "", 1)
-    assert log(seen, seen.stamp) == log(Event("fault", "dead motor", "error"), Time(1))
+    event = LogEvent(Time(1), "fault", "error", "dead motor", "", 1)
+    assert log(event, event.stamp) == log(Event("fault", "dead motor", "error"), Time(1))
 
 
 def test_a_log_line_without_actor_or_repetition_has_the_text_alone() -> None:
@@ -70,20 +70,20 @@ def test_a_source_without_commands_has_no_age() -> None:
 def test_null_fields_of_the_state_are_nan_in_ros() -> None:
     none = replace(STATE, linear=None, angular=None, wheels=[], feedback_age=None, bumpers=None)
     unknown = state(none)
-    told: Any = STORE.deserialize_cdr(Cdr(State).encode(unknown), CHANNEL.schema_name)
-    assert all(map(math.isnan, (told.linear, told.angular, told.feedback_age)))
-    assert math.isnan(told.sources[1].age)
-    assert (len(told.wheels), len(told.bumpers), told.x) == (0, 0, 1.0)
+    message: Any = STORE.deserialize_cdr(Cdr(State).encode(unknown), CHANNEL.schema_name)
+    assert all(map(math.isnan, (message.linear, message.angular, message.feedback_age)))
+    assert math.isnan(message.sources[1].age)
+    assert (len(message.wheels), len(message.bumpers), message.x) == (0, 0, 1.0)
     assert Cdr(State).decode(Cdr(State).encode(unknown)) == unknown
 
 
 def test_the_ros_state_equals_the_native_state_field_by_field() -> None:
-    told = state(STATE)
-    assert told.header.stamp == STATE.stamp
-    assert told.counters == [Counter("lines", 7), Counter("commands", 2)]
-    plain = set(told.__struct_fields__) - {"header", "sources", "counters"}
-    assert all(getattr(told, name) == getattr(STATE, name) for name in plain)
-    left_out = set(STATE.__struct_fields__) - set(told.__struct_fields__)
+    message = state(STATE)
+    assert message.header.stamp == STATE.stamp
+    assert message.counters == [Counter("lines", 7), Counter("commands", 2)]
+    plain = set(message.__struct_fields__) - {"header", "sources", "counters"}
+    assert all(getattr(message, name) == getattr(STATE, name) for name in plain)
+    left_out = set(STATE.__struct_fields__) - set(message.__struct_fields__)
     # A ROS Trigger has no field for the number of a latch, and diagnostics report the latch file.
     # An exported recording does not contain the configuration file, and the robot that a replay
     # makes knows no speed limit, only the setting that it lowers. The battery has its own topic.

@@ -112,8 +112,8 @@ def test_each_tree_can_be_switched_off(bridge: bool, rmw: bool) -> None:
 
 
 def test_two_robots_share_a_claim_if_one_topic_would_drive_both() -> None:
-    def shared(one: RosConfig, two: RosConfig) -> bool:
-        return bool({*claims(one)} & {*claims(two)})
+    def shared(first: RosConfig, two: RosConfig) -> bool:
+        return bool({*claims(first)} & {*claims(two)})
 
     usual, named = RosConfig(), RosConfig(namespace="lab/robot1")
     assert shared(usual, RosConfig(node="other", announce=False))
@@ -182,9 +182,9 @@ def test_transforms_that_are_switched_off_have_no_endpoint() -> None:
     odometry = OdometryConfig(publish_tf=False, gyro=True)
     off = Config(mcu=REAL, odometry=odometry, lidar=LidarConfig(publish_tf=False), ros=DESCRIBED)
     assert left_out(off) == {"tf", "tf_static"}
-    kept = endpoints(RosConfig(), ZID, left_out(off))
-    assert not {e.native for e in kept} & {"tf", "tf_static"}
-    assert {e.native for e in endpoints(RosConfig(), ZID)} - {e.native for e in kept} == {
+    endpoint_list = endpoints(RosConfig(), ZID, left_out(off))
+    assert not {e.native for e in endpoint_list} & {"tf", "tf_static"}
+    assert {e.native for e in endpoints(RosConfig(), ZID)} - {e.native for e in endpoint_list} == {
         "tf",
         "tf_static",
     }
@@ -200,8 +200,8 @@ def test_either_static_transform_keeps_tf_static() -> None:
 def test_a_robot_without_a_urdf_has_no_robot_description() -> None:
     config = Config(mcu=REAL, odometry=OdometryConfig(gyro=True))
     assert left_out(config) == {"robot_description"}
-    kept = {e.native for e in endpoints(RosConfig(), ZID, left_out(config))}
-    assert {e.native for e in found(RosConfig())} - kept == {"robot_description"}
+    native_keys = {e.native for e in endpoints(RosConfig(), ZID, left_out(config))}
+    assert {e.native for e in found(RosConfig())} - native_keys == {"robot_description"}
 
 
 def test_a_gyro_from_ros_is_used_if_configured_on_a_robot_that_is_not_simulated() -> None:

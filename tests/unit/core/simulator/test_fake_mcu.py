@@ -34,22 +34,22 @@ Heard = list[tuple[int, bytes]]
 
 def replies(mcu: FakeMcu, until_ns: int) -> Heard:
     """Advance the MCU from event to event, and return the data that it sent, with times."""
-    found = []
+    chunks = []
     while (due := mcu.next_ns()) is not None and due <= until_ns:
         data = mcu.advance(due)
         if data:
-            found.append((due, data))
+            chunks.append((due, data))
     assert mcu.advance(until_ns) == b""
-    return found
+    return chunks
 
 
 def drive(mcu: FakeMcu, start_ns: int, count: int, line: bytes = LINE) -> Heard:
     """Send a line every 10 ms, `count` times, and listen for 10 ms after the last one."""
-    found = []
+    chunks = []
     for n in range(count):
         mcu.receive(start_ns + n * 10 * MS, line)
-        found += replies(mcu, start_ns + (n + 1) * 10 * MS)
-    return found
+        chunks += replies(mcu, start_ns + (n + 1) * 10 * MS)
+    return chunks
 
 
 def told(line: bytes, config: Config = TRUE) -> FakeMcu:
@@ -97,18 +97,18 @@ def test_a_steady_speed_is_reported_byte_for_byte(sent: bytes, answered: bytes) 
 
 def test_the_encoders_count_whole_steps() -> None:
     coarse = Config(sim=SimConfig(motor_time_constant=0.0, encoder_counts=16))
-    seen = {data[2:7] for _, data in drive(FakeMcu(coarse), 0, 50)}
-    assert len(seen) > 1
-    assert b"00.00" in seen
-    assert b"12.50" not in seen
+    speeds = {data[2:7] for _, data in drive(FakeMcu(coarse), 0, 50)}
+    assert len(speeds) > 1
+    assert b"00.00" in speeds
+    assert b"12.50" not in speeds
 
 
 def test_a_motor_follows_with_its_lag() -> None:
     mcu = FakeMcu(Config(sim=SimConfig(motor_time_constant=0.05, encoder_counts=1_000_000)))
-    seen = [float(data[2:7]) for _, data in drive(mcu, 0, 60)]
-    assert seen == sorted(seen)
-    assert seen[2] < 0.6 * 12.5
-    assert seen[-1] == 12.5
+    speeds = [float(data[2:7]) for _, data in drive(mcu, 0, 60)]
+    assert speeds == sorted(speeds)
+    assert speeds[2] < 0.6 * 12.5
+    assert speeds[-1] == 12.5
 
 
 def test_the_commanded_speed_moves_the_vehicle() -> None:
@@ -162,12 +162,12 @@ def test_answers_leave_one_after_the_other(baud: int) -> None:
 
 
 def test_processing_takes_a_varying_time_of_one_to_five_milliseconds() -> None:
-    found = drive(FakeMcu(TRUE), 0, 40)
-    taken = [when - n * 10 * MS - 2 * LINE_NS for n, (when, _) in enumerate(found)]
-    assert len(found) >= 39
-    assert min(taken) >= 1 * MS - 10
-    assert max(taken) <= 5 * MS + 10
-    assert max(taken) - min(taken) > 2 * MS
+    chunks = drive(FakeMcu(TRUE), 0, 40)
+    delays = [when - n * 10 * MS - 2 * LINE_NS for n, (when, _) in enumerate(chunks)]
+    assert len(chunks) >= 39
+    assert min(delays) >= 1 * MS - 10
+    assert max(delays) <= 5 * MS + 10
+    assert max(delays) - min(delays) > 2 * MS
 
 
 def test_an_answer_arrives_only_when_it_is_complete() -> None:
@@ -350,9 +350,9 @@ def test_a_reset_stops_the_motors_and_leaves_the_board_deaf_for_its_bootloader()
     mcu.reset(100 * MS)
     assert mcu.vehicle.set_points == STILL
     deaf_until = 100 * MS + RESET_NS
-    heard = drive(mcu, 100 * MS, RESET_NS // (10 * MS))
+    chunks = drive(mcu, 100 * MS, RESET_NS // (10 * MS))
     assert mcu.vehicle.set_points == STILL
-    assert b"".join(data for _, data in heard).count(b"ap") == 0
+    assert b"".join(data for _, data in chunks).count(b"ap") == 0
     assert [data for _, data in drive(mcu, deaf_until, 3)][-1] == LINE
 
 
@@ -407,12 +407,12 @@ def story(mcu: FakeMcu, start_ns: int) -> tuple[Heard, list[float], list[float]]
 
     Return the MCU's replies with times, the wheel angles, and the motors' set points.
     """
-    found = drive(mcu, start_ns, 40)
-    found += drive(mcu, start_ns + 400 * MS, 10, SEALED)
-    found += replies(mcu, start_ns + 650 * MS)
+    chunks = drive(mcu, start_ns, 40)
+    chunks += drive(mcu, start_ns + 400 * MS, 10, SEALED)
+    chunks += replies(mcu, start_ns + 650 * MS)
     mcu.receive(start_ns + 650 * MS, b"ap0\r\n")
-    found += replies(mcu, start_ns + 1000 * MS)
-    at = [(when - start_ns, data) for when, data in found]
+    chunks += replies(mcu, start_ns + 1000 * MS)
+    at = [(when - start_ns, data) for when, data in chunks]
     return at, list(mcu.vehicle.angles), list(mcu.vehicle.set_points)
 
 
@@ -510,11 +510,11 @@ def test_replies_longer_than_the_commands_are_lost_once_the_output_buffer_is_ful
     mcu, count = FakeMcu(TRUE), 1000
     with mcu.spaces():
         mcu.receive(0, LINE * count)
-        came = replies(mcu, 10_000 * MS)
-    assert count * 0.85 < len(came) < count * 0.95
+        chunks = replies(mcu, 10_000 * MS)
+    assert count * 0.85 < len(chunks) < count * 0.95
     wire_ns = count * LINE_NS
-    assert all(due < wire_ns + 30 * MS for due, _ in came)
-    assert {len(line) for _, line in came} == {len(LINE) + 3}
+    assert all(due < wire_ns + 30 * MS for due, _ in chunks)
+    assert {len(line) for _, line in chunks} == {len(LINE) + 3}
 
 
 def test_the_spaces_fault_adds_a_space_after_every_comma_with_its_wire_time() -> None:
@@ -540,10 +540,10 @@ def test_a_bias_changes_the_report_of_one_motor_but_not_its_motion(
         data = drive(mcu, 0, 5)[-1][1]
     drive(sound, 0, 5)
     expected = LINE[:-2].split(b",")
-    got = data[:-2].split(b",")
-    assert abs(float(got[motor][2:]) - float(token[2:])) <= 0.011
-    assert got[motor][:2] == token[:2]
-    assert got[:motor] + got[motor + 1 :] == expected[:motor] + expected[motor + 1 :]
+    tokens = data[:-2].split(b",")
+    assert abs(float(tokens[motor][2:]) - float(token[2:])) <= 0.011
+    assert tokens[motor][:2] == token[:2]
+    assert tokens[:motor] + tokens[motor + 1 :] == expected[:motor] + expected[motor + 1 :]
     assert mcu.vehicle.angles == sound.vehicle.angles
 
 
@@ -619,11 +619,11 @@ def test_a_comma_latched_mcu_takes_the_wheels_of_a_damaged_line_one_by_one() -> 
 def test_an_unprompted_mcu_reports_by_its_own_clock_unpadded_and_with_a_comma() -> None:
     mcu = FakeMcu(TRUE)
     with mcu.free_running(0.1):
-        found = drive(mcu, 0, 40, b"ap02.50,bn08.75,cp15.00,dp00.00\r\n")
+        chunks = drive(mcu, 0, 40, b"ap02.50,bn08.75,cp15.00,dp00.00\r\n")
     expected = b"ap2.50,bn8.75,cp15.00,dp0.00,\r\n"
-    assert len(found) == 3
-    assert {data for _, data in found[1:]} == {expected}
-    gaps = [later - sooner for (sooner, _), (later, _) in pairwise(found[1:])]
+    assert len(chunks) == 3
+    assert {data for _, data in chunks[1:]} == {expected}
+    gaps = [later - sooner for (sooner, _), (later, _) in pairwise(chunks[1:])]
     assert gaps == [100 * MS]
     assert mcu.valid_lines == 40
 
@@ -631,8 +631,8 @@ def test_an_unprompted_mcu_reports_by_its_own_clock_unpadded_and_with_a_comma() 
 def test_an_unprompted_mcu_reports_also_without_commands() -> None:
     mcu = FakeMcu(TRUE)
     with mcu.free_running(0.05):
-        found = replies(mcu, 1000 * MS)
-    assert len(found) == 19
+        chunks = replies(mcu, 1000 * MS)
+    assert len(chunks) == 19
 
 
 def test_an_unprompted_mcu_reports_again_after_its_reset() -> None:
@@ -668,37 +668,37 @@ def test_a_comma_latched_mcu_survives_a_speed_that_is_not_a_number() -> None:
 
 def arrivals(mcu: FakeMcu, count: int = 100) -> Heard:
     """Return the data that the host reads each ms from an MCU that is prompted every 10 ms."""
-    found = []
+    chunks = []
     for ms in range(10 * count + 200):
         if ms % 10 == 0 and ms < 10 * count:
             mcu.receive(ms * MS, LINE)
         data = mcu.advance(ms * MS)
         if data:
-            found.append((ms * MS, data))
-    return found
+            chunks.append((ms * MS, data))
+    return chunks
 
 
-def joined(found: Heard) -> bytes:
-    return b"".join(data for _, data in found)
+def joined(chunks: Heard) -> bytes:
+    return b"".join(data for _, data in chunks)
 
 
 def test_a_usb_adapter_delivers_every_16_ms_and_loses_nothing() -> None:
     mcu = FakeMcu(TRUE)
     with mcu.ftdi():
-        found = arrivals(mcu)
-    assert {len(data) for when, data in found if when % (16 * MS)} <= {62}
-    assert joined(found) == joined(arrivals(FakeMcu(TRUE)))
-    assert any(len(data) > len(LINE) for _, data in found)
+        chunks = arrivals(mcu)
+    assert {len(data) for when, data in chunks if when % (16 * MS)} <= {62}
+    assert joined(chunks) == joined(arrivals(FakeMcu(TRUE)))
+    assert any(len(data) > len(LINE) for _, data in chunks)
 
 
 def test_a_full_packet_of_the_adapter_does_not_wait() -> None:
     mcu = FakeMcu(TRUE)
     with mcu.ftdi(latency_s=0.1):
-        found = arrivals(mcu)
-    early = [data for when, data in found if when % (100 * MS)]
+        chunks = arrivals(mcu)
+    early = [data for when, data in chunks if when % (100 * MS)]
     assert early
     assert {len(data) for data in early} == {62}
-    assert joined(found) == joined(arrivals(FakeMcu(TRUE)))
+    assert joined(chunks) == joined(arrivals(FakeMcu(TRUE)))
 
 
 def test_data_that_the_adapter_holds_when_the_fault_ends_arrive_in_order() -> None:
@@ -717,16 +717,16 @@ def test_data_that_the_adapter_holds_when_the_fault_ends_arrive_in_order() -> No
 def test_no_data_arrive_during_a_stall_and_all_of_them_after_it() -> None:
     mcu = FakeMcu(TRUE)
     with mcu.stalls(0.5, 0.15):
-        found = arrivals(mcu)
-    assert not [when for when, _ in found if when % (500 * MS) < 150 * MS]
-    (burst,) = [data for when, data in found if when == 650 * MS]
+        chunks = arrivals(mcu)
+    assert not [when for when, _ in chunks if when % (500 * MS) < 150 * MS]
+    (burst,) = [data for when, data in chunks if when == 650 * MS]
     assert burst.count(b"\n") >= 14
-    assert joined(found) == joined(arrivals(FakeMcu(TRUE)))
+    assert joined(chunks) == joined(arrivals(FakeMcu(TRUE)))
 
 
 def test_stalls_and_an_adapter_together_lose_no_data() -> None:
     mcu = FakeMcu(TRUE)
     with mcu.ftdi(), mcu.stalls(0.3, 0.1):
-        found = arrivals(mcu)
-    assert not [when for when, _ in found if when % (300 * MS) < 100 * MS]
-    assert joined(found) == joined(arrivals(FakeMcu(TRUE)))
+        chunks = arrivals(mcu)
+    assert not [when for when, _ in chunks if when % (300 * MS) < 100 * MS]
+    assert joined(chunks) == joined(arrivals(FakeMcu(TRUE)))

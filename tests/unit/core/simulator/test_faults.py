@@ -81,14 +81,14 @@ def test_each_named_fault_can_be_turned_on_and_off() -> None:
 
 def test_a_fault_in_the_configuration_is_active_from_the_start() -> None:
     for text in EACH:
-        mcu, told = FakeMcu(Config()), FakeMcu(Config(sim=SimConfig(faults=(text,))))
+        mcu, faulty_mcu = FakeMcu(Config()), FakeMcu(Config(sim=SimConfig(faults=(text,))))
         with mcu.switched_on(named(text)):
             for switch in switches(Faults()):
-                assert getattr(told, switch) == getattr(mcu, switch), (text, switch)
+                assert getattr(faulty_mcu, switch) == getattr(mcu, switch), (text, switch)
 
 
 def test_several_faults_in_the_configuration_are_active_together() -> None:
-    told = FakeMcu(Config(sim=SimConfig(faults=("ftdi", "stalls=5:0.15"))))
-    assert (told.latency_ns, told.stall_every_ns, told.stall_ns) == (
+    mcu = FakeMcu(Config(sim=SimConfig(faults=("ftdi", "stalls=5:0.15"))))
+    assert (mcu.latency_ns, mcu.stall_every_ns, mcu.stall_ns) == (
         16_000_000, 5_000_000_000, 150_000_000,
     )  # fmt: skip

@@ -37,7 +37,7 @@ def test_normal_numbers_have_mean_0_and_deviation_1() -> None:
     drawn = [gauss(7, n) for n in MANY]
     assert statistics.fmean(drawn) == pytest.approx(0.0, abs=5 / 20_000**0.5)
     assert statistics.pstdev(drawn) == pytest.approx(1.0, abs=0.03)
-    assert sum(abs(one) > 2 for one in drawn) / 20_000 == pytest.approx(0.0455, abs=0.006)
+    assert sum(abs(number) > 2 for number in drawn) / 20_000 == pytest.approx(0.0455, abs=0.006)
 
 
 def test_consecutive_normal_numbers_are_uncorrelated() -> None:

@@ -20,10 +20,10 @@ WALL_NS = 1_700_000_003_250_000_001
 
 
 def test_the_true_pose_is_the_observed_one_with_the_time_of_the_observation() -> None:
-    told = true_pose(SIGHT, WALL_NS)
-    assert told.header.stamp == Time(1_700_000_003, 250_000_001)
-    assert told.pose.position == Vector3(1.5, -2.0, 0.0)
-    turn = told.pose.orientation
+    pose = true_pose(SIGHT, WALL_NS)
+    assert pose.header.stamp == Time(1_700_000_003, 250_000_001)
+    assert pose.pose.position == Vector3(1.5, -2.0, 0.0)
+    turn = pose.pose.orientation
     assert (turn.x, turn.y, turn.z, turn.w) == pytest.approx((0.0, 0.0, 0.5**0.5, 0.5**0.5))
 
 
@@ -34,8 +34,8 @@ def test_the_true_pose_is_not_in_a_frame_of_the_odometry() -> None:
 
 @pytest.mark.parametrize("form", FORMATS)
 def test_a_sample_of_the_simulated_gyro_is_read_like_one_of_any_gyro(form: Format) -> None:
-    said = turn_rate(SIGHT, "base_link", 0.02, WALL_NS)
-    got = reading(Arrival("imu", True, encode(said, form), "", 7, None, ""))
-    assert (got.at_ns, got.stamp_ns, got.rate) == (7, WALL_NS, 0.25)
-    assert got.variance == pytest.approx(0.0004)
-    assert said.orientation_covariance[0] == said.linear_acceleration_covariance[0] == -1.0
+    message = turn_rate(SIGHT, "base_link", 0.02, WALL_NS)
+    sample = reading(Arrival("imu", True, encode(message, form), "", 7, None, ""))
+    assert (sample.at_ns, sample.stamp_ns, sample.rate) == (7, WALL_NS, 0.25)
+    assert sample.variance == pytest.approx(0.0004)
+    assert message.orientation_covariance[0] == message.linear_acceleration_covariance[0] == -1.0

@@ -236,20 +236,20 @@ def test_a_slippery_floor_takes_a_varying_part_of_the_turn_up_to_its_share() -> 
     sim = SimConfig(motor_time_constant=0.0, turn_slip=0.4)
     made = Vehicle(sim, DriveConfig())
     made.set_points[:] = SPIN
-    kept = []
+    shares = []
     for _ in range(400):
         before = made.turned
         made.advance(0.25)
-        kept.append((made.turned - before) / 0.25)
-    assert all(0.6 < share <= 1.0 for share in kept)
-    assert len(set(kept)) == 400
-    assert sum(kept) / 400 == pytest.approx(0.8, abs=0.03)
+        shares.append((made.turned - before) / 0.25)
+    assert all(0.6 < share <= 1.0 for share in shares)
+    assert len(set(shares)) == 400
+    assert sum(shares) / 400 == pytest.approx(0.8, abs=0.03)
 
 
 def test_the_slip_of_the_floor_depends_on_the_seed_only() -> None:
-    one, other = (SimConfig(turn_slip=0.4, seed=seed) for seed in (1, 2))
-    assert turned(5.0, one, steps=500) == turned(5.0, one, steps=500)
-    assert turned(5.0, one, steps=500) != turned(5.0, other, steps=500)
+    sim, other = (SimConfig(turn_slip=0.4, seed=seed) for seed in (1, 2))
+    assert turned(5.0, sim, steps=500) == turned(5.0, sim, steps=500)
+    assert turned(5.0, sim, steps=500) != turned(5.0, other, steps=500)
 
 
 def test_the_total_turn_counts_whole_turns_that_the_yaw_of_the_pose_wraps() -> None:

@@ -57,31 +57,31 @@ class Access:
         self.rules: dict[str, dict[str, Any]] = {rule["id"]: rule for rule in self.value["rules"]}
         self.subjects = {subject["id"]: subject for subject in self.value["subjects"]}
 
-    def rules_of(self, who: str) -> list[dict[str, Any]]:
+    def rules_of(self, subject: str) -> list[dict[str, Any]]:
         """Return the rules of a role and of the certificate with the same name."""
-        subjects = {who, f"certificate {who}"}
+        subjects = {subject, f"certificate {subject}"}
         policies = [p for p in self.value["policies"] if subjects & set(p["subjects"])]
         return [self.rules[name] for policy in policies for name in policy["rules"]]
 
-    def lets(self, who: str, message: str, key: str, flow: str = "ingress") -> bool:
+    def lets(self, subject: str, message: str, key: str, flow: str = "ingress") -> bool:
         """Return whether one of the rules allows the message and no rule denies it.
 
         A rule applies to every key that its key expressions include.
         """
         asked = zenoh.KeyExpr(key)
-        said = {
+        permissions = {
             rule["permission"]
-            for rule in self.rules_of(who)
+            for rule in self.rules_of(subject)
             if flow in rule["flows"] and message in rule["messages"]
-            if any(zenoh.KeyExpr(held).includes(asked) for held in rule["key_exprs"])
+            if any(zenoh.KeyExpr(key_expr).includes(asked) for key_expr in rule["key_exprs"])
         }
-        return said == {"allow"}
+        return permissions == {"allow"}
 
     def key(self, below: str) -> str:
         return full_key(self.config.robot.id, below)
 
     def who(self, message: str, key: str) -> set[str]:
-        return {who for who in EVERYBODY if self.lets(who, message, key)}
+        return {subject for subject in EVERYBODY if self.lets(subject, message, key)}
 
 
 DESCRIBED = RosConfig(urdf="/etc/acsard/robot.urdf")
@@ -145,14 +145,14 @@ def test_every_policy_names_rules_and_subjects_that_exist() -> None:
 TOLD = [key for topic in PUBLISHED for key in (topic.key, f"json/{topic.key}")]
 
 
-@each("told", TOLD)
-def test_every_role_may_subscribe_to_and_query_the_published_keys(told: str) -> None:
-    key = DEFAULT.key(told)
+@each("key_suffix", TOLD)
+def test_every_role_may_subscribe_to_and_query_the_published_keys(key_suffix: str) -> None:
+    key = DEFAULT.key(key_suffix)
     assert DEFAULT.who("declare_subscriber", key) == FROM["viewer"]
     assert DEFAULT.who("query", key) == FROM["viewer"]
-    for who in EVERYBODY:
-        assert DEFAULT.lets(who, "put", key, "egress")
-        assert DEFAULT.lets(who, "reply", key, "egress")
+    for subject in EVERYBODY:
+        assert DEFAULT.lets(subject, "put", key, "egress")
+        assert DEFAULT.lets(subject, "reply", key, "egress")
 
 
 @each("below", ["*", "**", "cmd_v$*", "json/*", "json/**"])
@@ -163,8 +163,8 @@ def test_wildcards_are_for_clients_on_the_robot_unless_access_wildcards_is_set(b
 
 @pytest.mark.parametrize("role", ROLES)
 def test_a_client_over_tls_may_use_exact_keys_only(role: Role) -> None:
-    heard = [rule for rule in GATEWAY.rules_of(role) if "ingress" in rule["flows"]]
-    named = [key for rule in heard for key in rule["key_exprs"]]
+    rules = [rule for rule in GATEWAY.rules_of(role) if "ingress" in rule["flows"]]
+    named = [key for rule in rules for key in rule["key_exprs"]]
     assert named
     assert not [key for key in named if "*" in key]
 
@@ -173,11 +173,11 @@ def test_over_tls_each_certificate_commands_only_on_its_own_keys() -> None:
     people = AccessConfig(viewers=("wall",), operators=("anna", "ben"), maintainers=("chief",))
     gateway = Access(gateway_access, access=people)
     for kind in ("cmd", "wheel_cmd"):
-        for who in ("wall", "anna", "ben", "chief", "viewer", "operator", "maintainer"):
+        for subject in ("wall", "anna", "ben", "chief", "viewer", "operator", "maintainer"):
             for name in ("anna", "ben", "chief", "wall", "*", "ann$*"):
-                own = who == name and who != "wall"
-                assert gateway.lets(who, "put", gateway.key(f"{kind}/app/{name}")) == own
-            assert not gateway.lets(who, "put", gateway.key(f"{kind}/app"))
+                own = subject == name and subject != "wall"
+                assert gateway.lets(subject, "put", gateway.key(f"{kind}/app/{name}")) == own
+            assert not gateway.lets(subject, "put", gateway.key(f"{kind}/app"))
 
 
 def test_a_router_forwards_the_commands_of_any_certificate_and_no_command_without_one() -> None:
@@ -218,15 +218,15 @@ def test_every_other_key_is_for_its_least_role_and_the_roles_above(topic: Any) -
     allowed = FROM[LEAST[topic.key]] if topic.key in LEAST else {"local"}
     assert access.who(message, key) == allowed
     declared = "declare_subscriber" if topic.direction == "in" else "declare_queryable"
-    for who in EVERYBODY:
-        assert access.lets(who, declared, access.key(topic.pattern), "egress")
+    for subject in EVERYBODY:
+        assert access.lets(subject, declared, access.key(topic.pattern), "egress")
 
 
 @pytest.mark.parametrize("access", [DEFAULT, TRUSTING], ids=["exact", "wildcards"])
 def test_a_role_may_query_only_the_whoami_keys_of_its_own_and_lower_roles(access: Access) -> None:
     for role in ROLES:
-        who = access.who("query", access.key(whoami_key(role)))
-        assert who == FROM[role]
+        clients = access.who("query", access.key(whoami_key(role)))
+        assert clients == FROM[role]
     assert access.who("query", access.key("whoami/*")) <= FROM["maintainer"]
 
 
@@ -273,8 +273,8 @@ def test_every_role_sees_that_the_robot_is_alive() -> None:
         assert DEFAULT.who(message, DEFAULT.key("alive")) == FROM["viewer"]
         assert DEFAULT.who(message, "acsard/*/alive") == {"local"}
         assert TRUSTING.who(message, "acsard/*/alive") == FROM["viewer"]
-    for who in EVERYBODY:
-        assert DEFAULT.lets(who, "liveliness_token", DEFAULT.key("alive"), "egress")
+    for subject in EVERYBODY:
+        assert DEFAULT.lets(subject, "liveliness_token", DEFAULT.key("alive"), "egress")
 
 
 def test_a_router_may_forward_tokens_of_another_daemon_with_this_id_or_these_ros_names() -> None:
@@ -289,8 +289,8 @@ def test_a_late_subscriber_gets_the_kept_static_transforms() -> None:
         for message in ("query", "declare_subscriber"):
             assert DEFAULT.who(message, f"{key}/@adv/**") == {"local"}
             assert TRUSTING.who(message, f"{key}/@adv/**") == FROM["viewer"]
-        for who in EVERYBODY:
-            assert DEFAULT.lets(who, "reply", f"{key}/@adv/**", "egress")
+        for subject in EVERYBODY:
+            assert DEFAULT.lets(subject, "reply", f"{key}/@adv/**", "egress")
 
 
 # no wildcard gets around the rules
@@ -330,9 +330,11 @@ def test_no_wildcard_covers_a_service_for_less_than_a_maintainer(role: Role) -> 
     services += [e.key for e in endpoints(RosConfig(), ZID) if e.direction in ("query", "service")]
     for rule in TRUSTING.rules_of(role):
         if "ingress" in rule["flows"] and "query" in rule["messages"]:
-            for held in map(zenoh.KeyExpr, rule["key_exprs"]):
-                met = [service for service in services if held.intersects(zenoh.KeyExpr(service))]
-                assert met in ([], [str(held)])
+            for key_expr in map(zenoh.KeyExpr, rule["key_exprs"]):
+                met = [
+                    service for service in services if key_expr.intersects(zenoh.KeyExpr(service))
+                ]
+                assert met in ([], [str(key_expr)])
 
 
 def test_not_even_a_maintainer_may_query_beyond_the_robots_own_keys() -> None:
@@ -401,9 +403,9 @@ def test_every_ros_name_is_for_its_least_role_and_the_roles_above(
     other = "rmw" if transport == "bridge" else "bridge"
     ros = RosConfig(**{other: False}, namespace=namespace, urdf=DESCRIBED.urdf)  # type: ignore[arg-type]
     access = Access(ros=ros, mcu=REAL, odometry=GYRO)
-    found = endpoints(ros, ZID)
-    assert {endpoint.direction for endpoint in found} == {"in", "out", "query", "service"}
-    for endpoint in found:
+    endpoint_list = endpoints(ros, ZID)
+    assert {endpoint.direction for endpoint in endpoint_list} == {"in", "out", "query", "service"}
+    for endpoint in endpoint_list:
         key, native = endpoint.key, endpoint.native
         if endpoint.direction == "out":
             assert access.who("declare_subscriber", key) == FROM["viewer"]
@@ -419,10 +421,10 @@ def test_every_ros_name_is_for_its_least_role_and_the_roles_above(
             assert access.lets("viewer", "liveliness_token", endpoint.token, "egress")
 
 
-@pytest.mark.parametrize("gone", ["bridge", "rmw"])
-def test_a_ros_transport_that_is_off_has_no_keys(gone: str) -> None:
-    access = Access(ros=RosConfig(**{gone: False}))  # type: ignore[arg-type]
-    keys = {e.key for e in endpoints(RosConfig(), ZID) if e.transport == gone}
+@pytest.mark.parametrize("transport", ["bridge", "rmw"])
+def test_a_ros_transport_that_is_off_has_no_keys(transport: str) -> None:
+    access = Access(ros=RosConfig(**{transport: False}))  # type: ignore[arg-type]
+    keys = {e.key for e in endpoints(RosConfig(), ZID) if e.transport == transport}
     named = {key for rule in access.rules.values() for key in rule["key_exprs"]}
     assert keys
     assert not keys & named
@@ -435,8 +437,12 @@ def test_a_ros_transport_that_is_off_has_no_keys(gone: str) -> None:
 def test_the_lists_of_certificates_are_the_subjects() -> None:
     names = AccessConfig(viewers=("wall",), operators=("anna", "ben"), maintainers=("chief",))
     subjects = Access(access=names).subjects
-    held = {role: subjects[role]["cert_common_names"] for role in ROLES}
-    assert held == {"viewer": ["wall"], "operator": ["anna", "ben"], "maintainer": ["chief"]}
+    certificates = {role: subjects[role]["cert_common_names"] for role in ROLES}
+    assert certificates == {
+        "viewer": ["wall"],
+        "operator": ["anna", "ben"],
+        "maintainer": ["chief"],
+    }
 
 
 @pytest.mark.parametrize("role", ROLES)

@@ -56,12 +56,12 @@ def test_a_missing_permission_is_reported_with_the_role_that_it_needs() -> None:
 
 def test_a_silent_robot_leads_to_questions_first_about_the_id_and_to_no_claim() -> None:
     nobody = Identity("", "anna", "joe/1/aa", "robot1", "tls/a.local:7449")
-    for told in (nobody.words(), nobody.lacks("state"), nobody.lacks("srv/stop")):
-        assert told.startswith("no daemon answers as 'robot1' at tls/a.local:7449")
-        assert "queried key: acsard/robot1/whoami/viewer" in told
-        assert told.index("is --id right") < told.index("daemon run") < told.index("role's list")
-        assert "your certificate, anna," in told
-        assert "add" not in told
+    for text in (nobody.words(), nobody.lacks("state"), nobody.lacks("srv/stop")):
+        assert text.startswith("no daemon answers as 'robot1' at tls/a.local:7449")
+        assert "queried key: acsard/robot1/whoami/viewer" in text
+        assert text.index("is --id right") < text.index("daemon run") < text.index("role's list")
+        assert "your certificate, anna," in text
+        assert "add" not in text
     stranger = Identity("", "", "joe/1/aa", "robot1", "tcp/127.0.0.1:7448")
     assert stranger.words().startswith("no daemon answers as 'robot1' at tcp/127.0.0.1:7448")
     assert "certificate" not in stranger.words()
@@ -72,5 +72,5 @@ def test_the_message_names_the_robot_and_the_endpoint_that_were_queried() -> Non
     def nobody(name: str, take: Any) -> None:
         pass
 
-    found = identity(nobody, "", "joe/1/aa", "robot1", "tcp/127.0.0.1:7448")
-    assert (found.robot, found.endpoint) == ("robot1", "tcp/127.0.0.1:7448")
+    result = identity(nobody, "", "joe/1/aa", "robot1", "tcp/127.0.0.1:7448")
+    assert (result.robot, result.endpoint) == ("robot1", "tcp/127.0.0.1:7448")

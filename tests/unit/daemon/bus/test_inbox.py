@@ -67,23 +67,27 @@ def test_commands_and_stops_wake_the_loop_and_a_gyro_sample_does_not() -> None:
 
 
 def test_the_loop_finds_the_sample_that_woke_it() -> None:
-    found: list[list[str]] = []
+    key_lists: list[list[str]] = []
     inbox, loop = an_inbox()
-    loop.command = lambda: found.append(keys_of(inbox))  # type: ignore[method-assign]
+    loop.command = lambda: key_lists.append(keys_of(inbox))  # type: ignore[method-assign]
     loop.stop = loop.command  # type: ignore[method-assign]
     arrived(inbox, "cmd/app", "stop")
-    assert found == [["cmd/app"], ["stop"]]
+    assert key_lists == [["cmd/app"], ["stop"]]
 
 
 def test_a_flood_on_a_key_displaces_only_samples_of_that_key_and_is_counted() -> None:
     inbox, _ = an_inbox()
     arrived(inbox, "cmd/nav", "stop", *["cmd/app"] * (COMMAND_BUFFER + 5))
-    taken = inbox.take(8)
-    assert [one.key for one in taken.arrivals] == ["stop", "cmd/nav", *["cmd/app"] * COMMAND_BUFFER]
-    assert (taken.overrun, taken.overrun_sources) == (5, ("app",))
+    batch = inbox.take(8)
+    assert [arrival.key for arrival in batch.arrivals] == [
+        "stop",
+        "cmd/nav",
+        *["cmd/app"] * COMMAND_BUFFER,
+    ]
+    assert (batch.overrun, batch.overrun_sources) == (5, ("app",))
     arrived(inbox, "cmd/app")
-    taken = inbox.take(8)
-    assert (taken.overrun, taken.overrun_sources) == (0, ())
+    batch = inbox.take(8)
+    assert (batch.overrun, batch.overrun_sources) == (0, ())
 
 
 @pytest.mark.parametrize(("rate_hz", "room"), [(10.0, 160), (20.0, 80), (100.0, 16), (300.0, 16)])
@@ -100,10 +104,10 @@ def test_a_slow_control_rate_has_larger_buffers_so_that_a_lawful_sender_loses_no
 def test_a_loop_that_wakes_up_finds_the_displaced_samples_counted() -> None:
     inbox, loop = an_inbox()
     arrived(inbox, *["cmd/app"] * COMMAND_BUFFER)
-    found: list[int] = []
-    loop.command = lambda: found.append(inbox.take(8).overrun)  # type: ignore[method-assign]
+    overruns: list[int] = []
+    loop.command = lambda: overruns.append(inbox.take(8).overrun)  # type: ignore[method-assign]
     arrived(inbox, "cmd/app")
-    assert found == [1]
+    assert overruns == [1]
 
 
 class Asked:
@@ -146,27 +150,27 @@ def ended(replies: Replies) -> None:
 
 
 def test_each_query_gets_the_replies_to_its_ticket_and_then_its_end() -> None:
-    replies, one, other = Replies("acsard/r7/"), Asked(), Asked()
-    first, second = issued(replies, one), issued(replies, other, "acsard/stop")
+    replies, query, other = Replies("acsard/r7/"), Asked(), Asked()
+    first, second = issued(replies, query), issued(replies, other, "acsard/stop")
     replies.send(Reply(first, "odom", b"1", ""))
     replies.send(Reply(second, "srv/stop", b"2", ""))
     replies.send(Reply(first, "tf", b"no", "", ok=False))
     replies.retire(first)
     replies.retire(second)
     ended(replies)
-    assert one.told == ["acsard/r7/odom=1", "error=no", "dropped"]
+    assert query.told == ["acsard/r7/odom=1", "error=no", "dropped"]
     assert other.told == ["acsard/stop=2", "dropped"]  # a ROS client sent its query on another key
 
 
 def test_a_client_that_left_and_an_unknown_ticket_block_no_other_reply() -> None:
-    replies, gone, here = Replies(""), Asked(gone=True), Asked()
-    first, second = issued(replies, gone), issued(replies, here)
+    replies, absent, here = Replies(""), Asked(gone=True), Asked()
+    first, second = issued(replies, absent), issued(replies, here)
     for ticket in (first, 999, second):
         replies.send(Reply(ticket, "odom", b"1", ""))
         replies.retire(ticket)
         replies.retire(ticket)
     ended(replies)
-    assert (gone.told, here.told) == (["dropped"], ["odom=1", "dropped"])
+    assert (absent.told, here.told) == (["dropped"], ["odom=1", "dropped"])
 
 
 def test_a_query_that_cannot_be_ended_blocks_no_other_reply() -> None:
@@ -182,10 +186,10 @@ def test_a_query_that_cannot_be_ended_blocks_no_other_reply() -> None:
 def test_the_number_of_tickets_is_limited_until_some_are_retired() -> None:
     replies, queries = Replies(""), [Asked() for _ in range(2 * MAX_OPEN_QUERIES)]
     tickets = [replies.issue(query, "") for query in queries]  # type: ignore[arg-type]
-    held = [ticket for ticket in tickets if ticket is not None]
-    assert len(held) == MAX_OPEN_QUERIES
-    for ticket in held:
+    open_tickets = [ticket for ticket in tickets if ticket is not None]
+    assert len(open_tickets) == MAX_OPEN_QUERIES
+    for ticket in open_tickets:
         replies.retire(ticket)
     ended(replies)
-    assert all(query.told == ["dropped"] for query in queries[: len(held)])
+    assert all(query.told == ["dropped"] for query in queries[: len(open_tickets)])
     assert replies.issue(queries[-1], "") is not None  # type: ignore[arg-type]

@@ -87,11 +87,11 @@ def test_a_blocked_bus_is_reported_once_for_each_time_that_it_blocks() -> None:
     publish(outlets, 0)
     assert publisher.entered.wait(WAIT_S)
     now_ns = clock.mono_ns()
-    told = [
+    reports = [
         outlets.losses(now_ns + late_ns)[1]
         for late_ns in (0, BLOCKED_AFTER_NS + 1, 2 * BLOCKED_AFTER_NS)
     ]
-    assert told == [False, True, False]
+    assert reports == [False, True, False]
     publisher.free.set()
     outlets.stop(WAIT_S)
     assert outlets.losses(now_ns + 3 * BLOCKED_AFTER_NS) == (0, False)

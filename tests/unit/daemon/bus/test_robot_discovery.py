@@ -69,15 +69,15 @@ def absent(*others: str) -> Presence:
 
 
 def test_for_an_absent_robot_the_most_similar_id_comes_first() -> None:
-    told = explain_silence("state", "rob1t1", PLAIN, absent("acsar", "robot2", "robot1"))
-    assert "there is no robot rob1t1. Robots here: robot1, robot2, acsar; use --id robot1" in told
+    text = explain_silence("state", "rob1t1", PLAIN, absent("acsar", "robot2", "robot1"))
+    assert "there is no robot rob1t1. Robots here: robot1, robot2, acsar; use --id robot1" in text
 
 
 def test_only_a_few_robots_of_a_large_fleet_are_named() -> None:
-    told = explain_silence("state", "robot7", PLAIN, absent(*(f"robot{n:02}" for n in range(100))))
+    text = explain_silence("state", "robot7", PLAIN, absent(*(f"robot{n:02}" for n in range(100))))
     # "no robot robot7", the listed robots, and "--id"
-    assert told.count("robot") == 2 + MAX_NAMED + 1
-    assert f"and {100 - MAX_NAMED} more (`acsard fleet` lists them)" in told
+    assert text.count("robot") == 2 + MAX_NAMED + 1
+    assert f"and {100 - MAX_NAMED} more (`acsard fleet` lists them)" in text
 
 
 def test_if_no_robot_is_visible_the_message_names_the_endpoint() -> None:
@@ -86,8 +86,8 @@ def test_if_no_robot_is_visible_the_message_names_the_endpoint() -> None:
 
 
 def test_a_lost_connection_is_reported_before_all_other_reasons() -> None:
-    told = explain_silence("oddom", "acsar", PLAIN, Presence(linked=False, here=False))
-    assert f"the connection to {PLAIN} is lost" in told
+    text = explain_silence("oddom", "acsar", PLAIN, Presence(linked=False, here=False))
+    assert f"the connection to {PLAIN} is lost" in text
 
 
 @each(
@@ -106,11 +106,11 @@ def test_a_lost_connection_is_reported_before_all_other_reasons() -> None:
     ],
 )
 def test_for_a_present_robot_the_reason_is_about_the_key(key: str, words: str) -> None:
-    told = explain_silence(key, "acsar", PLAIN, HERE)
-    assert told.startswith("robot acsar is there, but ")
-    assert words in told
+    text = explain_silence(key, "acsar", PLAIN, HERE)
+    assert text.startswith("robot acsar is there, but ")
+    assert words in text
 
 
-@each("key", [one.key for one in PUBLISHED])
+@each("key", [topic.key for topic in PUBLISHED])
 def test_each_published_key_has_a_reason(key: str) -> None:
     assert "no such key" not in explain_silence(key, "acsar", PLAIN, HERE)

@@ -34,8 +34,8 @@ class Queue:
 
 
 def numbers(subscription: Subscription) -> list[int]:
-    found: Any = subscription.until_silence(0.01)
-    return [sample.number for sample in found]
+    samples: Any = subscription.until_silence(0.01)
+    return [sample.number for sample in samples]
 
 
 def test_a_sample_that_was_put_on_a_wildcard_does_not_count_for_the_key() -> None:
@@ -130,7 +130,7 @@ def test_a_reader_sleeps_until_a_sample_arrives_and_ends_when_the_session_is_clo
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(subscription, "try_recv", counted)
-        assert [one.number for one in asleep] == [0, 1, 2]
+        assert [item.number for item in asleep] == [0, 1, 2]
     assert looks <= 1 + 2 * 4  # a poll every millisecond would look 200 times
 
 
@@ -140,7 +140,7 @@ async def test_a_sample_or_the_end_wakes_an_asyncio_reader() -> None:
         handler.callback(sample(number))
     asyncio.get_running_loop().call_later(0.05, handler.callback, sample(2))
     asyncio.get_running_loop().call_later(0.06, handler.drop)
-    arrived = [one.number async for one in subscription.arriving()]  # type: ignore[attr-defined]
+    arrived = [item.number async for item in subscription.arriving()]  # type: ignore[attr-defined]
     assert arrived == [0, 1, 2]
 
 

@@ -81,12 +81,12 @@ def test_a_key_that_this_user_may_not_read_is_a_missing_permission(tmp_path: Pat
 
 
 def test_the_ends_of_the_certificate_and_of_its_authority_are_read(tmp_path: Path) -> None:
-    found, later = (
+    expiries, later = (
         expiry_times(str(made(tmp_path, 10, 100))),
         expiry_times(str(made(tmp_path, 1, 1))),
     )
     # An authority is valid for five times the days that were asked for.
-    days = {whose: round((found[whose] - later[whose]) / DAY_NS) for whose in found}
+    days = {whose: round((expiries[whose] - later[whose]) / DAY_NS) for whose in expiries}
     assert days == {"": 10 - 1, AUTHORITY: 5 * 100 - 5 * 1}
 
 
@@ -95,7 +95,7 @@ def test_missing_files_have_no_end(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("number", "told", "untold"),
+    ("number", "phrase", "untold"),
     [
         (errno.EHOSTUNREACH, "robot.local cannot be reached (No route to host)", "listens"),
         (errno.ENETUNREACH, "robot.local cannot be reached (Network is unreachable)", "listens"),
@@ -103,15 +103,15 @@ def test_missing_files_have_no_end(tmp_path: Path) -> None:
     ],
 )
 def test_an_absent_host_is_distinguished_from_a_port_without_a_program(
-    number: int, told: str, untold: str, monkeypatch: pytest.MonkeyPatch
+    number: int, phrase: str, untold: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def connection(*_: Any) -> None:
         raise OSError(number, os.strerror(number))
 
     monkeypatch.setattr(socket, "create_connection", connection)
-    found = trouble("tls/robot.local:7449", "")
-    assert told in found
-    assert untold not in found
+    message = trouble("tls/robot.local:7449", "")
+    assert phrase in message
+    assert untold not in message
 
 
 @pytest.mark.parametrize("options", ["?prio=0-5", "#iface=eth0", "?prio=0-5#iface=eth0"])
@@ -133,7 +133,7 @@ def test_the_options_of_an_endpoint_are_not_part_of_its_port(
 
 
 @pytest.mark.parametrize(
-    ("code", "reason", "told"),
+    ("code", "reason", "phrase"),
     [
         (20, "unable to get local issuer certificate", "dir/ca.pem did not sign the certificate"),
         (47, "permitted subtree violation", "dir/ca.pem may not sign for the names in the"),
@@ -142,18 +142,18 @@ def test_the_options_of_an_endpoint_are_not_part_of_its_port(
     ],
 )
 def test_a_rejected_server_certificate_has_the_reason_of_openssl(
-    code: int, reason: str, told: str
+    code: int, reason: str, phrase: str
 ) -> None:
-    found = tls._server_certificate_error(code, reason, "robot", "dir")
-    assert found.startswith(("the authority in ", "the certificate of robot"))
-    assert told in found
-    assert f"({reason})" in found
-    assert ("did not sign" in found) is (code == 20)
+    message = tls._server_certificate_error(code, reason, "robot", "dir")
+    assert message.startswith(("the authority in ", "the certificate of robot"))
+    assert phrase in message
+    assert f"({reason})" in message
+    assert ("did not sign" in message) is (code == 20)
 
 
 def test_a_rejected_client_certificate_has_the_alert_of_the_server() -> None:
-    found = tls._client_certificate_error("SSLV3_ALERT_CERTIFICATE_REVOKED", "robot", "dir")
-    assert "robot does not accept dir/certificate.pem (SSLV3_ALERT_CERTIFICATE_REVOKED)" in found
+    message = tls._client_certificate_error("SSLV3_ALERT_CERTIFICATE_REVOKED", "robot", "dir")
+    assert "robot does not accept dir/certificate.pem (SSLV3_ALERT_CERTIFICATE_REVOKED)" in message
     assert "did not sign" in tls._client_certificate_error("TLSV1_ALERT_UNKNOWN_CA", "robot", "dir")
 
 
@@ -161,8 +161,8 @@ def test_a_rejected_client_certificate_has_the_alert_of_the_server() -> None:
 def test_a_server_that_never_answers_the_handshake_is_reported(tmp_path: Path) -> None:
     Authority.make(tmp_path, "test", 1, ["localhost"]).issue(tmp_path, "robot", ["localhost"], 1)
     with socket.create_server(("127.0.0.1", 0)) as deaf:
-        found = trouble(f"tls/localhost:{deaf.getsockname()[1]}", str(tmp_path))
-    assert "does not answer the TLS handshake" in found
+        message = trouble(f"tls/localhost:{deaf.getsockname()[1]}", str(tmp_path))
+    assert "does not answer the TLS handshake" in message
 
 
 def test_an_impossible_port_is_reported(tmp_path: Path) -> None:

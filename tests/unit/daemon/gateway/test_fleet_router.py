@@ -44,7 +44,7 @@ def test_the_router_accepts_the_file_of_the_project_unchanged() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "says"),
+    ("text", "phrase"),
     [
         (
             '{ mode: "peer", listen: { endpoints: ["tcp/127.0.0.1:0"] } }',
@@ -58,16 +58,16 @@ def test_the_router_accepts_the_file_of_the_project_unchanged() -> None:
     ],
 )
 def test_a_file_that_is_not_for_a_router_is_refused_with_its_name_and_the_fix(
-    tmp_path: Path, text: str, says: str
+    tmp_path: Path, text: str, phrase: str
 ) -> None:
     with pytest.raises(RouterFileError) as error:
         Router(written(tmp_path, text))
-    assert says in str(error.value)
+    assert phrase in str(error.value)
     assert "router.json5" in str(error.value)
 
 
 @pytest.mark.parametrize(
-    ("text", "says"),
+    ("text", "phrase"),
     [
         ("{ mode", "line 1, column 1: expected array, boolean, null, number, object, or string"),
         ('{\n  mode: "router"\n  listen: {} }', "line 2, column 9: expected boolean or null"),
@@ -78,11 +78,11 @@ def test_a_file_that_is_not_for_a_router_is_refused_with_its_name_and_the_fix(
     ],
 )
 def test_a_mistake_in_the_file_is_reported_with_line_and_column(
-    tmp_path: Path, text: str, says: str
+    tmp_path: Path, text: str, phrase: str
 ) -> None:
     with pytest.raises(RouterFileError) as error:
         Router(written(tmp_path, text))
-    assert says in str(error.value)
+    assert phrase in str(error.value)
     assert ".rs" not in str(error.value)
     assert "Location" not in str(error.value)
 
@@ -107,13 +107,13 @@ def test_an_address_in_use_may_be_free_later(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("endpoint", "says"),
+    ("endpoint", "phrase"),
     [("tls/127.0.0.1:0", "TLS private key"), ("pigeon/127.0.0.1:0", "pigeon protocol")],
 )
 def test_an_error_that_other_addresses_would_not_fix_is_an_error_of_the_file(
-    tmp_path: Path, endpoint: str, says: str
+    tmp_path: Path, endpoint: str, phrase: str
 ) -> None:
-    with pytest.raises(RouterFileError, match=rf"router\.json5 cannot be used: .*{says}"):
+    with pytest.raises(RouterFileError, match=rf"router\.json5 cannot be used: .*{phrase}"):
         on(tmp_path, endpoint).open()
 
 
@@ -161,19 +161,21 @@ def test_each_role_may_use_the_same_keys_as_at_the_gateway_of_a_robot(
 def granted(access: Any, subjects: set[str], message: str) -> set[str]:
     """Return the keys on which these subjects may send the message."""
     rules = {rule["id"]: rule for rule in access["rules"]}
-    policies = [one for one in access["policies"] if subjects & set(one["subjects"])]
-    held = [rules[name] for policy in policies for name in policy["rules"]]
-    sent = [one for one in held if message in one["messages"] and "ingress" in one["flows"]]
+    policies = [entry for entry in access["policies"] if subjects & set(entry["subjects"])]
+    own_rules = [rules[name] for policy in policies for name in policy["rules"]]
+    sent = [
+        entry for entry in own_rules if message in entry["messages"] and "ingress" in entry["flows"]
+    ]
     return {key for rule in sent for key in rule["key_exprs"]}
 
 
 def test_each_of_ten_robots_has_its_own_keys_and_none_of_another_robot() -> None:
-    one, ten = made(["robot1"]), made(TEN)
+    single, ten = made(["robot1"]), made(TEN)
     for robots in (["robot1"], TEN):
         line = f"// This file is for {', '.join(robots)}. To make a file for your own robots:\n"
         assert line in router_file(TEMPLATE, robots, {})
-    own = [rule for rule in one["rules"] if "robot1" in rule["id"]]
-    assert len(ten["rules"]) == len(one["rules"]) + 9 * len(own)
+    own = [rule for rule in single["rules"] if "robot1" in rule["id"]]
+    assert len(ten["rules"]) == len(single["rules"]) + 9 * len(own)
     rules = {rule["id"]: rule for rule in ten["rules"]}
     for robot in TEN:
         for rule in own:
@@ -189,7 +191,7 @@ def test_each_of_ten_robots_has_its_own_keys_and_none_of_another_robot() -> None
     for role in ("viewers", "operators", "maintainers"):
         before, after = (
             next(p["rules"] for p in each["policies"] if p["subjects"] == [role])
-            for each in (one, ten)
+            for each in (single, ten)
         )
         named = [rule for rule in before if "robot1" in rule]
         assert sorted(after) == sorted(
@@ -199,12 +201,12 @@ def test_each_of_ten_robots_has_its_own_keys_and_none_of_another_robot() -> None
 
 
 def test_further_certificates_are_in_the_list_of_their_role() -> None:
-    who: dict[Role, list[str]] = {
+    certificates: dict[Role, list[str]] = {
         "operator": ["laptop-anna", "robot1-ben"],
         "viewer": ["wall"],
         "maintainer": ["chief"],
     }
-    names = {s["id"]: s["cert_common_names"] for s in made(["a-1"], who)["subjects"]}
+    names = {s["id"]: s["cert_common_names"] for s in made(["a-1"], certificates)["subjects"]}
     assert names == {
         "viewers": ["viewer", "wall"],
         "operators": ["operator", "laptop-anna", "robot1-ben"],
@@ -263,7 +265,7 @@ def test_a_robot_may_have_a_name_that_the_template_uses_otherwise() -> None:
     robots = ["viewers", "hear", "learn", "a", "see-a", "own-a", "robot-a"]
     access = made(robots)
     for kind in ("rules", "subjects"):
-        ids = [one["id"] for one in access[kind]]
+        ids = [entry["id"] for entry in access[kind]]
         assert len(set(ids)) == len(ids)
     assert len(access["storages"]) == 3 * len(robots)
 

@@ -31,13 +31,13 @@ def test_a_gateway_with_free_connections_reports_nothing() -> None:
 
 
 def test_a_full_gateway_names_its_clients_once_a_minute_and_counts_every_observation() -> None:
-    health, told = SessionHealth(MOST, 0), []
+    health, events = SessionHealth(MOST, 0), []
     for number in range(2 * 60 * 4 + 1):
         event = health.full_event(look(number * S // 4, "ben", "ann", "ben", ""))
         if event is not None:
-            told.append((number * S // 4, event))
-    assert [at for at, _ in told] == [0, 60 * S, 120 * S]
-    _, event = told[0]
+            events.append((number * S // 4, event))
+    assert [at for at, _ in events] == [0, 60 * S, 120 * S]
+    _, event = events[0]
     assert (event.name, event.level) == ("gateway_full", "warning")
     assert event.text.startswith(
         "all 4 connections are in use, 2 by ben, 1 by ann, 1 by an unnamed"

@@ -22,7 +22,7 @@ async def first_piece(faults: tuple[str, ...], enough: Callable[[bytes], bool]) 
 
     Return it.
     """
-    found: asyncio.Future[bytes] = asyncio.get_running_loop().create_future()
+    future: asyncio.Future[bytes] = asyncio.get_running_loop().create_future()
     with Simulated(Config(sim=SimConfig(faults=faults))) as simulated:
         device = os.open(simulated.path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
         tty.setraw(device)
@@ -30,13 +30,13 @@ async def first_piece(faults: tuple[str, ...], enough: Callable[[bytes], bool]) 
         def more() -> None:
             piece = os.read(device, 4096)
             os.write(device, LINE)
-            if enough(piece) and not found.done():
-                found.set_result(piece)
+            if enough(piece) and not future.done():
+                future.set_result(piece)
 
         asyncio.get_running_loop().add_reader(device, more)
         try:
             os.write(device, LINE * 12)
-            return await asyncio.wait_for(found, 20.0)
+            return await asyncio.wait_for(future, 20.0)
         finally:
             asyncio.get_running_loop().remove_reader(device)
             os.close(device)
