@@ -60,8 +60,8 @@ def role_table() -> str:
             above = [t.key for t in TOPICS if t.direction == "query" and t.query in ROLES[1:]]
             others = ", ".join(f"`{key}`" for key in above)
             may = ["follow every published key", f"query every other key except {others}"]
-            assert verbs == ["`stop`"]
-            may.append("**stop** the robot")
+            calls = ", ".join(verb for verb in verbs if verb != "`stop`")
+            may += ["**stop** the robot", *([f"call {calls}"] if calls else [])]
         else:
             may = [f"all of {ROLES[ROLES.index(role) - 1]}"]
             may += ["drive by the listed sources"] if role == COMMAND_ROLE else []

@@ -331,6 +331,8 @@ def _remains(report: Report, calibration: Calibration, *, guided: bool) -> list[
     fastest = calibration.drives.fastest
     multipliers = calibration.multipliers
     share = multipliers.std[SEPARATION] / multipliers.values[SEPARATION]
+    # Adding 0.0 turns a rounded -0.0 into 0.0.
+    growth = round(report.effective_track_growth * fastest, 3) + 0.0
     known = (
         ""
         if TRACK in report.kept
@@ -338,7 +340,7 @@ def _remains(report: Report, calibration: Calibration, *, guided: bool) -> list[
     )
     sentences = [
         f"remaining error: skidding changes the effective track. {known}From slow to fast turns, "
-        f"it changes by {report.effective_track_growth * fastest:+.1%} "
+        f"it changes by {growth:+.1%} "
         f"(+- {report.effective_track_growth_std * fastest:.1%}). It also depends on the ground, "
         "so calibrate where you drive"
     ]

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import errno
+import io
 import os
 import re
 import sys
@@ -23,7 +24,7 @@ from importlib import import_module
 from typing import NoReturn
 
 from acsard.core.config.nearest import nearest
-from acsard.core.formatting import lines
+from acsard.core.formatting import lines, printable
 from acsard.core.values import AcsardError
 from acsard.host.errors import Exit, MendableError
 from acsard.host.version import version
@@ -62,6 +63,12 @@ VERBS = {
 
 The name of a subcommand is also the name of its module in this package.
 """
+
+MAX_ARGUMENT_LENGTH = 4096
+"""Largest length of an argument, characters. Zenoh fails on keys above 65,535 bytes."""
+
+PATH_VARIABLES = ("HOME", "STATE_DIRECTORY", "XDG_STATE_HOME")
+"""Environment variables with paths that acsard uses, beside those that begin with ACSARD_."""
 
 _EPILOG = """\
 exit codes: 0 done, 1 failure, 2 wrong usage, 65 part of the recording was left out, 66 no such
@@ -136,6 +143,10 @@ def parser(called: Collection[str] = VERBS) -> argparse.ArgumentParser:
 
 def main(argv: list[str] | None = None) -> int:
     words = [_decimal(word) for word in (sys.argv[1:] if argv is None else argv)]
+    trouble = _unusable(words)
+    if trouble:
+        print(f"acsard: {trouble}", file=sys.stderr)
+        return int(Exit.USAGE)
     known = {"-h", "--help", "--version"}
     if not words or (words[0].startswith("-") and words[0] not in known):
         words.insert(0, "run")
@@ -172,11 +183,39 @@ def _decimal(word: str) -> str:
     return f"{Decimal(word):f}" if _EXPONENT.fullmatch(word) else word
 
 
+def _unusable(words: Sequence[str]) -> str:
+    """Return why acsard cannot use these arguments or its environment, or "" if it can.
+
+    Paths and names appear in messages, which are UTF-8.
+    """
+    for word in words:
+        if len(word) > MAX_ARGUMENT_LENGTH:
+            return (
+                f"the argument that begins with {printable(word[:40])!r} is longer than "
+                f"{MAX_ARGUMENT_LENGTH} characters"
+            )
+    texts = {f"the argument {printable(word)!r}": word for word in words}
+    for name, value in os.environ.items():
+        if name in PATH_VARIABLES or name.startswith("ACSARD_"):
+            texts[f"the environment variable {printable(name)}"] = value
+    with suppress(OSError):
+        texts["the path of the current directory"] = os.getcwd()
+    for what, text in texts.items():
+        try:
+            text.encode()
+        except UnicodeEncodeError:
+            return f"{what} is not valid UTF-8; use a name in UTF-8"
+    return ""
+
+
 def entry() -> NoReturn:
     """Run `main`, flush the output, and end the process. This is the entry point of `acsard`."""
     # The process ends with `os._exit`, because Zenoh's threads may still call into Python. During a
     # normal shutdown of the interpreter, such a call would abort the process.
     _fill_closed_streams()
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        # A terminal without UTF-8 shows "\\u2026" instead of "…", as Python does for stderr.
+        sys.stdout.reconfigure(errors="backslashreplace")
     try:
         code = main()
     except SystemExit as end:  # argparse ends this way after --help, --version and usage errors

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import shlex
 from collections.abc import Sequence
 
 from acsard.cli.connection import SEVERAL_IDS, add_bus, connected_to_many
@@ -56,7 +57,9 @@ def main(args: argparse.Namespace) -> int:
         if not math.isfinite(value):
             raise UsageError(f"{name.upper()} = {value}: the number must be finite; correct it")
     if args.service != "stop" and (ids := parse_ids(args.id or "")):
-        raise UsageError(one_robot_only_text(args.service, args.values, ids))
+        typed = (("--config", args.config), ("--connect", args.connect), ("--tls", args.tls))
+        options = "".join(f" {name} {shlex.quote(value)}" for name, value in typed if value)
+        raise UsageError(one_robot_only_text(args.service, args.values, ids, options))
     with connected_to_many(args) as (robot, many):
         if many:
             return _stop_all(robot, many, as_json=args.json)
@@ -71,11 +74,14 @@ def _fields(service: Verb) -> tuple[str, ...]:
     return MESSAGES[SERVICES[service].payload].__struct_fields__
 
 
-def one_robot_only_text(service: str, values: Sequence[float], ids: tuple[str, ...]) -> str:
+def one_robot_only_text(
+    service: str, values: Sequence[float], ids: tuple[str, ...], options: str
+) -> str:
     """Return the error text for a service that can be called on only one robot at a time.
 
     The text contains the command to type for each robot in `ids`. `values` are the numbers that the
-    operator typed after the name of the service.
+    operator typed after the name of the service, and `options` are the typed options that reach
+    the robot, such as " --connect ADDRESS".
     """
     typed = " ".join(["acsard call", service, *(f"{value:g}" for value in values), "--id"])
     each = [one for one in ids if one != "*"] or ["robot1"]
@@ -83,7 +89,7 @@ def one_robot_only_text(service: str, values: Sequence[float], ids: tuple[str, .
     return (
         f"only stop can be called on several robots at once: before {service}, a person must look "
         "at each robot. Call one robot after the other: "
-        f"{', '.join(f'`{typed} {one}`' for one in each)}{more}"
+        f"{', '.join(f'`{typed} {robot_id}{options}`' for robot_id in each)}{more}"
     )
 
 

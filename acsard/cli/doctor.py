@@ -15,6 +15,7 @@ from rich.text import Text
 
 from acsard.cli.common import by_environment
 from acsard.cli.connection import add_bus, require_one
+from acsard.core.formatting import lines, printable
 from acsard.daemon.bus.address import address_of
 from acsard.host.config_file import find
 from acsard.machine.examination import examine
@@ -35,7 +36,8 @@ def main(args: argparse.Namespace) -> int:
     if args.json:
         print(msgspec.json.encode(findings).decode())
     else:
-        for one in findings:
-            mend = f"\n      -> {one.mend}" if one.mend else ""
-            show_whole(Text.assemble(LEVEL_MARKS[one.level], f"  {one.subject}: {one.text}{mend}"))
+        for finding in findings:
+            mend = f"\n      -> {lines(finding.mend)}" if finding.mend else ""
+            text = f"  {finding.subject}: {printable(finding.text)}{mend}"
+            show_whole(Text.assemble(LEVEL_MARKS[finding.level], text))
     return 1 if any(finding.level == "failure" for finding in findings) else 0

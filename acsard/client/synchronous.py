@@ -438,7 +438,9 @@ class Client:
                 raise self._unanswered(name)
             if reply.ok is not None:
                 return encoded(reply.ok)
-            error_text = reply.err.payload.to_string() if reply.err is not None else ""
+            error_text = ""
+            if reply.err is not None:
+                error_text = reply.err.payload.to_bytes().decode(errors="replace")
             if error_text == TIMED_OUT:
                 raise NoAnswerError(
                     f"no answer on the Zenoh key {self.key(name)} within {REPLY_TIMEOUT_S:g} s: "

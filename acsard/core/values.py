@@ -7,9 +7,9 @@ Python's garbage collector, which saves time. They are never part of a reference
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Literal, get_args
+from typing import Annotated, Literal, get_args
 
-from msgspec import Struct
+from msgspec import Meta, Struct
 from msgspec.structs import replace
 
 WHEELS = ("front_right", "front_left", "rear_left", "rear_right")
@@ -152,8 +152,10 @@ class Command(Struct, frozen=True):
 
 Verb = Literal["stop", "clear", "activate", "deactivate", "reset_odometry", "set_pose", "set"]
 
-Plain = bool | int | float | str | list[float | str]
-"""Value of a setting in a request of a client."""
+Plain = (
+    bool | Annotated[int, Meta(ge=-(1 << 63), le=(1 << 63) - 1)] | float | str | list[float | str]
+)
+"""Value of a setting in a request of a client. Integers have at most 64 bits, as in a recording."""
 
 
 class Request(Struct, frozen=True):

@@ -25,6 +25,10 @@ MAX_BYTES = 65_536
 """Largest size of a latch file, bytes. A larger file counts as unreadable. Three latches and all
 limits take about 1 kB."""
 
+MAX_NUMBER = 1 << 52
+"""Largest number of a latch in the file. It leaves room for later latches below 2^53, the limit of
+the numbers that a `clear` can name."""
+
 MAX_TEXT_LENGTH = 500
 """Largest length of a name or a reason in the latch file, characters. The rest is cut off."""
 
@@ -90,10 +94,17 @@ def decode(robot: str, data: bytes) -> Latches:
         raise LatchFileError(f"it belongs to the robot {_safe(content.robot)!r:.60}")
     latches = content.latches
     for latch in (latches.stop, latches.fault, latches.inactive):
-        if latch is not None and any(cause.earlier for cause in latch.earlier):
+        if latch is None:
+            continue
+        if any(cause.earlier for cause in latch.earlier):
             # No daemon writes such a file, and the code below cannot process causes that are nested
             # more deeply.
             raise LatchFileError("it is damaged (an earlier cause has causes of its own)")
+        for cause in (latch, *latch.earlier):
+            # A `clear` could not name a number outside this range, and messages have no integers
+            # above 64 bits.
+            if not (0 <= cause.number <= MAX_NUMBER and abs(cause.at_ns) < 1 << 63):
+                raise LatchFileError("it is damaged (a number or a time is out of range)")
     if _plain(content) != raw:
         raise LatchFileError("it is damaged (a field name is missing or unknown)")
     return latches.after_restart()

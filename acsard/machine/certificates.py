@@ -235,7 +235,9 @@ def _password() -> str:
 
 
 def _writable(directory: Path) -> None:
-    there = next(place for place in (directory, *directory.absolute().parents) if place.exists())
+    # `exists` is false for a symbolic link to a missing file, which is in the way all the same.
+    places = (directory, *directory.absolute().parents)
+    there = next(place for place in places if place.exists() or place.is_symlink())
     if not there.is_dir():
         raise MendableError(f"{there} is not a directory; name a directory with --directory")
     if not os.access(there, os.W_OK | os.X_OK):

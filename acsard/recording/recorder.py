@@ -235,7 +235,15 @@ class Recorder:
         over = False
         while not over:
             over = self._over.wait(SYNC_PAUSE_S)
-            self._writer.write(self._taken(), over)
+            try:
+                self._writer.write(self._taken(), over)
+            except Exception:
+                text = (
+                    "the recorder has ended because of an internal error: restart the daemon to "
+                    "record again"
+                )
+                self._events.append(Event("recording", text, "error"))
+                raise
 
     def _taken(self) -> list[FinishedStep | StateBeforeStep]:
         queue = self._queue

@@ -123,7 +123,9 @@ class Feed:
         elif isinstance(message, Odometry):
             self._odom[message.header.stamp.to_ns()] = message
             self._join(message.header.stamp.to_ns())
-        elif isinstance(message, JointState):
+        elif (
+            isinstance(message, JointState) and len(message.velocity) == len(message.position) == 4
+        ):
             self._wheels[message.header.stamp.to_ns()] = message
             self._join(message.header.stamp.to_ns())
 

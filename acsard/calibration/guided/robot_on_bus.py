@@ -141,8 +141,17 @@ class Recorder:
         self.samples: dict[str, list[Sample]] = {name: [] for name in COLUMNS_BY_STREAM}
 
     def wheels(self, message: JointState, arrival: float) -> float:
-        """Add a sample of the wheel speeds, and return the speed of the fastest wheel, rad/s."""
+        """Add a sample of the wheel speeds, and return the speed of the fastest wheel, rad/s.
+
+        Raises `GuideError` if the speed of a wheel is missing.
+        """
         speeds = dict(zip(message.name, message.velocity, strict=False))
+        for joint in self._joints:
+            if joint not in speeds:
+                raise GuideError(
+                    f"wheel_states has no speed of {joint}: if another program publishes on this "
+                    "key, stop it"
+                )
         self._add("wheels", message.header.stamp, arrival, tuple(speeds[j] for j in self._joints))
         return max(map(abs, speeds.values()))
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
 from acsard.cli import main, parser
@@ -100,3 +102,33 @@ def test_an_unexpected_word_after_an_option_is_named_too(
     output = capsys.readouterr().err
     assert "usage: acsard recording export " in output
     assert "unrecognized arguments: b.csv; `acsard recording export --help` lists" in output
+
+
+@each("word", ["\udcff", "x" * 4097])
+def test_an_argument_that_no_message_could_contain_is_refused(
+    word: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["get", word]) == Exit.USAGE
+    text = capsys.readouterr().err
+    assert ("not valid UTF-8" in text) == (len(word) == 1)
+    assert ("longer than 4096 characters" in text) == (len(word) > 1)
+
+
+@each("name", ["STATE_DIRECTORY", "XDG_STATE_HOME", "HOME", "ACSARD_CONFIG"])
+def test_a_path_in_the_environment_that_is_not_utf_8_is_refused(
+    name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setenv(name, "/var/lib/\udce4")
+        assert main(["check"]) == Exit.USAGE
+    assert f"the environment variable {name} is not valid UTF-8" in capsys.readouterr().err
+
+
+def test_a_current_directory_that_is_not_utf_8_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    where = tmp_path / "\udce4"
+    where.mkdir()
+    monkeypatch.chdir(where)
+    assert main(["check"]) == Exit.USAGE
+    assert "the path of the current directory is not valid UTF-8" in capsys.readouterr().err

@@ -15,6 +15,7 @@ from acsard.core.values import NS_PER_S, Event, Instant, Latch, Latches
 from acsard.daemon.latch_rules import (
     MAX_ANSWER_DELAY_NS,
     MAX_BYTES,
+    MAX_NUMBER,
     Handover,
     LatchFileError,
     after_failed_write,
@@ -34,7 +35,9 @@ INACTIVE = Latch(1_800_000_000_002, NOW.wall_ns, "page", "switched off by page")
 ALL = Latches(STOP, FAULT, INACTIVE, {"limits.linear_speed": 0.4})
 
 texts = st.text(st.characters(codec=None), max_size=600)
-latch = st.builds(Latch, st.integers(0, 2**53), st.integers(0, 2**63), texts, texts, st.booleans())
+latch = st.builds(
+    Latch, st.integers(0, MAX_NUMBER), st.integers(0, 2**63 - 1), texts, texts, st.booleans()
+)
 several = st.builds(
     Latches,
     st.none() | latch,
@@ -81,6 +84,24 @@ def test_an_earlier_cause_with_earlier_causes_of_its_own_is_refused(name: str, d
         return
     with pytest.raises(LatchFileError, match="causes of its own"):
         decode("acsar", data)
+
+
+@each("field", ["number", "at_ns"])
+@each("value", [-(1 << 64), 1 << 53, 1 << 63, 10**30])
+def test_a_number_or_a_time_that_no_message_could_contain_is_refused(
+    field: str, value: int
+) -> None:
+    latches = Latches(stop=replace(STOP, earlier=(STOP,)))
+    content = json.loads(encode("acsar", latches))
+    if (field, value) == ("at_ns", 1 << 53):
+        return  # an ordinary time
+    for latch in (content["latches"]["stop"], content["latches"]["stop"]["earlier"][0]):
+        before = latch[field]
+        latch[field] = value
+        with pytest.raises(LatchFileError, match="out of range"):
+            decode("acsar", json.dumps(content).encode())
+        latch[field] = before
+    assert decode("acsar", json.dumps(content).encode()).stop is not None
 
 
 @given(several)

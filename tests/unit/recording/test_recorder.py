@@ -465,6 +465,22 @@ def test_a_bug_whose_text_cannot_be_produced_is_still_recorded(bench: Bench) -> 
     assert (last.cut, last.why) == ("bug", "MuteError")
 
 
+def test_an_internal_error_that_ends_the_recorder_is_logged_at_once(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(threading, "excepthook", lambda _: None)
+    bench.world.run(1.0)
+    tape = Tape()
+    World(recorder=tape).run(0.1)
+    step = tape.taken[0]
+    bench.recorder._queue.append(step._replace(inputs=replace(step.inputs, missed=1 << 80)))
+    bench.recorder._over.set()
+    bench.recorder._thread.join(20.0)
+    bench.world.run(0.1)
+    assert bench.said[-1].text.startswith("the recorder has ended because of an internal error")
+    assert "the recorder has ended" in bench.recorder.status.trouble
+
+
 def test_inputs_that_cannot_be_encoded_are_left_out(bench: Bench) -> None:
     bench.world.run(1.0)
     tape = Tape()

@@ -58,6 +58,16 @@ def odom(seconds: float, yaw: float = 0.5) -> Odometry:
     return Odometry(wheels(seconds).header, "base_link", pose, twist)
 
 
+def test_wheel_states_with_another_number_of_wheels_are_ignored() -> None:
+    feed = Feed(Config(), state(10))
+    message = wheels(0.01)
+    message.velocity.pop()
+    for part in (odom(0.01), message, odom(0.02), wheels(0.02)):
+        feed.add(part)
+    (line,) = feed.received(state(11), diagnostics()).lines
+    assert line.at == 0.02
+
+
 def test_two_messages_of_one_stamp_make_a_line_in_any_order() -> None:
     feed = Feed(Config(), state(10))
     for message in (wheels(0.01), odom(0.01), odom(0.02, 1.5), wheels(0.02)):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from acsard.calibration.guided import robot_on_bus
-from acsard.calibration.guided.drive_plan import DisturbedError, Leg, Move
+from acsard.calibration.guided.drive_plan import DisturbedError, GuideError, Leg, Move
 from acsard.calibration.guided.leg_driver import STALL_REASON
 from acsard.calibration.guided.robot_on_bus import Recorder, RobotOnBus, Sample, times
 from acsard.calibration.log_table import LogError
@@ -103,6 +103,13 @@ def test_the_applied_commands_are_part_of_the_run() -> None:
 
 def test_the_speed_of_the_fastest_wheel_is_returned_for_either_direction() -> None:
     assert Recorder(JOINTS).wheels(wheels(1.0, 1.0, -4.0), 1.0) == 4.0
+
+
+def test_wheel_states_without_a_joint_of_the_robot_are_refused() -> None:
+    message = wheels(1.0, 1.0, 1.0)
+    message.name[0] = "arm_joint"
+    with pytest.raises(GuideError, match=f"no speed of {JOINTS[0]}"):
+        Recorder(JOINTS).wheels(message, 1.0)
 
 
 def test_a_recording_without_wheels_is_refused() -> None:

@@ -354,6 +354,14 @@ def test_a_service_query_with_its_exact_key_makes_a_request_to_the_robot(verb: A
     assert request == Request(verb, 7, pose, by="unnamed (native)", settings=settings, latch=latch)
 
 
+@each("value", [-(1 << 63) - 1, 1 << 63, 10**20, 10**300])
+def test_a_setting_with_an_integer_above_64_bits_is_refused(value: int) -> None:
+    asked = query("srv/set", payload=f'{{"settings": {{"rates.odom": {value}}}}}'.encode())
+    replies = queries().serve(asked, nothing, OUTPUTS)
+    assert isinstance(replies, list)
+    assert "$.settings" in str(replies[0])
+
+
 @each("asked", WILDCARDS)
 @each("verb", SERVICES)
 def test_a_wildcard_never_runs_a_service(verb: str, asked: str) -> None:
