@@ -72,11 +72,11 @@ def lines_of(chunks: Iterable[Chunk]) -> list[Chunk]:
 
     Line ends and trailing commas are removed.
     """
-    lines, held, began_ns = [], b"", 0
+    lines, rest, began_ns = [], b"", 0
     for at_ns, data in chunks:
-        if not held:
+        if not rest:
             began_ns = at_ns
-        *whole, held = (held + data).split(b"\n")
+        *whole, rest = (rest + data).split(b"\n")
         for line in whole:
             if line.strip():
                 lines.append((began_ns, line.rstrip(b",\r")))
@@ -97,17 +97,17 @@ def commands_to_lines(sent: Sequence[Chunk], lines: Sequence[Chunk]) -> list[int
     times: dict[bytes, list[int]] = {}
     for at_ns, line in lines:
         times.setdefault(line, []).append(at_ns)
-    found = []
+    delays_ns = []
     for at_ns, line in sent:
         all_ns = times.get(line, [])
         place = bisect_left(all_ns, at_ns)
         if place < len(all_ns) and all_ns[place] - at_ns < LOSS_TIMEOUT_NS:
-            found.append(all_ns[place] - at_ns)
-    return found
+            delays_ns.append(all_ns[place] - at_ns)
+    return delays_ns
 
 
 def lines_to_samples(
-    said: Sequence[tuple[int, float]], samples: Iterable[tuple[int, float]]
+    lines: Sequence[tuple[int, float]], samples: Iterable[tuple[int, float]]
 ) -> list[MatchedLine]:
     """Return a `MatchedLine` for each feedback line that became an odometry sample.
 
@@ -118,19 +118,19 @@ def lines_to_samples(
         said: for each feedback line, its time, ns, and its linear speed, m/s.
         samples: for each odometry sample, its time of arrival, ns, and its linear speed, m/s.
     """
-    all_ns = [at_ns for at_ns, _ in said]
+    all_ns = [at_ns for at_ns, _ in lines]
     places: dict[int, list[int]] = {}
-    for index, (_, speed) in enumerate(said):
+    for index, (_, speed) in enumerate(lines):
         places.setdefault(_key(speed), []).append(index)
-    found, told = [], -1
+    matches, last_index = [], -1
     for at_ns, speed in samples:
         before = bisect_right(all_ns, at_ns)
         indices = places.get(_key(speed), [])
         place = bisect_left(indices, before) - 1
-        if place >= 0 and indices[place] > told:
-            told = indices[place]
-            found.append(MatchedLine(at_ns - all_ns[told], before - 1 - told))
-    return found
+        if place >= 0 and indices[place] > last_index:
+            last_index = indices[place]
+            matches.append(MatchedLine(at_ns - all_ns[last_index], before - 1 - last_index))
+    return matches
 
 
 def _key(speed: float) -> int:
@@ -210,9 +210,9 @@ def feedback_fates(config: Config, record: Record) -> list[MatchedLine]:
     """Return a `MatchedLine` for each feedback line that became an odometry sample."""
     codec = Codec(config.mcu.wheels, config.mcu.trailing_comma)
     kinematics = Kinematics(config.drive)
-    said = [
+    lines = [
         (at_ns, kinematics.twist(codec.decode(line)).linear)
         for at_ns, line in record.feedback_lines
     ]
     samples = [(sample.at.mono_ns, sample.speed) for sample in record.samples]
-    return lines_to_samples(said, samples)
+    return lines_to_samples(lines, samples)

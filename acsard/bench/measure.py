@@ -130,18 +130,18 @@ def _result(
     record = rig.end()
     read = [sample.at.wall_ns - sample.stamp_ns for sample in record.samples]
     outside = {"read_to_odometry": summary(read)}
-    seen = lines_said = lines_waiting = start_up = None
+    wire_count = lines_said = lines_waiting = start_up = None
     lines_told = len(record.samples)
     if record.seen is not None:
-        heard = lines_of(record.seen.from_daemon)
+        daemon_lines = lines_of(record.seen.from_daemon)
         waits, fed = command_waits(record), feedback_fates(config, record)
         outside["command_to_wire"] = summary(waits)
-        outside["feedback_to_odometry"] = summary([one.delay_ns for one in fed])
-        seen, lines_said, lines_told = len(waits), len(record.feedback_lines), len(fed)
-        if record.sent and not seen:
+        outside["feedback_to_odometry"] = summary([line.delay_ns for line in fed])
+        wire_count, lines_said, lines_told = len(waits), len(record.feedback_lines), len(fed)
+        if record.sent and not wire_count:
             raise _nothing_seen(len(record.sent), state)
-        lines_waiting = max((one.waiting for one in fed), default=0)
-        start_up = round((heard[0][0] - record.began_ns) / 1e6, 1)
+        lines_waiting = max((line.waiting for line in fed), default=0)
+        start_up = round((daemon_lines[0][0] - record.began_ns) / 1e6, 1)
     return Result(
         machine=this_machine(),
         port=port or "simulator",
@@ -153,7 +153,7 @@ def _result(
         outside=outside,
         own=_own(state),
         commands_sent=len(record.sent),
-        commands_seen=seen,
+        commands_seen=wire_count,
         lines_said=lines_said,
         lines_told=lines_told,
         lines_waiting_max=lines_waiting,

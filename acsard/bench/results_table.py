@@ -115,9 +115,9 @@ def parts(result: Result) -> Iterator[RenderableType]:
 
 
 def _figures(
-    head: str, points: dict[str, str], found: Mapping[str, Summary | None]
+    head: str, points: dict[str, str], summaries: Mapping[str, Summary | None]
 ) -> list[tuple[str, ...]]:
-    rows = [(words, *_cells(found.get(name))) for name, words in points.items()]
+    rows = [(words, *_cells(summaries.get(name))) for name, words in points.items()]
     return [(head, "count", "p50", "p99", "max us"), *rows]
 
 
@@ -147,12 +147,12 @@ def _about(result: Result) -> list[tuple[str, str]]:
 
 def _counts(result: Result) -> list[tuple[str, str]]:
     r = result
-    seen = "" if r.commands_seen is None else f", {r.commands_seen} seen on the wire"
-    said = "" if r.lines_said is None else f" of {r.lines_said}"
+    wire_text = "" if r.commands_seen is None else f", {r.commands_seen} seen on the wire"
+    lines_text = "" if r.lines_said is None else f" of {r.lines_said}"
     start = "not measured" if r.start_up_ms is None else f"{r.start_up_ms:.0f} ms"
     rows = [
-        ("commands", f"{r.commands_sent} sent{seen}"),
-        ("feedback lines", f"{r.lines_told}{said} reached the benchmark as odometry"),
+        ("commands", f"{r.commands_sent} sent{wire_text}"),
+        ("feedback lines", f"{r.lines_told}{lines_text} reached the benchmark as odometry"),
         ("periods missed", f"{r.missed_periods}; {r.lines_sent} lines were sent"),
         ("processor", f"{r.cpu_percent_following:.1f} % of a core with one subscriber"),
         ("", f"{r.cpu_percent_commanded:.1f} % with 25 commands a second as well"),

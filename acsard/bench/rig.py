@@ -48,13 +48,13 @@ END_TIMEOUT_S = 5.0
 """Time limit for a process to end after the request to end, s. It usually takes 0.2 s."""
 
 
-def ended(who: str, code: int, said: str = "") -> MendableError:
-    """Return an error which says that the process named `who` ended, and how.
+def ended(name: str, code: int, text: str = "") -> MendableError:
+    """Return an error which says that the process named `name` ended, and how.
 
-    `code` is its exit code, or the negative number of the signal that ended the process. `said` is
+    `code` is its exit code, or the negative number of the signal that ended the process. `text` is
     the last message of the process; "" if it left none.
     """
-    return MendableError(f"{who} {how_it_ended(code)}" + (f": {said}" if said else ""))
+    return MendableError(f"{name} {how_it_ended(code)}" + (f": {text}" if text else ""))
 
 
 def daemon_ended(code: int, log: Path) -> MendableError:
@@ -66,10 +66,10 @@ def daemon_ended(code: int, log: Path) -> MendableError:
     """
     lines = log.read_text(errors="replace").splitlines()
     # The daemon's log lines are JSON; its reason for ending is plain text.
-    said = [line for line in lines if line.strip() and not line.startswith("{")]
-    if code in Exit.__members__.values() and code and said:
-        return ExitError(Exit(code), said[-1].removeprefix("acsard: "))
-    return ended("the daemon", code, said[-1] if said else "")
+    messages = [line for line in lines if line.strip() and not line.startswith("{")]
+    if code in Exit.__members__.values() and code and messages:
+        return ExitError(Exit(code), messages[-1].removeprefix("acsard: "))
+    return ended("the daemon", code, messages[-1] if messages else "")
 
 
 def processor_ns(pid: int) -> int:
@@ -226,9 +226,9 @@ class Rig:
         deadline_ns = clock.mono_ns() + int(START_TIMEOUT_S * NS_PER_S)
         while True:
             self._alive()
-            found = look()
-            if found is not None:
-                return found
+            result = look()
+            if result is not None:
+                return result
             if clock.mono_ns() > deadline_ns:
                 raise MendableError(f"no {what} within {START_TIMEOUT_S:g} s{self._why()}")
             time.sleep(0.01)
@@ -335,7 +335,7 @@ class Rig:
         time.sleep(0.1)
         self._alive()
         self.end_program()
-        seen = None if self._far_end is None else _recorded_data(self._far_end)
+        wire_data = None if self._far_end is None else _recorded_data(self._far_end)
         decoder = Decoder(Odometry)
         samples = []
         for at, payload in self._arrived:
@@ -345,14 +345,14 @@ class Rig:
             stamp = odometry.header.stamp
             stamp_ns = stamp.sec * NS_PER_S + stamp.nanosec
             samples.append(Sample(at, stamp_ns, odometry.twist.twist.linear.x))
-        return Record(self._began_ns, window_ns, seen, self._sent, samples)
+        return Record(self._began_ns, window_ns, wire_data, self._sent, samples)
 
 
 def _recorded_data(far_end: subprocess.Popen[bytes]) -> Seen:
     assert far_end.stdin is not None
     assert far_end.stdout is not None
     far_end.stdin.close()
-    told = far_end.stdout.read()
+    output = far_end.stdout.read()
     if far_end.wait(END_TIMEOUT_S):
         raise ended(SIMULATOR_PROCESS, far_end.returncode)
-    return msgspec.msgpack.decode(told, type=Seen)
+    return msgspec.msgpack.decode(output, type=Seen)

@@ -219,13 +219,13 @@ def _noise(calibration: Calibration) -> tuple[BeforeAfter, BeforeAfter]:
 
 
 def _deviations(calibration: Calibration) -> list[float | None]:
-    kept = (
+    fixed = (
         TRACK in calibration.stays_configured,
         RATIO in calibration.stays_configured,
         RATIO in calibration.stays_configured,
     )
     deviations = calibration.multipliers.std.tolist()
-    return [None if stays else std for stays, std in zip(kept, deviations, strict=True)]
+    return [None if stays else std for stays, std in zip(fixed, deviations, strict=True)]
 
 
 def keys(calibration: Calibration) -> dict[str, object]:
@@ -270,8 +270,8 @@ def parts(
         ("effective track, m", was, report.effective_track, report.effective_track_std),
     ]
     rows = [
-        (name, f"{old:.4f}", f"{found:.4f}", "as configured" if std is None else f"{std:.4f}")
-        for name, old, found, std in figures
+        (name, f"{old:.4f}", f"{value:.4f}", "as configured" if std is None else f"{std:.4f}")
+        for name, old, value, std in figures
     ]
     yield from ("", table(rows, ("", "now", "found", "standard deviation"), right={1, 2}), "")
     yield from _better(report)

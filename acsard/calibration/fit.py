@@ -254,9 +254,9 @@ class Fit(Struct, frozen=True):
         The result is one linear step away from `parameters`, so no new fit is needed.
         """
         rest = self.normal[~blocks].sum(axis=0) + self.prior_normal
-        found = self.parameters.copy()
-        found[list(self.active)] -= _solved(rest, self.score[blocks].sum(axis=0), self.active)
-        return found
+        parameters = self.parameters.copy()
+        parameters[list(self.active)] -= _solved(rest, self.score[blocks].sum(axis=0), self.active)
+        return parameters
 
     def marginal(self) -> Floats:
         """Return the matrix of the normal equations, reduced to the wheel parameters.
@@ -393,17 +393,17 @@ def _weight(part: Evidence) -> float:
 
 
 def _known(
-    parameters: Floats, held: Sequence[Held], usual: Mapping[Parameter, float]
+    parameters: Floats, targets: Sequence[Held], usual: Mapping[Parameter, float]
 ) -> tuple[Floats, Floats]:
     """Return the terms that constraints and prior information add to the normal equations.
 
-    `held` contains the constraints, and `usual` the prior standard deviations of the parameters.
+    `targets` contains the constraints, and `usual` the prior standard deviations of the parameters.
     """
     normal, score = np.zeros((PARAMETER_COUNT, PARAMETER_COUNT)), np.zeros(PARAMETER_COUNT)
     for index, deviation in usual.items():
         normal[index, index] = deviation**-2
         score[index] = -parameters[index] * deviation**-2
-    for weights, value in held:
+    for weights, value in targets:
         normal += CONSTRAINT_WEIGHT * np.outer(weights, weights)
         score += CONSTRAINT_WEIGHT * weights * (value - weights @ parameters)
     return normal, score

@@ -171,7 +171,7 @@ def of_gyro(driven: Sequence[Run]) -> Headings | None:
     biases = [_biases(run) for run in driven]
     all_biases = np.concatenate([values for _, values, _ in biases])
     usual = float(np.median(all_biases)) if len(all_biases) else 0.0
-    found, rested = [], []
+    yaws, rested = [], []
     for run, (t, values, noise) in zip(driven, biases, strict=True):
         true = np.abs(values - usual) < MAX_RATE_AT_REST
         rested.append((t[true], values[true], noise[true]))
@@ -180,10 +180,10 @@ def of_gyro(driven: Sequence[Run]) -> Headings | None:
         holes = gaps(run.gyro_t)
         steps = np.diff(run.gyro_t)
         steps[np.isin(run.gyro_t[:-1], holes[:, 0])] = 0.0
-        found.append(Heading(run.gyro_t, _sums(rate, steps), holes))
+        yaws.append(Heading(run.gyro_t, _sums(rate, steps), holes))
     seconds = [float(run.t[-1]) for run in driven]
     return Headings(
-        "yaw_rate", tuple(found), offset(found, driven), usual, bias_unknown=not len(all_biases),
+        "yaw_rate", tuple(yaws), offset(yaws, driven), usual, bias_unknown=not len(all_biases),
         bias_std=_bias_std(rested, seconds) if len(all_biases) else 0.0,
     )  # fmt: skip
 
@@ -196,15 +196,15 @@ def of_yaw(driven: Sequence[Run], radius_per_separation: float) -> Headings | No
     """
     if not any(len(run.yaw) for run in driven):
         return None
-    found = []
+    yaws = []
     for run in driven:
         if _in_degrees(run, radius_per_separation):
             raise LogError(
                 "column yaw is in degrees, but must be in radians: multiply its values by pi / 180"
             )
         angle = np.asarray(np.unwrap(run.yaw)) if len(run.yaw) else run.yaw
-        found.append(Heading(run.yaw_t, angle, gaps(run.yaw_t)))
-    return Headings("yaw", tuple(found), offset(found, driven), 0.0, bias_unknown=False)
+        yaws.append(Heading(run.yaw_t, angle, gaps(run.yaw_t)))
+    return Headings("yaw", tuple(yaws), offset(yaws, driven), 0.0, bias_unknown=False)
 
 
 def _in_degrees(run: Run, radius_per_separation: float) -> bool:
@@ -227,12 +227,12 @@ Rests = tuple[Floats, Floats, Floats]
 
 
 def _biases(run: Run) -> Rests:
-    found = []
+    means = []
     for begin, end in rests(run, REST_S, EDGE_S):
         a, b = np.searchsorted(run.gyro_t, (begin, end))
         if b - a >= MIN_SAMPLES:
-            found.append(((begin + end) / 2, *_mean(run.gyro[a:b])))
-    times, values, noise = np.array(found, dtype=np.float64).reshape(-1, 3).T
+            means.append(((begin + end) / 2, *_mean(run.gyro[a:b])))
+    times, values, noise = np.array(means, dtype=np.float64).reshape(-1, 3).T
     return times, values, noise
 
 
@@ -244,14 +244,14 @@ def _mean(samples: Floats) -> tuple[float, float]:
     off = np.abs(samples - np.median(samples))
     steps = np.diff(np.unique(samples))
     step = float(steps.min()) if len(steps) else 0.0
-    kept = samples[off <= max(OUTLIER_RATIO * float(np.median(off)), 1.01 * step)]
-    kept = kept if len(kept) >= MIN_SAMPLES else samples
+    inliers = samples[off <= max(OUTLIER_RATIO * float(np.median(off)), 1.01 * step)]
+    inliers = inliers if len(inliers) >= MIN_SAMPLES else samples
     # The variance comes from the means of five parts, so it is right for correlated noise as well.
     # The result is not the median, because the median of a coarse gyro is always one of its few
     # reported values.
-    parts = [float(part.mean()) for part in np.array_split(kept, MIN_SAMPLES)]
-    few = step**2 / 12 if len(np.unique(kept)) <= 2 else 0.0
-    return float(kept.mean()), float(np.var(parts, ddof=1)) / len(parts) + few
+    parts = [float(part.mean()) for part in np.array_split(inliers, MIN_SAMPLES)]
+    few = step**2 / 12 if len(np.unique(inliers)) <= 2 else 0.0
+    return float(inliers.mean()), float(np.var(parts, ddof=1)) / len(parts) + few
 
 
 def _bias_std(rested: Sequence[Rests], seconds: Sequence[float]) -> float:
@@ -281,17 +281,17 @@ def _sums(rate: Floats, steps: Floats) -> Floats:
     return cumulative((rate[1:] + rate[:-1]) / 2 * steps) if len(rate) else rate
 
 
-def offset(found: Sequence[Heading], driven: Sequence[Run]) -> float:
+def offset(headings: Sequence[Heading], driven: Sequence[Run]) -> float:
     """Return the delay of a heading sensor's recorded times relative to those of the wheels, s.
 
-    `found` contains the heading that the sensor measured in each run, and `driven` contains the
+    `headings` contains the heading that the sensor measured in each run, and `driven` contains the
     runs. The result is the delay for which the turns of the sensor correlate best with the robot's
     turns according to the wheels. It is between -`FURTHEST_S` and `FURTHEST_S`. It is 0 if the
     sensor or the wheels show no turns.
     """
     reach = round(FURTHEST_S / GRID_S)
     scores, sizes = np.zeros((2, 2 * reach + 1)), np.zeros(2)
-    for heading, run in zip(found, driven, strict=True):
+    for heading, run in zip(headings, driven, strict=True):
         grid = np.arange(run.t[0], run.t[-1], GRID_S)
         if len(heading.t) < 2 or len(grid) < 4:
             continue
@@ -334,25 +334,25 @@ def rows(headings: Headings | None, driven: Sequence[Run], parts: Sequence[Block
     intervals.
     """
     squares = [_signed_square_integral(run) for run in driven]
-    found: list[tuple[Floats, ...]] = []
+    pieces: list[tuple[Floats, ...]] = []
     for number, part in enumerate(parts):
         count = max(1, round((part.end - part.begin) / INTERVAL_S))
         edges = np.linspace(part.begin, part.end, count + 1)
         angle, whole = np.zeros(count + 1), np.ones(count, dtype=bool)
         if headings is not None:
-            heading, seen = headings.per_run[part.run], edges + headings.delay
+            heading, sensor_t = headings.per_run[part.run], edges + headings.delay
             if not len(heading.t):
                 continue
-            angle = np.interp(seen, heading.t, heading.angle)
-            whole = inside(seen[:-1], seen[1:], heading.gaps)
-            whole &= (seen[:-1] >= heading.t[0]) & (seen[1:] <= heading.t[-1])
+            angle = np.interp(sensor_t, heading.t, heading.angle)
+            whole = inside(sensor_t[:-1], sensor_t[1:], heading.gaps)
+            whole &= (sensor_t[:-1] >= heading.t[0]) & (sensor_t[1:] <= heading.t[-1])
         left, right = driven[part.run].angles(edges)
         square_sums = np.interp(edges, driven[part.run].t, squares[part.run])
         series = (angle, left, right, square_sums, edges)
-        found.append((np.full(count, number)[whole], *(np.diff(sums)[whole] for sums in series)))
-    if not found:
+        pieces.append((np.full(count, number)[whole], *(np.diff(sums)[whole] for sums in series)))
+    if not pieces:
         return Rows(np.zeros(0, dtype=np.int64), *[np.zeros(0)] * 5)
-    block, *columns = (np.concatenate(column) for column in zip(*found, strict=True))
+    block, *columns = (np.concatenate(column) for column in zip(*pieces, strict=True))
     return Rows(block.astype(np.int64), *columns)
 
 
@@ -457,12 +457,12 @@ def bias(rows: Rows, by_wheels: Floats) -> float:
     according to the wheels. `by_wheels` contains the robot's turn in each interval of `rows`
     according to the wheels, rad.
     """
-    seconds, found = rows.seconds, 0.0
+    seconds, estimate = rows.seconds, 0.0
     off = rows.turned - by_wheels
     for _ in range(10):
-        weight = _weight(rows, off - found * seconds, by_wheels)
-        found = float((weight * seconds) @ off / ((weight * seconds) @ seconds))
-    return found
+        weight = _weight(rows, off - estimate * seconds, by_wheels)
+        estimate = float((weight * seconds) @ off / ((weight * seconds) @ seconds))
+    return estimate
 
 
 def side_factors(rows: Rows, base: Base, *, in_place: bool = False) -> Floats:
@@ -480,13 +480,13 @@ def side_factors(rows: Rows, base: Base, *, in_place: bool = False) -> Floats:
     if in_place:
         columns = columns.sum(axis=1, keepdims=True)
     weight = np.ones(len(rows.turned))
-    found: Floats = np.zeros(columns.shape[1])
+    sides: Floats = np.zeros(columns.shape[1])
     for _ in range(10):
         root = np.sqrt(weight)[:, None]
-        found = np.asarray(np.linalg.lstsq(columns * root, rows.turned * root[:, 0], rcond=None)[0])
-        by_wheels = columns @ found
+        sides = np.asarray(np.linalg.lstsq(columns * root, rows.turned * root[:, 0], rcond=None)[0])
+        by_wheels = columns @ sides
         weight = _weight(rows, rows.turned - by_wheels, by_wheels)
-    return np.resize(found, 2)
+    return np.resize(sides, 2)
 
 
 def by_sides(rows: Rows, base: Base, sides: Floats) -> Floats:

@@ -136,11 +136,11 @@ def drives(driven: Sequence[Run]) -> list[Block]:
     longest = np.inf
     if len(driven) < MIN_RUNS:
         longest = sum(float(run.t[-1]) for run in driven) / FOLDS
-    found = []
+    parts = []
     for number, run in enumerate(driven):
         edges = np.linspace(0.0, run.t[-1], max(1, round(float(run.t[-1]) / longest)) + 1)
-        found += [Block(number, float(a), float(b)) for a, b in pairwise(edges)]
-    return found
+        parts += [Block(number, float(a), float(b)) for a, b in pairwise(edges)]
+    return parts
 
 
 def positions_of(drive: Block, driven: Sequence[Run]) -> list[Segment]:
@@ -164,12 +164,12 @@ def folds(fit: Fit, parts: Sequence[Block], left_out: Sequence[Block], rate: Rat
     run, begin, end = (
         np.array(column) for column in zip(*((p.run, p.begin, p.end) for p in parts), strict=True)
     )
-    found = []
+    result = []
     for drive in left_out:
         out = (run == drive.run) & (begin < drive.end - 1e-6) & (end > drive.begin + 1e-6)
         if out.any() and not out.all():
-            found.append(Fold(drive, out, with_constant_track(fit.without(out), rate)))
-    return found
+            result.append(Fold(drive, out, with_constant_track(fit.without(out), rate)))
+    return result
 
 
 def with_constant_track(parameters: Floats, rate: Rates) -> Floats:
@@ -184,7 +184,7 @@ def with_constant_track(parameters: Floats, rate: Rates) -> Floats:
 
 
 def improvement(
-    held: Sequence[Fold], configured: Floats, base: Base, rows: Rows,
+    test_folds: Sequence[Fold], configured: Floats, base: Base, rows: Rows,
     places: Sequence[Sequence[Segment]], steps: Sequence[WheelSteps],
 ) -> Improvement:  # fmt: skip
     """Return the errors of the odometry before and after the calibration.
@@ -203,7 +203,7 @@ def improvement(
     by_wheels = turned(rows, base, configured)
     before = rows.turned - by_wheels
     after = before.copy()
-    for fold in held:
+    for fold in test_folds:
         out = fold.blocks[rows.block]
         after[out] = (rows.turned - turned(rows, base, fold.parameters))[out]
     measured = rows.turned != 0.0
@@ -214,8 +214,8 @@ def improvement(
     angle, metres = float(np.abs(rows.turned[turning]).sum()), float(distance[straight].sum())
     if metres < MIN_STRAIGHT_M:
         metres = 0.0
-    squares = [_of_headings(held, before, after, rows)] if measured.any() else []
-    squares += [_of_positions(held, configured, base, places, steps)] if steps else []
+    squares = [_of_headings(test_folds, before, after, rows)] if measured.any() else []
+    squares += [_of_positions(test_folds, configured, base, places, steps)] if steps else []
     gain, gain_std = _gain(squares)
     of_heading, of_place = (
         rms(squares[0].sum(axis=0)) if measured.any() else NOT_COMPARED,
@@ -301,44 +301,44 @@ def _by_group(
     return np.array([*sums, amount])
 
 
-def _of_headings(held: Sequence[Fold], before: Floats, after: Floats, rows: Rows) -> Floats:
+def _of_headings(test_folds: Sequence[Fold], before: Floats, after: Floats, rows: Rows) -> Floats:
     """Return for each fold the row of squared heading errors, deg2, that `rms()` takes."""
-    found = np.zeros((len(held), 3))
-    for number, fold in enumerate(held):
+    squares = np.zeros((len(test_folds), 3))
+    for number, fold in enumerate(test_folds):
         out = fold.blocks[rows.block]
         for index, errors in enumerate((before[out], after[out])):
             heading = np.degrees(cumulative(errors))
-            found[number, index] = float(np.sum((heading - heading.mean()) ** 2))
-        found[number, 2] = len(heading) if out.any() else 0
-    return found
+            squares[number, index] = float(np.sum((heading - heading.mean()) ** 2))
+        squares[number, 2] = len(heading) if out.any() else 0
+    return squares
 
 
 def _of_positions(
-    held: Sequence[Fold], configured: Floats, base: Base,
+    test_folds: Sequence[Fold], configured: Floats, base: Base,
     places: Sequence[Sequence[Segment]], steps: Sequence[WheelSteps],
 ) -> Floats:  # fmt: skip
     """Return for each fold the row of squared position errors, m2, that `rms()` takes."""
-    found = np.zeros((len(held), 3))
+    squares = np.zeros((len(test_folds), 3))
     present = [path(run, base, configured) for run in steps]
-    for number, (fold, out) in enumerate(zip(held, places, strict=True)):
+    for number, (fold, out) in enumerate(zip(test_folds, places, strict=True)):
         if points := sum(len(segment.t) for segment in out):
             run = fold.drive.run
             new = {run: path(steps[run], base, fold.parameters)}
             errors = spread(out, present, configured), spread(out, new, fold.parameters)
-            found[number] = [*(points * error**2 for error in errors), points]
-    return found
+            squares[number] = [*(points * error**2 for error in errors), points]
+    return squares
 
 
-def no_better(found: Improvement) -> str:
+def no_better(result: Improvement) -> str:
     """Return the text of the error for new multipliers that are not clearly better.
 
-    `found` contains the errors of the odometry before and after the calibration.
+    `result` contains the errors of the odometry before and after the calibration.
     """
     errors = ", ".join(
         f"{name} {error.before * factor:.2g} {unit} now and {error.after * factor:.2g} {unit} "
         "with the new values"
         for name, error, unit, factor in (
-            ("heading", found.heading, "deg", 1.0), ("position", found.place, "cm", 100.0)
+            ("heading", result.heading, "deg", 1.0), ("position", result.place, "cm", 100.0)
         )
         if error.before is not None and error.after is not None
     )  # fmt: skip

@@ -52,10 +52,10 @@ def parted(cell: str) -> tuple[str, str]:
     The name is in snake case. The unit is the text in brackets up to a comma, or "" if the cell has
     no brackets.
     """
-    found = _NAME.match(cell.strip().lower())
-    assert found is not None
-    name = re.sub(r"[\s-]+", "_", found["name"].strip())
-    return name, re.sub(r"[\s^]", "", found["unit"].partition(",")[0])
+    match = _NAME.match(cell.strip().lower())
+    assert match is not None
+    name = re.sub(r"[\s-]+", "_", match["name"].strip())
+    return name, re.sub(r"[\s^]", "", match["unit"].partition(",")[0])
 
 
 def factor(name: str, unit: str) -> float | None:
@@ -134,12 +134,12 @@ def _alone(sizes: Floats, usual: float) -> npt.NDArray[np.bool_]:
 
     Far above means more than `SPIKE` times as large. NaN values do not count as neighbors.
     """
-    held = np.flatnonzero(np.isfinite(sizes))
-    seen = np.concatenate([[0.0], sizes[held], [0.0]])
-    around = np.maximum(np.maximum(seen[:-2], seen[2:]), usual)
-    found = np.zeros(len(sizes), dtype=bool)
-    found[held[seen[1:-1] > SPIKE * around]] = True
-    return found
+    indices = np.flatnonzero(np.isfinite(sizes))
+    padded = np.concatenate([[0.0], sizes[indices], [0.0]])
+    around = np.maximum(np.maximum(padded[:-2], padded[2:]), usual)
+    mask = np.zeros(len(sizes), dtype=bool)
+    mask[indices[padded[1:-1] > SPIKE * around]] = True
+    return mask
 
 
 FOUR, TWO = ("fr", "fl", "rl", "rr"), ("left", "right")
@@ -421,10 +421,10 @@ class _Reader:
             except ValueError:
                 if parted(cell)[0] == self._names[i]:
                     return []  # the line repeats the header, because several logs were concatenated
-                shown = printable(cell if len(cell) <= 30 else cell[:27] + "...")
+                text = printable(cell if len(cell) <= 30 else cell[:27] + "...")
                 date = self._names[i] == "t" and ":" in cell
                 why = "a date, but t must be in seconds" if date else "not a number"
-                self._refuse(f'line {number}, column {self._names[i]}: "{shown}" is {why}')
+                self._refuse(f'line {number}, column {self._names[i]}: "{text}" is {why}')
                 return []
         return row
 

@@ -176,7 +176,7 @@ Its arguments are the multipliers, as in `Multipliers.values`, and the index of 
 
 
 def scaled(
-    found: Multipliers, tape: Tape, names: Sequence[str], follow: Follow, *, known: bool
+    prior: Multipliers, tape: Tape, names: Sequence[str], follow: Follow, *, known: bool
 ) -> tuple[Multipliers, str]:
     """Correct the multipliers with a distance that was measured by tape.
 
@@ -201,7 +201,7 @@ def scaled(
             f'--distance: the log has no run "{tape.run}"; its runs are {", ".join(names[:10])}'
         )
     numbers = [names.index(tape.run)] if tape.run else range(len(names))
-    extents = {number: follow(found.values, number) for number in numbers}
+    extents = {number: follow(prior.values, number) for number in numbers}
     best = max(extents, key=lambda number: extents[number].straight)
     extent = extents[best]
     if extent.straight < MIN_STRAIGHTNESS:
@@ -214,11 +214,11 @@ def scaled(
     # multipliers.
     jacobian = np.zeros(3)
     for index in (SEPARATION, LEFT_RADIUS, RIGHT_RADIUS):
-        longer = found.values.copy()
+        longer = prior.values.copy()
         longer[index] *= 1.0 + 1e-4
         jacobian[index] = np.log(follow(longer, best).distance / extent.distance) / 1e-4
-    logs = np.diag(1 / found.values)
-    covariance = logs @ found.covariance @ logs
+    logs = np.diag(1 / prior.values)
+    covariance = logs @ prior.covariance @ logs
     if not known:
         covariance = covariance + UNKNOWN_SIZE_STD**2
     noise = (RUN_LENGTH_STD_M / tape.metres) ** 2
@@ -232,7 +232,7 @@ def scaled(
             "y in m?"
         )
     gain = covariance @ jacobian / variance
-    values = found.values * np.exp(gain * longer_by)
+    values = prior.values * np.exp(gain * longer_by)
     rest = np.eye(3) - np.outer(gain, jacobian)
     covariance = rest @ covariance @ rest.T + np.outer(gain, gain) * noise
     back = np.diag(values)

@@ -216,10 +216,10 @@ class Windows(Struct, frozen=True):
             scores = np.einsum("wij,wj->wi", inverse, self.residual)
             squares = np.einsum("wi,wi->w", scores, self.residual)
             weight = np.minimum(1.0, OUTLIER_LIMIT * self.size / np.maximum(squares, 1e-300))
-            seen = flat @ np.einsum("w,wi,wj->wij", weight, scores, scores).ravel()
+            actual = flat @ np.einsum("w,wi,wj->wij", weight, scores, scores).ravel()
             expected = flat @ inverse.ravel()
             used = free & (expected > 0.0)
-            noise[used] *= np.sqrt(seen[used] / expected[used])
+            noise[used] *= np.sqrt(actual[used] / expected[used])
         return noise
 
     def at_least(self, noise: Floats) -> Floats:
@@ -309,8 +309,8 @@ class Noise(Struct, frozen=True):
 
 
 def settings(
-    known: Deviations, track: float, kept: Collection[str], odometry: OdometryConfig,
-    shown: Noise | None = None, *, scaled: bool,
+    known: Deviations, track: float, fixed: Collection[str], odometry: OdometryConfig,
+    log_noise: Noise | None = None, *, scaled: bool,
 ) -> dict[str, float]:  # fmt: skip
     """Return the new values for settings of `[odometry]`, by the name of the setting.
 
@@ -323,25 +323,25 @@ def settings(
         shown: the noise that the log shows, or None if the noise settings stay as configured.
         scaled: whether the size of the wheels was measured.
     """
-    found, x = {}, np.zeros(SOURCE_COUNT) if shown is None else shown.found
-    if TRACK not in kept or shown is not None:
+    values, x = {}, np.zeros(SOURCE_COUNT) if log_noise is None else log_noise.found
+    if TRACK not in fixed or log_noise is not None:
         std = math.hypot(known.track, math.sqrt(x[Source.TRACK]))
-        found["wheel_separation_multiplier_std"] = track * std
-    if RATIO not in kept or shown is not None:
-        found["wheel_radius_ratio_std"] = math.hypot(known.ratio, math.sqrt(x[Source.RATIO]))
+        values["wheel_separation_multiplier_std"] = track * std
+    if RATIO not in fixed or log_noise is not None:
+        values["wheel_radius_ratio_std"] = math.hypot(known.ratio, math.sqrt(x[Source.RATIO]))
         # The deviation of the ratio of both radii replaces the deviations of the single radii.
         for side in ("left_wheel_radius_multiplier_std", "right_wheel_radius_multiplier_std"):
             if getattr(odometry, side):
-                found[side] = 0.0
+                values[side] = 0.0
     if scaled:
-        found["distance_scale_std"] = known.scale
-    if shown is not None:
-        found["yaw_variance_per_metre"] = float(x[Source.YAW])
-        found["yaw_variance_per_radian"] = float(x[Source.SKID])
-        if shown.places:
-            found["distance_variance_per_metre"] = float(x[Source.DISTANCE])
-            found["wheel_slip_std"] = math.sqrt(x[Source.SLIP])
-    return {name: min(value, MAX_SETTING) for name, value in found.items()}
+        values["distance_scale_std"] = known.scale
+    if log_noise is not None:
+        values["yaw_variance_per_metre"] = float(x[Source.YAW])
+        values["yaw_variance_per_radian"] = float(x[Source.SKID])
+        if log_noise.places:
+            values["distance_variance_per_metre"] = float(x[Source.DISTANCE])
+            values["wheel_slip_std"] = math.sqrt(x[Source.SLIP])
+    return {name: min(value, MAX_SETTING) for name, value in values.items()}
 
 
 class Reference(Struct, frozen=True):
@@ -362,7 +362,7 @@ class Reference(Struct, frozen=True):
 
 
 def noise(
-    held: Sequence[Fold], seen: Reference, known: Deviations, odometry: OdometryConfig
+    folds: Sequence[Fold], sensors: Reference, known: Deviations, odometry: OdometryConfig
 ) -> Noise | None:
     """Return the noise that a log shows, compared with the configured noise.
 
@@ -375,7 +375,7 @@ def noise(
         odometry: the configured settings.
     """
     motions: list[_Motion] = []
-    windows = _windows(held, seen, known, motions)
+    windows = _windows(folds, sensors, known, motions)
     if windows is None or len(np.unique(windows.drive)) < 2:
         return None
     present = INITIAL_NOISE.copy()
@@ -384,26 +384,26 @@ def noise(
         odometry.yaw_variance_per_radian, odometry.wheel_slip_std**2, 0.0, 0.0,
     )  # fmt: skip
     every = np.ones(SOURCE_COUNT, dtype=bool)
-    found = windows.search(INITIAL_NOISE, every)
+    estimate = windows.search(INITIAL_NOISE, every)
     by_present = windows.search(present, SENSOR_SOURCES)
     gains: list[tuple[float, float]] = []
     fold = np.unique(windows.drive, return_inverse=True)[1] % MAX_FOLDS
     for number in range(fold.max() + 1):
         out = fold == number
         rest, tested = windows.of(~out), windows.of(out)
-        then = rest.at_least(rest.search(found, every, FEWER_STEPS))
+        then = rest.at_least(rest.search(estimate, every, FEWER_STEPS))
         now = rest.search(by_present, SENSOR_SOURCES, FEWER_STEPS)
         more = tested.likelihood(then) - tested.likelihood(now)
         gains.append((float(more.sum()), float(tested.size.sum())))
-    found = windows.at_least(found)
-    if not seen.places:
-        found[[Source.DISTANCE, Source.SLIP]] = present[[Source.DISTANCE, Source.SLIP]]
+    estimate = windows.at_least(estimate)
+    if not sensors.places:
+        estimate[[Source.DISTANCE, Source.SLIP]] = present[[Source.DISTANCE, Source.SLIP]]
     sums = np.array(gains)
     gain, gain_std = with_gain_std(
         lambda left: float(np.divide(*sums[left].sum(axis=0))), np.ones(len(sums), dtype=bool)
     )
-    turning = sum(one.turned for one in motions) / max(0.1, sum(one.metres for one in motions))
-    return Noise(found, present, gain, gain_std, seen.places, turning, motions[0].track)
+    turning = sum(move.turned for move in motions) / max(0.1, sum(move.metres for move in motions))
+    return Noise(estimate, present, gain, gain_std, sensors.places, turning, motions[0].track)
 
 
 class _Motion(Struct, frozen=True):
@@ -477,23 +477,23 @@ class _Window(Struct, frozen=True):
             known.scale**2 * effects[Source.SLIP] + known.ratio**2 * effects[Source.RATIO]
             + known.track**2 * effects[Source.TRACK] + self.bias
         )  # fmt: skip
-        kept = np.linalg.qr(self.start, mode="complete")[0][:, self.start.shape[1] :]
-        return kept.T @ self.residual, kept.T @ effects @ kept, kept.T @ sure_of @ kept
+        basis = np.linalg.qr(self.start, mode="complete")[0][:, self.start.shape[1] :]
+        return basis.T @ self.residual, basis.T @ effects @ basis, basis.T @ sure_of @ basis
 
 
 def _windows(
-    held: Sequence[Fold], seen: Reference, known: Deviations, motions: list[_Motion]
+    folds: Sequence[Fold], sensors: Reference, known: Deviations, motions: list[_Motion]
 ) -> Windows | None:
     rows = []
-    for number, fold in enumerate(held):
-        for window in _of_drive(fold, seen):
+    for number, fold in enumerate(folds):
+        for window in _of_drive(fold, sensors):
             motions.append(window.motion)
             rows.append((number, *window.projected(known)))
     if not rows:
         return None
     rows = rows[:: math.ceil(len(rows) / MAX_WINDOWS)]
     most = max(len(residual) for _, residual, _, _ in rows)
-    metres, turned = np.mean([(one.metres, one.turned) for one in motions], axis=0)
+    metres, turned = np.mean([(motion.metres, motion.turned) for motion in motions], axis=0)
     lasting = np.array([metres, metres / motions[0].track ** 2, turned])
     made = Windows(
         np.array([number for number, *_ in rows]),
@@ -509,21 +509,21 @@ def _windows(
     return made
 
 
-def _of_drive(fold: Fold, seen: Reference) -> Iterator[_Window]:
+def _of_drive(fold: Fold, sensors: Reference) -> Iterator[_Window]:
     drive, parameters = fold.drive, fold.parameters.copy()
-    parameters[Parameter.DELAY :] = seen.parameters[Parameter.DELAY :]
-    run, way = seen.runs[drive.run], path(seen.steps[drive.run], seen.base, parameters)
-    track = seen.base.separation / abs(float(parameters[Parameter.INVERSE_TRACK]))
-    if seen.headings is not None:
-        heading, late = seen.headings.per_run[drive.run], seen.headings.delay
+    parameters[Parameter.DELAY :] = sensors.parameters[Parameter.DELAY :]
+    run, way = sensors.runs[drive.run], path(sensors.steps[drive.run], sensors.base, parameters)
+    track = sensors.base.separation / abs(float(parameters[Parameter.INVERSE_TRACK]))
+    if sensors.headings is not None:
+        heading, late = sensors.headings.per_run[drive.run], sensors.headings.delay
         ends = heading.t[[0, -1]] - late if len(heading.t) else np.zeros(2)
         for t in _times(max(drive.begin, ends[0]), min(drive.end, ends[1])):
             at = t + late
             whole = inside(at[:1], at[-1:], heading.gaps) & inside(t[:1], t[-1:], run.gaps)
             if whole[0]:
-                yield _by_headings(t, at, heading, way, track, seen.headings, parameters)
-    if seen.places:
-        for segment in positions_of(drive, seen.runs):
+                yield _by_headings(t, at, heading, way, track, sensors.headings, parameters)
+    if sensors.places:
+        for segment in positions_of(drive, sensors.runs):
             for t in _times(float(segment.t[0]), float(segment.t[-1])):
                 part = slice(*np.searchsorted(segment.t, (t[0], t[-1])))
                 yield from _by_places(

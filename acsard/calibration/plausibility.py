@@ -170,7 +170,7 @@ TRACK, RATIO = "the effective track", "the ratio of the right to the left wheel 
 
 
 def too_inaccurate(
-    found: Multipliers, track_std: float, worst: tuple[float, float] = MAX_LOG_STDS
+    multipliers: Multipliers, track_std: float, worst: tuple[float, float] = MAX_LOG_STDS
 ) -> dict[str, float]:
     """Return the quantities that a log determines too inaccurately.
 
@@ -183,7 +183,7 @@ def too_inaccurate(
             more.
         worst: largest accepted relative standard deviations of `TRACK` and of `RATIO`.
     """
-    deviations = {TRACK: track_std, RATIO: found.ratio_std}
+    deviations = {TRACK: track_std, RATIO: multipliers.ratio_std}
     return {
         name: deviation
         for (name, deviation), most in zip(deviations.items(), worst, strict=True)
@@ -200,14 +200,14 @@ def inaccuracy(deviations: Mapping[str, float], worst: tuple[float, float]) -> s
         worst: largest accepted relative standard deviations of `TRACK` and of `RATIO`.
     """
     accepted = dict(zip((TRACK, RATIO), worst, strict=True))
-    found = [
+    reasons = [
         f"the standard deviation of {name} is {deviation:.1%}, but at most "
         f"{100 * accepted[name]:g}% is accepted"
         if np.isfinite(deviation)
         else f"{name} cannot be determined"
         for name, deviation in deviations.items()
     ]
-    return f"this log is too inaccurate: {', and '.join(found)}: {DRIVE_ADVICE}"
+    return f"this log is too inaccurate: {', and '.join(reasons)}: {DRIVE_ADVICE}"
 
 
 def separates_track(fitted: Fit) -> bool:
@@ -309,11 +309,11 @@ def turns_like_the_wheels(source: str, rows: Rows, base: Base) -> None:
 
     `source` is the name of the sensor. `MIN_TURN_RATIO` is the limit for the ratio of the turns.
     """
-    shown = float(np.abs(rows.turned).sum())
+    angle = float(np.abs(rows.turned).sum())
     by_wheels = float(np.abs(heading.by_sides(rows, base, np.ones(2))).sum())
-    if shown < MIN_TURN_RATIO * by_wheels:
+    if angle < MIN_TURN_RATIO * by_wheels:
         raise RefusedError(
-            f"{source} shows turns of {np.degrees(shown):.0f} deg in total, but the wheels would "
+            f"{source} shows turns of {np.degrees(angle):.0f} deg in total, but the wheels would "
             f"turn the robot by up to {np.degrees(by_wheels):.0f} deg: is {source} the rate about "
             "the upright axis? If the IMU lies on its side, fill the column with the rate about "
             "the axis that points up, positive to the left. Are the wheel speeds in rad/s, not "
@@ -388,9 +388,9 @@ def in_range(values: Floats) -> None:
     """Raise `RefusedError` if the configuration does not accept the multipliers `values`."""
     if np.all((values >= LEAST_FACTOR) & (values <= MOST_FACTOR)):
         return
-    shown = ", ".join(f"{value:.3g}" for value in values)
+    text = ", ".join(f"{value:.3g}" for value in values)
     raise RefusedError(
-        f"the multipliers are {shown} (wheel separation, left radius, right radius), but must be "
+        f"the multipliers are {text} (wheel separation, left radius, right radius), but must be "
         f"from {LEAST_FACTOR:g} to {MOST_FACTOR:g}: first measure wheel radius and wheel "
         "separation by tape, and write drive.wheel_radius and drive.wheel_separation into the "
         "configuration"

@@ -133,15 +133,15 @@ def segments(driven: Sequence[Run], parts: Sequence[Block]) -> list[Segment]:
     Segments with fewer than `MIN_POINTS` positions are left out.
     """
     edges = [jumps(run) for run in driven]
-    found = []
+    result = []
     for number, part in enumerate(parts):
         run = driven[part.run]
         a, b = np.searchsorted(run.place_t, (part.begin, part.end))
         cuts = edges[part.run]
         for piece in np.split(np.arange(a, b), cuts[(cuts > a) & (cuts < b)] - a):
             if len(piece) >= MIN_POINTS:
-                found.append(Segment(number, part.run, run.place_t[piece], run.place[piece]))
-    return found
+                result.append(Segment(number, part.run, run.place_t[piece], run.place[piece]))
+    return result
 
 
 def jumps(run: Run) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
@@ -168,8 +168,8 @@ def wheel_steps(run: Run, fine_s: float = STEP_S) -> WheelSteps:
     """
     usual = float(np.median(np.diff(run.t)))
     every = max(1, int(fine_s / usual))
-    kept = np.unique(np.append(np.arange(0, len(run.t), every), len(run.t) - 1))
-    t, left, right = run.t[kept], *(angles[kept] for angles in run.rolled)
+    indices = np.unique(np.append(np.arange(0, len(run.t), every), len(run.t) - 1))
+    t, left, right = run.t[indices], *(angles[indices] for angles in run.rolled)
     apart, steps = run.speed_difference((t[1:] + t[:-1]) / 2), np.diff(t)
     return WheelSteps(t, np.diff(left), np.diff(right), np.abs(apart) * apart * steps)
 
@@ -406,23 +406,23 @@ def search(
         base: the configured geometry.
         sides: the result of `heading.side_factors()`, or None without a heading sensor.
     """
-    kept = _furthest(segments, MOST_SEGMENTS)
-    needed = sorted({segment.run for segment in kept})
+    subset = _furthest(segments, MOST_SEGMENTS)
+    needed = sorted({segment.run for segment in subset})
     steps = {run: wheel_steps(driven[run], SEARCH_STEP_S) for run in needed}
     points: list[StartingPoint] = []
     for left, way in itertools.product((1.0, -1.0), (1.0, -1.0)):
         points += _local_minima(
-            [_tried(kept, steps, base, (left, way * turn, 0.0)) for turn in INVERSE_TRACK_RATIOS]
+            [_tried(subset, steps, base, (left, way * turn, 0.0)) for turn in INVERSE_TRACK_RATIOS]
         )
     if sides is not None:
         left, way = np.sign(sides[0] * sides[1]), np.sign(sides[1]) * np.abs(sides).mean()
-        points.append(_tried(kept, steps, base, (float(left), float(way), 0.0)))
+        points.append(_tried(subset, steps, base, (float(left), float(way), 0.0)))
 
     def badness(point: StartingPoint) -> float:
         return (point.unexplained + UNEXPLAINED_OFFSET) * _penalty(point, sides)
 
     points.sort(key=badness)
-    few, worst = _furthest(kept, REFINED_SEGMENTS), FAR_WORSE * badness(points[0])
+    few, worst = _furthest(subset, REFINED_SEGMENTS), FAR_WORSE * badness(points[0])
     refined = [
         _refined(_timed(point, few, steps, base), few, steps, base)
         for point in points[:MOST_REFINED]
@@ -433,10 +433,10 @@ def search(
 
 def _furthest(segments: Sequence[Segment], most: int) -> list[Segment]:
     reach = [extent(s.place) for s in segments]
-    kept = [segments[i] for i in sorted(np.argsort(reach)[::-1][:most])]
+    subset = [segments[i] for i in sorted(np.argsort(reach)[::-1][:most])]
     return [
         replace(s, t=s.t[::every], place=s.place[::every])
-        for s in kept
+        for s in subset
         for every in [math.ceil(len(s.t) / MAX_POINTS)]
     ]
 
@@ -477,16 +477,16 @@ def _turn(parameters: Floats) -> float:
 
 
 def _timed(
-    point: StartingPoint, kept: Sequence[Segment], steps: dict[int, WheelSteps], base: Base
+    point: StartingPoint, subset: Sequence[Segment], steps: dict[int, WheelSteps], base: Base
 ) -> StartingPoint:
     parameters = point.parameters
     shape = float(np.sign(parameters[Parameter.LEFT])), _turn(parameters)
-    tried = [_tried(kept, steps, base, (*shape, late)) for late in DELAYS_S]
+    tried = [_tried(subset, steps, base, (*shape, late)) for late in DELAYS_S]
     return min([point, *tried], key=lambda point: point.unexplained)
 
 
 def _tried(
-    kept: Sequence[Segment],
+    subset: Sequence[Segment],
     steps: dict[int, WheelSteps],
     base: Base,
     shape: tuple[float, float, float],
@@ -508,7 +508,7 @@ def _tried(
     )
     paths = {run: place(of_run, base, parameters) for run, of_run in steps.items()}
     cross = squares = size = 0.0
-    for segment in kept:
+    for segment in subset:
         along = np.interp(segment.t - shape[2], steps[segment.run].t, paths[segment.run])
         centred, centred_path = segment.place - segment.place.mean(), along - along.mean()
         # Each path is rotated so that it fits best, but all paths share one scale.

@@ -143,12 +143,12 @@ def _bag(files: list[Path], config: Config, choice: Choice) -> Table:
 def _messages(file: Path, notes: list[str]) -> Iterator[RosMessage]:
     with file.open("rb") as stream:
         try:
-            for schema, channel, one in _reader(stream).iter_messages(log_time_order=False):
+            for schema, channel, message in _reader(stream).iter_messages(log_time_order=False):
                 type_ = "" if schema is None else schema.name
                 encoding = channel.message_encoding
-                if one.log_time > MAX_LOG_TIME_NS:
-                    raise ValueError(f"a message has the impossible time {one.log_time} ns")
-                yield RosMessage(channel.topic, type_, encoding, one.log_time, one.data)
+                if message.log_time > MAX_LOG_TIME_NS:
+                    raise ValueError(f"a message has the impossible time {message.log_time} ns")
+                yield RosMessage(channel.topic, type_, encoding, message.log_time, message.data)
         except EndOfFile:
             notes.append(f"{file.name} is cut off: only the messages before the cut are used")
         except BAG_DAMAGE as error:

@@ -220,14 +220,14 @@ def wheel_joints(names: tuple[str, ...], joints: tuple[str, ...]) -> dict[str, l
     if set(joints) <= set(names):
         return {column: [names.index(joint)] for column, joint in zip(FOUR, joints, strict=True)}
     wheels = [name for name in names if "wheel" in name.lower()] or names
-    found: dict[str, list[int]] = {}
+    columns: dict[str, list[int]] = {}
     for name in wheels:
         if column := wheel_of(name):
-            found.setdefault(column, []).append(names.index(name))
-    if found.keys() == set(FOUR) and all(len(indices) == 1 for indices in found.values()):
-        return {column: found[column] for column in FOUR}
+            columns.setdefault(column, []).append(names.index(name))
+    if columns.keys() == set(FOUR) and all(len(indices) == 1 for indices in columns.values()):
+        return {column: columns[column] for column in FOUR}
     sides: dict[str, list[int]] = {side: [] for side in TWO}
-    for column, indices in found.items():
+    for column, indices in columns.items():
         sides["left" if column[-1] == "l" or column == "left" else "right"] += indices
     return sides if all(sides.values()) else {}
 
@@ -376,11 +376,11 @@ class _Log:
         )
 
     def _listed(self) -> str:
-        shown = [str(topic) for topic in self._topics]
-        shown += [f"{printable(name)} ({printable(kind)})" for name, kind in self._others.items()]
-        if not shown:
+        topics = [str(topic) for topic in self._topics]
+        topics += [f"{printable(name)} ({printable(kind)})" for name, kind in self._others.items()]
+        if not topics:
             return "The bag has no messages at all"
-        return f"The bag contains {', '.join(shown[:20])}{', ...' if len(shown) > 20 else ''}"
+        return f"The bag contains {', '.join(topics[:20])}{', ...' if len(topics) > 20 else ''}"
 
     # Times
 
@@ -417,8 +417,8 @@ class _Log:
     def _wheels(self, topic: _Topic, t: Floats) -> dict[str, Floats]:
         count = len(topic.wheels)
         angles, speeds = topic.columns()[:, :count], topic.columns()[:, count:]
-        held = angles[np.isfinite(angles).all(axis=1)]
-        if len(held) and np.any(np.ptp(held, axis=0) > 0.0):
+        samples = angles[np.isfinite(angles).all(axis=1)]
+        if len(samples) and np.any(np.ptp(samples, axis=0) > 0.0):
             t, speeds = speeds_of(t, angles)
         elif not np.any(np.abs(speeds) > 0.0):
             raise LogError(
@@ -492,16 +492,16 @@ def speeds_of(t: Floats, angles: Floats) -> tuple[Floats, Floats]:
     order = np.arange(len(steps))
     cut = np.any([spikes(column, order) for column in steps.T], axis=0)
     cut |= np.isin(times[:-1], gaps(times)[:, 0])
-    found_t, found = [], []
+    speed_t, speeds = [], []
     for part in np.split(np.arange(len(times)), np.flatnonzero(cut) + 1):
         if len(part) < 2:
             continue
         begin, end = times[part[0]], times[part[-1]]
         edges = np.linspace(begin, end, max(1, round((end - begin) / period)) + 1)
         sampled = [np.interp(edges, times[part], column[part]) for column in angles.T]
-        found_t.append((edges[1:] + edges[:-1]) / 2)
-        found.append(np.column_stack([np.diff(column) / np.diff(edges) for column in sampled]))
-    return np.concatenate(found_t), np.concatenate(found)
+        speed_t.append((edges[1:] + edges[:-1]) / 2)
+        speeds.append(np.column_stack([np.diff(column) / np.diff(edges) for column in sampled]))
+    return np.concatenate(speed_t), np.concatenate(speeds)
 
 
 def _unwrapped(angles: Floats) -> Floats:
@@ -543,19 +543,19 @@ def _follows(t: Floats, rates: Floats, sides: tuple[Floats, Floats, Floats]) -> 
     edges = _edges(t, sides)
     if len(edges) < 4:
         return math.nan
-    shown = np.diff(np.interp(edges, t[order], _summed(t[order], rates[order])))
+    sensor_turns = np.diff(np.interp(edges, t[order], _summed(t[order], rates[order])))
     wheels, left, right = sides
     turned = np.diff(np.interp(edges, wheels, right - left))
-    if not np.ptp(shown) or not np.ptp(turned):
+    if not np.ptp(sensor_turns) or not np.ptp(turned):
         return math.nan
-    return float(np.corrcoef(shown, turned)[0, 1])
+    return float(np.corrcoef(sensor_turns, turned)[0, 1])
 
 
 def _computed_from(t: Floats, yaw: Floats, sides: tuple[Floats, Floats, Floats]) -> bool:
     """Return whether the yaw follows the wheels so exactly that it was computed from them."""
-    held = np.isfinite(yaw)
-    order = np.argsort(t[held], kind="stable")
-    times, angle = t[held][order], np.unwrap(yaw[held][order])
+    finite = np.isfinite(yaw)
+    order = np.argsort(t[finite], kind="stable")
+    times, angle = t[finite][order], np.unwrap(yaw[finite][order])
     edges = _edges(times, sides)[1:-1]
     if len(edges) < 4:
         return False

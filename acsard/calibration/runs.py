@@ -245,7 +245,7 @@ def runs(table: Table) -> Log:
     timed = np.isfinite(t)
     notes.add(f"{{}} of {len(t)} rows have no time and are left out", int((~timed).sum()))
     drives: list[tuple[str, Streams]] = []
-    taken = set(table.names)
+    labels = set(table.names)
     for number, name in enumerate(table.names):
         rows = np.flatnonzero(timed & (table.runs == number))
         parts = _restarts(t, rows, columns)
@@ -266,14 +266,14 @@ def runs(table: Table) -> Log:
             if streams is None:
                 continue
             if not name:
-                label = _numbered("", len(drives) + 1, taken)
+                label = _numbered("", len(drives) + 1, labels)
             else:
-                label = name if at == 0 else _numbered(f"{name}.", at + 1, taken)
-            taken.add(label)
+                label = name if at == 0 else _numbered(f"{name}.", at + 1, labels)
+            labels.add(label)
             drives.append((label, streams))
     _remove_repeats(drives, notes)
-    found = [_run(name, streams) for name, streams in drives]
-    if not found:
+    usable_runs = [_run(name, streams) for name, streams in drives]
+    if not usable_runs:
         empty = [
             name for name in ("t", *FOUR, *TWO)
             if name in table.columns and not np.isfinite(table.columns[name]).any()
@@ -284,11 +284,11 @@ def runs(table: Table) -> Log:
             else f"no run has {MIN_ROWS} rows with a time and both sides' wheel speeds: "
             "record the wheels at 5 Hz or more while the robot drives"
         )
-    return Log(tuple(found), notes.sentences())
+    return Log(tuple(usable_runs), notes.sentences())
 
 
-def _numbered(prefix: str, number: int, taken: Collection[str]) -> str:
-    while f"{prefix}{number}" in taken:
+def _numbered(prefix: str, number: int, labels: Collection[str]) -> str:
+    while f"{prefix}{number}" in labels:
         number += 1
     return f"{prefix}{number}"
 
@@ -312,11 +312,11 @@ def _apart(columns: dict[str, Floats], front: str, rear: str) -> float:
 
     Raises `LogError` if they differ by more than `MAX_DIFFERENCE`.
     """
-    seen = np.isfinite(columns[front]) & np.isfinite(columns[rear])
-    starts = np.arange(0, int(seen.sum()), SUMMED_ROWS)
+    finite = np.isfinite(columns[front]) & np.isfinite(columns[rear])
+    starts = np.arange(0, int(finite.sum()), SUMMED_ROWS)
     if not len(starts):
         return 0.0
-    a, b = (np.add.reduceat(columns[name][seen], starts) for name in (front, rear))
+    a, b = (np.add.reduceat(columns[name][finite], starts) for name in (front, rear))
     apart, rolled = np.abs(a - b).sum(), np.maximum(np.abs(a), np.abs(b)).sum()
     if apart <= MAX_DIFFERENCE * rolled:
         return float(apart / rolled) if rolled else 0.0
@@ -348,8 +348,8 @@ def _restarts(t: Floats, rows: Rows, columns: dict[str, Floats]) -> list[Rows]:
 
 
 def _wheel_times(t: Floats, rows: Rows, columns: dict[str, Floats]) -> Floats:
-    held = np.isfinite(columns["left"][rows]) & np.isfinite(columns["right"][rows])
-    return np.sort(t[rows[held]])
+    finite = np.isfinite(columns["left"][rows]) & np.isfinite(columns["right"][rows])
+    return np.sort(t[rows[finite]])
 
 
 def _in_seconds(name: str, t: Floats, parts: list[Rows], columns: dict[str, Floats]) -> None:
@@ -410,16 +410,16 @@ def _run(name: str, streams: Streams) -> Run:
 def _remove_repeats(drives: Iterable[tuple[str, Streams]], notes: Notes) -> None:
     # A short drive may not show the repetition, so all drives are evaluated together.
     for what in ("yaw", "x y"):
-        found = [(streams, *_repeats(streams, what)) for _, streams in drives]
-        rolling = sum(int((again & rolls).sum()) for _, again, rolls in found)
-        if rolling <= MAX_REPEATED_FRACTION * sum(int(rolls.sum()) for *_, rolls in found):
+        repeats = [(streams, *_repeats(streams, what)) for _, streams in drives]
+        rolling = sum(int((again & rolls).sum()) for _, again, rolls in repeats)
+        if rolling <= MAX_REPEATED_FRACTION * sum(int(rolls.sum()) for *_, rolls in repeats):
             continue
         notes.add(
             f"the columns {what} repeat their last value between samples: such rows are left out "
             "({} of them while the wheels turn)",
             rolling,
         )
-        for streams, again, _ in found:
+        for streams, again, _ in repeats:
             # Remove the repetitions at rest as well, because a repeated value may be older than the
             # time of its row.
             streams[what] = tuple(column[~again] for column in streams[what])
@@ -442,10 +442,10 @@ def _repeats(streams: Streams, what: str) -> tuple[Mask, Mask]:
 def _stream(
     columns: dict[str, Floats], rows: Rows, names: Iterable[str], notes: Notes
 ) -> tuple[Floats, ...]:
-    held = [columns.get(name) for name in names]
-    if any(values is None for values in held):
-        return (np.zeros(0),) * (1 + len(held))
-    stream = [columns["t"][rows], *(values[rows] for values in held if values is not None)]
+    arrays = [columns.get(name) for name in names]
+    if any(values is None for values in arrays):
+        return (np.zeros(0),) * (1 + len(arrays))
+    stream = [columns["t"][rows], *(values[rows] for values in arrays if values is not None)]
     whole = np.all(np.isfinite(stream), axis=0)
     return tuple(_ordered([values[whole] for values in stream], " ".join(names), notes))
 
@@ -515,8 +515,8 @@ def rests(run: Run, least_s: float, edge_s: float) -> Floats:
     moving = np.concatenate(([True], run.moving, [True])).astype(np.int8)
     changes = np.flatnonzero(np.diff(moving))
     spans = [(run.t[a], run.t[b - 1]) for a, b in changes.reshape(-1, 2)]
-    found = [(a + edge_s, b - edge_s) for a, b in spans if b - a >= least_s + 2 * edge_s]
-    return np.array(found, dtype=np.float64).reshape(-1, 2)
+    intervals = [(a + edge_s, b - edge_s) for a, b in spans if b - a >= least_s + 2 * edge_s]
+    return np.array(intervals, dtype=np.float64).reshape(-1, 2)
 
 
 def blocks(driven: Sequence[Run], shortest_s: float) -> list[Block]:
@@ -527,7 +527,7 @@ def blocks(driven: Sequence[Run], shortest_s: float) -> list[Block]:
     """
     moved = sum(float(np.minimum(np.diff(r.t), GAP_S) @ r.moving[1:]) for r in driven)
     length = float(np.clip(moved / BLOCK_COUNT, shortest_s, max(MAX_BLOCK_S, shortest_s)))
-    found = []
+    result = []
     for number, run in enumerate(driven):
         ends = np.concatenate((run.gaps[:, 0], run.t[-1:]))
         begins = np.concatenate((run.t[:1], run.gaps[:, 1]))
@@ -538,8 +538,8 @@ def blocks(driven: Sequence[Run], shortest_s: float) -> list[Block]:
             for at in range(count):
                 a, b = edges[at], edges[at + 1]
                 if b > a and _turned(run, a, b, left[at : at + 2], right[at : at + 2]):
-                    found.append(Block(number, float(a), float(b)))
-    return found
+                    result.append(Block(number, float(a), float(b)))
+    return result
 
 
 def _turned(run: Run, begin: float, end: float, left: Floats, right: Floats) -> bool:

@@ -86,7 +86,7 @@ class Drives(Struct, frozen=True):
 
     @classmethod
     def of(
-        cls, runs: Sequence[Run], rows: Rows, by_wheels: Floats, base: Base, found: Multipliers,
+        cls, runs: Sequence[Run], rows: Rows, by_wheels: Floats, base: Base, result: Multipliers,
         rate: Rates,
     ) -> Drives:  # fmt: skip
         """Return the totals of the runs.
@@ -100,7 +100,7 @@ class Drives(Struct, frozen=True):
             found: the new multipliers.
             rate: the turn rates of the log.
         """
-        size = base.radius * float(found.values[[LEFT_RADIUS, RIGHT_RADIUS]].mean())
+        size = base.radius * float(result.values[[LEFT_RADIUS, RIGHT_RADIUS]].mean())
         return cls(
             len(runs), sum(float(run.t[-1]) for run in runs),
             size * float(np.abs(rows.left + rows.right).sum()) / 2,
@@ -183,8 +183,8 @@ def calibrate(
     if follows is not None:
         log = replace(log, notes=(*follows.sentences(), *log.notes))
     try:
-        found = _calibrated(log, drive, tape, odometry or OdometryConfig())
-        return replace(found, feedback={} if follows is None else follows.settings())
+        calibration = _calibrated(log, drive, tape, odometry or OdometryConfig())
+        return replace(calibration, feedback={} if follows is None else follows.settings())
     except AcsardError as error:
         attach_notes(error, log.notes)
         raise
@@ -331,11 +331,11 @@ def _calibrated(
             improvement=UNMEASURED,
         )  # fmt: skip
     known = _known(best, odometry)
-    shown = _noise(best, known, odometry, present=bool(worse))
+    log_noise = _noise(best, known, odometry, present=bool(worse))
     # With a tape, the calibration gives the size of the wheels even if the log improves nothing.
-    if worse and tape is None and (shown is None or not shown.better):
+    if worse and tape is None and (log_noise is None or not log_noise.better):
         raise RefusedError(worse)
-    return _calibration(log, tape, best, odometry, shown)
+    return _calibration(log, tape, best, odometry, log_noise)
 
 
 def _known(best: Candidate, odometry: OdometryConfig) -> Deviations:
@@ -357,17 +357,17 @@ def _noise(
     the fitted geometry.
     """
     made, fitted = best.made, best.fitted
-    held = folds(fitted, made.parts, drives(made.runs), best.rate)
+    test_folds = folds(fitted, made.parts, drives(made.runs), best.rate)
     if present:
         start = fitted.parameters.copy()
         start[: Parameter.DELAY] = made.base.start()[: Parameter.DELAY]
-        held = [replace(fold, parameters=start) for fold in held]
+        test_folds = [replace(fold, parameters=start) for fold in test_folds]
     parameters = fitted.parameters.copy()
     if made.headings is not None:
         parameters[Parameter.BIAS_ERROR] = best.gyro_bias - made.headings.bias
     steps = made.steps or [positions.wheel_steps(run) for run in made.runs]
-    seen = Reference(made.runs, made.headings, bool(made.segments), steps, made.base, parameters)
-    return noise(held, seen, known, odometry)
+    sensors = Reference(made.runs, made.headings, bool(made.segments), steps, made.base, parameters)
+    return noise(test_folds, sensors, known, odometry)
 
 
 def _candidates(made: Prepared) -> list[Candidate]:
@@ -376,18 +376,18 @@ def _candidates(made: Prepared) -> list[Candidate]:
     Otherwise return one or two other fits: one that keeps the ratio as configured, and one that
     keeps the track as configured. Raises `RefusedError` if no fit is accurate enough.
     """
-    found: list[Candidate] = []
+    candidates: list[Candidate] = []
     deviations: dict[str, float] = {}
     refused: dict[str, float] = {}
     headings = made.headings
     gyro = headings is not None and headings.source == "yaw_rate"
     bias_std = headings.bias_std if headings is not None else 0.0
-    for kept, held in _held(made.base).items():
-        if found and not found[0].stays_configured:
+    for fixed, constraints in _held(made.base).items():
+        if candidates and not candidates[0].stays_configured:
             break
         fitted = fit(
             made.sources, made.start, places=bool(made.segments), gyro=gyro, bias_std=bias_std,
-            held=held,
+            held=constraints,
         )  # fmt: skip
         if fitted.converged:
             candidate = _candidate(made, fitted)
@@ -396,22 +396,22 @@ def _candidates(made: Prepared) -> list[Candidate]:
             )
             track /= abs(float(fitted.parameters[Parameter.INVERSE_TRACK]))
             too_wide = plausibility.too_inaccurate(candidate.result, track, MAX_LOG_STDS)
-            if not kept:
+            if not fixed:
                 deviations = {TRACK: track, RATIO: candidate.result.ratio_std}
                 if not plausibility.separates_track(fitted):
                     too_wide[RATIO] = deviations[RATIO] = np.inf
             if not too_wide:
-                deviation_by_name = {kept: deviations.get(kept, np.inf)} if kept else {}
-                found.append(replace(candidate, stays_configured=deviation_by_name))
+                deviation_by_name = {fixed: deviations.get(fixed, np.inf)} if fixed else {}
+                candidates.append(replace(candidate, stays_configured=deviation_by_name))
             # The fit of both quantities comes first, so its deviations are reported.
             refused = too_wide | refused
-    if not found:
+    if not candidates:
         raise RefusedError(
             plausibility.inaccuracy(refused, MAX_LOG_STDS)
             if refused
             else f"the search for the parameters does not converge: {DRIVE_ADVICE}"
         )
-    return found
+    return candidates
 
 
 def _held(base: Base) -> dict[str, list[Held]]:
@@ -435,9 +435,9 @@ def _candidate(made: Prepared, fitted: Fit) -> Candidate:
     rate = rates(rows, by_wheels)
     present = fitted.parameters.copy()
     present[: Parameter.DELAY] = base.start()[: Parameter.DELAY]
-    held = folds(fitted, made.parts, drives(made.runs), rate)
-    places = [positions_of(fold.drive, made.runs) if made.segments else [] for fold in held]
-    better = improvement(held, present, base, rows, places, made.steps)
+    test_folds = folds(fitted, made.parts, drives(made.runs), rate)
+    places = [positions_of(fold.drive, made.runs) if made.segments else [] for fold in test_folds]
+    better = improvement(test_folds, present, base, rows, places, made.steps)
     covariance = fitted.covariance([part.run for part in made.parts])
     result = multipliers(fitted.parameters, covariance, rate)
     better = replace(better, apart=result.apart(base))
@@ -445,7 +445,7 @@ def _candidate(made: Prepared, fitted: Fit) -> Candidate:
 
 
 def _calibration(
-    log: Log, tape: Tape | None, best: Candidate, odometry: OdometryConfig, shown: Noise | None
+    log: Log, tape: Tape | None, best: Candidate, odometry: OdometryConfig, log_noise: Noise | None
 ) -> Calibration:
     made, fitted, rows, rate = best.made, best.fitted, best.rows, best.rate
     headings, base = made.headings, made.base
@@ -469,7 +469,7 @@ def _calibration(
         known = replace(known, scale=result.relative_deviations().scale)
     totals = Drives.of(log.runs, rows, by_wheels, base, result, rate)
     notes += [_stays(name, deviation) for name, deviation in best.stays_configured.items()]
-    notes += _of_noise(shown)
+    notes += _of_noise(log_noise)
     notes += _cuts(log.runs)
     notes += _too_good(made, fitted, log)
     notes += plausibility.remarks(
@@ -483,9 +483,9 @@ def _calibration(
         improvement=best.improvement, delays=delays, gyro_bias=best.gyro_bias, notes=tuple(notes),
         odometry=settings(
             known, float(result.values[SEPARATION]), best.stays_configured, odometry,
-            shown if shown is not None and shown.better else None, scaled=bool(scale),
+            log_noise if log_noise is not None and log_noise.better else None, scaled=bool(scale),
         ),
-        stays_configured=tuple(best.stays_configured), noise=shown,
+        stays_configured=tuple(best.stays_configured), noise=log_noise,
     )  # fmt: skip
 
 
@@ -494,13 +494,13 @@ def _stays(name: str, deviation: float) -> str:
     return f"{name} stays as configured, because this log does not improve it{known}"
 
 
-def _of_noise(shown: Noise | None) -> Iterator[str]:
-    if shown is None or not shown.better:
+def _of_noise(log_noise: Noise | None) -> Iterator[str]:
+    if log_noise is None or not log_noise.better:
         yield (
             "the odometry's variances per metre and per radian stay as configured, because the "
             "errors of another drive may differ from those of this log"
         )
-    elif not shown.places:
+    elif not log_noise.places:
         yield (
             "the settings for random errors of the distance stay as configured, because only "
             "positions show these errors, and a gyro does not"

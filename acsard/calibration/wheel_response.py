@@ -114,13 +114,13 @@ class WheelResponse(Struct, frozen=True):
             )
         else:
             then = f", which agrees with the configured feedback.response_time = {self.present:g} s"
-        found = [follow + then]
+        sentences = [follow + then]
         if np.isfinite(self.fastest):
-            found.append(
+            sentences.append(
                 f"the wheels reach only {self.fastest:.3g} rad/s although commands were higher: "
                 f"write limits.wheel_speed = {self.fastest:.3g}"
             )
-        return found
+        return sentences
 
 
 def response(
@@ -134,17 +134,17 @@ def response(
     room = MOST_ROWS
     for run in driven:
         if len(run.commands_t) > 1 and room:
-            steps, wanted, seen = _commanded(run, drive)
-            parts.append((steps[:room], wanted[:room], seen[:room]))
+            steps, wanted, actual = _commanded(run, drive)
+            parts.append((steps[:room], wanted[:room], actual[:room]))
             room -= len(parts[-1][0])
     if sum(len(steps) for steps, _, _ in parts) < LEAST_ROWS:
         return None
     fastest = _fastest(parts)
     squares, whole = np.zeros(len(RESPONSE_TIMES_S)), 0.0
-    for steps, wanted, seen in parts:
-        expected = _expected(steps, np.clip(wanted, -fastest, fastest), seen)
-        squares += ((expected - seen[:, :, None]) ** 2).sum(axis=(0, 1))
-        whole += float((seen**2).sum())
+    for steps, wanted, actual in parts:
+        expected = _expected(steps, np.clip(wanted, -fastest, fastest), actual)
+        squares += ((expected - actual[:, :, None]) ** 2).sum(axis=(0, 1))
+        whole += float((actual**2).sum())
     best = int(np.argmin(squares))
     if not squares[best] < MAX_UNEXPLAINED * whole:
         return None
@@ -183,7 +183,7 @@ def _commanded(run: Run, drive: DriveConfig) -> tuple[Floats, Floats, Floats]:
     return steps, np.asarray(wanted), np.column_stack((run.left, run.right))
 
 
-def _expected(steps: Floats, wanted: Floats, seen: Floats) -> Floats:
+def _expected(steps: Floats, wanted: Floats, actual: Floats) -> Floats:
     """Return the wheel speeds, rad/s, that each of `RESPONSE_TIMES_S` predicts.
 
     The shape is (samples, 2 sides, response times).
@@ -195,7 +195,7 @@ def _expected(steps: Floats, wanted: Floats, seen: Floats) -> Floats:
     last = np.zeros((2, len(RESPONSE_TIMES_S)))
     for number, step in enumerate(steps):
         if np.isnan(step):
-            last = np.repeat(seen[number, :, None], len(RESPONSE_TIMES_S), axis=1)
+            last = np.repeat(actual[number, :, None], len(RESPONSE_TIMES_S), axis=1)
         else:
             last = last + (wanted[number, :, None] - last) * (step / (RESPONSE_TIMES_S + step))
         expected[number] = last
@@ -210,10 +210,10 @@ def _evidence(
     If this time exceeds `fault_time`, the daemon would report a fault.
     """
     longest, most = 0.0, fault_time / MIN_EVIDENCE_LINES
-    for steps, wanted, seen in parts:
+    for steps, wanted, actual in parts:
         sides = [(Expected(), Witness()) for _ in range(2)]
         for step, commands, speeds in zip(
-            steps.tolist(), wanted.tolist(), seen.tolist(), strict=True
+            steps.tolist(), wanted.tolist(), actual.tolist(), strict=True
         ):
             still = max(map(abs, commands)) < MIN_COMMANDED_SPEED
             for (expected, witness), command, speed in zip(sides, commands, speeds, strict=True):
@@ -232,9 +232,9 @@ def _fastest(parts: Sequence[tuple[Floats, Floats, Floats]]) -> float:
 
     Return infinity if no wheel stays below its command at a steady speed.
     """
-    found: list[float] = []
-    for steps, wanted, seen in parts:
-        for command, speed in zip(wanted.T, np.abs(seen.T), strict=True):
+    speeds: list[float] = []
+    for steps, wanted, actual in parts:
+        for command, speed in zip(wanted.T, np.abs(actual.T), strict=True):
             short = (
                 (speed > MIN_FAULT_SPEED) & (speed < REACHED * np.abs(command)) & ~np.isnan(steps)
             )
@@ -246,5 +246,5 @@ def _fastest(parts: Sequence[tuple[Floats, Floats, Floats]]) -> float:
                     continue
                 last, first = (float(speed[begin:end][m].mean()) for m in (late, before & ~late))
                 if abs(last - first) < CONSTANT * last:
-                    found.append(last)
-    return max(found, default=np.inf)
+                    speeds.append(last)
+    return max(speeds, default=np.inf)

@@ -183,8 +183,8 @@ class Board:
         The results of the steps remain unchanged.
         """
         self.restarts, self._unanswered_s = Restarts(), 0.0
-        for heard in (self._lines, self.replies, self.unrecognized_lines):
-            heard.clear()
+        for buffer in (self._lines, self.replies, self.unrecognized_lines):
+            buffer.clear()
 
     def __enter__(self) -> Board:
         self.open(self.mcu.baud_rate)
@@ -321,12 +321,12 @@ class Board:
         """
         # Receive the replies to earlier lines now, so that they are not taken for replies to these.
         self.listen(max(motion.SHORT_MEASUREMENT_S / 4, wait_s))
-        got: list[tuple[float, Reply]] = []
+        pairs: list[tuple[float, Reply]] = []
         for _ in range(lines):
             self.ask(max(wait_s, 1.5 * self.period_s), comma)
             first = motion.since(self.replies, self.sent_s)[:1]
-            got += [(reply.at_s - self.sent_s, reply) for reply in first]
-        return got
+            pairs += [(reply.at_s - self.sent_s, reply) for reply in first]
+        return pairs
 
     def drive(self, motors: Motors, seconds: float, period_s: float = 0.0) -> list[Reply]:
         """Send lines with the speeds `motors`, rad/s, for `seconds` s, and return the replies.
@@ -338,7 +338,7 @@ class Board:
         """
         period_s = period_s or self.period_s
         end_s = self.now_s + seconds
-        got: list[Reply] = []
+        replies: list[Reply] = []
         while (began_s := self.now_s) < end_s - MIN_WAIT_S:
             self.send(motors)
             answers = self.listen(min(period_s, end_s - began_s))
@@ -347,8 +347,8 @@ class Board:
             if self.armed and self._unanswered_s > self._max_silence_s:
                 self.zeros()
                 raise self._silence(motors, self._unanswered_s)
-            got += answers
-        return got
+            replies += answers
+        return replies
 
     @property
     def _max_silence_s(self) -> float:
@@ -360,8 +360,8 @@ class Board:
         names = motor_names(self.mcu, turned)
         # A delay of this computer that is much shorter than the silence cannot cause it.
         beyond_s = seconds - self._max_silence_s
-        found = outcomes.find(outcome, motors=names, seconds=seconds, margin_s=beyond_s)
-        return StoppedError(found)
+        finding = outcomes.find(outcome, motors=names, seconds=seconds, margin_s=beyond_s)
+        return StoppedError(finding)
 
     def stop_and_be_silent(self, silent_s: float) -> None:
         """Send zero speeds once, then send nothing for `silent_s` s.
@@ -384,21 +384,21 @@ class Board:
             # Discard the delay of a simulated board before this call, because nothing was measured
             # then.
             self.wire.late_ns()
-        got: list[Reply] = []
+        replies: list[Reply] = []
         self.abort_check()
         while True:
             until_ns = min(end_ns, self.wire.now_ns() + BEAT_NS)
-            got += self._hear(until_ns)
+            replies += self._hear(until_ns)
             now_ns = self.wire.now_ns()
             self._listened_s = now_ns / NS_PER_S
             late_ns = max(now_ns - until_ns, self.wire.late_ns())
             self.lateness.look(late_ns / NS_PER_S, self._listened_s)
             self.abort_check()
             if now_ns >= end_ns:
-                return got
+                return replies
 
     def _hear(self, until_ns: int) -> list[Reply]:
-        got = []
+        new_replies = []
         for at_ns, data in self.wire.listen(until_ns):
             self.heard.take(data)
             for line, following in self._lines.feed(data):
@@ -412,13 +412,13 @@ class Board:
                 if restart := self.restarts.look(line, at_s, reply):
                     raise RestartedError(restart)
                 if reply is not None:
-                    got.append(reply)
-        self.replies += got
-        if got:
+                    new_replies.append(reply)
+        self.replies += new_replies
+        if new_replies:
             self._unanswered_s = 0.0
             if self.armed:
                 self._guard()
-        return got
+        return new_replies
 
     def _take_status(self, line: bytes) -> None:
         try:
@@ -456,15 +456,15 @@ class Board:
         fastest = motion.fastest(self.replies, motion.RUNAWAY_SPEED)
         if fastest is None:
             return
-        motor, seen = fastest
+        motor, speed = fastest
         commanded = self._commanded[motor]
         self._abandon()
-        outcome = "runaway: against" if commanded * seen < 0 else "runaway: along"
+        outcome = "runaway: against" if commanded * speed < 0 else "runaway: along"
         name, letter, most = motor_name(self.mcu, motor), LETTERS[motor], motion.RUNAWAY_SPEED
-        found = outcomes.find(
-            outcome, motor=name, letter=letter, told=commanded, seen=seen, most=most
+        finding = outcomes.find(
+            outcome, motor=name, letter=letter, told=commanded, seen=speed, most=most
         )
-        raise StoppedError(found)
+        raise StoppedError(finding)
 
     def _abandon(self) -> None:
         self.runaway_seen = True
@@ -489,10 +489,10 @@ class Board:
         if self.settles(self.comma):
             return
         turning = motion.turning(self.replies, self.now_s)
-        kept = turning == [3] and not self._slows()
+        runs_on = turning == [3] and not self._slows()
         silent = self._unheard_s(began_s) > self._max_silence_s
         if self.settles(not self.comma):
-            if kept:
+            if runs_on:
                 self.latched, self.comma = True, not self.comma
             return
         # A board may ignore lines with the other ending. So a silence counts only if the board
@@ -507,8 +507,8 @@ class Board:
 
     def _unheard_s(self, since_s: float) -> float:
         """Return the time since the last reply or since `since_s`, whichever is later, s."""
-        heard = motion.since(self.replies[-1:], since_s)
-        return self.now_s - (heard[-1].at_s if heard else since_s)
+        replies = motion.since(self.replies[-1:], since_s)
+        return self.now_s - (replies[-1].at_s if replies else since_s)
 
     def settles(self, comma: bool) -> bool:
         """Send zero speeds until all motors stand still, and return whether they do so in time.
@@ -521,8 +521,8 @@ class Board:
         began_s = self.now_s
         while True:
             last = motion.since(self.replies[-2:], began_s)
-            shown = any(motion.moving(reply.motors, motion.STANDING_SPEED) for reply in last)
-            if len(last) == 2 and not (shown or motion.turning(self.replies, self.now_s)):
+            is_moving = any(motion.moving(reply.motors, motion.STANDING_SPEED) for reply in last)
+            if len(last) == 2 and not (is_moving or motion.turning(self.replies, self.now_s)):
                 return True
             patience_s = motion.SLOWING_TIMEOUT_S if self._slows() else motion.MOTOR_TIMEOUT_S
             if self.now_s - began_s >= patience_s:

@@ -49,8 +49,8 @@ def changes(findings: Sequence[Finding], config: Config, port: str = "") -> Chan
         wanted |= finding.keys
     differing = {key: value for key, value in wanted.items() if attrgetter(key)(config) != value}
 
-    def fits(given: Changes) -> bool:
-        changed = applied(given, config)
+    def fits(candidate: Changes) -> bool:
+        changed = applied(candidate, config)
         return changed is not None and not contradictions(changed)
 
     # Longer or slower lines may take too long for the control rate. Then leave out one optional key
@@ -77,10 +77,10 @@ def withheld(simulated: bool, config: Config) -> str:
     )
 
 
-def applied(given: Changes, config: Config) -> Config | None:
-    """Return a copy of `config` with the values `given`, or None if a value is not permitted."""
+def applied(updates: Changes, config: Config) -> Config | None:
+    """Return a copy of `config` with the values `updates`, or None if a value is not permitted."""
     plain: Any = effective(config)
-    for key, value in given.items():
+    for key, value in updates.items():
         where, _, name = key.rpartition(".")
         reduce(getitem, where.split("."), plain)[name] = value
     try:
@@ -124,7 +124,7 @@ def report(
     """
     judged = answered(findings) and not lateness.unjudged(findings)
     passed = judged and not any(
-        one.verdict == "FAIL" or one.name == SKIPPED_STEPS for one in findings
+        finding.verdict == "FAIL" or finding.name == SKIPPED_STEPS for finding in findings
     )
     toml = "\n".join(excerpt(changes))
     return Report(
@@ -132,20 +132,20 @@ def report(
     )
 
 
-def summary(found: Report, where: str) -> str:
-    """Return the text that the check prints last, for the report `found`.
+def summary(result: Report, where: str) -> str:
+    """Return the text that the check prints last, for the report `result`.
 
     It contains the number of findings with each verdict, and the suggested changes. `where` is the
     path of the configuration file.
     """
-    verdicts = [finding.verdict for finding in found.findings]
+    verdicts = [finding.verdict for finding in result.findings]
     counts = ", ".join(f"{verdicts.count(v)} {v}" for v in get_args(Verdict) if v in verdicts)
-    if late := lateness.unjudged(found.findings):
+    if late := lateness.unjudged(result.findings):
         again = "so the check has not passed: repeat it when this computer is idle"
         counts += f"\nfor {len(late)} of the steps there is no result, {again}"
-    if found.withheld:
-        return f"\n{counts}\n{where} stays unchanged: {found.withheld}"
-    if not found.toml:
+    if result.withheld:
+        return f"\n{counts}\n{where} stays unchanged: {result.withheld}"
+    if not result.toml:
         return f"\n{counts}\nacsard.toml: nothing to change"
-    head = f"{where}: written" if found.written else "for acsard.toml:"
-    return f"\n{counts}\n\n{head}\n{found.toml}"
+    head = f"{where}: written" if result.written else "for acsard.toml:"
+    return f"\n{counts}\n\n{head}\n{result.toml}"

@@ -34,7 +34,7 @@ def broken_lines(comma: bool, sealed: bool, motors: Sequence[int]) -> list[tuple
     def line(*tokens: str) -> bytes:
         return (",".join(tokens) + end).encode()
 
-    found = [
+    lines = [
         ("a value is missing", line(a, b, c)),
         ("a wrong letter", line(a, b, c, "x" + d[1:])),
         ("a letter twice", line(a, a, c, d)),
@@ -49,8 +49,8 @@ def broken_lines(comma: bool, sealed: bool, motors: Sequence[int]) -> list[tuple
     if sealed:
         good = seal(line(a, b, c, d), 7)
         wrong = good[:-3] + (b"0" if good[-3:-2] != b"0" else b"1") + b"\r\n"
-        found += [("a wrong check", wrong), ("a check cut short", good[:-4] + b"\r\n")]
-    return found
+        lines += [("a wrong check", wrong), ("a check cut short", good[:-4] + b"\r\n")]
+    return lines
 
 
 def finding(board: Board, motors: Sequence[int]) -> Finding:
@@ -70,8 +70,8 @@ def finding(board: Board, motors: Sequence[int]) -> Finding:
         return outcomes.find("damaged lines: right", lines=len(lines))
     outcome = "lenient" if took.keys() <= HARMLESS_KINDS else "taken"
     kinds = {what for what, _ in lines}
-    seen = {"took": len(took), "kinds": len(kinds), "which": ", ".join(took)}
-    return outcomes.find(f"damaged lines: {outcome}", None, **seen)
+    values = {"took": len(took), "kinds": len(kinds), "which": ", ".join(took)}
+    return outcomes.find(f"damaged lines: {outcome}", None, **values)
 
 
 def _moves(board: Board, line: bytes) -> bool:
@@ -79,6 +79,6 @@ def _moves(board: Board, line: bytes) -> bool:
     for _ in range(3):
         board.wire.send(line)
         board.listen(max(SHORT_MEASUREMENT_S / 6, len(line) * 12 / board.baud_rate))
-    shown = board.drive(ZERO, SHORT_MEASUREMENT_S + 2 * board.gap_s)
+    replies = board.drive(ZERO, SHORT_MEASUREMENT_S + 2 * board.gap_s)
     board.rest()
-    return any(moving(reply.motors) for reply in shown)
+    return any(moving(reply.motors) for reply in replies)

@@ -35,15 +35,15 @@ def baud(board: Board) -> Finding:
     # The wait is long, because opening the port resets many boards.
     if _knock(board, BOOT_S):
         return outcomes.find("baud rate: right", {"mcu.baud_rate": configured}, rate=configured)
-    heard = board.heard
+    data = board.heard
     for rate in (rate for rate in reversed(get_args(Baud)) if rate != configured):
         board.open(rate)
         if _knock(board, 0.6):
-            seen = {"rate": rate, "configured": configured, "heard": heard.counted}
-            return outcomes.find("baud rate: other", {"mcu.baud_rate": rate}, **seen)
+            values = {"rate": rate, "configured": configured, "heard": data.counted}
+            return outcomes.find("baud rate: other", {"mcu.baud_rate": rate}, **values)
     board.open(configured)
-    told = outcomes.find(f"baud rate: {heard.looks}", heard=heard.counted, configured=configured)
-    raise StoppedError(told)
+    finding = outcomes.find(f"baud rate: {data.looks}", heard=data.counted, configured=configured)
+    raise StoppedError(finding)
 
 
 def _knock(board: Board, seconds: float) -> bool:
@@ -135,12 +135,12 @@ def replies(board: Board) -> Finding:
     """
     lines = [reply.line.partition(b"#")[0] for reply in board.replies]
     forms = {"spaces": rb", ", "unpadded": rb"[pn]\d\.", "trailing comma": rb", *\Z"}
-    found = [name for name, sign in forms.items() if any(re.search(sign, line) for line in lines)]
+    names = [name for name, sign in forms.items() if any(re.search(sign, line) for line in lines)]
     if not all(re.search(rb"\.\d\d,? *\Z", line) for line in lines):
-        found.append("other decimals")
-    if not found:
+        names.append("other decimals")
+    if not names:
         return outcomes.find("reply form: right")
-    return outcomes.find("reply form: other", forms=", ".join(found), line=lines[-1].decode())
+    return outcomes.find("reply form: other", forms=", ".join(names), line=lines[-1].decode())
 
 
 def check(board: Board) -> Finding:
@@ -176,14 +176,14 @@ def rate(board: Board) -> Finding:
     board.own_clock = bool(unasked) and unasked[-1].at_s - unasked[0].at_s > SHORT_MEASUREMENT_S
     highest_hz = highest_rate(board.baud_rate, line_bytes(board.comma), COMFORTABLE_USE)
     period_s, before = 1 / min(board.rate_hz, highest_hz), board.sent_lines
-    got = board.drive(ZERO, 0.5, period_s)
-    if len(got) < 10:
-        got += board.drive(ZERO, 1.0, period_s)
-    if len(got) < 2:
+    answers = board.drive(ZERO, 0.5, period_s)
+    if len(answers) < 10:
+        answers += board.drive(ZERO, 1.0, period_s)
+    if len(answers) < 2:
         return outcomes.find("reply rate: none")
-    gaps = [after.at_s - one.at_s for one, after in pairwise(got)]
+    gaps = [after.at_s - earlier.at_s for earlier, after in pairwise(answers)]
     board.gap_s = gap_s = fmean(gaps)
-    configured, answered = board.mcu.reply_period, len(got) / (board.sent_lines - before)
+    configured, answered = board.mcu.reply_period, len(answers) / (board.sent_lines - before)
     unset_s = max(0.1, 4 * period_s)  # the silence that the host allows by default
     quiet_s = max(unset_s, 3 * configured)
     slow, lossy = 3 * gap_s > 1.1 * quiet_s, not board.own_clock and answered < 0.8

@@ -78,9 +78,9 @@ def coarse(replies: Sequence[Reply], motors: Sequence[int]) -> float | None:
     for motor in motors:
         speeds = [abs(step.speeds[motor]) for step in course]
         angles += [abs(s.speeds[motor]) * s.seconds for s in course if s.speeds[motor]]
-        for one, two, three in zip(speeds, speeds[1:], speeds[2:], strict=False):
-            if one or two or three:
-                jumps.append(abs(one - 2 * two + three) / 2 * period)
+        for first, second, third in zip(speeds, speeds[1:], speeds[2:], strict=False):
+            if first or second or third:
+                jumps.append(abs(first - 2 * second + third) / 2 * period)
     if len(angles) < MIN_READINGS or fmean(jumps) < COARSE_ANGLE:
         return None
     least = sorted(angles)[len(angles) // 20]
@@ -101,8 +101,8 @@ def finding(board: Board, motors: Sequence[int]) -> Finding:
         return outcomes.find("encoder counts: coarse", about=about)
     if board.lost > line_loss.MAX_LOSS:
         return outcomes.find("encoder counts: damaged", share=board.lost)
-    said = board.identity.get("counts", "")
-    named = int(said) if said.isdigit() and len(said) < 9 else 0
+    text = board.identity.get("counts", "")
+    named = int(text) if text.isdigit() and len(text) < 9 else 0
     measured, configured = per_turn(board.replies, motors), board.mcu.encoder_counts
     unused: dict[str, object] = {"mcu.encoder_counts": 0} if configured else {}
     if measured is None and not named:
@@ -114,8 +114,8 @@ def finding(board: Board, motors: Sequence[int]) -> Finding:
         names, least = motor_names(board.mcu, wrong), min(each.values())
         return outcomes.find("encoder counts: backward", unused, names=names, measured=least)
     if each and min(each.values()) < MIN_COUNT_RATIO * max(each.values()):
-        shown = ", ".join(f"{LETTERS[motor]} {counts:.0f}" for motor, counts in each.items())
-        return outcomes.find("encoder counts: unequal", unused, shown=shown)
+        listing = ", ".join(f"{LETTERS[motor]} {counts:.0f}" for motor, counts in each.items())
+        return outcomes.find("encoder counts: unequal", unused, shown=listing)
     if measured is None:
         counts, how = named, "the firmware states this number; the check could not measure it"
     elif not named:

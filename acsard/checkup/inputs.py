@@ -69,15 +69,15 @@ def finding(board: Board, operator: Operator, safety: SafetyConfig) -> Finding:
 
 def _pressed(board: Board, operator: Operator, asked: Input, inputs: list[Input]) -> str:
     operator.doing(f"press the {asked.name} and release it, within {PRESS_TIMEOUT_S:g} s")
-    end_s, seen = board.now_s + PRESS_TIMEOUT_S, set[int]()
+    end_s, numbers = board.now_s + PRESS_TIMEOUT_S, set[int]()
     while board.now_s < end_s:
         board.ask()
         now = {number for number, pressed in board.inputs.items() if pressed}
-        seen |= now
-        if seen and not now:
+        numbers |= now
+        if numbers and not now:
             break
-    others = [each.name for each in inputs if each.number in seen - {asked.number}]
-    if asked.number not in seen:
+    others = [each.name for each in inputs if each.number in numbers - {asked.number}]
+    if asked.number not in numbers:
         instead = f"; instead the board reported the {' and the '.join(others)}" if others else ""
         return f"{asked.name}: no press was reported{instead}"
     if others:

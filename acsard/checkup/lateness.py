@@ -54,17 +54,17 @@ class Lateness:
         return max((late_s for at_s, late_s in self._seen if at_s >= began_s), default=0.0)
 
 
-def is_doubtful(found: TimingFinding, late_s: float) -> bool:
+def is_doubtful(result: TimingFinding, late_s: float) -> bool:
     """Return whether the finding may be wrong because this computer ran the check too late.
 
     `late_s` is the longest delay of this computer during the step, s. The result is True if the
-    delay reaches both half of `found.margin_s` and a minimum. The minimum is `MAX_PAUSE_S` for a
+    delay reaches both half of `result.margin_s` and a minimum. The minimum is `MAX_PAUSE_S` for a
     finding with the verdict PASS, else `MAX_LATENESS_S`.
     """
     # Half of the margin is enough, because this computer may have been late by the same time at the
     # start and at the end of the measurement.
-    least_s = MAX_PAUSE_S if found.verdict == "PASS" else MAX_LATENESS_S
-    return late_s >= max(least_s, found.margin_s / 2)
+    least_s = MAX_PAUSE_S if result.verdict == "PASS" else MAX_LATENESS_S
+    return late_s >= max(least_s, result.margin_s / 2)
 
 
 def finding(name: str, late_s: float) -> Finding:
@@ -75,9 +75,9 @@ def finding(name: str, late_s: float) -> Finding:
     return outcomes.find(NOT_JUDGED, name=name, late=late_s * 1000)
 
 
-def judged(found: Finding) -> bool:
+def judged(result: Finding) -> bool:
     """Return False if the finding says that the step was not judged, otherwise True."""
-    return found.figure != outcomes.OUTCOMES_BY_NAME[NOT_JUDGED].figure
+    return result.figure != outcomes.OUTCOMES_BY_NAME[NOT_JUDGED].figure
 
 
 def unjudged(findings: Iterable[Finding]) -> list[str]:
@@ -85,5 +85,5 @@ def unjudged(findings: Iterable[Finding]) -> list[str]:
 
     If several findings have the same name, only the last one counts.
     """
-    last = {found.name: found for found in findings}
-    return [name for name, found in last.items() if not judged(found)]
+    last = {result.name: result for result in findings}
+    return [name for name, result in last.items() if not judged(result)]

@@ -87,7 +87,7 @@ def finding(board: Board) -> Finding:
     else:
         outcome = "back" if 2 * count.damaged > count.lost else "both"
     last = board.unrecognized_lines[-1] if count.damaged else b""
-    found = outcomes.find(
+    result = outcomes.find(
         f"lost lines: {outcome}",
         lines=count.lines,
         lost=count.lost,
@@ -97,8 +97,8 @@ def finding(board: Board) -> Finding:
         last=printable_bytes(last, MAX_SHOWN_BYTES),
     )
     if outcome in ("back", "both") and not board.sealed:
-        raise StoppedError(found)
-    return found
+        raise StoppedError(result)
+    return result
 
 
 def _period_s(board: Board) -> float:
@@ -115,11 +115,11 @@ def _period_s(board: Board) -> float:
 
 def _counted(board: Board, began_s: float, lines: int, others: int) -> Count:
     damaged = sum(not line.startswith(IDENTITY) for line in board.unrecognized_lines[others:])
-    got = motion.since(board.replies, began_s)
+    replies = motion.since(board.replies, began_s)
     if not board.own_clock:
-        return Count(lines, max(damaged, lines - len(got)), damaged)
-    lost = max(damaged, _left_out(got))
-    return Count(len(got) + lost, lost, damaged)
+        return Count(lines, max(damaged, lines - len(replies)), damaged)
+    lost = max(damaged, _left_out(replies))
+    return Count(len(replies) + lost, lost, damaged)
 
 
 def _gaps(replies: Sequence[Reply]) -> list[float]:
@@ -263,8 +263,8 @@ def _whole(board: Board, since_s: float) -> bool:
 def _grain(board: Board, motors: Sequence[int]) -> float:
     """Return the smallest nonzero angle by which an encoder turned between two replies, rad."""
     course = motion.steps(board.replies)
-    shown = [abs(step.speeds[m]) * step.seconds for step in course for m in motors]
-    return min((angle for angle in shown if angle), default=0.0)
+    angles = [abs(step.speeds[m]) * step.seconds for step in course for m in motors]
+    return min((angle for angle in angles if angle), default=0.0)
 
 
 def _stand(board: Board) -> bool:

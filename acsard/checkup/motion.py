@@ -120,14 +120,14 @@ def mean(replies: Sequence[Reply]) -> Motors:
 def steps(replies: Sequence[Reply]) -> Iterator[Step]:
     """Yield one `Step` for each interval from a reply to the next reply."""
     for before, after in pairwise(replies):
-        seconds, one, other = after.at_s - before.at_s, before.reading, after.reading
-        if one is None or other is None:
+        seconds, previous, other = after.at_s - before.at_s, before.reading, after.reading
+        if previous is None or other is None:
             yield Step(seconds, after.motors)
             continue
-        pairs = zip(one.counts, other.counts, strict=True)
-        went = [(b - a + FIELD_VALUES // 2) % FIELD_VALUES - FIELD_VALUES // 2 for a, b in pairs]
-        mcu_s = (other.mcu_ms - one.mcu_ms) % FIELD_VALUES / 1000
-        yield Step(seconds, after.motors, mcu_s, each(went.__getitem__))
+        pairs = zip(previous.counts, other.counts, strict=True)
+        deltas = [(b - a + FIELD_VALUES // 2) % FIELD_VALUES - FIELD_VALUES // 2 for a, b in pairs]
+        mcu_s = (other.mcu_ms - previous.mcu_ms) % FIELD_VALUES / 1000
+        yield Step(seconds, after.motors, mcu_s, each(deltas.__getitem__))
 
 
 def covered(replies: Sequence[Reply], since_s: float, per_turn: float = 0.0) -> Motors:
@@ -154,18 +154,18 @@ def turning(replies: Sequence[Reply], now_s: float) -> list[int]:
     """
     # The motor counts as turning for the time in which it would turn by the same angle at the speed
     # `STANDING_SPEED`.
-    found: set[int] = set()
+    motors: set[int] = set()
     for reply, earlier in pairwise(reversed([Reply(-math.inf, ZERO, b""), *replies])):
         ago_s = now_s - reply.at_s
         if ago_s > MAX_REPLY_AGE_S:
             break
         gap_s = min(SHORT_MEASUREMENT_S, reply.at_s - earlier.at_s)
-        found.update(
+        motors.update(
             motor
             for motor in moving(reply.motors, STANDING_SPEED)
             if ago_s <= abs(reply.motors[motor]) * gap_s / STANDING_SPEED
         )
-    return sorted(found)
+    return sorted(motors)
 
 
 def trend(replies: Sequence[Reply], now_s: float, gap_s: float) -> Motors:
@@ -179,7 +179,7 @@ def trend(replies: Sequence[Reply], now_s: float, gap_s: float) -> Motors:
     span_s = max(TREND_S, 4 * gap_s)
     before = mean(since(replies, now_s - 2 * span_s, now_s - span_s))
     now = mean(since(replies, now_s - span_s, now_s))
-    turn = [min(abs(one), abs(other)) > 0.1 for one, other in zip(before, now, strict=True)]
+    turn = [min(abs(speed), abs(other)) > 0.1 for speed, other in zip(before, now, strict=True)]
     return each(lambda motor: abs(now[motor] / before[motor]) if turn[motor] else 1.0)
 
 

@@ -394,22 +394,22 @@ class Outcome(Struct, frozen=True):
 
 
 def _read(manual: str) -> dict[str, Outcome]:
-    found = {}
+    outcomes = {}
     for entry in re.split(r"\n+(?! )", manual.strip()):
         head, *rest = entry.splitlines()
         verdict, _, head = head.partition(" ")
         outcome, _, figure = head.partition(" | ")
         text, _, mend = " ".join(line.strip() for line in rest).partition("-> ")
         parts = {"verdict": verdict.rstrip("?"), "unsure": verdict.endswith("?"), "figure": figure}
-        found[outcome] = convert(parts | {"text": text.strip(), "mend": mend}, Outcome)
-    return found
+        outcomes[outcome] = convert(parts | {"text": text.strip(), "mend": mend}, Outcome)
+    return outcomes
 
 
 OUTCOMES_BY_NAME = _read(OUTCOMES)
 """Maps the name of each outcome, such as "baud rate: right", to the outcome."""
 
 
-def find(outcome: str, keys: dict[str, object] | None = None, **seen: object) -> Finding:
+def find(outcome: str, keys: dict[str, object] | None = None, **values: object) -> Finding:
     """Return the finding for an outcome, with the measured values in its texts.
 
     Args:
@@ -420,14 +420,14 @@ def find(outcome: str, keys: dict[str, object] | None = None, **seen: object) ->
             `TimingFinding`).
     """
     entry = OUTCOMES_BY_NAME[outcome]
-    name = str(seen.get("name", outcome.partition(":")[0]))
-    figure, text, mend = (s.format(**seen) for s in (entry.figure, entry.text, entry.mend))
+    name = str(values.get("name", outcome.partition(":")[0]))
+    figure, text, mend = (s.format(**values) for s in (entry.figure, entry.text, entry.mend))
     if not entry.unsure:
         return Finding(name, entry.verdict, figure, text, mend, keys or {})
-    margin_s = float(str(seen.get("margin_s", 0.0)))
+    margin_s = float(str(values.get("margin_s", 0.0)))
     return TimingFinding(name, entry.verdict, figure, text, mend, keys or {}, margin_s)
 
 
-def plain(found: Finding) -> Finding:
+def plain(finding: Finding) -> Finding:
     """Return the finding as a `Finding`, without the `margin_s` of a `TimingFinding`."""
-    return Finding(*(getattr(found, name) for name in Finding.__struct_fields__))
+    return Finding(*(getattr(finding, name) for name in Finding.__struct_fields__))

@@ -118,7 +118,7 @@ def run(
         asleep_ns: function that returns for how long this computer has been suspended since its
             start, ns. The clock of `wire` does not count this time.
     """
-    told: set[str] = set()
+    finding_names: set[str] = set()
     unjudged: set[str] = set()
 
     def once(finding: Finding | None) -> None:
@@ -130,13 +130,13 @@ def run(
         if finding is None:
             return
         judged = lateness.judged(finding)
-        if finding.name not in told or (judged and finding.name in unjudged):
+        if finding.name not in finding_names or (judged and finding.name in unjudged):
             (unjudged.discard if judged else unjudged.add)(finding.name)
-            told.add(finding.name)
+            finding_names.add(finding.name)
             tell(outcomes.plain(finding))
 
     why = ""
-    seen: list[Restart] = []
+    all_restarts: list[Restart] = []
     try:
         longest_s = longest_reply(config.feedback.fault_time)
         with Board(wire, config.mcu, config.rate_hz, longest_s) as board:
@@ -145,19 +145,19 @@ def run(
                 raise StoppedError(outcomes.find("wheels: not lifted"))
             watched = _Watched(operator, board, asleep_ns)
             board.abort_check = watched.look
-            _Steps(board, watched, once, seen).all(config.safety)
+            _Steps(board, watched, once, all_restarts).all(config.safety)
     except StoppedError as end:
         once(end.finding)
         why = f"the check ended early: {end.finding.name}"
     except WireLostError as lost:
         once(outcomes.find("serial line: lost", error=lost))
         why = "the check ended early: the serial line was lost"
-    if seen:
-        once(restarts.finding(config.mcu, seen))
+    if all_restarts:
+        once(restarts.finding(config.mcu, all_restarts))
     motors = [motor_name(config.mcu, motor) for motor in range(4)]
-    names = ["motors"] if told.isdisjoint(motors) else motors
+    names = ["motors"] if finding_names.isdisjoint(motors) else motors
     steps = [name for step in STEPS for name in (names if step == "motors" else [step])]
-    rest = [step for step in steps if step not in told]
+    rest = [step for step in steps if step not in finding_names]
     if why and rest:
         left = f"{why}; not finished: {', '.join(rest)}"
         tell(Finding(SKIPPED_STEPS, "SKIPPED", many(len(rest), "step"), left))
@@ -249,10 +249,10 @@ class _Steps:
             channels[motor:] = [wheels.channel(board, motor)]
             return encoder_finding(board.mcu, channels[motor])
 
-        found = self._in_time(looked)
-        if found is not None and not lateness.judged(found):
+        finding = self._in_time(looked)
+        if finding is not None and not lateness.judged(finding):
             channels[motor] = structs.replace(channels[motor], judged=False)
-            return found
+            return finding
         channels[motor] = wheels.ask_which_wheel(board, operator, channels[motor])
         return encoder_finding(board.mcu, channels[motor])
 
@@ -274,30 +274,30 @@ class _Steps:
                 if board.armed:
                     board.rest()
             began_s = board.now_s
-            found, ends = _ended(step)
+            finding, ends = _ended(step)
             # A finding that is not `TimingFinding` is right even if this computer ran the check too
             # late.
-            if board.runaway_seen or not isinstance(found, TimingFinding):
+            if board.runaway_seen or not isinstance(finding, TimingFinding):
                 break
             # The delay of a simulated board is known only when its program runs again, so wait for
             # an answer. If the board does not answer at all, a delay is not the cause.
-            if found.verdict != "PASS" and not board.answers_within(BOOT_S):
+            if finding.verdict != "PASS" and not board.answers_within(BOOT_S):
                 break
             meanwhile_s = board.lateness.since(began_s)
-            if not lateness.is_doubtful(found, meanwhile_s):
+            if not lateness.is_doubtful(finding, meanwhile_s):
                 break
             late_s = max(late_s, meanwhile_s)
-            told = lateness.finding(found.name, late_s)
+            late_finding = lateness.finding(finding.name, late_s)
             if ends and board.armed:
                 # The step has ended the check. So do not turn a motor again, even if the cause was
                 # only a delay of this computer.
-                found, board.saved_results = told, saved
+                finding, board.saved_results = late_finding, saved
                 break
         else:
-            found, board.saved_results = told, saved
-        if found is not None and ends:
-            raise StoppedError(found)
-        return found
+            finding, board.saved_results = late_finding, saved
+        if finding is not None and ends:
+            raise StoppedError(finding)
+        return finding
 
     def _take(self, doing: str, step: Step) -> None:
         board, again = self._board, 0
@@ -345,8 +345,8 @@ class _Steps:
         )
         if not board.answers_within(BOOT_S):
             raise StoppedError(restarts.finding(board.mcu, self._seen, back=False))
-        if said := restarts.cause(board.unrecognized_lines):
-            self._seen[-1] = structs.replace(self._seen[-1], cause=said)
+        if cause := restarts.cause(board.unrecognized_lines):
+            self._seen[-1] = structs.replace(self._seen[-1], cause=cause)
         if board.armed:
             board.rest()
 

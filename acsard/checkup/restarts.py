@@ -165,8 +165,8 @@ def cause(lines: Sequence[bytes]) -> str:
 
     Return "" if `lines` do not report a cause.
     """
-    said = [match[1].decode() for line in lines if (match := _CAUSE.search(line))]
-    return said[-1] if said else ""
+    causes = [match[1].decode() for line in lines if (match := _CAUSE.search(line))]
+    return causes[-1] if causes else ""
 
 
 def finding(mcu: McuConfig, restarts: Sequence[Restart], back: bool = True) -> Finding:
@@ -175,31 +175,31 @@ def finding(mcu: McuConfig, restarts: Sequence[Restart], back: bool = True) -> F
     `restarts` contains at least one restart. `back` is false if the board did not answer after the
     last restart.
     """
-    each = Counter(_told(mcu, one) for one in restarts)
-    seen: dict[str, object] = {
+    each = Counter(_told(mcu, restart) for restart in restarts)
+    values: dict[str, object] = {
         "times": ", ".join(filter(None, ("restarted", _times(len(restarts))))),
         "told": "; ".join(
             f"{_times(n)} while {when}: {sign}".lstrip() for (when, sign), n in each.items()
         ),
-        "silent": min(one.silent_s for one in restarts),
+        "silent": min(restart.silent_s for restart in restarts),
         "patience": BOOT_S,
     }
-    return outcomes.find(f"restarts: {_outcome(restarts) if back else 'gone'}", None, **seen)
+    return outcomes.find(f"restarts: {_outcome(restarts) if back else 'gone'}", None, **values)
 
 
 def _outcome(restarts: Sequence[Restart]) -> str:
-    said = {CAUSES[one.cause] for one in restarts if one.cause in CAUSES}
-    if len(said) == 1 and not (said == {"watchdog"} and _silent(restarts)):
-        return said.pop()
+    causes = {CAUSES[restart.cause] for restart in restarts if restart.cause in CAUSES}
+    if len(causes) == 1 and not (causes == {"watchdog"} and _silent(restarts)):
+        return causes.pop()
     if len(restarts) == 1:
         return "seen"
     if _silent(restarts):
         return "silence"
-    return "motors" if all(any(one.turned) for one in restarts) else "seen"
+    return "motors" if all(any(restart.turned) for restart in restarts) else "seen"
 
 
 def _silent(restarts: Sequence[Restart]) -> bool:
-    return len(restarts) > 1 and all(one.silent_s >= MIN_SILENCE_S for one in restarts)
+    return len(restarts) > 1 and all(restart.silent_s >= MIN_SILENCE_S for restart in restarts)
 
 
 def _told(mcu: McuConfig, restart: Restart) -> tuple[str, str]:

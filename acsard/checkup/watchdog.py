@@ -133,16 +133,16 @@ def measured(board: Board, motors: Sequence[int], stop: Run) -> Bounds:
         motion.WATCHDOG_SILENCE_S + stop.slow_s,
         motion.STANDSTILL_TIMEOUT_S + stop.slow_s,
     ):
-        found = run(board, motors, length_s)
-        ran_on_s = found.ran_s - stop.ran_s
-        if ran_on_s < 0.95 * found.silent_s:
+        trial = run(board, motors, length_s)
+        ran_on_s = trial.ran_s - stop.ran_s
+        if ran_on_s < 0.95 * trial.silent_s:
             break
-        least_s = found.silent_s
+        least_s = trial.silent_s
     else:
         return motion.STANDSTILL_TIMEOUT_S, NOT_MEASURED
     by_counts = _per_turn(board, motors) > 0
-    if not (board.own_clock or by_counts or found.first >= STOPPED):
-        return _asked(board, motors, stop, (least_s, found.silent_s))
+    if not (board.own_clock or by_counts or trial.first >= STOPPED):
+        return _asked(board, motors, stop, (least_s, trial.silent_s))
     # Each of the two distances may be wrong by one jump of the reported speeds, and a motor that
     # slows down may add half a jump.
     about_s = max(2.5 * stop.grain_s, 0.0 if by_counts else board.gap_s / 2)

@@ -148,15 +148,15 @@ def _whose(mcu: McuConfig, channel: Channel) -> str:
     wrong encoder. Return "" for a kind of result that needs no such distinction.
     """
     wheel, sign = wheel_of(mcu, channel.motor)
-    seen = channel.wheel
+    answer = channel.wheel
     match channel.kind:
-        case "dead" if seen is not None:
-            return ", turns" if seen else ", still"
-        case "reversed" if seen == wheel:
+        case "dead" if answer is not None:
+            return ", turns" if answer else ", still"
+        case "reversed" if answer == wheel:
             return ", encoder" if channel.forward == (sign > 0) else ", motor"
-        case "other" if seen == wheel:
+        case "other" if answer == wheel:
             return ", encoder"
-        case "other" if seen == wheel_of(mcu, channel.moved[0])[0]:
+        case "other" if answer == wheel_of(mcu, channel.moved[0])[0]:
             return ", motor"
         case "dead" | "reversed" | "other":
             return ", not seen"
@@ -164,17 +164,17 @@ def _whose(mcu: McuConfig, channel: Channel) -> str:
             return ""
 
 
-def wheel_map(mcu: McuConfig, found: Sequence[Channel]) -> Finding:
+def wheel_map(mcu: McuConfig, channels: Sequence[Channel]) -> Finding:
     """Return the finding that compares `[mcu.wheels]` with the wheels that the operator saw turn.
 
     The finding suggests an entry (sign and motor, such as "-d") for each wheel. If the motor does
     not work correctly, or if the operator saw no wheel turn, this is the configured entry. If no
     operator answered, the finding has no entries.
     """
-    if any(channel.wheel is None for channel in found):
+    if any(channel.wheel is None for channel in channels):
         return outcomes.find("wheel map: not seen")
     entries: dict[str, str] = {}
-    for channel in found:
+    for channel in channels:
         wheel, sign = wheel_of(mcu, channel.motor)
         if channel.kind in FOLLOWING_KINDS and channel.wheel:
             wheel, sign = channel.wheel, 1 if channel.forward else -1
@@ -282,10 +282,10 @@ def channel(board: Board, motor: int) -> Channel:
     If motor d (number 3) does not move, repeat the test with the other line ending: a comma or
     none. If motor d moves then, use that ending for all later lines too.
     """
-    found = _both_ways(board, motor)
-    if motor == 3 and found.kind == "dead" and not board.latched:
-        found = _with_other_comma(board, found)
-    return found
+    result = _both_ways(board, motor)
+    if motor == 3 and result.kind == "dead" and not board.latched:
+        result = _with_other_comma(board, result)
+    return result
 
 
 def _both_ways(board: Board, motor: int) -> Channel:
@@ -293,9 +293,9 @@ def _both_ways(board: Board, motor: int) -> Channel:
 
     First probe the motor. If its own encoder does not move with it, do not turn the motor further.
     """
-    shown = probe(board, motor)
-    if shown is not None:
-        return Channel(motor, shown, ZERO, probed=True)
+    speeds = probe(board, motor)
+    if speeds is not None:
+        return Channel(motor, speeds, ZERO, probed=True)
     (forth, unsure), back = turn(board, motor, motion.SPEED), ZERO
     if motor in moving(forth):
         board.rest()
@@ -317,14 +317,14 @@ def probe(board: Board, motor: int) -> Motors | None:
     # short for that. If the encoder does not follow, repeat the probe, because a coarse encoder may
     # need more movement.
     began_s = board.now_s
-    shown = _probe(board, motor, motion.SPEED / 2)
+    speeds = _probe(board, motor, motion.SPEED / 2)
     own = [reply.motors[motor] for reply in motion.since(board.replies, began_s)]
-    seen = [speed for speed in own if speed]
-    if shown is None or (len(seen) >= 3 and max(seen) < 0):
+    nonzero = [speed for speed in own if speed]
+    if speeds is None or (len(nonzero) >= 3 and max(nonzero) < 0):
         # Several replies show that the motor or its encoder is reversed. A second probe would make
         # the motor run away again.
-        return shown
-    if not moving(shown, motion.PROBE_MOVING_SPEED):
+        return speeds
+    if not moving(speeds, motion.PROBE_MOVING_SPEED):
         return _probe(board, motor, motion.SPEED)
     again = _probe(board, motor, motion.SPEED / 2)
     # If only the first probe showed a movement, a motor may have coasted during that probe.
@@ -359,8 +359,8 @@ def _probe(board: Board, motor: int, speed: float) -> Motors | None:
     moved = moving(shown(), motion.PROBE_MOVING_SPEED)
     board.stop_and_be_silent(motion.STANDSTILL_TIMEOUT_S if moved else motion.WATCHDOG_SILENCE_S)
     board.rest()
-    seen = shown()
-    return None if seen[motor] >= motion.PROBE_MOVING_SPEED else seen
+    speeds = shown()
+    return None if speeds[motor] >= motion.PROBE_MOVING_SPEED else speeds
 
 
 def _with_other_comma(board: Board, dead: Channel) -> Channel:

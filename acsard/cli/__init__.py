@@ -95,15 +95,15 @@ class _Parser(argparse.ArgumentParser):
         # parse all words again with `parse_known_intermixed_args`.
         if self._intermixed:
             return super().parse_known_args(args, namespace)
-        found, unknown = super().parse_known_args(args, copy(namespace))
+        options, unknown = super().parse_known_args(args, copy(namespace))
         if unknown and self._subparsers is None:
             self._intermixed = True
-            found, unknown = self.parse_known_intermixed_args(args, namespace)
+            options, unknown = self.parse_known_intermixed_args(args, namespace)
             self._intermixed = False
         if unknown:
             text = f"unrecognized arguments: {' '.join(unknown)}"
             self.error(f"{text}; `{self.prog} --help` lists the options")
-        return found, unknown
+        return options, unknown
 
     def _check_value(self, action: argparse.Action, value: object) -> None:
         try:

@@ -46,8 +46,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     with connected(args) as robot, suppress(KeyboardInterrupt):
-        for found in budgets(robot, _config(robot, args.config), args.seconds):
-            _print(found, args.json)
+        for budget in budgets(robot, _config(robot, args.config), args.seconds):
+            _print(budget, args.json)
             if not args.follow:
                 break
     return int(Exit.OK)
@@ -65,11 +65,11 @@ def _config(robot: Client, path: str | None) -> Config:
         return config
 
 
-def _print(found: Budget, as_json: bool) -> None:
+def _print(budget: Budget, as_json: bool) -> None:
     if not as_json:
-        show(*parts(found), most=MAX_TEXT_WIDTH)
+        show(*parts(budget), most=MAX_TEXT_WIDTH)
         return
-    millimetres, degrees = found.total()
-    told = msgspec.to_builtins(found)
-    told |= {"mm_per_100_m": millimetres, "deg_per_turn": degrees, "advice": advice(found)}
-    print(msgspec.json.encode(told).decode(), flush=True)
+    millimetres, degrees = budget.total()
+    fields = msgspec.to_builtins(budget)
+    fields |= {"mm_per_100_m": millimetres, "deg_per_turn": degrees, "advice": advice(budget)}
+    print(msgspec.json.encode(fields).decode(), flush=True)

@@ -126,10 +126,10 @@ def _calibrate(args: argparse.Namespace, lines: JsonPrompt | None) -> int:
     source = str(args.log) if args.log else "the drive"
     try:
         if args.log:
-            found = calibrated(args.log, local_config, args.distance, _choice(args))
+            calibration = calibrated(args.log, local_config, args.distance, _choice(args))
             config = local_config
         else:
-            found, config = _guided(args, local_config, where, lines)
+            calibration, config = _guided(args, local_config, where, lines)
     except (LogError, RefusedError, GuideError, NobodyError) as error:
         notes = tuple(getattr(error, "__notes__", ()))
         if args.json:
@@ -139,13 +139,13 @@ def _calibrate(args: argparse.Namespace, lines: JsonPrompt | None) -> int:
     written, trouble = "", None
     if args.write:
         try:
-            change(Path(where), keys(found))
+            change(Path(where), keys(calibration))
             written = where
         except MendableError as error:
             # Print the result of the long drive before the error.
             trouble = error
-    result = report(source, found, config.drive, written)
-    words = parts(result, found, where, guided=not args.log)
+    result = report(source, calibration, config.drive, written)
+    words = parts(result, calibration, where, guided=not args.log)
     if lines is None:
         if args.json:
             print(msgspec.json.encode(result).decode())
@@ -154,7 +154,7 @@ def _calibrate(args: argparse.Namespace, lines: JsonPrompt | None) -> int:
     else:
         lines.result(plain(*words, width=MAX_TEXT_WIDTH))
         differing = _differing(config, local_config, where)
-        if not args.write and lines.offer(args.config, keys(found), differing):
+        if not args.write and lines.offer(args.config, keys(calibration), differing):
             written = where
     if trouble is not None:
         raise trouble
@@ -270,10 +270,10 @@ def _guided(
             robot.positions(args.positions, elsewhere)
         true = info.simulated and args.positions in (TRUE_POSE, full_key(robot_id, TRUE_POSE))
         try:
-            found = guide(
+            calibration = guide(
                 name, made, prompt, robot.ride, simulated=info.simulated, true_positions=true
             )
-            return found, config
+            return calibration, config
         except KeyboardInterrupt:
             raise GuideError("the operator ended the drive. No file was written") from None
 

@@ -84,7 +84,7 @@ def one_robot_only_text(
     the robot, such as " --connect ADDRESS".
     """
     typed = " ".join(["acsard call", service, *(f"{value:g}" for value in values), "--id"])
-    each = [one for one in ids if one != "*"] or ["robot1"]
+    each = [robot for robot in ids if robot != "*"] or ["robot1"]
     more = "" if "*" not in ids else "; `acsard fleet` lists the ids"
     return (
         f"only stop can be called on several robots at once: before {service}, a person must look "
@@ -97,6 +97,6 @@ def _stop_all(robot: Client, ids: tuple[str, ...], *, as_json: bool) -> int:
     # First stop every named robot without waiting for answers. `of_each` may first look up which
     # robots are present, which would delay the stop.
     robot_discovery.stop(robot.session, ids, robot.caller)
-    replies = of_each(robot, ids, lambda one: one.call("stop"))
+    replies = of_each(robot, ids, lambda client: client.call("stop"))
     silence = "NO ANSWER: go to the robot, or use its emergency switch ({error})"
     return print_each(replies, robot, ids, silence, as_json=as_json)

@@ -125,12 +125,12 @@ def tables(
     dotted keys, such as "mcu.port", to values, which replace those in `before`. A key with the
     value None is ignored.
     """
-    given = {table: dict(values) for table, values in before.items()}
+    result = {table: dict(values) for table, values in before.items()}
     for key, value in options.items():
         if value is not None:
             table, _, name = key.partition(".")
-            given.setdefault(table, {})[name] = value
-    return given
+            result.setdefault(table, {})[name] = value
+    return result
 
 
 OPTIONS = {
@@ -159,12 +159,12 @@ def load(path: str | None, options: Mapping[str, object] | None = None) -> tuple
             with the value None is ignored.
     """
     where, text = find(path)
-    given = tables(options or {}, by_environment())
+    overrides = tables(options or {}, by_environment())
     typed = {key: OPTIONS[key] for key, value in (options or {}).items() if value is not None}
     try:
-        return where, configuration.parse(text, given)
+        return where, configuration.parse(text, overrides)
     except ConfigError as error:
-        places = [typed.get(re.split(r"[ :\[]", one)[0], where) for one in error.problems]
+        places = [typed.get(re.split(r"[ :\[]", message)[0], where) for message in error.problems]
         for place, problem in zip(places, error.problems, strict=True):
             others = [f"{key} is from {name}" for key, name in typed.items() if key in problem]
             note = f" ({', '.join(others)})" if others and place == where else ""
@@ -183,6 +183,6 @@ def with_record_directory(config: Config) -> Config:
     """
     # The path is absolute because a client that receives it over the bus may run in another working
     # directory.
-    told = config.record.directory or os.environ.get(RECORD_VARIABLE, "")
-    directory = os.path.abspath(told) if told else ""
+    path = config.record.directory or os.environ.get(RECORD_VARIABLE, "")
+    directory = os.path.abspath(path) if path else ""
     return replace(config, record=replace(config.record, directory=directory))

@@ -174,22 +174,22 @@ def explained(
     come, end, looked = Event(), Event(), Event()
     began_s = time.monotonic()
 
-    def say(found: str) -> bool:
-        if found and not come.is_set():
-            print(f"acsard: {printable(found)}", file=sys.stderr, flush=True)
-        return bool(found)
+    def say(reason: str) -> bool:
+        if reason and not come.is_set():
+            print(f"acsard: {printable(reason)}", file=sys.stderr, flush=True)
+        return bool(reason)
 
     def tell() -> None:
         try:
-            told = not come.wait(min(after_s, timeout_s)) and say(look())
+            reported = not come.wait(min(after_s, timeout_s)) and say(look())
         finally:
             looked.set()
         while ceased is not None and not end.wait(after_s):
             if come.is_set():
                 come.clear()
-                told = False
-            elif not told:
-                told = say(ceased())
+                reported = False
+            elif not reported:
+                reported = say(ceased())
 
     Thread(target=tell, name="waiting", daemon=True).start()
     try:
@@ -220,11 +220,11 @@ def silence_explained(
 
 def _none_yet(robot: Client, key: str) -> str:
     where = robot.where
-    seen = presence(robot.session, where.robot_id, where.endpoint)
-    if seen is None:
+    status = presence(robot.session, where.robot_id, where.endpoint)
+    if status is None:
         return ""
-    reason = "" if seen.linked else _of_link(where)
-    reason = reason or explain_silence(key, where.robot_id, where.endpoint, seen)
+    reason = "" if status.linked else _of_link(where)
+    reason = reason or explain_silence(key, where.robot_id, where.endpoint, status)
     return f"waiting for messages on {robot.key(key)}: {reason}"
 
 
@@ -234,8 +234,8 @@ def _ceased(robot: Client) -> str:
             return ""
     except zenoh.ZError:
         return ""  # the session is being closed
-    where, gone = robot.where, Presence(linked=False, here=False)
-    return _of_link(where) or explain_silence("", where.robot_id, where.endpoint, gone)
+    where, status = robot.where, Presence(linked=False, here=False)
+    return _of_link(where) or explain_silence("", where.robot_id, where.endpoint, status)
 
 
 def _of_link(where: Address) -> str:

@@ -81,8 +81,8 @@ def main(args: argparse.Namespace) -> int:
         for key in args.topic:
             if key not in KEYS:
                 raise UsageError(f"{key} cannot be in a CSV log; --csv takes {', '.join(KEYS)}")
-        with connected(args) as robot, silence_explained(robot, topic, args.timeout) as heard:
-            return _record(robot, args.topic, args.n, args.timeout, heard)
+        with connected(args) as robot, silence_explained(robot, topic, args.timeout) as on_message:
+            return _record(robot, args.topic, args.n, args.timeout, on_message)
     if len(args.topic) > 1:
         raise UsageError(
             "several keys can only be printed as one CSV log: add --csv, or name one key"
@@ -101,8 +101,8 @@ def main(args: argparse.Namespace) -> int:
             print(f"acsard: {why}. Waiting.", file=sys.stderr)
             # The reason for the silence has just been printed.
             unexplained = ""
-        with silence_explained(robot, unexplained, args.timeout) as heard:
-            return _print(samples, short_form, quota, bool(many), args.timeout, heard)
+        with silence_explained(robot, unexplained, args.timeout) as on_message:
+            return _print(samples, short_form, quota, bool(many), args.timeout, on_message)
 
 
 class Quota:
@@ -128,7 +128,7 @@ class Quota:
     def used_up(self) -> bool:
         if self._most is None:
             return False
-        return all(self._counts.get(one) == self._most for one in self._robots or self._counts)
+        return all(self._counts.get(robot) == self._most for robot in self._robots or self._counts)
 
 
 def _print(
@@ -137,13 +137,13 @@ def _print(
     quota: Quota,
     of_many: bool,
     timeout: float | None,
-    heard: Callable[[], None],
+    on_message: Callable[[], None],
 ) -> int:
     """Print the messages. Return 0 after Ctrl-C or a used-up `quota`, and 1 if messages cease."""
     printed_s = time.monotonic()
     try:
         for sample in samples:
-            heard()
+            on_message()
             whose = robot_of(str(sample.key_expr)) if of_many else ""
             if quota.take(whose):
                 print(_shown(decoder, *encoded(sample), whose), flush=True)
@@ -161,7 +161,7 @@ def _shortened(key: str) -> Decoder[Any]:
     kinds = {kind.__name__: kind for kind in SHORT_TEXTS}
     topic = by_key(key)
     if topic is None or topic.type not in kinds:
-        known = ", ".join(one.key for one in TOPICS if one.type in kinds)
+        known = ", ".join(entry.key for entry in TOPICS if entry.type in kinds)
         raise UsageError(f"{key} has no short form, only JSON; these keys have one: {known}")
     return Decoder(MESSAGES[topic.type])
 
@@ -169,11 +169,11 @@ def _shortened(key: str) -> Decoder[Any]:
 def _shown(decoder: Decoder[Any] | None, encoding: str, payload: bytes, whose: str) -> str:
     if decoder is not None:
         try:
-            told = short(decoder.decode(encoding, payload))
+            text = short(decoder.decode(encoding, payload))
         except DecodeError:
             pass
         else:
-            return formatting.printable(f"{whose}: {told}" if whose else told)
+            return formatting.printable(f"{whose}: {text}" if whose else text)
     line = json_line(encoding, payload)
     return of_robot(whose, line) if whose else formatting.json_line(line)
 
@@ -183,7 +183,7 @@ def _record(
     keys: list[str],
     most: int | None,
     timeout: float | None,
-    heard: Callable[[], None],
+    on_message: Callable[[], None],
 ) -> int:
     queues = [(key, robot.subscribe(key), decoder(key)) for key in keys]
     reported = set[str]()
@@ -195,7 +195,7 @@ def _record(
                 return int(Exit.FAILURE)
             for key, queue, reader in queues:
                 while (sample := queue.try_recv()) is not None and count != most:
-                    heard()
+                    on_message()
                     try:
                         line = row(reader.decode(*encoded(sample)), clock.now().wall_ns)
                     except (DecodeError, ValueError) as error:
@@ -227,7 +227,7 @@ def _expected(robot: Client, ids: tuple[str, ...]) -> Collection[str]:
     there: list[str] = []
     try:
         there = running_robots(robot.session, ids, robot.where.endpoint)
-        missing = [one for one in ids if one not in there and one != ALL_ROBOTS]
+        missing = [robot_id for robot_id in ids if robot_id not in there and robot_id != ALL_ROBOTS]
         words = f"following {', '.join(there) or 'no robot yet'}"
         words += f"; not present: {', '.join(missing)}" if missing else ""
     except NoAnswerError as error:

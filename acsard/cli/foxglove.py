@@ -49,8 +49,8 @@ def main(args: argparse.Namespace) -> int:
         try:
             may = "; Foxglove can show and stop the robot. To drive it from Foxglove, add --drive"
             where = f"ws://{address[0]}:{address[1]}: connect Foxglove to this address"
-            told = f"{robot.where.robot_id} at {where}{'' if args.drive else may}"
-            print(told, flush=True)
+            text = f"{robot.where.robot_id} at {where}{'' if args.drive else may}"
+            print(text, flush=True)
             bridge.run()
         finally:
             bridge.close()

@@ -30,8 +30,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    given = {"robot.id": args.id or None, "ros.namespace": args.namespace}
-    where, config = load(args.config, given)
+    overrides = {"robot.id": args.id or None, "ros.namespace": args.namespace}
+    where, config = load(args.config, overrides)
     if not config.bus.outside:
         raise UsageError(
             f"{where} has no tls/ endpoint in bus.listen: `acsard tls init --write FILE` adds one",

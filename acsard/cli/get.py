@@ -37,17 +37,17 @@ def main(args: argparse.Namespace) -> int:
             if ALL_ROBOTS in many
             else many
         )
-        for one in wanted:
+        for robot_id in wanted:
             try:
-                line = json_line(*robot.sibling(one).reply(args.key))
+                line = json_line(*robot.sibling(robot_id).reply(args.key))
             except AcsardError as error:
                 silent += 1
-                print(printable(f"{one}: NO ANSWER: {error}"), file=sys.stderr)
+                print(printable(f"{robot_id}: NO ANSWER: {error}"), file=sys.stderr)
                 continue
-            _show(of_robot(one, line))
+            _show(of_robot(robot_id, line))
     return int(Exit.UNREACHABLE if silent else Exit.OK)
 
 
 def _show(line: str) -> None:
-    shown = msgspec.json.format(line, indent=2) if sys.stdout.isatty() else line
-    print(formatting.json_line(shown))
+    text = msgspec.json.format(line, indent=2) if sys.stdout.isatty() else line
+    print(formatting.json_line(text))

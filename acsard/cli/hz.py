@@ -37,11 +37,11 @@ def main(args: argparse.Namespace) -> int:
     require_followed(args.topic)
     times: deque[float] = deque(maxlen=MAX_TIMES)
     left = args.n
-    with connected(args) as robot, silence_explained(robot, args.topic) as heard:
+    with connected(args) as robot, silence_explained(robot, args.topic) as on_message:
 
         def take(_: zenoh.Sample) -> None:
             times.append(time.monotonic())
-            heard()
+            on_message()
 
         subscriber = robot.listen(args.topic, take)
         try:

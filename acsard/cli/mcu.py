@@ -73,8 +73,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    given = {"mcu.port": args.port, "mcu.baud_rate": args.baud_rate}
-    where, config = load(args.config, given)
+    overrides = {"mcu.port": args.port, "mcu.baud_rate": args.baud_rate}
+    where, config = load(args.config, overrides)
     _, configured = load(args.config)
     if args.write:
         writable(args.config)
@@ -126,13 +126,13 @@ def _checked(
         except MendableError as error:
             # Print the findings of the long check before the error.
             trouble = error
-    found = report(port, findings, found_changes, written, str(trouble or ""), why)
-    prompt.result(msgspec.json.encode(found).decode() if args.json else summary(found, where))
+    result = report(port, findings, found_changes, written, str(trouble or ""), why)
+    prompt.result(msgspec.json.encode(result).decode() if args.json else summary(result, where))
     if trouble is not None:
         raise trouble
     if found_changes and not args.write:
         prompt.offer(args.config, found_changes)
-    return int(Exit.OK if found.passed else Exit.FAILURE)
+    return int(Exit.OK if result.passed else Exit.FAILURE)
 
 
 def _prompt(args: argparse.Namespace, port: str) -> TerminalPrompt | NoPrompt | JsonPrompt:

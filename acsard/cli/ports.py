@@ -23,14 +23,14 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    found = serial_devices()
+    ports = serial_devices()
     if args.json:
-        print(msgspec.json.encode(found).decode())
-        return 0 if found else 1
-    if not found:
+        print(msgspec.json.encode(ports).decode())
+        return 0 if ports else 1
+    if not ports:
         print(f"no serial ports: {NO_PORT_ADVICE}", file=sys.stderr)
         return 1
-    for port in found:
+    for port in ports:
         kind = " ".join(filter(None, [port.usb_id, port.driver, port.description]))
         print(f"{port.device}  {kind}".rstrip())
         if port.board:
@@ -39,13 +39,13 @@ def main(args: argparse.Namespace) -> int:
             print(f"    also        {name}")
         for holder in port.holders:
             print(f"    held by     {holder.name} (pid {holder.pid})")
-    if not any(port.usb_id for port in found):
+    if not any(port.usb_id for port in ports):
         print(
             f"none of these ports is a USB port, so acsard finds no board: {NO_PORT_ADVICE}",
             file=sys.stderr,
         )
         return 0
-    likely = [port for port in found if port.board]
+    likely = [port for port in ports if port.board]
     if not likely:
         print(
             "no port has the USB id of a common board: unplug the board and run this again; the "

@@ -106,15 +106,15 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     _own_config(parser, None)
     _times(parser, None, TIME_EXAMPLES)
     actions = parser.add_subparsers(title="subcommands", metavar="SUBCOMMAND")
-    shown = actions.add_parser(
+    view = actions.add_parser(
         "show",
         help="print the events of a recording as text",
         description="Print the events of a recording as text, one line per event. A line `gap` "
         "shows where steps are missing, for example because the file is damaged; the exit code is "
         "still 0.",
     )
-    shown.add_argument("--json", action="store_true", help="print each event as a line of JSON")
-    shown.set_defaults(main=main_show)
+    view.add_argument("--json", action="store_true", help="print each event as a line of JSON")
+    view.set_defaults(main=main_show)
     replay = actions.add_parser(
         "replay",
         help="run the recorded inputs through the program again, without a robot, and compare the "
@@ -153,10 +153,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
     report.set_defaults(main=main_report)
     number = "the recording's number in the list of `acsard recording`"
-    one = f"file of a recording, or {number} (default: the newest recording)"
+    file = f"file of a recording, or {number} (default: the newest recording)"
     default = "the newest recording, or all if --from or --to is a date or a time"
     several = f"file of a recording, {number}, or `all` (default: {default})"
-    for action, words in ((shown, several), (replay, one), (exported, several), (report, several)):
+    for action, words in ((view, several), (replay, file), (exported, several), (report, several)):
         action.add_argument("file", nargs="?", metavar="FILE", help=words)
     for action, name, default in (
         (
@@ -178,13 +178,13 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         )
     for action in (recover, exported, report):
         action.add_argument("--force", action="store_true", help="overwrite an existing file")
-    for action in (shown, exported, report):
+    for action in (view, exported, report):
         _times(action, argparse.SUPPRESS, f"{ALL_EXAMPLES} (not with FILE `all`)")
-    for action in (shown, replay, recover, exported, report):
+    for action in (view, replay, recover, exported, report):
         _directory(action, argparse.SUPPRESS)
     # `replay` and `export` do not get this option. Their own option --config names a configuration
     # to try, and not the one that names the directory of the recordings.
-    for action in (shown, recover, report):
+    for action in (view, recover, report):
         _own_config(action, argparse.SUPPRESS)
 
 
@@ -274,8 +274,8 @@ def _row(path: Path, end: EndRecord, note: str) -> tuple[str, ...]:
     began = clock(end.wall_ns / 1e9, day=True)
     seconds, size = (end.last_ns - end.wall_ns) / 1e9, path.stat().st_size / 1000
     mark = "! " if is_serious(end.said) or end.cut in CRASH_CUTS else "  "
-    said = end.said + _bracketed(ending_text(end.cut, end.why)) + _bracketed(note)
-    return path.name, began, f"{seconds:.0f} s", f"{size:.0f} kB", mark + printable(said).strip()
+    text = end.said + _bracketed(ending_text(end.cut, end.why)) + _bracketed(note)
+    return path.name, began, f"{seconds:.0f} s", f"{size:.0f} kB", mark + printable(text).strip()
 
 
 def _bracketed(text: str) -> str:
@@ -311,7 +311,7 @@ def _is_being_recorded(recording: Recording) -> bool:
 def _show(recording: Recording, part: Span, as_json: bool) -> bool:
     """Print the events in the time span `part`, and return whether `part` contains steps."""
     story = TimelineWriter(_config_of(recording))
-    found, over = False, False
+    has_steps, over = False, False
     for step in steps(recording):
         if over:
             # Read the remaining steps too, so that `recording.missing_text` covers the whole
@@ -319,16 +319,16 @@ def _show(recording: Recording, part: Span, as_json: bool) -> bool:
             continue
         seconds = (step.inputs.now.mono_ns - recording.about.mono_ns) / NS_PER_S
         over = seconds > part.end
-        entries = list(story.end() if over and found else story.step(step))
-        if part.begin <= seconds <= part.end or (over and found):
-            found = True
+        entries = list(story.end() if over and has_steps else story.step(step))
+        if part.begin <= seconds <= part.end or (over and has_steps):
+            has_steps = True
             for entry in entries:
                 _tell(entry, as_json)
-    if over or (part.begin > 0.0 and not found):
-        return found
+    if over or (part.begin > 0.0 and not has_steps):
+        return has_steps
     for entry in story.end("" if _is_being_recorded(recording) else recording.ending):
         _tell(entry, as_json)
-    return found
+    return has_steps
 
 
 def _config_of(recording: Recording) -> Config | None:
@@ -343,13 +343,13 @@ def _note(recording: Recording, note: str) -> None:
         print(f"{recording.path}: {note.strip()}", file=sys.stderr)
 
 
-def _tell(one: TimelineEntry, as_json: bool) -> None:
+def _tell(entry: TimelineEntry, as_json: bool) -> None:
     if as_json:
-        print(json_line(msgspec.json.encode(one).decode()))
+        print(json_line(msgspec.json.encode(entry).decode()))
     else:
-        mark = {"warning": "! ", "error": "!! "}.get(one.level, "")
-        at = f"{date(one.seconds)} {clock(one.seconds)}"
-        words = f"{at}  {mark}{one.name.replace('_', ' ')}: {one.sentence}"
+        mark = {"warning": "! ", "error": "!! "}.get(entry.level, "")
+        at = f"{date(entry.seconds)} {clock(entry.seconds)}"
+        words = f"{at}  {mark}{entry.name.replace('_', ' ')}: {entry.sentence}"
         print(printable(words))
 
 
@@ -507,7 +507,7 @@ def _search(args: argparse.Namespace) -> list[tuple[Recording, Span]]:
         raise RecordingError(
             f"{error} (searched {many(len(files), 'recording')} in {where})"
         ) from None
-    names = [path.name for found in result.found for path in found.recording.paths]
+    names = [path.name for hit in result.found for path in hit.recording.paths]
     looked = f"{len(names)} of {many(len(files), 'recording')} in {where}"
     print(f"{in_words(first, last)}: {looked}: {listed(names, MAX_NAMES)}", file=sys.stderr)
     if result.gaps:
@@ -515,7 +515,7 @@ def _search(args: argparse.Namespace) -> list[tuple[Recording, Span]]:
         print(f"nothing was recorded {gaps}", file=sys.stderr)
     for sentence in result.unreadable:
         print(printable(sentence), file=sys.stderr)
-    return [(found.recording, found.part) for found in result.found]
+    return [(hit.recording, hit.part) for hit in result.found]
 
 
 def _files(args: argparse.Namespace) -> tuple[Path, list[Path]]:

@@ -151,9 +151,9 @@ class Budget(Struct, frozen=True):
         """
         known = [share for share in self.shares if share.basis in bases]
         for size in (_millimetres, _degrees):
-            found = max(known, key=size, default=None)
-            if found is not None and size(found) > 0.0:
-                return found
+            candidate = max(known, key=size, default=None)
+            if candidate is not None and size(candidate) > 0.0:
+                return candidate
         return None
 
     def total(self) -> tuple[float | None, float | None]:
@@ -204,10 +204,10 @@ def budget(received: Received, config: Config, metres: float = BUDGET_DISTANCE_M
     rolled, turned = float(np.abs(moved.distance).sum()), float(np.abs(moved.turn).sum())
     if rolled < LEAST_M and turned < LEAST_RAD:
         return still
-    found = rounding(np.array([line.speeds for line in lines]), moved.period)
-    counts = still.counts or (round(math.tau / found.count) if found.count else 0)
+    errors = rounding(np.array([line.speeds for line in lines]), moved.period)
+    counts = still.counts or (round(math.tau / errors.count) if errors.count else 0)
     creeping = metres / max(rolled, LEAST_M) * moved.seconds / MAX_STEPS
-    driving = Driving(lines, moved, found, model.kinematics, max(STEP_S, creeping), received.gyro)
+    driving = Driving(lines, moved, errors, model.kinematics, max(STEP_S, creeping), received.gyro)
     # `_Model` repeats the steps, in which motion to and fro cancels.
     net, net_turn = np.abs(driving.plain().rows[:, :2]).sum(axis=0).tolist()
     model.rolls = net >= max(LEAST_M, LEAST_SHARE * rolled)
@@ -216,7 +216,7 @@ def budget(received: Received, config: Config, metres: float = BUDGET_DISTANCE_M
         return still
     return replace(
         still, metres=rolled, turned=math.degrees(turned), missing=moved.missing,
-        unseen=moved.unseen, lateness=moved.lateness, quantum=found.quantum, counts=counts,
+        unseen=moved.unseen, lateness=moved.lateness, quantum=errors.quantum, counts=counts,
         still=False, shares=tuple(_causes(received, model, driving, counts)),
     )  # fmt: skip
 
@@ -262,8 +262,8 @@ def _causes(received: Received, model: _Model, driving: Driving, counts: int) ->
     yield share("gaps", basis, plain if counted else driving.missed())
 
     declared = share("slip", "settings", plain, _only(odometry, *NOISE))
-    seen = share("slip", "measured", driving.contradicted())
-    yield max(declared, seen, key=lambda candidate: (_millimetres(candidate), _degrees(candidate)))
+    slip = share("slip", "measured", driving.contradicted())
+    yield max(declared, slip, key=lambda candidate: (_millimetres(candidate), _degrees(candidate)))
 
     kind = _only(odometry, *PARAMETERS)
     basis = "settings" if model.declares_parameters else "unknown"
@@ -343,8 +343,8 @@ class _Model:
         return pose.covariance
 
 
-def _only(odometry: OdometryConfig, *kept: str) -> OdometryConfig:
-    zeros = {name: 0.0 for name in (*NOISE, *PARAMETERS) if name not in kept}
+def _only(odometry: OdometryConfig, *names: str) -> OdometryConfig:
+    zeros = {name: 0.0 for name in (*NOISE, *PARAMETERS) if name not in names}
     return replace(odometry, pose_covariance_diagonal=(0.0,) * 6, **zeros)
 
 

@@ -82,7 +82,7 @@ def line_times(t: Floats, sent: Floats) -> LineTimes:
     asked = _asked(t, sent)
     if asked is None or np.ptp(t) == 0.0:
         return even
-    return min(even, asked, key=lambda found: float(np.mean(np.abs(found.late))))
+    return min(even, asked, key=lambda estimate: float(np.mean(np.abs(estimate.late))))
 
 
 def _even(t: Floats) -> LineTimes:
@@ -130,16 +130,16 @@ def _missing(at: Floats) -> Counts:
     ahead = at - np.arange(count)
     padded = np.concatenate([ahead, np.full(UNDELAYED_LINES, np.inf)])
     earliest = np.lib.stride_tricks.sliding_window_view(padded, UNDELAYED_LINES)[:count].min(axis=1)
-    found = np.zeros(count, dtype=np.int64)
+    counts = np.zeros(count, dtype=np.int64)
     usual = float(earliest[0])
     for i, now in enumerate(earliest.tolist()):
         over = now - usual
         if over >= LOST_LINE_PERIODS:
-            found[i] = round(over)
+            counts[i] = round(over)
             usual += round(over)
         else:
             usual += DELAY_GAIN * over
-    return found
+    return counts
 
 
 BLOCK_S = 0.5
@@ -228,7 +228,7 @@ def motion(lines: list[Line], sent: Floats, kinematics: Kinematics, whole: bool)
             lost only if the odometry of the daemon has a gap too.
     """
     t = np.array([line.at for line in lines])
-    found = line_times(t, sent)
+    times = line_times(t, sent)
     twists = [kinematics.twist(WheelSpeeds(*line.speeds)) for line in lines]
     rolled = [
         kinematics.twist(WheelSpeeds(*np.subtract(b.positions, a.positions).tolist()))
@@ -239,12 +239,12 @@ def motion(lines: list[Line], sent: Floats, kinematics: Kinematics, whole: bool)
         t, np.array([line.speeds for line in lines]), np.array(turns),
         np.array([line.yaw_variance for line in lines]),
     )  # fmt: skip
-    filled, unfilled, missing, unseen = _gaps(t, twists, rolled, found, whole)
-    late = _late(t, twists, found)
+    filled, unfilled, missing, unseen = _gaps(t, twists, rolled, times, whole)
+    late = _late(t, twists, times)
     late[unfilled.any(axis=1)] = 0.0
     return Motion(
-        float(t[-1] - t[0]), found.period, np.array([one.linear for one in rolled]),
-        np.array(turns), growth, late, float(np.sqrt(np.mean(found.late**2))), filled,
+        float(t[-1] - t[0]), times.period, np.array([twist.linear for twist in rolled]),
+        np.array(turns), growth, late, float(np.sqrt(np.mean(times.late**2))), filled,
         unfilled, missing, unseen,
     )  # fmt: skip
 
@@ -275,21 +275,21 @@ def _noise(t: Floats, speeds: Floats, turns: Floats, variances: Floats) -> Float
     return np.where(moves, max(0.0, rate) * dt, 0.0)
 
 
-def _late(t: Floats, twists: list[Twist], found: LineTimes) -> Floats:
+def _late(t: Floats, twists: list[Twist], times: LineTimes) -> Floats:
     # A wrong stamp changes the interval dt before a line, and thus the distance, which is speed
     # times dt. It changes the next interval by the opposite amount. Summation by parts gives each
     # line one error: the delay of the line times (speed in this line - speed in the next line).
-    speeds = np.array([(one.linear, one.angular) for one in twists])
-    near = np.abs(found.late) <= MAX_DELAY_S
+    speeds = np.array([(twist.linear, twist.angular) for twist in twists])
+    near = np.abs(times.late) <= MAX_DELAY_S
     # A constant delay causes no error, so subtract the mean delay.
-    late = np.where(near, found.late - found.late[near].mean(), 0.0)
+    late = np.where(near, times.late - times.late[near].mean(), 0.0)
     parts = np.zeros((len(t) - 1, 2))
     parts[:-1] = -late[1:-1, None] * np.diff(speeds[1:], axis=0)
     return parts
 
 
 def _gaps(
-    t: Floats, twists: list[Twist], rolled: list[Twist], found: LineTimes, whole: bool
+    t: Floats, twists: list[Twist], rolled: list[Twist], times: LineTimes, whole: bool
 ) -> tuple[Floats, Floats, int, float]:
     """Compute the errors that lost feedback lines cause.
 
@@ -308,7 +308,7 @@ def _gaps(
     lost, unseen = 0, 0.0
     gaps = Gaps()
     gaps.interrupt(twists[0])
-    for k, (moved, missing) in enumerate(zip(rolled, found.missing[1:].tolist(), strict=True)):
+    for k, (moved, missing) in enumerate(zip(rolled, times.missing[1:].tolist(), strict=True)):
         before, after, dt = twists[k], twists[k + 1], float(t[k + 1] - t[k])
         mean = Twist((before.linear + after.linear) / 2, (before.angular + after.angular) / 2)
         moves = moved != Twist() or after == Twist()
@@ -319,18 +319,18 @@ def _gaps(
             unfilled[k] = dt * mean.linear, dt * mean.angular, along, yaw
             gaps.interrupt(after)
         elif missing and whole:
-            seconds = missing * found.period
+            seconds = missing * times.period
             unseen += seconds
             lost += missing
             # The odometry may have filled the gap with another motion than the motion at the mean
             # of the speeds before and after the gap.
-            off = moved.linear - after.linear * found.period - mean.linear * seconds
-            turned = moved.angular - after.angular * found.period - mean.angular * seconds
+            off = moved.linear - after.linear * times.period - mean.linear * seconds
+            turned = moved.angular - after.angular * times.period - mean.angular * seconds
             along, yaw = gaps.unseen(seconds, before, after)
             filled[k] = along + off * off, yaw + turned * turned
             gaps.interrupt(after)
         else:
-            gaps.follow(after, found.period)
+            gaps.follow(after, times.period)
     return filled, unfilled, lost, unseen
 
 
@@ -403,7 +403,7 @@ def _runs(values: Floats) -> Floats:
     # Of n equal speeds in a row, the last one has the variance n^2, and the others have 0. If the
     # wheel passed through this speed while it became faster or slower, the last one has the
     # variance 1.
-    found = np.zeros(len(values))
+    variances = np.zeros(len(values))
     ends = np.append(np.flatnonzero(np.diff(values)), len(values) - 1)
     starts = np.append(0, ends[:-1] + 1)
     for start, end in zip(starts.tolist(), ends.tolist(), strict=True):
@@ -413,14 +413,14 @@ def _runs(values: Floats) -> Floats:
         if start > 0 and end + 1 < len(values):
             before, after = values[start - 1] - values[start], values[end + 1] - values[start]
             length = 1 if before * after < 0.0 else length
-        found[end] = length**2
-    return found
+        variances[end] = length**2
+    return variances
 
 
 def _quantum(speeds: Floats) -> float:
     # Count each value once, because its repetitions do not add evidence.
-    seen = np.unique(np.abs(speeds[speeds != 0.0]))
-    return quantization_step(seen) if len(seen) >= MIN_VALUES else 0.0
+    sizes = np.unique(np.abs(speeds[speeds != 0.0]))
+    return quantization_step(sizes) if len(sizes) >= MIN_VALUES else 0.0
 
 
 class Steps(Struct, frozen=True):
@@ -492,12 +492,12 @@ class Driving:
 
     def rounded(self) -> Steps:
         """Return the steps with the errors that the rounding of reported speeds causes."""
-        found = self._rounding
-        if found.count:
-            return self._steps(missed=self._of_wheels(found.offset[1:]))
-        roots = np.sqrt(found.variance[1:])
+        errors = self._rounding
+        if errors.count:
+            return self._steps(missed=self._of_wheels(errors.offset[1:]))
+        roots = np.sqrt(errors.variance[1:])
         variances = [
-            np.einsum("ki,ij,kj->k", roots * row, found.equal_errors, roots * row)
+            np.einsum("ki,ij,kj->k", roots * row, errors.equal_errors, roots * row)
             for row in self._weights
         ]
         return self._steps(np.column_stack(variances))
@@ -527,8 +527,8 @@ class Driving:
     ) -> Steps:  # fmt: skip
         moved, count = self._motion, len(self._motion.distance)
         errors = [
-            np.zeros((count, width)) if given is None else given.reshape(count, width)
-            for given, width in ((variances, 2), (missed, 4), (gyro, 1))
+            np.zeros((count, width)) if error is None else error.reshape(count, width)
+            for error, width in ((variances, 2), (missed, 4), (gyro, 1))
         ]
         if self._gyro:
             # The gyro determines the heading, so wheel errors do not affect it.

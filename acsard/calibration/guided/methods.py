@@ -100,8 +100,8 @@ def turns(setup: Setup, rate: float, track: float, most: int) -> int:
     `rate` is the true turn rate, rad/s. `track` is the ratio of effective track to wheel
     separation.
     """
-    one = setup.turn(2 * math.pi, rate, track).seconds
-    return max(1, min(most, int(MAX_SPIN_S / one)))
+    turn_s = setup.turn(2 * math.pi, rate, track).seconds
+    return max(1, min(most, int(MAX_SPIN_S / turn_s)))
 
 
 # The method "tape": a tape measure, and a straight line on the floor.

@@ -279,7 +279,7 @@ class RobotOnBus:
         return False
 
     def _drive(self, driver: LegDriver, recorder: Recorder) -> None:
-        begun = sent = shown = clock.steady_s()
+        begun = sent = display_s = clock.steady_s()
         last = None
         while not driver.over:
             for key in self._prompt.keys(POLL_PERIOD_S):
@@ -291,9 +291,9 @@ class RobotOnBus:
             if command != last or now - sent >= period:
                 self._client.send(command.linear, command.angular)
                 last, sent = command, now
-            if now - shown > DISPLAY_PERIOD_S:
+            if now - display_s > DISPLAY_PERIOD_S:
                 self._prompt.progress(driver.progress(now))
-                shown = now
+                display_s = now
         self._prompt.progress(1.0)
 
     def _receive(self, driver: LegDriver, recorder: Recorder, now: float) -> None:

@@ -115,7 +115,7 @@ def guide(
             f"{again + 1}{back}."
         )
         if method.tool and again == number and (since := angle_before(leg)):
-            (before,) = [one for one in legs if one.name == since]
+            (before,) = [candidate for candidate in legs if candidate.name == since]
             ask_for(since, before.asks)
         return again
 
@@ -137,13 +137,13 @@ def guide(
             if measure.quantity == "turned":
                 track = track_ratio(made, setup.drive)
     if method.tool:
-        taken = [made for leg in legs for made in readings[leg.name]]
-        found = calibrated(method.tool, taken, setup.drive, setup.odometry)
+        all_readings = [made for leg in legs for made in readings[leg.name]]
+        result = calibrated(method.tool, all_readings, setup.drive, setup.odometry)
         follows = response(list(rides.values()), setup.drive, setup.feedback)
         if follows is None:
-            return found
-        notes = (*follows.sentences(), *found.notes)
-        return replace(found, notes=notes, feedback=follows.settings())
+            return result
+        notes = (*follows.sentences(), *result.notes)
+        return replace(result, notes=notes, feedback=follows.settings())
     metres = answers.get((STRAIGHT_LEG, "metres"), 0.0)
     tape = Tape(metres, STRAIGHT_LEG) if metres >= MIN_TAPE_M else None
     driven = tuple(replace(run, name=name) for name, run in rides.items())

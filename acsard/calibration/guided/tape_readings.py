@@ -189,7 +189,7 @@ def fit_readings(readings: Sequence[Reading], base: Base) -> TapeFit:
     parameters, normal = _solved(readings, base, _starting_parameters(readings, base))
     left, right, inverse = parameters[[Parameter.LEFT, Parameter.RIGHT, Parameter.INVERSE_TRACK]]
     in_range(np.array([1 / inverse, left, right]))
-    compared = [(found, weight) for _, found, weight in _compared(readings, base, parameters)]
+    compared = [(residual, weight) for _, residual, weight in _compared(readings, base, parameters)]
     residuals, weights = np.array(compared).T
     # Combine the scatter of these readings with the assumed noise. If there are few readings, the
     # scatter is uncertain itself, so widen the deviation to that of Student's t.
