@@ -156,7 +156,7 @@ class Rig:
             session = self._session = self._wait(self._connect, f"daemon at {self._endpoint}")
             stack.callback(session.close)
             key = full_key(self._config.robot.id, "odom")
-            self._kept = session.declare_subscriber(key, direct(self._odometry))
+            self._subscriber = session.declare_subscriber(key, direct(self._odometry))
             self._publisher = session.declare_publisher(
                 full_key(self._config.robot.id, f"cmd/{self._config.commands.sources[0].name}"),
                 encoding=encoding_name("msgpack", "Twist"),
@@ -316,7 +316,7 @@ class Rig:
 
     def unsubscribe(self) -> None:
         """Unsubscribe from the odometry, so that no more samples are recorded."""
-        self._kept.undeclare()
+        self._subscriber.undeclare()
 
     def state(self) -> RobotState:
         key = full_key(self._config.robot.id, "state")

@@ -36,7 +36,7 @@ class Lateness:
     """Record of the delays of this computer: the times by which it ran the check too late."""
 
     def __init__(self) -> None:
-        self._seen: list[tuple[float, float]] = []
+        self._delays: list[tuple[float, float]] = []
 
     def look(self, late_s: float, now_s: float) -> None:
         """Record a delay of `late_s` s that ended at the monotonic time `now_s`, s.
@@ -44,14 +44,14 @@ class Lateness:
         A delay that is shorter than `MIN_DELAY_S` is ignored.
         """
         if late_s >= MIN_DELAY_S:
-            self._seen.append((now_s, late_s))
+            self._delays.append((now_s, late_s))
 
     def since(self, began_s: float) -> float:
         """Return the longest delay, s, of those that ended at or after the time `began_s`.
 
         `began_s` is a monotonic time, s. Return 0 if no delay is recorded from then on.
         """
-        return max((late_s for at_s, late_s in self._seen if at_s >= began_s), default=0.0)
+        return max((late_s for at_s, late_s in self._delays if at_s >= began_s), default=0.0)
 
 
 def is_doubtful(result: TimingFinding, late_s: float) -> bool:

@@ -209,7 +209,7 @@ class _Steps:
         seen: list[Restart],
     ) -> None:
         self._board, self._operator, self._tell = board, operator, tell
-        self._seen = seen
+        self._all_restarts = seen
         """All restarts of the board so far. The caller of `all` reads this list afterward."""
         self._channels: list[Channel] = []
         self._late_left = LATE_MOST
@@ -311,10 +311,10 @@ class _Steps:
                 self._tell(self._tried(step))
                 return
             except RestartedError as error:
-                self._seen.append(error.restart)
+                self._all_restarts.append(error.restart)
                 again += 1
-                if again > AGAIN or len(self._seen) >= MOST:
-                    raise StoppedError(restarts.finding(board.mcu, self._seen)) from None
+                if again > AGAIN or len(self._all_restarts) >= MOST:
+                    raise StoppedError(restarts.finding(board.mcu, self._all_restarts)) from None
                 board.saved_results = saved
 
     def _tried(self, step: Step) -> Finding | None:
@@ -344,9 +344,9 @@ class _Steps:
             "the board restarted; this part of the check runs again when the board answers"
         )
         if not board.answers_within(BOOT_S):
-            raise StoppedError(restarts.finding(board.mcu, self._seen, back=False))
+            raise StoppedError(restarts.finding(board.mcu, self._all_restarts, back=False))
         if cause := restarts.cause(board.unrecognized_lines):
-            self._seen[-1] = structs.replace(self._seen[-1], cause=cause)
+            self._all_restarts[-1] = structs.replace(self._all_restarts[-1], cause=cause)
         if board.armed:
             board.rest()
 

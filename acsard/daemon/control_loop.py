@@ -145,14 +145,14 @@ class ControlLoop:
         self._started, self._speed = config.limits, SpeedLimiter(self.robot.config)
         """`_started` has the limits at the daemon's start. `_speed` handles the key
         `speed_limit`."""
-        self._kept: tuple[Latches, LimitsConfig, LimitsConfig, Latches] | None = None
+        self._latches_cache: tuple[Latches, LimitsConfig, LimitsConfig, Latches] | None = None
         """Cache of the method `_to_keep`: the latches and the two sets of limits of its last
         computation, and the result."""
         self._step_answers: tuple[Answer, ...] = ()
         self._answers: deque[tuple[int, Answer]] = deque()
         """Answers that are not sent yet, because the latch file does not contain the newest
         latches. Each answer is paired with the monotonic time at which it was queued, ns."""
-        self._got = NO_INPUT
+        self._bus_input = NO_INPUT
         """The input that the present step has taken from the bus."""
         stop = self.robot.session.codec.stop
         self._guard = Guard(stop, config)
@@ -218,13 +218,15 @@ class ControlLoop:
         `period` says how many periods have ended since the last step. For an extra step between the
         ends of two periods, it is `NO_PERIOD`.
         """
-        self._got = NO_INPUT
+        self._bus_input = NO_INPUT
         try:
             return self._step(now, period)
         except Exception:
             # Store the stops that this step has taken from the bus. The exception may have come
             # before the robot processed them.
-            self._handover.take_stops(self._to_keep(self.robot.latches), _stops(self._got), now)
+            self._handover.take_stops(
+                self._to_keep(self.robot.latches), _stops(self._bus_input), now
+            )
             raise
 
     def _step(self, now: Instant, period: Period) -> Outputs:
@@ -321,12 +323,12 @@ class ControlLoop:
         if file is not None:
             latches = file.latches(latches, now)
         if self._speed.lowers:
-            limits, cache = self._started if file is None else file.limits, self._kept
+            limits, cache = self._started if file is None else file.limits, self._latches_cache
             if cache is None or not (
                 cache[0] is latches and cache[1] is now and cache[2] is limits
             ):
                 without = replace(latches, lowered=lowered(limits, now))
-                cache = self._kept = latches, now, limits, without
+                cache = self._latches_cache = latches, now, limits, without
             latches = cache[3]
         last = self._handover.latches
         # Return the last object if nothing has changed, because the keeper writes its file again
@@ -357,7 +359,7 @@ class ControlLoop:
     ) -> tuple[tuple[Command, ...], tuple[Refusal, ...], tuple[Request, ...]]:
         # Before the first step there are no outputs with which to answer queries. The bus then
         # returns at most one slow query, whose answer needs no outputs.
-        batch = self._got = self._bus.take(QUERIES_PER_STEP if self.outputs else 0)
+        batch = self._bus_input = self._bus.take(QUERIES_PER_STEP if self.outputs else 0)
         if batch is NO_INPUT:
             return (), (), ()
         commands: list[Command] = []

@@ -130,7 +130,7 @@ class SettingsFile:
         file since its start has the new value."""
         self._no_thread = ""
         """The reason why the thread could not be started, or "" if it runs."""
-        self._kept: tuple[Latches, LimitsConfig, LimitsConfig, Latches] | None = None
+        self._latches_cache: tuple[Latches, LimitsConfig, LimitsConfig, Latches] | None = None
         """Cache of the method `latches`: the two arguments of its last computation, the value of
         `_limits` at that time, and the result."""
 
@@ -281,12 +281,12 @@ class SettingsFile:
         file = self._limits
         if file is self._started:
             return latches
-        cache = self._kept
+        cache = self._latches_cache
         # Return the same object for the same arguments, because the latch file is written again for
         # each new object.
         if cache is None or not (cache[0] is latches and cache[1] is now and cache[2] is file):
             result = replace(latches, lowered=lowered(file, now))
-            cache = self._kept = latches, now, file, result
+            cache = self._latches_cache = latches, now, file, result
         return cache[3]
 
     def close(self) -> None:

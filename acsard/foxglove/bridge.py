@@ -78,7 +78,7 @@ class Bridge:
         self._token = robot.session.liveliness().declare_subscriber(key, self._alive, history=True)
         facts = learn(robot)
         ros = facts.config.ros
-        self._shown = Shown(self._wake.set)
+        self._shown_topics = Shown(self._wake.set)
         self._settings = Settings(robot, self._notices, facts.tables, self._wake.set)
         topic = full_name(ros.namespace, "cmd_vel")
         self._drives = Drives(self._viewer, topic, self._notices, facts.forbidden)
@@ -90,7 +90,7 @@ class Bridge:
         """Reason why the viewers cannot see the commands of other programs, in words. It is "" if
         they can see these commands, or after the reason has been sent to the viewers."""
         logging.getLogger("foxglove").addHandler(Refusals(self._notices))
-        listener = Listener(self._shown, self._drives, self._settings)
+        listener = Listener(self._shown_topics, self._drives, self._settings)
         offered = services(robot, ros, DRIVE_SERVICES if acts else OPEN_SERVICES)
         self._server = start(f"acsard {self._id}", address, listener, offered, context, acts=acts)
         self._objections: dict[int, Objections] = {}
@@ -144,7 +144,7 @@ class Bridge:
             self._went()
         self._was_here = here
         driving = self._drives.driving()
-        topics, fresh = self._shown.take()
+        topics, fresh = self._shown_topics.take()
         self._relay.follow(topics, fresh)
         if self._commands_hidden_reason and not topics.isdisjoint(self._relay.commanders):
             self._notices.say(

@@ -41,7 +41,7 @@ class EventDeduplicator:
 
     def __init__(self) -> None:
         self._total = self._stamp_ns = 0
-        self._told: list[LogEvent] = []
+        self._reported: list[LogEvent] = []
 
     def of(self, events: Events) -> list[Log]:
         """Return a log message for each event that was in no earlier list.
@@ -49,13 +49,13 @@ class EventDeduplicator:
         After a restart of the daemon, all events are new. If the wall clock was also set back, some
         of them may be left out. A list that is older than an earlier list adds no messages.
         """
-        known, previous, stamp_ns = self._total, self._told, events.stamp.to_ns()
+        known, previous, stamp_ns = self._total, self._reported, events.stamp.to_ns()
         before_ns = self._stamp_ns
         if events.total < known:
             if stamp_ns <= self._stamp_ns:
                 return []  # an older answer that arrived after a published list
             known, previous = 0, []  # the daemon was restarted
-        self._total, self._stamp_ns, self._told = events.total, stamp_ns, events.events
+        self._total, self._stamp_ns, self._reported = events.total, stamp_ns, events.events
         first = len(events.events) - min(events.total - known, len(events.events))
         # The number of new events is wrong if the daemon was restarted and has logged at least as
         # many events as before, so also use the times. Times alone are not enough, because the
@@ -138,7 +138,7 @@ class Commanders:
         self._robot, self._wake = robot, wake
         self._reader, self._commands_hidden = Reader(Config()), False
         self._forms: dict[str, dict[str, CommandForm]] = {}
-        self._heard: dict[str, _Heard] = {}
+        self._subscriptions: dict[str, _Heard] = {}
 
     def use(self, facts: Facts) -> None:
         """Use the command sources, keys and permissions in `facts` from now on.
@@ -164,14 +164,14 @@ class Commanders:
         to receive the commands of other clients.
         """
         wanted = set() if self._commands_hidden else self._forms.keys() & set(topics)
-        for topic in self._heard.keys() - wanted:
-            self._heard.pop(topic).undeclare()
-        for topic in wanted - self._heard.keys():
-            self._heard[topic] = _Heard(self._robot.session, self._forms[topic], self._wake)
+        for topic in self._subscriptions.keys() - wanted:
+            self._subscriptions.pop(topic).undeclare()
+        for topic in wanted - self._subscriptions.keys():
+            self._subscriptions[topic] = _Heard(self._robot.session, self._forms[topic], self._wake)
 
     def take(self) -> Iterator[tuple[str, TwistStamped]]:
         """Yield a pair (topic, command) for each valid command since the last call."""
-        for topic, subscription in self._heard.items():
+        for topic, subscription in self._subscriptions.items():
             for arrival, wall_ns in subscription.take():
                 try:
                     yield topic, self._reader.read(arrival, wall_ns)

@@ -212,13 +212,13 @@ class Listener:
     """The callbacks for requests of viewers. The server runs them on its own threads."""
 
     def __init__(self, shown: Shown, drives: Drives, settings: Settings) -> None:
-        self._shown, self._drives, self._settings = shown, drives, settings
+        self._shown_topics, self._drives, self._settings = shown, drives, settings
 
     def on_subscribe(self, client: Client, channel: ChannelView) -> None:
-        self._shown.add(channel.topic, client.id)
+        self._shown_topics.add(channel.topic, client.id)
 
     def on_unsubscribe(self, client: Client, channel: ChannelView) -> None:
-        self._shown.remove(channel.topic, client.id)
+        self._shown_topics.remove(channel.topic, client.id)
 
     def on_client_advertise(self, client: Client, channel: ClientChannel) -> None:
         self._drives.advertised(

@@ -91,26 +91,26 @@ class Places:
 
     def __init__(self, most: int, per_name: int) -> None:
         self._most, self._per_name = most, per_name
-        self._taken: Counter[str] = Counter()
+        self._counts: Counter[str] = Counter()
 
     @property
     def taken(self) -> int:
-        return self._taken.total()
+        return self._counts.total()
 
     def room(self, name: str) -> bool:
-        return self._taken[name] < self._per_name and self.taken < self._most
+        return self._counts[name] < self._per_name and self.taken < self._most
 
     def enter(self, name: str) -> bool:
         """Take a place for `name` and return True. Return False if no place is free."""
         if not self.room(name):
             return False
-        self._taken[name] += 1
+        self._counts[name] += 1
         return True
 
     def leave(self, name: str) -> None:
-        self._taken[name] -= 1
-        if not self._taken[name]:
-            del self._taken[name]
+        self._counts[name] -= 1
+        if not self._counts[name]:
+            del self._counts[name]
 
     @contextmanager
     def place(self, name: str = "") -> Iterator[bool]:

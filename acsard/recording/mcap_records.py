@@ -442,7 +442,7 @@ class _Chunks:
         """Work that may still be spent on incomplete chunks, in unpacked bytes."""
         self._searched = 0
         """Offset up to which the file was searched for complete chunks, bytes."""
-        self._found: int | None = None
+        self._last_complete: int | None = None
         """Offset of the complete chunk that was found last, bytes, or None."""
 
     @property
@@ -457,16 +457,16 @@ class _Chunks:
 
     def later(self, begin: int) -> int | None:
         """Return the offset of the next complete chunk. `begin` must not decrease between calls."""
-        if self._found is not None and self._found >= begin:
-            return self._found
-        self._found = None
+        if self._last_complete is not None and self._last_complete >= begin:
+            return self._last_complete
+        self._last_complete = None
         for at in chunk_places(self._data, max(begin, self._searched)):
             if self.spent:
                 return None
             self._searched = at + 1
             chunk = self.read(at)
             if chunk is not None and chunk.complete and chunk.messages:
-                self._found = at
+                self._last_complete = at
                 return at
         self._searched = len(self._data)
         return None

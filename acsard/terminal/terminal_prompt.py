@@ -43,7 +43,7 @@ class Screen:
     def __init__(self, as_json: bool = False) -> None:
         self._as_json = as_json
         self._on = sys.stderr.isatty() and not as_json
-        self._shown = False
+        self._visible = False
 
     def __enter__(self) -> Self:
         return self
@@ -63,7 +63,7 @@ class Screen:
             # Cut the line and never wrap it, because a wrapped line cannot be overwritten.
             room = (os.get_terminal_size(sys.stderr.fileno()).columns or 80) - 1
             self._print(f"\r\033[K{f'   ... {text}'[:room]}")
-            self._shown = True
+            self._visible = True
 
     def found(self, finding: Finding) -> None:
         if not self._as_json:
@@ -79,9 +79,9 @@ class Screen:
         return False
 
     def _clear(self) -> None:
-        if self._shown:
+        if self._visible:
             self._print("\r\033[K")
-            self._shown = False
+            self._visible = False
 
     def _print(self, text: str) -> None:
         print(text, end="", file=sys.stderr, flush=True)

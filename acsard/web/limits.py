@@ -308,7 +308,7 @@ class Shares:
 
     def __init__(self, most: int, of_one: int) -> None:
         self._most, self._of_one = most, of_one
-        self._held: defaultdict[Hashable, Counter[str]] = defaultdict(Counter)
+        self._acquired: defaultdict[Hashable, Counter[str]] = defaultdict(Counter)
         """For each resource, the number of times that each holder has acquired it."""
 
     def enter(self, holder: str, thing: Hashable) -> bool:
@@ -317,22 +317,22 @@ class Shares:
         Return False if the limits forbid it. A holder may acquire the same resource several times,
         and must then call `leave` the same number of times.
         """
-        holders = self._held.get(thing)
-        if holders is None and len(self._held) >= self._most:
+        holders = self._acquired.get(thing)
+        if holders is None and len(self._acquired) >= self._most:
             return False
         if not (holders and holder in holders) and self._of(holder) >= self._of_one:
             return False
-        self._held[thing][holder] += 1
+        self._acquired[thing][holder] += 1
         return True
 
     def leave(self, holder: str, thing: Hashable) -> None:
         """Release the resource `thing`. This undoes one successful call of `enter`."""
-        holders = self._held[thing]
+        holders = self._acquired[thing]
         holders[holder] -= 1
         if not holders[holder]:
             del holders[holder]
         if not holders:
-            del self._held[thing]
+            del self._acquired[thing]
 
     def _of(self, holder: str) -> int:
-        return sum(holder in holders for holders in self._held.values())
+        return sum(holder in holders for holders in self._acquired.values())

@@ -265,7 +265,7 @@ class Reports:
         recording. If it is empty, use `acsard recording report --supervised`.
         """
         self._command = command or acsard("recording", "report", "--supervised")
-        self._one: _Drawing | None = None
+        self._drawing: _Drawing | None = None
         self._work: asyncio.Task[None] | None = None
 
     def ask(self, path: Path, stamp: tuple[int, int]) -> ReportState:
@@ -276,7 +276,7 @@ class Reports:
         call draws the report again if the drawing failed, or if the recording has changed since.
         `path` and `stamp` are the results of `BlackBox.found()`.
         """
-        drawing, now_ns = self._one, clock.mono_ns()
+        drawing, now_ns = self._drawing, clock.mono_ns()
         if drawing is not None and not drawing.ended and drawing.path != path:
             return ReportState(
                 "busy",
@@ -287,7 +287,7 @@ class Reports:
             or drawing.path != path
             or (drawing.result_delivered and (drawing.failed or drawing.stamp != stamp))
         ):
-            drawing = self._one = _Drawing(path, stamp)
+            drawing = self._drawing = _Drawing(path, stamp)
             self._work = asyncio.get_running_loop().create_task(self._draw(drawing))
         drawing.asked_ns, drawing.result_delivered = now_ns, drawing.ended
         if drawing.failed:
@@ -303,7 +303,7 @@ class Reports:
         Return None if this report is not finished or not in memory. Each call restarts the time
         `KEEP_REPORT_NS` after which the report is discarded.
         """
-        drawing = self._one
+        drawing = self._drawing
         if drawing is None or drawing.path.name != name or not drawing.packed:
             return None
         drawing.asked_ns = clock.mono_ns()
@@ -315,7 +315,7 @@ class Reports:
         This time is `ABANDONED_NS` while the report is being drawn, and `KEEP_REPORT_NS` after
         that. Call this method once a second.
         """
-        drawing = self._one
+        drawing = self._drawing
         if drawing is None:
             return
         old_ns = clock.mono_ns() - drawing.asked_ns
@@ -326,7 +326,7 @@ class Reports:
         """Stop drawing the report, and discard it."""
         if self._work is not None:
             self._work.cancel()
-        self._one = self._work = None
+        self._drawing = self._work = None
 
     async def _draw(self, drawing: _Drawing) -> None:
         try:

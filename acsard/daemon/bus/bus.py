@@ -58,7 +58,7 @@ class ZenohBus:
         self._inbox = Inbox(prefix, self._replies, sources, waker, config.rate_hz)
         self._outlets, self._links = Outlets(), RouterLinks(config.bus)
         self._session: zenoh.Session
-        self._kept: list[object] = []
+        self._entities: list[object] = []
         """References to the declared Zenoh entities. Zenoh undeclares an entity when nothing refers
         to it."""
 
@@ -149,7 +149,7 @@ class ZenohBus:
         for endpoint in endpoints(ros, zid, left_out(config)):
             self._declare_ros(session, endpoint)
         for token in (self._alive, *claims(ros), *node_tokens(ros, zid)):
-            self._kept.append(session.liveliness().declare_token(token))
+            self._entities.append(session.liveliness().declare_token(token))
         self._outlets.start()
         self._links.start(session)
         return session
@@ -184,10 +184,10 @@ class ZenohBus:
         for topic in offered(self._config):
             key = full_key(self._id, topic.pattern)
             if topic.direction == "in":
-                self._kept.append(session.declare_subscriber(key, direct(inbox.on_sample)))
+                self._entities.append(session.declare_subscriber(key, direct(inbox.on_sample)))
             elif topic.key not in ("alive", json_key("<key>")):
                 on_query = direct(partial(inbox.on_query, topic.key))
-                self._kept.append(session.declare_queryable(key, on_query))
+                self._entities.append(session.declare_queryable(key, on_query))
         for topic in published(self._config):
             key, encoding = full_key(self._id, topic.key), encoding_name("msgpack", topic.type)
             signed = Signature(SIMULATOR_SENDER).pack() if topic.key == IMU else b""
@@ -204,18 +204,18 @@ class ZenohBus:
         # subscribers. A late subscriber can query the key for the newest message instead.
         self._outlets.declare(session, topic.key, key, "json", encoding)
         on_query = direct(partial(self._inbox.on_query, below))
-        self._kept.append(session.declare_queryable(key, on_query))
+        self._entities.append(session.declare_queryable(key, on_query))
 
     def _declare_ros(self, session: zenoh.Session, endpoint: Endpoint) -> None:
         key = endpoint.key
         match endpoint.direction:
             case "in":
                 on_sample = direct(partial(self._inbox.on_ros_sample, endpoint))
-                self._kept.append(session.declare_subscriber(key, on_sample))
+                self._entities.append(session.declare_subscriber(key, on_sample))
             case "query" | "service":
                 on_query = direct(partial(self._inbox.on_ros_query, endpoint))
                 # Clients of rmw_zenoh query only complete queryables.
-                self._kept.append(session.declare_queryable(key, on_query, complete=True))
+                self._entities.append(session.declare_queryable(key, on_query, complete=True))
             case "out":
                 identity = gid(endpoint.token) if endpoint.transport == "rmw" else b""
                 encoding = encoding_name("cdr")
@@ -223,7 +223,7 @@ class ZenohBus:
                     session, endpoint.native, key, "cdr", encoding, endpoint.latched, identity
                 )
         if endpoint.token:
-            self._kept.append(session.liveliness().declare_token(endpoint.token))
+            self._entities.append(session.liveliness().declare_token(endpoint.token))
 
     # Closing the session.
 

@@ -40,7 +40,7 @@ class CertificateFiles:
         before this call, `renewed` would not detect that.
         """
         self._files = authority, certificate, key
-        self._used = self._seen = self._signature()
+        self._used = self._last_signature = self._signature()
         self._due_ns = clock.mono_ns() + FILES_CHECK_PERIOD_NS
 
     def renewed(self) -> bool:
@@ -53,12 +53,16 @@ class CertificateFiles:
         if now_ns < self._due_ns:
             return False
         self._due_ns = now_ns + FILES_CHECK_PERIOD_NS
-        before, self._seen = self._seen, self._signature()
-        if self._seen != before or self._seen == self._used or not self._seen:
+        before, self._last_signature = self._last_signature, self._signature()
+        if (
+            self._last_signature != before
+            or self._last_signature == self._used
+            or not self._last_signature
+        ):
             return False
         if unusable(*self._files):
             return False
-        self._used = self._seen
+        self._used = self._last_signature
         return True
 
     def refused(self) -> str:

@@ -73,7 +73,7 @@ class Outlets:
     def __init__(self) -> None:
         self._outlets: dict[str, list[_Outlet]] = {}
         """Maps the native key of each topic to its outlets."""
-        self._kept: list[object] = []
+        self._listeners: list[object] = []
         """References to Zenoh's listeners. Zenoh ends a listener when nothing refers to it."""
         self._counting = Lock()
         self.wanted: frozenset[str] = frozenset()
@@ -220,7 +220,7 @@ class Outlets:
         def matching(status: zenoh.MatchingStatus) -> None:
             self._count(outlet, status.matching)
 
-        self._kept.append(publisher.declare_matching_listener(direct(matching)))
+        self._listeners.append(publisher.declare_matching_listener(direct(matching)))
         # The listener reports only later changes, so ask whether the key has a subscriber already.
         if publisher.matching_status.matching:
             self._count(outlet, True)
