@@ -125,7 +125,7 @@ async def _play(config: Config, args: argparse.Namespace) -> int:
             _make_link(link, device)
             stack.callback(_remove_link, link, device)
         print(f"acsard run --port {args.link or device}", flush=True)
-        faults = ", ".join((*config.sim.faults, *(fault.name for fault in args.fault))) or "none"
+        faults = ", ".join((*config.sim.faults, *map(str, args.fault))) or "none"
         print(f"simulated MCU on {device}, faults: {faults}; Ctrl-C ends it", file=sys.stderr)
         await ended.wait()
     print(f"the simulated MCU received {mcu.valid_lines} valid lines", file=sys.stderr)

@@ -62,6 +62,15 @@ class NamedFault(Struct, frozen=True):
     name: str
     values: tuple[int | float, ...] = ()
 
+    def __str__(self) -> str:
+        """The fault as a user writes it, such as "bias=a:0.9"."""
+        kinds = ARGUMENTS.get(self.name, "n" * len(self.values))
+        words = [
+            MOTORS[int(value)] if kind == "m" else f"{value:g}"
+            for kind, value in zip(kinds, self.values, strict=True)
+        ]
+        return f"{self.name}={':'.join(words)}" if words else self.name
+
 
 def forms() -> list[str]:
     """Return each fault with arguments as a user writes it, such as "stuck_encoder=MOTOR"."""

@@ -27,7 +27,10 @@ from tests.each import each
         ("reset=5", (5,)),
     ],
 )
-def test_a_fault_is_read_with_its_numbers(text: str, values: tuple[float, ...]) -> None:
+def test_a_fault_is_read_with_its_numbers_and_printed_as_it_was_written(
+    text: str, values: tuple[float, ...]
+) -> None:
+    assert str(named(text)) == text
     assert named(text) == NamedFault(text.partition("=")[0], values)
 
 
