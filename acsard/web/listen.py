@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import socket
 from collections.abc import Sequence
 
@@ -160,7 +161,13 @@ def _open_socket(addr: Listen, next_port: bool, both: bool) -> tuple[Listen, soc
             continue
         opened.setblocking(False)
         return Listen(addr.secure, addr.host, port), opened
+    assert trouble is not None
+    # The text of `create_server` repeats the address as a Python tuple. Errors of names have
+    # negative numbers.
+    number = trouble.errno or 0
+    why = os.strerror(number) if number > 0 else trouble.strerror
     raise InUseError(
-        f"cannot listen at {addr.url}: {trouble}; if another program uses this address, stop that "
-        "program, or choose another address with --address or the setting web.address"
+        f"cannot listen at {addr.url}: {why}; if another program uses this address, such as a "
+        "daemon that serves its page there, stop that program, or choose another address with "
+        "--address or the setting web.address"
     ) from None
