@@ -115,7 +115,7 @@ def lines_to_samples(
     ignored.
 
     Args:
-        said: for each feedback line, its time, ns, and its linear speed, m/s.
+        lines: for each feedback line, its time, ns, and its linear speed, m/s.
         samples: for each odometry sample, its time of arrival, ns, and its linear speed, m/s.
     """
     all_ns = [at_ns for at_ns, _ in lines]

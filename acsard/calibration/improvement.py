@@ -192,7 +192,8 @@ def improvement(
     The errors after the calibration are measured on drives that the fit did not use.
 
     Args:
-        held: the folds. Each contains a drive, and parameters that were fitted without this drive.
+        test_folds: the folds. Each contains a drive, and parameters that were fitted without this
+            drive.
         configured: the parameters with the configured multipliers.
         base: the configured geometry.
         rows: the motion in intervals of about a second. `rows.turned` is 0 if the log has no

@@ -183,7 +183,7 @@ def scaled(
     The correction is the update step of a Kalman filter on the logarithms of the multipliers.
 
     Args:
-        found: the multipliers to correct.
+        prior: the multipliers to correct.
         tape: the distance that was measured.
         names: the names of the runs.
         follow: returns the `Extent` of a run for given multipliers.

@@ -317,10 +317,10 @@ def settings(
     Args:
         known: the standard deviations of the new geometry.
         track: the new multiplier of the wheel separation.
-        kept: the names of the quantities that stay as configured. The possible names are
+        fixed: the names of the quantities that stay as configured. The possible names are
             `plausibility.TRACK` and `plausibility.RATIO`.
         odometry: the configured settings.
-        shown: the noise that the log shows, or None if the noise settings stay as configured.
+        log_noise: the noise that the log shows, or None if the noise settings stay as configured.
         scaled: whether the size of the wheels was measured.
     """
     values, x = {}, np.zeros(SOURCE_COUNT) if log_noise is None else log_noise.found
@@ -369,8 +369,8 @@ def noise(
     Return None if fewer than two drives have residuals.
 
     Args:
-        held: the drives, each with parameters that were fitted without this drive.
-        seen: the sensors of the log.
+        folds: the drives, each with parameters that were fitted without this drive.
+        sensors: the sensors of the log.
         known: the standard deviations of the fitted track and wheel radii.
         odometry: the configured settings.
     """

@@ -178,7 +178,7 @@ def too_inaccurate(
     deviation.
 
     Args:
-        found: the multipliers that were computed from the log.
+        multipliers: the multipliers that were computed from the log.
         track_std: relative standard deviation of the mean track. The track of a single turn varies
             more.
         worst: largest accepted relative standard deviations of `TRACK` and of `RATIO`.

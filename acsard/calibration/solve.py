@@ -97,7 +97,7 @@ class Drives(Struct, frozen=True):
             by_wheels: the robot's turn in each interval of `rows`, rad, computed from the
                 calibrated wheels.
             base: the configured geometry.
-            found: the new multipliers.
+            result: the new multipliers.
             rate: the turn rates of the log.
         """
         size = base.radius * float(result.values[[LEFT_RADIUS, RIGHT_RADIUS]].mean())

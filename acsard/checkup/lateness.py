@@ -19,11 +19,11 @@ MIN_DELAY_S = 0.005
 """Shortest delay of this computer that `Lateness` records, s. Shorter delays are normal."""
 
 MAX_LATENESS_S = motion.LINE_PERIOD_S
-"""Delay of this computer from which a finding is doubtful, s. It is the time between two lines of
-the check. For a finding with the verdict PASS, the limit is `MAX_PAUSE_S`."""
+"""Shortest delay of this computer that can make a finding doubtful, s. It is the time between two
+lines of the check. For a finding with the verdict PASS, the limit is `MAX_PAUSE_S`."""
 
 MAX_PAUSE_S = motion.MIN_WATCHDOG_S
-"""Delay of this computer from which even a finding with the verdict PASS is doubtful, s.
+"""Shortest delay that can make even a finding with the verdict PASS doubtful, s.
 
 During such a delay the board's watchdog may have stopped the motors.
 """

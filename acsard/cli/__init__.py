@@ -16,7 +16,7 @@ import os
 import re
 import sys
 import traceback
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from copy import copy
 from decimal import Decimal
@@ -143,13 +143,13 @@ def parser(called: Collection[str] = VERBS) -> argparse.ArgumentParser:
 
 def main(argv: list[str] | None = None) -> int:
     words = [_decimal(word) for word in (sys.argv[1:] if argv is None else argv)]
+    known = {"-h", "--help", "--version"}
+    if not words or (words[0].startswith("-") and words[0] not in known):
+        words.insert(0, "run")
     trouble = _unusable(words)
     if trouble:
         print(f"acsard: {trouble}", file=sys.stderr)
         return int(Exit.USAGE)
-    known = {"-h", "--help", "--version"}
-    if not words or (words[0].startswith("-") and words[0] not in known):
-        words.insert(0, "run")
     code = int(Exit.OK)
     try:
         try:
@@ -186,7 +186,8 @@ def _decimal(word: str) -> str:
 def _unusable(words: Sequence[str]) -> str:
     """Return why acsard cannot use these arguments or its environment, or "" if it can.
 
-    Paths and names appear in messages, which are UTF-8.
+    Paths and names appear in messages, which are UTF-8. The environment and the current directory
+    matter to the daemon only: a tool such as `acsard call stop` must work everywhere.
     """
     for word in words:
         if len(word) > MAX_ARGUMENT_LENGTH:
@@ -195,11 +196,18 @@ def _unusable(words: Sequence[str]) -> str:
                 f"{MAX_ARGUMENT_LENGTH} characters"
             )
     texts = {f"the argument {printable(word)!r}": word for word in words}
+    if words[0] != "run":
+        return _not_utf_8(texts)
     for name, value in os.environ.items():
         if name in PATH_VARIABLES or name.startswith("ACSARD_"):
             texts[f"the environment variable {printable(name)}"] = value
     with suppress(OSError):
         texts["the path of the current directory"] = os.getcwd()
+    return _not_utf_8(texts)
+
+
+def _not_utf_8(texts: Mapping[str, str]) -> str:
+    """Return the problem of the first text that is not valid UTF-8, or ""."""
     for what, text in texts.items():
         try:
             text.encode()
@@ -214,7 +222,7 @@ def entry() -> NoReturn:
     # normal shutdown of the interpreter, such a call would abort the process.
     _fill_closed_streams()
     if isinstance(sys.stdout, io.TextIOWrapper):
-        # A terminal without UTF-8 shows "\\u2026" instead of "…", as Python does for stderr.
+        # A terminal without UTF-8 shows "\u2026" instead of "…", as Python does for stderr.
         sys.stdout.reconfigure(errors="backslashreplace")
     try:
         code = main()

@@ -15,7 +15,7 @@ from rich.text import Text
 
 from acsard.cli.common import by_environment
 from acsard.cli.connection import add_bus, require_one
-from acsard.core.formatting import lines, printable
+from acsard.core.formatting import json_line, lines, printable
 from acsard.daemon.bus.address import address_of
 from acsard.host.config_file import find
 from acsard.machine.examination import examine
@@ -34,7 +34,7 @@ def main(args: argparse.Namespace) -> int:
     find_address = partial(address_of, connect=args.connect, robot_id=args.id, tls=args.tls)
     findings = list(examine(*find(args.config), by_environment(), find_address))
     if args.json:
-        print(msgspec.json.encode(findings).decode())
+        print(json_line(msgspec.json.encode(findings).decode()))
     else:
         for finding in findings:
             mend = f"\n      -> {lines(finding.mend)}" if finding.mend else ""

@@ -152,7 +152,8 @@ def settings_file(where: str, config: Config, cli_values: dict[str, object]) -> 
     Args:
         where: the path of the configuration file, or another text if there is no file.
         config: the present configuration.
-        given: maps dotted keys to values from the command line, which replace those of the file.
+        cli_values: maps dotted keys to values from the command line, which replace those of the
+            file.
     """
     overrides = tables(cli_values, by_environment())
     file = Path(where).absolute() if Path(where).is_file() else None

@@ -124,7 +124,7 @@ class LatchFile:
         loop never takes this lock."""
         self._abandoned = False
         """True if `start` has timed out while another thread was reading and writing the file."""
-        self._at_start: Latches | None = None
+        self._start_latches: Latches | None = None
         """The latches that the file contained when the daemon started; None before it is read."""
         self._blind = False
         """True if `start()` could not read the file in time. The writing thread must then read it
@@ -166,7 +166,7 @@ class LatchFile:
             self._abandoned = True
             why = str(error) if isinstance(error, NoThreadError) else DISK_HANGS
             self._fail(why)
-            file_latches = self._at_start
+            file_latches = self._start_latches
             if file_latches is None:
                 self._blind = True
                 latches = stopped(Latches(), unreadable(self.where, why), now)
@@ -195,7 +195,7 @@ class LatchFile:
         with self._disk:
             if self._abandoned:
                 return Latches()
-            latches = self._at_start = self._read(now)
+            latches = self._start_latches = self._read(now)
             trouble = self._replace(latches)
             if trouble and not self._abandoned:
                 self._fail(trouble)
@@ -364,13 +364,13 @@ class LatchFile:
         Without this call, the next write of the file would overwrite these latches.
         """
         self._blind = False
-        if self._at_start is None:
+        if self._start_latches is None:
             try:
-                self._at_start = self._read(now)
+                self._start_latches = self._read(now)
             except InUseError:
                 # `_barred` says why the file is not written.
-                self._at_start = Latches()
-        self._missed = replace_fields(self._at_start, stop=None)
+                self._start_latches = Latches()
+        self._missed = replace_fields(self._start_latches, stop=None)
 
     def _replace(self, latches: Latches) -> str:
         if self._path is None or self._barred:

@@ -228,7 +228,7 @@ def examine(
     Args:
         where: the path of the configuration file, for messages.
         text: the content of the configuration file.
-        given: the values that replace values in the file, by table and key.
+        overrides: the values that replace values in the file, by table and key.
         find_address: function that returns the daemon's address for a configuration.
 
     Raises:

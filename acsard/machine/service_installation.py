@@ -386,8 +386,8 @@ def admitted(file: File, content: bytes | None, directory: Path) -> Write | Keep
 
     Args:
         file: the drop-in file as the installation writes it.
-        found: the present content of the drop-in file, which the step changes; None if the drop-in
-            file does not exist.
+        content: the present content of the drop-in file, which the step changes; None if the
+            drop-in file does not exist.
         directory: the directory of the certificates.
     """
     place = str(directory).encode()
@@ -423,7 +423,7 @@ def installing(
 
     Args:
         wanted: the files of the installation.
-        found: the present content of each file, by path; None for a file that does not exist.
+        contents: the present content of each file, by path; None for a file that does not exist.
         wrong: the paths of the existing files whose mode or owner is wrong. The steps write these
             files again.
         force: whether to overwrite other existing files whose content differs from the
@@ -477,7 +477,7 @@ def uninstalling(
 
     Args:
         wanted: the files of the installation.
-        found: the present content of each file, by path; None for a file that does not exist.
+        contents: the present content of each file, by path; None for a file that does not exist.
         others: other paths in the service's directories. Only `purge` removes them.
         force: whether to remove files whose content was changed, too. Even then, a changed file
             stays if it is meant for the user's changes (`File.kept` is true).

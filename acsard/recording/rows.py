@@ -163,7 +163,7 @@ def encode(first: int, steps: Sequence[FinishedStep]) -> bytes:
 
     Args:
         first: the number of the first step. It counts the steps since the daemon's start.
-        taken: 1 to `MAX_ROWS` steps.
+        steps: 1 to `MAX_ROWS` steps.
     """
     start = steps[0].inputs.now
     offset_ns = start.wall_ns - start.mono_ns

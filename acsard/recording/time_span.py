@@ -261,7 +261,7 @@ def part_between(stretch_list: list[Stretch], first: float, last: float) -> Span
     overlaps no stretch.
 
     Args:
-        found: the stretches of the recording, in order.
+        stretch_list: the stretches of the recording, in order.
         first: beginning of the range, s since 1970.
         last: end of the range, s since 1970.
     """

@@ -89,7 +89,7 @@ class Calls:
         A stop of the page's own robot also interrupts the running check or calibration.
 
         Args:
-            who: the client of the page.
+            identity: the client of the page.
             verb: the name of the service.
             payload: the arguments of the service.
             robot: the id of the robot, or "" for the page's own robot. Only `stop` may be called

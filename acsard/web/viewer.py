@@ -164,7 +164,7 @@ class Viewer:
         self._ended = False
         self._stamp_ns = -1
         """Stamp of the last command, ns since 1970; -1 before the first command."""
-        self._unreachable, self._about = "", parts.robots.about
+        self._unreachable_reason, self._about = "", parts.robots.about
         self._fleet_due: float | None = None
 
     async def run(self) -> None:
@@ -380,10 +380,10 @@ class Viewer:
 
         `now` is the present time. Both times are in s on the event loop's clock.
         """
-        if self._robots.gone != self._unreachable:
-            self._unreachable = self._robots.gone
-            if self._unreachable:
-                self._out.say(socket_messages.Gone(self._unreachable))
+        if self._robots.gone != self._unreachable_reason:
+            self._unreachable_reason = self._robots.gone
+            if self._unreachable_reason:
+                self._out.say(socket_messages.Gone(self._unreachable_reason))
         if self._robots.about is not self._about:
             self._greet()
         if self._fleet_due is not None and now >= self._fleet_due:

@@ -300,7 +300,7 @@ def _gaps(
         twists: the twist of the robot at each line, computed from the wheel speeds.
         rolled: the motion of the robot from each line to the next, computed from the wheel
             positions.
-        found: the delays of the lines, and the number of lost lines.
+        times: the delays of the lines, and the number of lost lines.
         whole: whether this program received every line that the daemon received. If it is false,
             a lost line counts only in a gap that the odometry of the daemon did not fill.
     """

@@ -50,7 +50,7 @@ def with_lowered(config: Config, saved_limits: Mapping[str, float]) -> tuple[Con
 
     Args:
         config: the content of the configuration file.
-        kept: the limits that were lowered before the restart, by dotted key.
+        saved_limits: the limits that were lowered before the restart, by dotted key.
     """
     limits = config.limits
     wishes: dict[str, object] = {

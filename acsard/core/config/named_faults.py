@@ -63,10 +63,10 @@ class NamedFault(Struct, frozen=True):
     values: tuple[int | float, ...] = ()
 
     def __str__(self) -> str:
-        """The fault as a user writes it, such as "bias=a:0.9"."""
+        """Return the fault as a user writes it, such as "bias=a:0.9"."""
         kinds = ARGUMENTS.get(self.name, "n" * len(self.values))
         words = [
-            MOTORS[int(value)] if kind == "m" else f"{value:g}"
+            MOTORS[int(value)] if kind == "m" else str(value)
             for kind, value in zip(kinds, self.values, strict=True)
         ]
         return f"{self.name}={':'.join(words)}" if words else self.name

@@ -146,7 +146,7 @@ def _serial_link(config: Config, outputs: Outputs, snapshot: Snapshot) -> Row:
 
 def _control_loop(snapshot: Snapshot) -> Row:
     figures, missed = snapshot.figures, snapshot.missed_last_minute
-    on_time = figures.get("period_lateness", Measured()).last_minute.count
+    run_count = figures.get("period_lateness", Measured()).last_minute.count
     values = {
         f"{name}{when}_{share}_us": f"{getattr(spread, share):.0f}"
         for name, figure in figures.items()
@@ -155,8 +155,8 @@ def _control_loop(snapshot: Snapshot) -> Row:
     }
     return Row(
         "control loop",
-        WARN if missed > MAX_MISSED_FRACTION * (on_time + missed) else OK,
-        f"{missed} of {on_time + missed} periods missed in the last minute",
+        WARN if missed > MAX_MISSED_FRACTION * (run_count + missed) else OK,
+        f"{missed} of {run_count + missed} periods missed in the last minute",
         values | _counted(snapshot.counters, "missed") | _counted(snapshot.counters, "bus"),
     )
 

@@ -162,8 +162,8 @@ class Report:
         now_ns = outputs.now.mono_ns
         if outputs.due and "cmd_vel_out" in wanted and self._rates["cmd_vel_out"].due(now_ns):
             yield "cmd_vel_out", self._cmd_vel_out(outputs)
-        if outputs.events and "events" in wanted and (event_list := self._happened.message()):
-            yield "events", event_list
+        if outputs.events and "events" in wanted and (events_message := self._happened.message()):
+            yield "events", events_message
         for key, build in (
             ("state", self._state),
             ("diagnostics", self._diagnostics),

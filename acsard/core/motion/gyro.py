@@ -130,7 +130,8 @@ class Turn(Struct, frozen=True, gc=False):
     angle: float
     variance: float
     rate: float
-    """Turn rate according to the last sample of the gyro, rad/s."""
+    """Turn rate, rad/s: that of the gyro's last sample, or of the wheels if `angle` is the wheels'
+    turn."""
     rate_variance: float
     wheels: float | None = None
     """Turn that wheels without a fault would report, rad. It is `angle` divided by the learned
@@ -237,6 +238,7 @@ class Gyro:
                 # The track is a property of wheels and floor, so it stays valid with another gyro.
                 self._learned = self.learned
                 self._end_contradiction()
+                self._drop_waiting_correction()
                 self._begin()
             self._hole |= len(self._heard) == self._heard.maxlen
             self._heard.append((self._time_of(sample), sample))
@@ -426,8 +428,17 @@ class Gyro:
             # Perhaps the gyro did not hang, but its bias has changed.
             off = suspect - self._bias.value
             self._unsure, self._suspect = off * off, suspect
+        self._drop_waiting_correction()
         self._repeated_s, self._rested_s, self._repeats, self._frozen = 0.0, 0.0, 0, False
         self._forget_repeated()
+
+    def _drop_waiting_correction(self) -> None:
+        """Add a correction that waits for the next line to the uncertainty of the heading.
+
+        A correction waits if the gyro was found to hang in a line that covers no known time.
+        """
+        if self._frozen:
+            self._doubt += self._repeated * self._repeated + self._repeated_gaps
 
     # Comparison with the wheels.
 

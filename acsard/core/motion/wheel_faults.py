@@ -338,7 +338,7 @@ class WheelFaults:
         Args:
             commanded: the commanded wheel speeds, rad/s. None means that the motors may have no
                 power, because the emergency stop counts as pressed.
-            seen: the reported wheel speeds, rad/s.
+            wheel_speeds: the reported wheel speeds, rad/s.
             dt: the time since the previous line, s.
         """
         self.pushed, speeds = "", wheel_speeds.as_tuple()

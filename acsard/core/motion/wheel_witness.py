@@ -181,7 +181,7 @@ class Witness:
         """Check the wheel speed in a feedback line, and return whether it is evidence of a fault.
 
         Args:
-            seen: the reported speed of the wheel, rad/s.
+            raw_speed: the reported speed of the wheel, rad/s.
             expected: the speed of a healthy wheel.
             dt: the time since the previous line, s.
             most: the longest time that one line can add to the evidence, s.

@@ -120,7 +120,7 @@ def test_a_path_in_the_environment_that_is_not_utf_8_is_refused(
 ) -> None:
     with pytest.MonkeyPatch.context() as patched:
         patched.setenv(name, "/var/lib/\udce4")
-        assert main(["check"]) == Exit.USAGE
+        assert main(["--config", "/missing"]) == Exit.USAGE
     assert f"the environment variable {name} is not valid UTF-8" in capsys.readouterr().err
 
 
@@ -130,5 +130,9 @@ def test_a_current_directory_that_is_not_utf_8_is_refused(
     where = tmp_path / "\udce4"
     where.mkdir()
     monkeypatch.chdir(where)
-    assert main(["check"]) == Exit.USAGE
+    with pytest.raises(SystemExit) as end:
+        main(["call", "--help"])
+    assert end.value.code == 0
+    capsys.readouterr()
+    assert main(["--config", "/missing"]) == Exit.USAGE
     assert "the path of the current directory is not valid UTF-8" in capsys.readouterr().err

@@ -593,6 +593,26 @@ def test_the_turn_of_a_gyro_that_hangs_in_a_gap_is_taken_back_in_the_line_after_
     assert bench.variance == pytest.approx(0.005**2, rel=0.1)
 
 
+@pytest.mark.parametrize("end", ["recovers", "another gyro"])
+def test_a_gyro_that_hangs_in_a_gap_and_ends_before_the_next_line_is_in_the_variance(
+    end: str,
+) -> None:
+    bench = proved(0.002)
+    frozen(bench)
+    bench.run(0.05, 0.1)
+    bench.run(0.9)
+    for _ in range(20):
+        bench.now_ns += LINE_NS
+        bench._sample()
+    bench.gyro.add_samples(tuple(bench._way))
+    bench._way = []
+    assert bench.gyro.turn(bench.now_ns, 0.0, 0.0, still=True) is None
+    bench.distort = lambda rate: rate
+    bench.other = end == "another gyro"
+    bench.run(0.5)
+    assert abs(bench.told - bench.true) < 3.0 * math.sqrt(bench.variance)
+
+
 def test_the_rate_of_a_gyro_that_hangs_does_not_become_its_bias() -> None:
     bench = proved(0.002)
     frozen(bench)
