@@ -68,7 +68,7 @@ MAX_ARGUMENT_LENGTH = 4096
 """Largest length of an argument, characters. Zenoh fails on keys above 65,535 bytes."""
 
 PATH_VARIABLES = ("HOME", "STATE_DIRECTORY", "XDG_STATE_HOME")
-"""Environment variables with paths that acsard uses, beside those that begin with ACSARD_."""
+"""Environment variables with paths that the daemon uses, besides those that begin with ACSARD_."""
 
 _EPILOG = """\
 exit codes: 0 done, 1 failure, 2 wrong usage, 65 part of the recording was left out, 66 no such

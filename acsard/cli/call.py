@@ -6,9 +6,9 @@ from __future__ import annotations
 
 import argparse
 import math
-import shlex
 from collections.abc import Sequence
 
+from acsard.cli.common import options_text
 from acsard.cli.connection import SEVERAL_IDS, add_bus, connected_to_many
 from acsard.cli.replies import of_each, print_each
 from acsard.client import Client
@@ -58,8 +58,7 @@ def main(args: argparse.Namespace) -> int:
             raise UsageError(f"{name.upper()} = {value}: the number must be finite; correct it")
     if args.service != "stop" and (ids := parse_ids(args.id or "")):
         typed = (("--config", args.config), ("--connect", args.connect), ("--tls", args.tls))
-        options = "".join(f" {name} {shlex.quote(value)}" for name, value in typed if value)
-        raise UsageError(one_robot_only_text(args.service, args.values, ids, options))
+        raise UsageError(one_robot_only_text(args.service, args.values, ids, options_text(typed)))
     with connected_to_many(args) as (robot, many):
         if many:
             return _stop_all(robot, many, as_json=args.json)
@@ -84,7 +83,7 @@ def one_robot_only_text(
     the robot, such as " --connect ADDRESS".
     """
     typed = " ".join(["acsard call", service, *(f"{value:g}" for value in values), "--id"])
-    each = [robot for robot in ids if robot != "*"] or ["robot1"]
+    each = [robot_id for robot_id in ids if robot_id != "*"] or ["robot1"]
     more = "" if "*" not in ids else "; `acsard fleet` lists the ids"
     return (
         f"only stop can be called on several robots at once: before {service}, a person must look "

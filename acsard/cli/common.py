@@ -6,8 +6,9 @@ import argparse
 import math
 import os
 import re
+import shlex
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 
 from msgspec.structs import replace
 
@@ -105,6 +106,14 @@ def whole(units: str, most: int, hint: str = "") -> Callable[[str], int]:
         return int(text)
 
     return number
+
+
+def options_text(options: Iterable[tuple[str, str | None]]) -> str:
+    """Return options as text for a command line, such as " --id robot2".
+
+    Each option is a pair of its name and its value. An option without a value is left out.
+    """
+    return "".join([f" {name} {shlex.quote(value)}" for name, value in options if value])
 
 
 def by_environment() -> dict[str, dict[str, object]]:

@@ -8,12 +8,18 @@ import argparse
 import asyncio
 import faulthandler
 import os
-import shlex
 import sys
 from importlib.util import find_spec
 from pathlib import Path
 
-from acsard.cli.common import add_config, by_environment, load, tables, with_record_directory
+from acsard.cli.common import (
+    add_config,
+    by_environment,
+    load,
+    options_text,
+    tables,
+    with_record_directory,
+)
 from acsard.core.config.contradictions import warnings
 from acsard.core.config.parsing import parse
 from acsard.core.config.settings import Config
@@ -196,7 +202,7 @@ def reach(args: argparse.Namespace) -> str:
     """
     listens = args.listen and reachable(args.listen)
     pairs = (("--config", args.config), ("--connect", listens), ("--id", args.id))
-    return "".join([f" {option} {shlex.quote(value)}" for option, value in pairs if value])
+    return options_text(pairs)
 
 
 def banner(

@@ -235,7 +235,7 @@ class Client:
         begun_s = clock.steady_s()
         # When the longest timeout has passed, a zero would only stop the next sender that drives.
         known = list(self._spacing.moving.items())
-        moving = [robot for robot, at_s in known if begun_s - at_s < MAX_SOURCE_TIMEOUT_S]
+        moving = [client for client, at_s in known if begun_s - at_s < MAX_SOURCE_TIMEOUT_S]
         try:
             for pause_s in (REPEAT_ZERO_S, 0.0) if moving else ():
                 for client in moving:

@@ -45,6 +45,12 @@ second."""
 MAX_ERROR_LENGTH = 200
 """Number of characters to which the text of an exception is cut."""
 
+ENDED = (
+    "the recorder has ended because of an internal error, which is in the log: restart the daemon "
+    "to record again"
+)
+"""Text for the log and for `state` after an internal error has ended the recorder's thread."""
+
 CLOSE_S, MARK_S = 0.5, 0.1
 """Time limits in `Recorder.close()`, s. `CLOSE_S` applies to writing the last steps and the end of
 the file. If the disk is too slow for that, `MARK_S` applies to writing a marker file."""
@@ -182,10 +188,7 @@ class Recorder:
         if self._full:
             trouble = "the disk is too slow, so steps of the recording are lost"
         if not self._thread.is_alive():
-            trouble = (
-                "the recorder has ended because of an internal error, which is in the log: restart "
-                "the daemon to record again"
-            )
+            trouble = ENDED
         return Recording(self._writer.where, trouble, self._lost + self._writer.lost)
 
     def close(self, error: BaseException | None = None) -> None:
@@ -238,11 +241,7 @@ class Recorder:
             try:
                 self._writer.write(self._taken(), over)
             except Exception:
-                text = (
-                    "the recorder has ended because of an internal error: restart the daemon to "
-                    "record again"
-                )
-                self._events.append(Event("recording", text, "error"))
+                self._events.append(Event("recording", ENDED, "error"))
                 raise
 
     def _taken(self) -> list[FinishedStep | StateBeforeStep]:

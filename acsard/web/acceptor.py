@@ -224,10 +224,8 @@ class Acceptor:
         loop, self._again = asyncio.get_running_loop(), None
         if not self._waiting:
             return
-        now_ns, begun = (
-            clock.mono_ns(),
-            Counter(connection.network for connection in self._starting),
-        )
+        now_ns = clock.mono_ns()
+        begun = Counter(connection.network for connection in self._starting)
         # A network with many handshakes must not delay the handshakes of other networks.
         ready = [name for name in self._waiting if self._handshakes.room(name, now_ns)]
         if ready and self._has_room(loop.time()):

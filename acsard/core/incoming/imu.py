@@ -114,10 +114,8 @@ def reading(arrival: Arrival) -> GyroSample:
         message = decode_cdr(Imu, arrival.payload)
     else:
         message = _readings.decode(arrival.encoding, arrival.payload)
-    rate, variances = (
-        message.angular_velocity,
-        message.angular_velocity_covariance or UNKNOWN_COVARIANCE,
-    )
+    rate = message.angular_velocity
+    variances = message.angular_velocity_covariance or UNKNOWN_COVARIANCE
     numbers = (rate.x, rate.y, rate.z, variances[8])
     if not all(map(math.isfinite, numbers)):
         raise DecodeError("not_finite", "the angular velocity contains NaN or infinity")

@@ -676,9 +676,8 @@ class PromptedTimes:
         # The first part of a reply can come sooner than a complete reply.
         earliest = self._soonest // 2 if cut else self._soonest
         while old_commands and (len(left) < began or at - left[began - 1] < earliest):
-            left.appendleft(
-                old_commands.pop()
-            )  # too soon: the replies answer commands that were given up
+            # Too soon: the replies answer commands that were given up.
+            left.appendleft(old_commands.pop())
             again = True
         if len(left) < lines or self._delay is None:
             return

@@ -293,11 +293,8 @@ class Confirmation:
         # damaged line of the usual duration can.
         most = (self._acceleration * period + SPEED_MARGIN) * period / seconds
         used, now = believed(before.as_tuple()), believed(line.speeds.as_tuple())
-        lines, three = (
-            [*pending, line],
-            [*[believed(sample.speeds.as_tuple()) for sample in pending], now],
-        )
-        good_lines = lines
+        lines = good_lines = [*pending, line]
+        three = [*[believed(sample.speeds.as_tuple()) for sample in pending], now]
         if len(lines) == 3:
             nearest = [min(_alone(a, b, line.steps) for b in three if b is not a) for a in three]
             least = 2 * min(nearest) + most

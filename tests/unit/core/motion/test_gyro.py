@@ -116,7 +116,7 @@ def stirring(t: float) -> float:
     return 0.8 * math.sin(1.3 * t) + 0.5 * math.sin(3.1 * t + 1.0) + 1e-3
 
 
-def over_a_gap(bench: Bench, seconds: float, rate: float) -> Turn | None:
+def over_a_gap(bench: Bench, seconds: float, rate: float, still: bool = False) -> Turn | None:
     """Turn for this time without a line. Return the turn of a next line that covers no time."""
     for _ in range(round(seconds / DT)):
         bench.now_ns += LINE_NS
@@ -124,7 +124,7 @@ def over_a_gap(bench: Bench, seconds: float, rate: float) -> Turn | None:
         bench._sample()
     bench.gyro.add_samples(tuple(bench._way))
     bench._way = []
-    return bench.gyro.turn(bench.now_ns, 0.0, 0.0, still=False)
+    return bench.gyro.turn(bench.now_ns, 0.0, 0.0, still)
 
 
 # a gyro in use
@@ -581,12 +581,7 @@ def test_the_turn_of_a_gyro_that_hangs_in_a_gap_is_taken_back_in_the_line_after_
     frozen(bench)
     bench.run(0.05, 1.0)
     bench.run(0.9)
-    for _ in range(20):
-        bench.now_ns += LINE_NS
-        bench._sample()
-    bench.gyro.add_samples(tuple(bench._way))
-    bench._way = []
-    assert bench.gyro.turn(bench.now_ns, 0.0, 0.0, still=True) is None
+    assert over_a_gap(bench, 0.2, 0.0, still=True) is None
     assert bench.says() == "not believed"
     bench.run(DT)
     assert bench.told == pytest.approx(bench.true, abs=0.02)
@@ -601,12 +596,7 @@ def test_a_gyro_that_hangs_in_a_gap_and_ends_before_the_next_line_is_in_the_vari
     frozen(bench)
     bench.run(0.05, 0.1)
     bench.run(0.9)
-    for _ in range(20):
-        bench.now_ns += LINE_NS
-        bench._sample()
-    bench.gyro.add_samples(tuple(bench._way))
-    bench._way = []
-    assert bench.gyro.turn(bench.now_ns, 0.0, 0.0, still=True) is None
+    assert over_a_gap(bench, 0.2, 0.0, still=True) is None
     bench.distort = lambda rate: rate
     bench.other = end == "another gyro"
     bench.run(0.5)
