@@ -116,6 +116,8 @@ class SettingsFile:
         self._file, self._parse = file, parse
         self._in_force = self._written = started
         self._signature: Signature | None = None
+        self._compared = started, started, ""
+        """The two configurations that the thread compared last, and their differences in words."""
         self._box = Mailbox[Request | Literal["look"]](MAX_JOBS)
         """Queue of the thread: the requests that it must check. The item "look" only wakes the
         thread, which then writes the changes and compares the file."""
@@ -350,9 +352,13 @@ class SettingsFile:
                 "the daemon could not start with the present content of its file: "
                 f"{error.problems[0]}"
             )
-        changes = differences(self._in_force, self._written)
-        texts = [change.words(key) for key, change in changes.items()]
-        return listed(texts, MAX_NAMED)
+        in_force, written = self._in_force, self._written
+        # Comparing all settings takes 1 ms, and they are usually the same objects as last time.
+        if self._compared[0] is not in_force or self._compared[1] is not written:
+            changes = differences(in_force, written)
+            texts = [change.words(key) for key, change in changes.items()]
+            self._compared = in_force, written, listed(texts, MAX_NAMED)
+        return self._compared[2]
 
     def _read(self) -> None:
         if self._file is None:
