@@ -17,6 +17,7 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from statistics import median
 from time import thread_time_ns
+from types import MethodType
 
 import pytest
 
@@ -41,11 +42,8 @@ pytestmark = [pytest.mark.bench, pytest.mark.timeout(300)]
 
 ROUNDS, SECONDS = 7, 10.0
 
-ALLOWED, STEP = 15.0, 63.0
-"""Time that a step may have gained, and its time before, us."""
-
 ASSERTED = 2.0
-"""Allowed ratio of the added parts to the rest of the step, as measured."""
+"""Allowed ratio of the added parts to the rest of the step."""
 
 ALL = Config(
     odometry=OdometryConfig(
@@ -62,12 +60,13 @@ ALL = Config(
 
 
 class Timed:
-    """Wraps a method of one object, and counts its calls and their total processor time in ns."""
+    """Replaces a method of an object. Counts its calls and their total processor time, ns."""
 
-    def __init__(self, owner: object, name: str) -> None:
-        self._call: Callable[..., object] = getattr(owner, name)
+    def __init__(self, method: Callable[..., object]) -> None:
+        assert isinstance(method, MethodType)
+        self._call: Callable[..., object] = method
         self.calls = self.ns = 0
-        setattr(owner, name, self)
+        setattr(method.__self__, method.__name__, self)
 
     def __call__(self, *arguments: object) -> object:
         began = thread_time_ns()
@@ -124,9 +123,9 @@ class Run:
         setattr(made.bus, "publish", lambda key, message: encode(message, "msgpack"))  # noqa: B010
         feed, step = made.port.feed, made.loop.step
         robot, self.heard = made.loop.robot, list[Received]()
-        self.lines = Timed(robot._odometry, "fold")
-        self.parts = {"odometry": self.lines, "session": Timed(robot.session, "update")}
-        self.parts["gyro"] = Timed(robot._odometry.checks, "hear")
+        self.lines = Timed(robot._odometry.fold)
+        self.parts = {"odometry": self.lines, "session": Timed(robot.session.update)}
+        self.parts["gyro"] = Timed(robot._odometry.checks.add_samples)
         self.took = dict.fromkeys((*self.parts, "step", "simplest"), 0)
         simplest = Simplest()
 
@@ -168,11 +167,7 @@ class Run:
         return {name: ns / lines / 1e3 for name, ns in self.took.items()}
 
 
-def test_what_a_step_has_grown_by_is_told_beside_what_it_may() -> None:
-    """Print the added time beside the allowed time.
-
-    The asserted bound is higher than the allowed time, and keeps the added time from growing.
-    """
+def test_the_time_that_the_full_odometry_adds_to_a_step() -> None:
     run, rounds = Run(ALL), []
     for seed in range(ROUNDS):
         times = run.drive(seed)
@@ -183,5 +178,5 @@ def test_what_a_step_has_grown_by_is_told_beside_what_it_may() -> None:
     assert run.world.loop.robot.session.count_recovery.counts == (400,) * 4
     share = medians.pop("share")
     print("\nus a line: " + ", ".join(f"{name} {value:.1f}" for name, value in medians.items()))
-    print(f"added is {share:.0%} of the rest of the step; it may be {ALLOWED / STEP:.0%}")
+    print(f"added is {share:.0%} of the rest of the step")
     assert share < ASSERTED
