@@ -61,8 +61,7 @@ class Screen:
     def doing(self, text: str) -> None:
         if self._on:
             # Cut the line and never wrap it, because a wrapped line cannot be overwritten.
-            room = (os.get_terminal_size(sys.stderr.fileno()).columns or 80) - 1
-            self._print(f"\r\033[K{f'   ... {text}'[:room]}")
+            self._print(f"\r\033[K{f'   ... {text}'[: _columns() - 1]}")
             self._visible = True
 
     def found(self, finding: Finding) -> None:
@@ -229,5 +228,12 @@ def _lines() -> Iterator[None]:
             termios.tcsetattr(sys.stdin, termios.TCSANOW, before)
 
 
+def _columns() -> int:
+    """Return the width of the terminal at stderr, or 80 if stderr is not a terminal."""
+    with suppress(OSError):
+        return os.get_terminal_size(sys.stderr.fileno()).columns or 80
+    return 80
+
+
 def _wrapped(text: str) -> str:
-    return "\n".join(textwrap.wrap(text, 88))
+    return "\n".join(textwrap.wrap(text, min(_columns(), MAX_TEXT_WIDTH)))

@@ -16,6 +16,7 @@ import pytest
 
 from acsard.client import connect
 from acsard.core.messages.signature import public_name
+from acsard.daemon.bus import robot_discovery
 from acsard.host.own_identity import own_name
 from acsard.host.version import version
 from tests.system.harness import Bus, Daemon, Peer, acsard, running, until
@@ -43,16 +44,30 @@ def test_the_log_names_the_client_of_each_call_by_its_own_name(shared: Daemon, b
     assert by(shared, "deactivate") == ["unnamed (native)"]
 
 
-def test_a_put_on_stop_is_reported_with_the_session_that_stamped_it(
-    shared: Daemon, bus: Bus
+@pytest.mark.parametrize("named", [True, False])
+def test_a_put_on_stop_is_reported_with_its_sender_id_or_the_session_that_stamped_it(
+    named: bool, shared: Daemon, bus: Bus
 ) -> None:
     stops = len(shared.events("stop"))
     with connect(shared.endpoint) as robot:
         key, stamp = robot.key("stop"), robot.session.new_timestamp()
-        robot.session.put(key, b"", timestamp=stamp, attachment=b'{"sender": "ann/s3cret"}')
+        attachment = b'{"sender": "ann/s3cret"}' if named else b""
+        robot.session.put(key, b"", timestamp=stamp, attachment=attachment)
         (line,) = until(lambda: shared.events("stop")[stops:], 5.0, "the stop is in the log")
     session = public_name(str(stamp.get_id()))
-    assert line["by"] == f"{public_name('ann/s3cret')} (native, session {session})"
+    unnamed = f"unnamed (native, session {session})"
+    assert line["by"] == (f"{public_name('ann/s3cret')} (native)" if named else unnamed)
+
+
+def test_one_program_that_puts_on_stop_and_calls_it_has_one_name(shared: Daemon, bus: Bus) -> None:
+    stops = len(shared.events("stop"))
+    with connect(shared.endpoint) as robot:
+        robot_discovery.stop(robot.session, ["acsar"], robot.caller)
+        robot.call("stop")
+        until(lambda: len(shared.events("stop")) == stops + 2, 5.0, "both stops are in the log")
+        (name,) = {line["by"] for line in shared.events("stop")[stops:]}
+        assert bus.state()["reason"].count(f"stopped by {name}") == 1
+        robot.call("clear")
 
 
 @pytest.mark.slow

@@ -407,9 +407,9 @@ def caller_name(via: Via, attachment: bytes, stamped_by: str = "") -> str:
 
     The name has a suffix in brackets, which begins with the transport `via`:
 
-    - native: the public name of the sender id in `attachment`, or "unnamed". The brackets also
-      contain the public name of the Zenoh session `stamped_by`, which stamped the sample, unless
-      `stamped_by` is "".
+    - native: the public name of the sender id in `attachment`. Without a sender id the name is
+      "unnamed", and the brackets also contain the public name of the Zenoh session `stamped_by`,
+      which stamped the sample, unless `stamped_by` is "".
     - rmw: "unnamed". The brackets also contain the GID of the client.
     - bridge: "unnamed".
 
@@ -419,7 +419,9 @@ def caller_name(via: Via, attachment: bytes, stamped_by: str = "") -> str:
         return f"unnamed (rmw {attachment[-GID_BYTES:].hex()})"
     if via == "bridge":
         return "unnamed (bridge)"
-    session = f", session {public_name(stamped_by)}" if stamped_by else ""
     signed = signature.unpack(attachment)
-    name = public_name(signed.sender) if signed else "unnamed"
-    return f"{name} (native{session})"
+    if signed is not None:
+        # With the session, one program would have two names: only samples have such a stamp.
+        return f"{public_name(signed.sender)} (native)"
+    session = f", session {public_name(stamped_by)}" if stamped_by else ""
+    return f"unnamed (native{session})"
