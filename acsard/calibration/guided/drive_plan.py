@@ -162,12 +162,6 @@ class Leg(Struct, frozen=True):
 FLOOR_M = 3.0
 """Side length of the square floor that must be free, m."""
 
-MAX_DRIVE_S = 90.0
-"""Limit for the total driving time of all legs of a method, s.
-
-A test checks this limit for each method.
-"""
-
 USUAL_SPEED = 0.3
 """Speed straight ahead in a guided drive, m/s, unless the robot's limits are lower."""
 

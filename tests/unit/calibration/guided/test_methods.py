@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 from acsard.calibration.guided.drive_plan import (
-    MAX_DRIVE_S,
     MAX_TRACK_RATIO,
     NEEDS,
     GuideError,
@@ -32,6 +31,9 @@ from tests.unit.calibration.robots import SEPARATION, Drive, Robot, drive, wande
 from tests.unit.calibration.test_solve import off
 
 FEW, MANY = 1, 20
+
+MAX_DRIVE_S = 90.0
+"""Limit for the total driving time of all legs of a method, s."""
 
 each_way = pytest.mark.parametrize("way", METHODS)
 so_many = pytest.mark.parametrize("count", [FEW, pytest.param(MANY, marks=pytest.mark.soak)])
