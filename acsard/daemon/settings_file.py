@@ -156,7 +156,7 @@ class SettingsFile:
                 set with the Zenoh key `speed_limit`.
         """
         self._in_force = config
-        self._look()
+        self._wake_thread()
 
     def keep(self, request: Request, now_ns: int) -> None:
         """Queue a `set` request with the field `keep`, so that the thread checks it.
@@ -182,7 +182,7 @@ class SettingsFile:
         if not why:
             self._box.put(request)
 
-    def _look(self) -> None:
+    def _wake_thread(self) -> None:
         # If requests wait, the thread is awake. In a full queue, "look" would displace a request.
         if not self._box.waiting:
             self._box.put("look")
@@ -205,7 +205,7 @@ class SettingsFile:
             return False
         pending.answer = answer
         self._changes.append((pending.edit, answer))
-        self._look()
+        self._wake_thread()
         return True
 
     def results(self, now_ns: int, events: list[Event]) -> list[Request | Answer]:

@@ -54,7 +54,7 @@ def off(made: World) -> tuple[float, float]:
 
 
 def row(made: World) -> DiagnosticStatus:
-    message = made.loop.report.current("diagnostics", made.loop._look)
+    message = made.loop.report.current("diagnostics", made.loop._snapshot)
     assert isinstance(message, DiagnosticArray)
     (row_status,) = [status for status in message.status if status.name == "acsard: wheels"]
     return row_status

@@ -35,7 +35,7 @@ from acsard.core.link.link_diagnosis import blames_host
 from acsard.core.messages.encodings import FORMATS, encode
 from acsard.core.messages.schema import Odometry, PoseStamped
 from acsard.daemon.bus.zenoh_sessions import client_session
-from acsard.terminal.prompt import Ask
+from acsard.terminal.prompt import NumberQuestion
 from acsard.terminal.terminal_prompt import NoPrompt
 from tests.system.bystander import lost
 from tests.system.harness import (
@@ -305,7 +305,7 @@ class Beside:
         self._player.place = (place - self._place) * cmath.exp(-1j * self._yaw)
         self._player.yaw = yaw - self._yaw
         unit = words.rstrip(":").rpartition(" ")[2]
-        return f"{self._player.answer(Ask(words, unit, -math.inf, math.inf)):.4g}"
+        return f"{self._player.answer(NumberQuestion(words, unit, -math.inf, math.inf)):.4g}"
 
     def _true(self) -> tuple[complex, float]:
         pose = self._bus.get("sim/pose")["pose"]

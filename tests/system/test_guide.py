@@ -77,7 +77,7 @@ async def test_a_board_is_checked_without_a_daemon_from_the_first_question_to_th
             assert (end["ended"], end["meaning"]) == (1, "failure")  # it was another map
             frames = guided.ours.heard
             findings = [s["guide"]["finding"] for s in frames if "finding" in str(s)]
-            kinds = {"Subject", "Doing", "Progress", "Question", "Found", "Result"}
+            kinds = {"Subject", "Doing", "Progress", "Question", "FindingMessage", "Result"}
             assert described.kinds(frames) >= kinds
     names = [finding["name"] for finding in findings]
     assert names[0] == "baud rate"

@@ -139,7 +139,7 @@ class Robot:
     def _end(self) -> None:
         self.followed = False
 
-    def ask(self, name: str, take: Any) -> None:
+    def start_query(self, name: str, take: Any) -> None:
         assert name == "state"
         if self.answer is not None:
             take(self.answer)
@@ -152,8 +152,8 @@ def test_the_states_that_arrived_are_returned_in_order() -> None:
     robot = Robot()
     watch = Watch(robot, 0.0)
     robot.queue.extend(map(sample_of, (at(1), at(2))))
-    assert watch.look(0.1) == [at(1), at(2)]
-    assert watch.look(0.2) == []
+    assert watch.poll(0.1) == [at(1), at(2)]
+    assert watch.poll(0.2) == []
     assert watch.age(0.2) == 0.1
 
 
@@ -161,11 +161,11 @@ def test_a_state_published_after_the_answer_replaces_the_answer() -> None:
     robot = Robot()
     watch = Watch(robot, 0.0)
     robot.queue.append(sample_of(at(1)))
-    watch.look(0.0)
+    watch.poll(0.0)
     robot.answer = sample_of(at(2))
-    watch.look(QUERY_PERIOD_S + 0.1)
+    watch.poll(QUERY_PERIOD_S + 0.1)
     robot.queue.append(sample_of(at(3)))
-    assert watch.look(QUERY_PERIOD_S + 0.2) == [at(3)]
+    assert watch.poll(QUERY_PERIOD_S + 0.2) == [at(3)]
     assert watch.state == at(3)
 
 
@@ -173,21 +173,21 @@ def test_a_state_that_was_published_before_the_answer_comes_first() -> None:
     robot = Robot()
     watch = Watch(robot, 0.0)
     robot.queue.append(sample_of(at(1)))
-    watch.look(0.0)
+    watch.poll(0.0)
     robot.answer = sample_of(at(3))
-    watch.look(QUERY_PERIOD_S + 0.1)
+    watch.poll(QUERY_PERIOD_S + 0.1)
     robot.queue.append(sample_of(at(2)))
-    assert watch.look(QUERY_PERIOD_S + 0.2) == [at(2), at(3)]
+    assert watch.poll(QUERY_PERIOD_S + 0.2) == [at(2), at(3)]
 
 
 def test_unreadable_messages_are_counted_until_a_readable_one_arrives() -> None:
     robot = Robot()
     watch = Watch(robot, 0.0)
     robot.queue.extend([UNREADABLE] * 3)
-    assert watch.look(0.0) == []
+    assert watch.poll(0.0) == []
     assert watch.unreadable == 3
     robot.queue.append(sample_of(at(1)))
-    watch.look(0.0)
+    watch.poll(0.0)
     assert watch.unreadable == 0
 
 
@@ -195,7 +195,7 @@ def test_a_flood_of_messages_does_not_block_the_caller() -> None:
     robot = Robot()
     watch = Watch(robot, 0.0)
     robot.queue.extend([UNREADABLE] * (MAX_QUEUED_SAMPLES + 7))
-    watch.look(0.0)
+    watch.poll(0.0)
     assert len(robot.queue) == 7
 
 
@@ -204,14 +204,14 @@ def test_commands_have_no_effect_on_a_daemon_that_is_silent_or_objects() -> None
     watch = Watch(robot, 0.0)
     assert watch.objection("app", STATE.sender, 0.0) == ""
     robot.queue.append(sample_of(STATE))
-    watch.look(0.0)
+    watch.poll(0.0)
     assert watch.objection("app", STATE.sender, 0.0) == ""
     assert "nothing received from the daemon" in watch.objection(
         "app", STATE.sender, ROBOT_SILENCE_TIMEOUT_S + 0.01
     )
     stopped = replace(STATE, mode="stopped", reason="stopped by request")
     robot.queue.append(sample_of(stopped))
-    watch.look(5.0)
+    watch.poll(5.0)
     assert watch.objection("app", STATE.sender, 5.0) == "stopped by request"
 
 

@@ -308,7 +308,7 @@ def test_after_a_write_and_a_removal_the_directory_is_unchanged(tmp_path: Path) 
     (tmp_path / "elsewhere").write_text("untouched")
     file = File(tmp_path / "acsard" / "bin" / "tool", b"new", 0o755)
     Write(file).do()
-    assert file.found() == b"new"
+    assert file.current_content() == b"new"
     assert file.path.stat().st_mode & 0o777 == 0o755
     file.path.unlink()
     file.path.symlink_to(tmp_path / "elsewhere")
@@ -370,4 +370,4 @@ def test_an_unreadable_file_is_reported_in_a_sentence(tmp_path: Path) -> None:
     place.path.mkdir()
     assert place.condition() == "unreadable"
     with pytest.raises(MendableError, match=r"cannot read .*acsard\.toml"):
-        place.found()
+        place.current_content()

@@ -17,10 +17,10 @@ import pytest
 from acsard.checkup.findings import Finding
 from acsard.terminal import json_prompt
 from acsard.terminal.json_prompt import MAX_LINE_BYTES, JsonPrompt
-from acsard.terminal.prompt import Ask, ended_by_signals
+from acsard.terminal.prompt import NumberQuestion, ended_by_signals
 
-DISTANCE = Ask("How far?", "m", 0.5, 3.0)
-OPTIONAL = Ask("How far, if you like?", "m", 0.0, 3.0, 0.0)
+DISTANCE = NumberQuestion("How far?", "m", 0.5, 3.0)
+OPTIONAL = NumberQuestion("How far, if you like?", "m", 0.0, 3.0, 0.0)
 
 
 class Program:
@@ -238,7 +238,7 @@ def test_findings_are_reported_as_they_are_made_with_the_progress(program: Progr
         person.begin("port sim", simulated=True)
         person.doing("a motor turns")
         for _ in range(20):
-            person.found(Finding("baud rate", "PASS", "115200 baud"))
+            person.show_finding(Finding("baud rate", "PASS", "115200 baud"))
     assert program.told("doing") == ["a motor turns"]
     assert program.said[0] == {"subject": "port sim", "simulated": True}
     assert program.told("finding")[0]["figure"] == "115200 baud"

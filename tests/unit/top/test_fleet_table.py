@@ -274,7 +274,9 @@ def fleet_of(
     """Return a fleet in which only the robots in `answering` answer queries."""
     robot: Any = SimpleNamespace(session=session, where=Address("tcp/127.0.0.1:7448", "acsar", ""))
     stamps = count(2000)
-    robot.sibling = lambda name: SimpleNamespace(ask=lambda key, take: answer(name, key, take))
+    robot.sibling = lambda name: SimpleNamespace(
+        start_query=lambda key, take: answer(name, key, take)
+    )
 
     def answer(name: str, key: str, take: Callable[[Any], object]) -> None:
         if name in answering:
@@ -292,7 +294,7 @@ def test_robots_beyond_the_limit_are_reported_as_left_out(session: Session) -> N
     for number in range(3):
         session.comes(f"robot{number}")
     assert fleet.left_out_text == ""
-    assert fleet.seen == "all robots visible at tcp/127.0.0.1:7448: 3 robots"
+    assert fleet.presence_text == "all robots visible at tcp/127.0.0.1:7448: 3 robots"
     session.comes("robot3")
     assert [row.robot_id for row in fleet.rows()] == ["robot0", "robot1", "robot2"]
     assert "more than 3 robots, and this list shows only 3 of them" in fleet.left_out_text
@@ -385,7 +387,7 @@ class Remembers:
     def sibling(self, name: str) -> Remembers:
         return self
 
-    def ask(self, key: str, take: Callable[[Any], object]) -> None:
+    def start_query(self, key: str, take: Callable[[Any], object]) -> None:
         if key == "state":
             take(sample_of(self.stored, f"acsard/robot1/{key}"))
 

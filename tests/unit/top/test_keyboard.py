@@ -185,7 +185,7 @@ class Robot:
     def subscribe(self, name: str) -> Any:
         return SimpleNamespace(try_recv=lambda: self.said.popleft() if self.said else None)
 
-    def ask(self, name: str, take: Any) -> None:
+    def start_query(self, name: str, take: Any) -> None:
         """Do nothing: the query of the follower gets no answer."""
 
     def send(self, linear: float, angular: float = 0.0) -> None:
@@ -460,12 +460,12 @@ def test_the_operator_is_informed_that_a_held_key_no_longer_drives(
 ) -> None:
     keyboard = Held(STOPPED, monkeypatch)
     keyboard.step("i", times=12)
-    assert keyboard.ride.seen().objection == "stopped by request"
+    assert keyboard.ride.screen_data().objection == "stopped by request"
     keyboard.robot.said.append(sample_of(replace(STATE, mode="ready", source="")))
     keyboard.step("i", times=12)
-    assert keyboard.ride.seen().objection == RELEASE_REASON
+    assert keyboard.ride.screen_data().objection == RELEASE_REASON
     keyboard.step(" ")
-    assert keyboard.ride.seen().objection == ""
+    assert keyboard.ride.screen_data().objection == ""
 
 
 def test_a_space_stops_at_the_next_step(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -480,9 +480,9 @@ def test_the_operator_is_informed_that_a_robot_is_silent(monkeypatch: pytest.Mon
     robot = Robot(STATE)
     drive = Drive(robot, monkeypatch)
     drive.step("i")
-    assert not drive.ride.seen().silent
+    assert not drive.ride.screen_data().silent
     drive.now += ROBOT_SILENCE_TIMEOUT_S
-    assert drive.ride.seen().silent
+    assert drive.ride.screen_data().silent
 
 
 def test_the_operator_is_informed_why_keys_have_no_effect(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -491,6 +491,6 @@ def test_the_operator_is_informed_why_keys_have_no_effect(monkeypatch: pytest.Mo
     drive = Drive(robot, monkeypatch)
     drive.step(times=10)
     drive.step("i", times=round(GRACE_S / 0.05) - 2)
-    assert drive.ride.seen().objection == ""
+    assert drive.ride.screen_data().objection == ""
     drive.step("i", times=4)
-    assert drive.ride.seen().objection == "stopped by request"
+    assert drive.ride.screen_data().objection == "stopped by request"

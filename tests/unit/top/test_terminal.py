@@ -22,7 +22,9 @@ from tests.unit.top.test_fleet_table import ROW
 def told(states: list[tuple[float, RobotState]]) -> list[RobotState]:
     """Return the states that are printed when these states arrive at these times, s."""
     throttle = ReportThrottle()
-    return [state for now, state in states if throttle.tell(replace(SEEN, state=state), now)]
+    return [
+        state for now, state in states if throttle.should_print(replace(SEEN, state=state), now)
+    ]
 
 
 def test_a_robot_that_moves_is_a_line_a_second_and_one_at_rest_one_in_ten() -> None:
@@ -71,7 +73,7 @@ class Ended:
         if len(self.states) > 1:
             self.states.pop(0)
 
-    def seen(self) -> Teleop:
+    def screen_data(self) -> Teleop:
         return replace(SEEN, state=self.states[0], age=0.0)
 
 
@@ -105,8 +107,8 @@ def test_a_terminal_of_any_height_shows_the_heading_of_the_table_of_robots(
     monkeypatch.setenv("COLUMNS", "80")
     monkeypatch.setenv("LINES", str(height))
     monkeypatch.setattr(terminal, "_watch", watch)
-    monkeypatch.setattr(terminal, "_hold", lambda shows: shows([]))
-    fleet = SimpleNamespace(rows=lambda: [ROW], left_out_text="", seen="1 robot")
+    monkeypatch.setattr(terminal, "_run_suspendable", lambda shows: shows([]))
+    fleet = SimpleNamespace(rows=lambda: [ROW], left_out_text="", presence_text="1 robot")
     terminal.roster(cast(Roster, fleet))
     head, *others = capsys.readouterr().out.splitlines()
     assert head.startswith("ROBOT")

@@ -29,7 +29,7 @@ from acsard.host import clock
 from acsard.host.threads import NoThreadError
 from acsard.web import robots
 from acsard.web.metrics import Counts
-from acsard.web.robots import PROCESS_PERIOD_S, About, Robots, _Asking
+from acsard.web.robots import PROCESS_PERIOD_S, About, Robots, _TaskQueries
 from tests.each import each
 from tests.unit.client.test_follower import UNREADABLE, Robot
 from tests.unit.top.screens import INFO, STATE, sample_of
@@ -68,7 +68,7 @@ class World:
 
         async def story() -> None:
             client: Any = self.robot
-            watch = Watch(_Asking(client), self.now)
+            watch = Watch(_TaskQueries(client), self.now)
             watching = asyncio.create_task(self.robots._follow(watch))
             began, before = self.now, self.robots.gone
             while self.now - began < seconds:
@@ -94,10 +94,10 @@ class Answering(Robot):
         super().__init__()
         self._world = world
 
-    def ask(self, name: str, take: Any) -> None:
+    def start_query(self, name: str, take: Any) -> None:
         self._world.asked += 1
         self.answer = self._world.answers()
-        super().ask(name, take)
+        super().start_query(name, take)
 
 
 @pytest.fixture

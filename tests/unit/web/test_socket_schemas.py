@@ -36,7 +36,7 @@ SAID: tuple[Struct, ...] = (
     socket_messages.Rows([socket_messages.Row("acsar", None, "", None, "", None, "")], ""),
     socket_messages.Pong(12.5, 1e12),
     socket_messages.Refused("cmd", "why"),
-    socket_messages.Gone("why"),
+    socket_messages.DaemonUnreachable("why"),
 )
 
 GUIDED: tuple[Struct, ...] = (
@@ -47,7 +47,7 @@ GUIDED: tuple[Struct, ...] = (
     json_prompt.Doing("so"),
     json_prompt.Progress(0.5),
     json_prompt.Question(question=1, words="How far?", unit="m", least=0.5, most=3.0),
-    json_prompt.Found(Finding("watchdog", "PASS", keys={"mcu.port": "sim"})),
+    json_prompt.FindingMessage(Finding("watchdog", "PASS", keys={"mcu.port": "sim"})),
     json_prompt.Result("all"),
 )
 

@@ -18,7 +18,7 @@ from acsard.calibration.log_table import Table
 from acsard.calibration.runs import Run, runs
 from acsard.calibration.solve import Calibration
 from acsard.core.config.settings import Config
-from acsard.terminal.prompt import Ask
+from acsard.terminal.prompt import NumberQuestion
 from acsard.terminal.terminal_prompt import NoPrompt
 from tests.unit.calibration.robots import Drive, Plan, Robot, drive
 
@@ -87,7 +87,7 @@ class Player:
             rate = abs(angular) / (self.robot.chi * (1 + self.robot.rate * rate))
         return (2 * math.pi + float(self.robot.rng.normal(0, REACTION_RAD))) / rate
 
-    def answer(self, ask: Ask) -> float:
+    def answer(self, ask: NumberQuestion) -> float:
         number = self._seen(ask.words)
         if ask.unit == "mm":
             number = round(1000 * number)
@@ -126,7 +126,7 @@ class Asked(NoPrompt):
         super().__init__()
         self._player = player
 
-    def number(self, ask: Ask) -> float:
+    def number(self, ask: NumberQuestion) -> float:
         return self._player.answer(ask)
 
 
