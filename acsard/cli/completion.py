@@ -64,7 +64,7 @@ def main(args: argparse.Namespace) -> int:
         raise missing("shtab", "shell") from None
     whole = parser()
     kinds = {"FILE": shtab.FILE, "DIR": shtab.DIRECTORY, "DIRECTORY": shtab.DIRECTORY}
-    known = _words()
+    known = _candidates()
     for verb, action in _actions(whole):
         kind = kinds.get(str(action.metavar))
         if verb == "recording" and action.dest == "file":
@@ -84,7 +84,7 @@ def main(args: argparse.Namespace) -> int:
     return 0
 
 
-def _words() -> Mapping[tuple[str, str], list[str]]:
+def _candidates() -> Mapping[tuple[str, str], list[str]]:
     config = Config()
     sources = [source.name for source in config.commands.sources]
     published = [topic.key for topic in PUBLISHED]

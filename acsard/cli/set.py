@@ -79,7 +79,7 @@ def main(args: argparse.Namespace) -> int:
         require_changeable(file, settings)
     with connected_to_many(args) as (robot, many):
         if not settings:
-            _tell(robot.get("config"), args.json)
+            _print_settings(robot.get("config"), args.json)
             return int(Exit.OK)
         if many:
             return _set_all(robot, many, settings, keep=args.keep, as_json=args.json)
@@ -196,7 +196,7 @@ def _file(path: str | None, settings: dict[str, Plain]) -> Path:
     return writable(path)
 
 
-def _tell(config: object, as_json: bool) -> None:
+def _print_settings(config: object, as_json: bool) -> None:
     now = {key: value for key, value in flat(config) if live(key)}
     if as_json:
         print(msgspec.json.encode(now).decode())

@@ -95,7 +95,7 @@ class Host:
 
     def write(self) -> None:
         """Write the recorded steps to the file, as the recorder's thread does each second."""
-        self.recorder._writer.write(self.recorder._taken(), False)
+        self.recorder._writer.write(self.recorder._take_queue(), False)
 
     def run(self, seconds: float) -> None:
         self.world.run(seconds)
