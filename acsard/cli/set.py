@@ -24,7 +24,7 @@ import msgspec
 from acsard.cli.connection import SEVERAL_IDS, add_bus, connected_to_many
 from acsard.cli.replies import of_each, print_each
 from acsard.client import Client
-from acsard.core.config.live import flat, live
+from acsard.core.config.live import find_live_setting, flat
 from acsard.core.config.lowered import LIMITS_PREFIX, lowered, survives_restart
 from acsard.core.config.settings import LimitsConfig
 from acsard.core.config.validation import finite, show
@@ -197,7 +197,7 @@ def _file(path: str | None, settings: dict[str, Plain]) -> Path:
 
 
 def _print_settings(config: object, as_json: bool) -> None:
-    now = {key: value for key, value in flat(config) if live(key)}
+    now = {key: value for key, value in flat(config) if find_live_setting(key)}
     if as_json:
         print(msgspec.json.encode(now).decode())
         return

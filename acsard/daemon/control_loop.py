@@ -503,7 +503,7 @@ class ControlLoop:
 
     def _publish(self, outputs: Outputs) -> None:
         bus, queued_ns = self._bus, None
-        for key, message in self.report.due(outputs, bus.wanted, self._snapshot):
+        for key, message in self.report.due(outputs, bus.wanted_keys, self._snapshot):
             bus.publish(key, message)
             if key in FEEDBACK_TOPICS:
                 queued_ns = self._mono_ns()

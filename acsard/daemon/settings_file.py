@@ -351,7 +351,7 @@ class SettingsFile:
                 f"{error.problems[0]}"
             )
         changes = differences(self._in_force, self._written)
-        texts = [change.words(key) for key, change in changes.items()]
+        texts = [change.describe(key) for key, change in changes.items()]
         return listed(texts, MAX_NAMED)
 
     def _read(self) -> None:

@@ -18,7 +18,7 @@ import msgspec
 from foxglove.websocket import Capability, ChannelView, Client, ClientChannel, WebSocketServer
 
 from acsard.client import Client as Robot
-from acsard.core.config.live import flat, live
+from acsard.core.config.live import find_live_setting, flat
 from acsard.core.config.settings import RosConfig
 from acsard.core.messages.encodings import DecodeError, Decoder, encode
 from acsard.core.messages.json_schema import SCHEMAS
@@ -197,7 +197,7 @@ def live_settings(config: object) -> dict[str, Any]:
 
     `config` is the configuration as nested dicts. Tuples become lists.
     """
-    items = ((key, value) for key, value in flat(config) if live(key))
+    items = ((key, value) for key, value in flat(config) if find_live_setting(key))
     return {key: list(value) if isinstance(value, tuple) else value for key, value in items}
 
 

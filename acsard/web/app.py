@@ -18,7 +18,7 @@ from aiohttp import web
 from msgspec import UNSET, Meta, Struct, UnsetType, inspect
 
 from acsard import __version__
-from acsard.core.config.live import WHEN_TEXTS, flat, live
+from acsard.core.config.live import WHEN_TEXTS, find_live_setting, flat
 from acsard.core.config.settings import WebConfig
 from acsard.core.messages.encodings import DecodeError
 from acsard.core.messages.permissions import least_role
@@ -370,7 +370,7 @@ def settings_in(config: Mapping[str, Any]) -> list[Setting]:
     return [
         Setting(key, value, setting.what, WHEN_TEXTS[setting.when], **_allowed(key))
         for key, value in flat(config)
-        if (setting := live(key)) is not None
+        if (setting := find_live_setting(key)) is not None
     ]
 
 

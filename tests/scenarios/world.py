@@ -110,7 +110,7 @@ class MemoryBus:
     """
 
     def __init__(self, wanted: Collection[str]) -> None:
-        self.wanted = set(wanted)
+        self.wanted_keys = set(wanted)
         self.published: dict[str, deque[Message]] = {}
         self.replies: dict[int, list[Reply]] = {}
         self.finished: set[int] = set()

@@ -190,7 +190,7 @@ class Product:
 
     def _began(self) -> None:
         world = self._world
-        world.bus.wanted = set()
+        world.bus.wanted_keys = set()
         world.watch = self._watch
         if isinstance(world.mcu, WatchedMcu):
             world.mcu._see = self._sight

@@ -75,7 +75,7 @@ def test_a_daemon_with_the_settings_of_the_file_is_ok() -> None:
 
 def test_each_key_that_differs_from_the_file_is_reported_with_both_values() -> None:
     runs = replace(FILE, mcu=McuConfig(port="/dev/pts/3", baud_rate=57600))
-    assert [difference.words(key) for key, difference in differences(runs, FILE).items()] == [
+    assert [difference.describe(key) for key, difference in differences(runs, FILE).items()] == [
         'mcu.port = "/dev/pts/3", not "sim"',
         "mcu.baud_rate = 57600, not 115200",
     ]

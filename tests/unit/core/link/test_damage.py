@@ -136,7 +136,7 @@ def live(lines: list[bytes], every: int) -> tuple[int, int, int]:
             speeds = codec.decode(sent[:-2])
         except FrameError:
             continue
-        steps = recovery.look(Feedback(AT, speeds, 0.01)).steps
+        steps = recovery.recover_counts(Feedback(AT, speeds, 0.01)).steps
         if speeds != truth and i > len(lines) // 10:
             wrong += 1
             believed[0] += plausible(sanity, before, speeds, steps)

@@ -27,7 +27,7 @@ def look(recovery: CountRecovery, rows: Array, counts: bool = False) -> list[Fee
     """Process each row as a line. With `counts`, the lines contain counts."""
     turned = (0.0,) * 4 if counts else None
     lines = (Feedback(AT, WheelSpeeds(*row), PERIOD, turned=turned) for row in rows.tolist())
-    return [recovery.look(line) for line in lines]
+    return [recovery.recover_counts(line) for line in lines]
 
 
 def test_without_configured_counts_no_line_has_whole_counts_and_coarse_lines_are_counted() -> None:
@@ -63,7 +63,7 @@ def test_no_counts_are_derived_from_speeds_if_the_line_has_its_own_counts() -> N
 def test_no_counts_are_derived_from_a_line_after_a_gap() -> None:
     recovery = CountRecovery(400)
     look(recovery, speeds(400))
-    line = recovery.look(Feedback(AT, WheelSpeeds(*[15.71] * 4), 0.0, gap=0.5))
+    line = recovery.recover_counts(Feedback(AT, WheelSpeeds(*[15.71] * 4), 0.0, gap=0.5))
     assert line.counted is None
 
 
@@ -72,7 +72,7 @@ def test_a_randomly_jumping_wheel_beside_three_fine_ones_is_not_a_coarse_encoder
     for _ in range(1000):
         fine = [round(5.0 + dice.uniform(-0.1, 0.1), 2) for _ in range(3)]
         speeds = WheelSpeeds(round(dice.uniform(-70.0, 70.0), 2), *fine)
-        line = recovery.look(Feedback(AT, speeds, 0.01))
+        line = recovery.recover_counts(Feedback(AT, speeds, 0.01))
     assert max(line.steps) < 1.0
 
 

@@ -232,7 +232,7 @@ class Doubtful:
         """Receive a further line, and return the numbers of the lines to use and to drop."""
         self.lines += 1
         line = Feedback(Instant(self.lines, 0), speeds, dt, **more)
-        used, dropped = self.confirmation.look(line, self.skipped, self.before, self.believed)
+        used, dropped = self.confirmation.confirm(line, self.skipped, self.before, self.believed)
         if used:
             self.before = used[-1].speeds
         return [each.at.mono_ns for each in used], [each.at.mono_ns for each in dropped]

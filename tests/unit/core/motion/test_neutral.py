@@ -203,7 +203,7 @@ def test_an_unproven_zero_leaves_an_unarmed_sender_live_so_its_source_keeps_prio
     peer = sender()
     peer.take(sent(GO, 0, shared), 0)
     peer.take(sent(REST, 10, shared), 0, "unproven")
-    assert peer.live(20 * MS)
+    assert peer.is_live(20 * MS)
     assert peer.armed(20 * MS) is not shared
 
 
@@ -237,7 +237,7 @@ def test_a_sender_that_was_not_silent_before_a_stall_keeps_its_place_after_the_s
     peer.take(sent(GO, 0), 0)
     peer.resume(silent_ms * MS, 1000 * MS)
     assert peer.present(1250 * MS) is stays
-    assert not peer.live(1000 * MS)
+    assert not peer.is_live(1000 * MS)
     assert not peer.present(1251 * MS)
 
 
@@ -284,7 +284,7 @@ def test_a_sender_whose_stamps_are_in_doubt_keeps_its_place_for_four_seconds() -
     for at_ms in range(200, 5000, 200):
         peer.refuse(sent(GO, at_ms), "stale")
         assert peer.present(at_ms * MS) is (at_ms <= 4000)
-        assert peer.live(at_ms * MS) is (at_ms <= 250)
+        assert peer.is_live(at_ms * MS) is (at_ms <= 250)
 
 
 def test_a_sender_that_was_silent_gets_no_place_by_a_command_in_doubt() -> None:
@@ -387,16 +387,16 @@ def test_without_neutral_first_every_sender_is_armed() -> None:
 def test_a_command_counts_until_its_timeout_unless_its_stamp_is_in_doubt() -> None:
     peer = sender()
     peer.take(sent(GO, 600), 0, "unproven")
-    assert not peer.live(600 * MS)
+    assert not peer.is_live(600 * MS)
     assert peer.doubtful(850 * MS)
     assert not peer.doubtful(850 * MS + 1)
     peer.take(sent(GO, 610), 0)
-    assert peer.live(860 * MS)
-    assert not peer.live(860 * MS + 1)
+    assert peer.is_live(860 * MS)
+    assert not peer.is_live(860 * MS + 1)
     assert not peer.doubtful(610 * MS)
     peer.refuse(sent(GO, 620), "stale")
     assert (peer.doubtful(620 * MS), peer.doubt, peer.noticed_ns) == (True, "stale", 620 * MS)
-    assert peer.live(860 * MS)
+    assert peer.is_live(860 * MS)
 
 
 # neutral first

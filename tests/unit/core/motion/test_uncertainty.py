@@ -303,12 +303,12 @@ def test_the_error_of_a_track_counts_for_the_turns_that_it_made() -> None:
 def test_the_yaw_errors_of_the_gyro_and_of_gaps_are_separate_whichever_came_first() -> None:
     gaps_first, gyro_first = uncertainty(), uncertainty()
     before = gyro_first.covariance.yawyaw
-    gaps_first.stand(0.0, 0.0, 0.0, 0.0)
+    gaps_first.add_gap(0.0, 0.0, 0.0, 0.0)
     for model in (gaps_first, gyro_first):
         model.advance(0.0, 10.0, 0.0, 0.0, 0.0, variance=0.0)
-        model.stand(0.0, 0.2, 0.0, 0.0)
+        model.add_gap(0.0, 0.2, 0.0, 0.0)
         model.advance(0.0, 10.0, 0.0, 0.0, 0.0, variance=0.0)
-        model.stand(0.0, -0.2, 0.0, 0.0)
+        model.add_gap(0.0, -0.2, 0.0, 0.0)
     of_skidding = 0.4 * DEFAULT.skid
     for model in (gaps_first, gyro_first):
         grown = model.covariance.yawyaw - before

@@ -74,7 +74,7 @@ class Bench:
             )  # fmt: skip
             by_gyro = None if turn is None else turn * PERIOD
             self.faults.watch(command, speeds, PERIOD)
-            if self.faults.look(turned, speeds, PERIOD, by_gyro):
+            if self.faults.check_line(turned, speeds, PERIOD, by_gyro):
                 time_s = min(time_s, (line + 1) * PERIOD)
             self.events += [event.kind for event in self.faults.events]
         return time_s
@@ -183,7 +183,7 @@ def test_a_wheel_left_out_as_stuck_is_a_fault_only_while_it_repeats_that_speed(
         speeds = only(0, pair[line % 2], others=5.0)
         turned = tuple(speed * PERIOD for speed in speeds.as_tuple())
         text = text or bench.faults.watch(five, speeds, PERIOD)
-        bench.faults.look(turned, speeds, PERIOD)  # type: ignore[arg-type]
+        bench.faults.check_line(turned, speeds, PERIOD)  # type: ignore[arg-type]
     assert ("stuck" in text) is fault
     assert bench.faults.status.left_out == ("front_right",)
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from acsard.core.config.live import flat, live
+from acsard.core.config.live import find_live_setting, flat
 from acsard.core.config.parsing import effective
 from acsard.core.config.settings import Config
 from acsard.core.messages.cdr import Cdr, CdrError
@@ -238,7 +238,7 @@ def test_the_description_of_a_choice_lists_its_values() -> None:
 def test_every_key_has_a_description_and_is_read_only_unless_it_can_be_set(key: str) -> None:
     descriptor = described(key, DOUBLE)
     assert descriptor.description
-    assert descriptor.read_only == (live(key) is None)
+    assert descriptor.read_only == (find_live_setting(key) is None)
 
 
 def test_an_unknown_key_has_no_description() -> None:
