@@ -17,7 +17,7 @@ OBJECTS_NS = int(GRACE_S * NS_PER_S)
 WHY = "stopped by request"
 
 
-def shown(notices: Notices, *, newcomers: bool = False) -> list[str]:
+def sent_texts(notices: Notices, *, newcomers: bool = False) -> list[str]:
     """Send the waiting notices and return what a viewer saw."""
     server: Any = Server()
     notices.send(server, lambda line: None, newcomers=newcomers)
@@ -29,30 +29,30 @@ def test_a_notice_is_repeated_only_after_a_while(monkeypatch: pytest.MonkeyPatch
     for at_ns in (0, again_ns - 1, again_ns):
         monkeypatch.setattr(clock, "mono_ns", lambda at_ns=at_ns: at_ns)
         notices.enqueue("warning", "drive", "too slow")
-    assert shown(notices) == ["too slow", "too slow"]
+    assert sent_texts(notices) == ["too slow", "too slow"]
 
 
 def test_a_lasting_notice_is_repeated_only_with_another_text_or_after_it_was_over() -> None:
     notices = Notices(lambda text: None, lambda: None)
     for text in ("gone", "gone", "no reply", "gone"):
         notices.enqueue("error", "daemon", text, status_id="daemon")
-    assert shown(notices) == ["gone", "no reply", "gone"]
+    assert sent_texts(notices) == ["gone", "no reply", "gone"]
     notices.enqueue("error", "daemon", "gone", status_id="daemon")
-    assert shown(notices) == []
+    assert sent_texts(notices) == []
     notices.remove("daemon")
     notices.enqueue("error", "daemon", "gone", status_id="daemon")
-    assert shown(notices) == ["without daemon", "gone"]
+    assert sent_texts(notices) == ["without daemon", "gone"]
 
 
 def test_a_new_viewer_gets_the_lasting_statuses_until_they_are_over() -> None:
     notices = Notices(lambda text: None, lambda: None)
     notices.enqueue("error", "daemon", "gone", status_id="daemon")
     notices.enqueue("info", "set", "done")
-    assert shown(notices) == ["gone", "done"]
-    assert shown(notices, newcomers=True) == ["gone"]
+    assert sent_texts(notices) == ["gone", "done"]
+    assert sent_texts(notices, newcomers=True) == ["gone"]
     notices.remove("daemon")
-    assert shown(notices) == ["without daemon"]
-    assert shown(notices, newcomers=True) == []
+    assert sent_texts(notices) == ["without daemon"]
+    assert sent_texts(notices, newcomers=True) == []
 
 
 def test_the_newest_notices_wait_for_the_viewers_and_each_wakes_the_main_thread() -> None:
@@ -60,7 +60,7 @@ def test_the_newest_notices_wait_for_the_viewers_and_each_wakes_the_main_thread(
     notices = Notices(lambda text: None, lambda: wakes.append(1))
     for number in range(MAX_WAITING + 3):
         notices.enqueue("info", "test", str(number))
-    assert shown(notices) == [str(number) for number in range(3, MAX_WAITING + 3)]
+    assert sent_texts(notices) == [str(number) for number in range(3, MAX_WAITING + 3)]
     assert len(wakes) == MAX_WAITING + 3
 
 
