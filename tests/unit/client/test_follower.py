@@ -29,7 +29,7 @@ def at(sec: int) -> RobotState:
     return replace(STATE, stamp=Time(sec))
 
 
-def asked(follower: Follower, since: float, until: float) -> list[float]:
+def query_times(follower: Follower, since: float, until: float) -> list[float]:
     """Return the times at which the follower queries the state."""
     times = [since + n * TICK for n in range(round((until - since) / TICK))]
     return [now for now in times if follower.query_is_due(now)]
@@ -46,12 +46,12 @@ def test_the_age_of_a_state_is_the_time_since_its_arrival() -> None:
 def test_a_robot_that_publishes_often_is_never_queried() -> None:
     follower = Follower(0.0)
     for n in range(100):
-        assert not asked(follower, n / 10, (n + 1) / 10)
+        assert not query_times(follower, n / 10, (n + 1) / 10)
         follower.published(at(n), (n + 1) / 10)
 
 
 def test_a_robot_that_rarely_publishes_is_queried_at_even_intervals() -> None:
-    times = asked(Follower(0.0), 0.0, 10.0)
+    times = query_times(Follower(0.0), 0.0, 10.0)
     assert times == pytest.approx(
         [QUERY_PERIOD_S * n for n in range(1, len(times) + 1)], abs=10 * TICK
     )
@@ -71,7 +71,7 @@ def test_a_robot_that_is_rarely_queried_is_not_silent_between_its_answers() -> N
     follower, now = Follower(0.0, FLEET_QUERY_PERIOD_S), 0.0
     follower.published(at(1), now)
     for sec in range(2, 10):
-        (now,) = asked(follower, now, now + 1.5 * FLEET_QUERY_PERIOD_S)
+        (now,) = query_times(follower, now, now + 1.5 * FLEET_QUERY_PERIOD_S)
         now += 0.5
         assert not follower.silent(now)
         assert follower.answered(at(sec), now)

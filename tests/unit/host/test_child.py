@@ -63,7 +63,7 @@ def is_alive(pid: int) -> bool:
         return False
 
 
-def until_gone(pid: int) -> None:
+def wait_for_end(pid: int) -> None:
     end_ns = clock.mono_ns() + WAIT_S * NS_PER_S
     while is_alive(pid):
         assert clock.mono_ns() < end_ns
@@ -256,7 +256,7 @@ def test_a_child_ends_when_its_parent_is_killed() -> None:
     assert is_alive(grandchild)
     process.kill()
     process.wait(WAIT_S)
-    until_gone(grandchild)
+    wait_for_end(grandchild)
 
 
 # the parent, as the child sees it

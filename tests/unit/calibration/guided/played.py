@@ -88,13 +88,13 @@ class Player:
         return (2 * math.pi + float(self.robot.rng.normal(0, REACTION_RAD))) / rate
 
     def answer(self, ask: NumberQuestion) -> float:
-        number = self._seen(ask.words)
+        number = self._measure(ask.words)
         if ask.unit == "mm":
             number = round(1000 * number)
         assert ask.least <= number <= ask.most, ask
         return float(number)
 
-    def _seen(self, words: str) -> float:
+    def _measure(self, words: str) -> float:
         noise = float(self.robot.rng.normal(0, READ_M))
         off = math.remainder(self.yaw, math.pi)
         half = math.sin(off) / 2
@@ -119,7 +119,7 @@ class Player:
         return round(math.degrees(off) + float(self.robot.rng.normal(0, 2.0)))
 
 
-class Asked(NoPrompt):
+class PlayedPrompt(NoPrompt):
     """A prompt that passes every question to the simulated person."""
 
     def __init__(self, player: Player) -> None:
@@ -132,7 +132,7 @@ class Asked(NoPrompt):
 
 def play(way: str, player: Player) -> Calibration:
     """Run a guided calibration with the simulated person and robot to its end."""
-    return guide(way, usual_setup(), Asked(player), player.ride)
+    return guide(way, usual_setup(), PlayedPrompt(player), player.ride)
 
 
 def leg(way: str, name: str, track: float = 1.6) -> Leg:

@@ -27,7 +27,14 @@ from acsard.calibration.solve import Calibration
 from acsard.core.config.settings import Config, DriveConfig
 from acsard.terminal.prompt import NumberQuestion
 from tests.unit.calibration.cut import IDEAL
-from tests.unit.calibration.guided.played import Asked, Player, anyone, leg, play, usual_setup
+from tests.unit.calibration.guided.played import (
+    PlayedPrompt,
+    Player,
+    anyone,
+    leg,
+    play,
+    usual_setup,
+)
 from tests.unit.calibration.robots import SEPARATION, Drive, Robot, drive, wander
 from tests.unit.calibration.test_solve import off
 
@@ -119,7 +126,7 @@ def test_the_improvement_is_reported(way: str) -> None:
 # the legs of each way
 
 
-class Talk(Asked):
+class Talk(PlayedPrompt):
     """A prompt that records what it shows and asks."""
 
     def __init__(self, player: Player) -> None:

@@ -178,7 +178,7 @@ def test_the_text_of_a_silence_shows_whether_the_host_caused_it() -> None:
     assert not any(blames_host(words) for words in others)
 
 
-def heard(data: bytes) -> Heard:
+def diagnosis_of(data: bytes) -> Heard:
     diagnosis = Heard()
     diagnosis.take(data)
     for line, _ in LineReader().feed(data):
@@ -190,7 +190,7 @@ def heard(data: bytes) -> Heard:
 def test_the_diagnosis_says_what_was_received_how_it_looks_and_what_to_do(
     data: bytes, looks: ReceivedClass, counted: str
 ) -> None:
-    diagnosis = heard(data)
+    diagnosis = diagnosis_of(data)
     assert diagnosis.looks == looks
     assert counted in diagnosis.counted
     text = f"no link to the microcontroller: {diagnosis.counted}; {RECEIVED_ADVICE[looks]}"

@@ -23,7 +23,7 @@ def speeds(counts: int) -> Array:
     return values
 
 
-def look(recovery: CountRecovery, rows: Array, counts: bool = False) -> list[Feedback]:
+def recover(recovery: CountRecovery, rows: Array, counts: bool = False) -> list[Feedback]:
     """Process each row as a line. With `counts`, the lines contain counts."""
     turned = (0.0,) * 4 if counts else None
     lines = (Feedback(AT, WheelSpeeds(*row), PERIOD, turned=turned) for row in rows.tolist())
@@ -32,7 +32,9 @@ def look(recovery: CountRecovery, rows: Array, counts: bool = False) -> list[Fee
 
 def test_without_configured_counts_no_line_has_whole_counts_and_coarse_lines_are_counted() -> None:
     coarse, fine = CountRecovery(), CountRecovery()
-    assert all(line.counted is None for line in look(coarse, speeds(20)) + look(fine, speeds(3200)))
+    assert all(
+        line.counted is None for line in recover(coarse, speeds(20)) + recover(fine, speeds(3200))
+    )
     assert coarse.counts == fine.counts == (0,) * 4
     assert coarse.coarse_lines > 1000
     assert fine.coarse_lines == 0
@@ -40,7 +42,7 @@ def test_without_configured_counts_no_line_has_whole_counts_and_coarse_lines_are
 
 def test_with_configured_counts_no_line_is_counted_as_coarse() -> None:
     recovery = CountRecovery(20)
-    lines = look(recovery, speeds(20))
+    lines = recover(recovery, speeds(20))
     assert all(line.counted for line in lines)
     assert recovery.counts == (20,) * 4
     assert recovery.coarse_lines == 0
@@ -48,21 +50,21 @@ def test_with_configured_counts_no_line_is_counted_as_coarse() -> None:
 
 def test_after_forgetting_no_step_is_known() -> None:
     recovery = CountRecovery()
-    look(recovery, speeds(400))
+    recover(recovery, speeds(400))
     recovery.forget()
-    (line,) = look(recovery, speeds(400)[500:501])
+    (line,) = recover(recovery, speeds(400)[500:501])
     assert line.steps == (math.inf,) * 4
 
 
 def test_no_counts_are_derived_from_speeds_if_the_line_has_its_own_counts() -> None:
-    lines = look(CountRecovery(20), speeds(20), counts=True)
+    lines = recover(CountRecovery(20), speeds(20), counts=True)
     assert all(line.counted is None for line in lines)
     assert max(lines[-1].steps) == pytest.approx(math.tau / 20 / PERIOD, abs=0.01)
 
 
 def test_no_counts_are_derived_from_a_line_after_a_gap() -> None:
     recovery = CountRecovery(400)
-    look(recovery, speeds(400))
+    recover(recovery, speeds(400))
     line = recovery.recover_counts(Feedback(AT, WheelSpeeds(*[15.71] * 4), 0.0, gap=0.5))
     assert line.counted is None
 

@@ -55,7 +55,7 @@ class Bench:
             self.least = min(self.least, lost_slots)
         self.waiting = 0
 
-    def found(self) -> Bench:
+    def until_clock_is_known(self) -> Bench:
         """Send lines until the clock is known."""
         while self.slots.period is None:
             self.line()
@@ -78,7 +78,7 @@ def test_no_period_is_known_before_half_a_second() -> None:
     for _ in range(45):
         bench.line()
         assert bench.slots.period is None
-    bench.found()
+    bench.until_clock_is_known()
 
 
 @pytest.mark.parametrize(
@@ -100,7 +100,7 @@ def test_the_period_is_rounded_to_the_one_that_the_firmware_intends(
 
 
 def test_punctual_lines_are_not_counted_as_lost() -> None:
-    bench = Bench().found()
+    bench = Bench().until_clock_is_known()
     for _ in range(1000):
         bench.line(0.2)
     assert (bench.error, bench.least) == (0, 0)
@@ -117,7 +117,7 @@ def test_a_lossless_link_counts_each_line_once_despite_host_stalls(
     stalls: list[tuple[int, float]], seed: int, drift: float
 ) -> None:
     chance = random.Random(seed)
-    bench = Bench(PERIOD * (1 + drift)).found()
+    bench = Bench(PERIOD * (1 + drift)).until_clock_is_known()
     for count, late_ms in stalls:
         for _ in range(count):
             bench.line(held=True)
@@ -248,7 +248,7 @@ def test_replies_to_commands_at_odd_times_do_not_delay_the_slots(
 
 @pytest.mark.parametrize("lost", [1, 2, 7, 50])
 def test_missing_lines_are_counted_with_the_next_one(lost: int) -> None:
-    bench = Bench().found()
+    bench = Bench().until_clock_is_known()
     for _ in range(100):
         bench.line(0.3)
     for _ in range(lost):
@@ -261,7 +261,7 @@ def test_missing_lines_are_counted_with_the_next_one(lost: int) -> None:
 @given(seed=st.integers(0, 1000))
 def test_every_lost_line_is_counted_when_a_fifth_is_lost(seed: int) -> None:
     chance = random.Random(seed)
-    bench = Bench().found()
+    bench = Bench().until_clock_is_known()
     for _ in range(2000):
         bench.line(chance.uniform(0.0, 1.0), lost=chance.random() < 0.2)
     bench.line(lost=False)
@@ -270,7 +270,7 @@ def test_every_lost_line_is_counted_when_a_fifth_is_lost(seed: int) -> None:
 
 
 def test_a_slot_counted_for_a_late_single_line_is_subtracted_at_the_next_line() -> None:
-    bench = Bench().found()
+    bench = Bench().until_clock_is_known()
     for _ in range(100):
         bench.line(0.2)
     bench.line(9.0)
@@ -280,7 +280,7 @@ def test_a_slot_counted_for_a_late_single_line_is_subtracted_at_the_next_line() 
 
 
 def test_lines_missing_in_a_backlog_are_counted_with_the_backlog() -> None:
-    bench = Bench().found()
+    bench = Bench().until_clock_is_known()
     for _ in range(100):
         bench.line(0.2)
     for number in range(20):
@@ -300,7 +300,7 @@ def forgets(bench: Bench, lines: Iterable[Callable[[], None]]) -> bool:
 
 @each("period", [0.005, 0.0093, 0.0108, 0.02, 0.05])
 def test_a_changed_period_is_noticed_and_learned(period: float) -> None:
-    bench = Bench().found()
+    bench = Bench().until_clock_is_known()
     began = bench.time_ns()
     bench.made, bench.period_ns = 0, period * 1e9
     slots, periods = bench.slots, []
@@ -323,7 +323,7 @@ def test_irregular_lines_have_no_period(seed: int) -> None:
 
 
 def test_the_age_of_a_line_comes_from_its_slot_and_not_from_its_read() -> None:
-    bench = Bench().found()
+    bench = Bench().until_clock_is_known()
     chance = random.Random(1)
     errors, raw = [], []
     for number in range(5000):
@@ -343,10 +343,10 @@ def deviation(values: list[float]) -> float:
 
 
 def test_a_forgotten_period_is_learned_again() -> None:
-    bench = Bench().found()
+    bench = Bench().until_clock_is_known()
     bench.slots.forget()
     assert bench.slots.period is None
-    bench.found()
+    bench.until_clock_is_known()
 
 
 # boards that answer each line

@@ -22,7 +22,7 @@ from acsard.core.values import GyroStatus, TrackUse
 SURE = CERTAIN / 2
 
 
-def told(track: LearnedTrack) -> str | None:
+def event_kind(track: LearnedTrack) -> str | None:
     return None if track.event is None else track.event.kind
 
 
@@ -46,7 +46,7 @@ def test_a_certain_learned_track_is_used_and_reported_once() -> None:
     assert track.event.text.endswith(": learned 1.800 ± 0.180 (in use), configured 1.500")
     track.choose(Track(1.25, SURE))
     assert track.used == Track(1.25, SURE)
-    assert told(track) is None
+    assert event_kind(track) is None
 
 
 def test_a_learned_track_in_use_is_dropped_only_if_it_becomes_clearly_uncertain() -> None:
@@ -71,7 +71,7 @@ def test_a_learned_track_too_far_from_the_configured_one_is_reported_and_not_use
     assert track.event.level == "warning"
     assert "(out of range, not used), configured 1.000 (in use)" in track.event.text
     track.choose(Track(share, SURE))
-    assert told(track) is None
+    assert event_kind(track) is None
 
 
 @pytest.mark.parametrize(
@@ -93,10 +93,10 @@ def test_a_learned_track_at_a_bound_is_not_switched_on_and_off(
     for _ in range(10):
         for learned in (beyond, within):
             track.choose(learned)
-            reports.append(told(track))
+            reports.append(event_kind(track))
     assert reports == ["too far off", *[None] * 19]
     track.choose(Track(bound * (1.0 + inwards * 0.06), SURE))
-    assert told(track) == "used"
+    assert event_kind(track) == "used"
 
 
 def test_a_learned_track_too_far_off_is_reported_once_while_it_is_nearly_certain() -> None:
@@ -104,7 +104,7 @@ def test_a_learned_track_too_far_off_is_reported_once_while_it_is_nearly_certain
     for _ in range(10):
         for deviation in (0.99 * CERTAIN, 1.01 * CERTAIN):
             track.choose(Track(2 * TRACK_RATIO_RANGE[1], deviation))
-            reports.append(told(track))
+            reports.append(event_kind(track))
     assert reports == ["too far off", *[None] * 19]
 
 

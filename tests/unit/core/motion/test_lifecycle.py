@@ -315,7 +315,7 @@ def test_every_cause_survives_restarts() -> None:
 # clear
 
 
-class Held(NamedTuple):
+class LatchCase(NamedTuple):
     """How one client stops or deactivates a robot, and how another client releases it."""
 
     said: str
@@ -329,8 +329,8 @@ class Held(NamedTuple):
 HELD = each(
     "held",
     [
-        Held("stopped", Mode.STOPPED, stop, "clear", " and stopped by ann"),
-        Held("switched off", Mode.INACTIVE, lambda life, s, by: life.deactivate(by, at(s)),
+        LatchCase("stopped", Mode.STOPPED, stop, "clear", " and stopped by ann"),
+        LatchCase("switched off", Mode.INACTIVE, lambda life, s, by: life.deactivate(by, at(s)),
              "activate", ""),
     ],
 )  # fmt: skip
@@ -340,7 +340,7 @@ HELD = each(
 @pytest.mark.parametrize("asked_s", [0.5, 1.0])
 @pytest.mark.parametrize("named", [True, False])
 def test_a_release_that_arrived_before_the_latch_is_refused(
-    held: Held, asked_s: float, named: bool
+    held: LatchCase, asked_s: float, named: bool
 ) -> None:
     life = ready()
     held.hold(life, 1.0, "ann")
@@ -350,7 +350,7 @@ def test_a_release_that_arrived_before_the_latch_is_refused(
 
 
 @HELD
-def test_a_release_of_the_same_step_as_the_latch_is_refused(held: Held) -> None:
+def test_a_release_of_the_same_step_as_the_latch_is_refused(held: LatchCase) -> None:
     life = ready()
     held.hold(life, 1.0, "ann")
     with pytest.raises(RefusedError, match="at the same time as this call or after it"):
@@ -360,7 +360,7 @@ def test_a_release_of_the_same_step_as_the_latch_is_refused(held: Held) -> None:
 @HELD
 @pytest.mark.parametrize(("since_s", "age"), [(0.1, "0.1"), (0.4, "0.4"), (1.999, "1.9")])
 def test_a_release_without_a_number_is_refused_until_two_seconds_after_the_latch(
-    held: Held, since_s: float, age: str
+    held: LatchCase, since_s: float, age: str
 ) -> None:
     life = ready()
     held.hold(life, 1.0, "ann")
@@ -379,7 +379,7 @@ def test_a_release_without_a_number_is_refused_until_two_seconds_after_the_latch
 
 @HELD
 @pytest.mark.parametrize("none", [False, True])
-def test_a_release_that_names_another_latch_is_refused(held: Held, none: bool) -> None:
+def test_a_release_that_names_another_latch_is_refused(held: LatchCase, none: bool) -> None:
     life = ready()
     held.hold(life, 1.0, "ann")
     latch = 0 if none else number(life)
