@@ -15,7 +15,7 @@ from typing import Literal
 
 import pytest
 
-from tests.system.harness import Heard, until
+from tests.system.harness import ReceivedLine, until
 from tests.systemd.container import (
     ACSARD,
     CONFIG,
@@ -43,7 +43,7 @@ CYCLE_S = 2.0
 FILE = f"{STATES}/acsard/acsar.latches.json"
 
 
-def moves(board: Board, since: float) -> list[Heard]:
+def moves(board: Board, since: float) -> list[ReceivedLine]:
     """Return the lines after this time that turn a wheel."""
     return [entry for entry in board.since(since) if entry.line not in (ZERO, b"-")]
 
